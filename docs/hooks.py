@@ -1,7 +1,8 @@
 """What the documentation takes from the program itself when the site is built: commands, stages, the Python API.
 
 mkdocs calls `on_page_markdown` for every page (`hooks` in mkdocs.yml). A line `<!-- commands -->`, `<!-- stages -->`,
-`<!-- api -->` or `<!-- modules ROOM -->` of a page is replaced by what the function of that name returns.
+`<!-- api -->`, `<!-- options -->`, `<!-- vocabulary -->` or `<!-- modules ROOM -->` of a page is replaced by what the
+function of that name returns.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 import click
 
 import wavebatch
+from wavebatch.batch.options import describe_options
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.program.command import group_options
 from wavebatch.cli.program.examples import EXAMPLES
@@ -27,7 +29,7 @@ from wavebatch.stages.chain_file import format_step
 
 def on_page_markdown(markdown: str, **_: object) -> str:
     """The page with the generated parts in their places."""
-    makers = {"commands": commands, "stages": stages, "api": api, "modules": modules}
+    makers = {one.__name__: one for one in (commands, stages, api, options, vocabulary, modules)}
     markdown = _name_links(markdown)
     return re.sub(r"(?m)^<!-- (\w+)((?: \w+)*) -->$", lambda found: makers[found[1]](*found[2].split()), markdown)
 
@@ -143,6 +145,31 @@ def _plain(text: str) -> str:
         for piece in pieces
     )
     return _name_links(re.sub(r"docs/((?:algorithms|las-waveforms)\.md)", r"[\1](\1)", plain))
+
+
+def vocabulary() -> str:
+    """Which command has which of the options that several of them have."""
+    have: dict[str, list[str]] = {}
+    for name in COMMANDS:
+        command = main.get_command(click.Context(main), name)
+        parts = getattr(command, "commands", {}) or {"": command}
+        for inner, one in parts.items():
+            for option in one.params:
+                if isinstance(option, click.Option):
+                    have.setdefault(max(option.opts, key=len), []).append(f"{name} {inner}".strip())
+    shared = {name: found for name, found in have.items() if len(found) > 1}
+    lines = ["| option | commands |", "|---|---|"]
+    return "\n".join(lines + [f"| `{name}` | {', '.join(found)} |" for name, found in sorted(shared.items())])
+
+
+def options() -> str:
+    """The keywords of `wavebatch.run`: the fields of RunOptions."""
+    lines = ["| keyword | type | meaning |", "|---|---|---|"]
+    for entry in describe_options().replace("\n    ", "\t").splitlines():
+        head, text = entry.split("\t")
+        name, kind = head.split(" : ", 1)
+        lines.append(f"| `{name}` | `{_cell(kind)}` | {_cell(_plain(text))} |")
+    return "\n".join(lines)
 
 
 def api() -> str:

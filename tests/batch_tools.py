@@ -5,22 +5,22 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from wavebatch.batch.job import RunOptions, StripJob, choose_columns
+from wavebatch.batch.job import StripJob, choose_columns
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.strip_task import BatchOptions
 from wavebatch.stages.chain_file import load_profile
 
 
 def make_job(path, *, profile="fast", columns=None, **options) -> StripJob:
     """A job of a strip with a shipped chain."""
     chain = load_profile(profile)
-    return StripJob(Path(path), chain, RunOptions(columns=choose_columns(chain, columns), **options))
+    return StripJob(Path(path), chain, RunOptions(profile=profile, **options), choose_columns(chain, columns))
 
 
 def run_one(path, folder, *, profile="fast", columns=None, batch=None, **options):
-    """The outcome of one strip; options are those of RunOptions, `batch` those of BatchOptions."""
+    """The outcome of one strip; options are those that decide what is written, `batch` the others."""
     job = make_job(path, profile=profile, columns=columns, **options)
-    result = run_batch([job], BatchOptions(Path(folder), **(batch or {})))
+    result = run_batch([job], RunOptions(Path(folder), **(batch or {})))
     return result.outcomes[0]
 
 

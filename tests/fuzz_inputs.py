@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
+from pulse_files import Pulse, PulseFile, Sampling, bell
 from strips import vlr
 
 from wavebatch.cli import main
@@ -70,7 +71,7 @@ synthesize {input} -o {out}/a.las -q
 synthesize {input} -o {out}/a.las --intensity reflectance --sensor-height 900 -q
 check {input}
 grid {input} --column amplitude --column z --statistic median --size 1 -o {out}/a.tif
-grid {input} --column echo_width --statistic std -o {out}/a.tif -q --flags-without WEAK
+grid {input} --column echo_width --statistic std -o {out}/a.tif -q --drop-flags WEAK
 plot histogram {input} --column amplitude --by number_of_returns -o {out}/a.svg --json
 plot histogram {input} --column echo_flags -o {out}/a.png
 plot map {input} --column echo_width -o {out}/a.png
@@ -85,13 +86,13 @@ run {input} -o {out} --points returns --where Energy<2 --no-data nan --profile f
 run {input} -o {out} --trajectory {base}/degrees.txt --profile fast -q
 run {input} -o {out} --polygon {base}/polygons.geojson --las-version 1.4 --profile fast -q
 slice {input} -o {out}/a.geojson -q
-stats {input} --polygons {base}/polygons.geojson -o {out}/a.csv
+stats {input} --polygon {base}/polygons.geojson -o {out}/a.csv
 grid {input} --column Energy --column Deviation --size 5 -o {out}/a.tif
 plot histogram {input} --column Deviation -o {out}/a.png
 """
 _CARRIED = """
 grid {input} --column Energy --column Deviation --statistic mean --size 5 -o {out}/a.tif
-stats {input} --polygons {base}/polygons.geojson --where "Energy > 1 or Deviation < 3"
+stats {input} --polygon {base}/polygons.geojson --where "Energy > 1 or Deviation < 3"
 compare {input} {base}/carried.las
 compare {input} --angles
 info {input} -v --json
@@ -134,7 +135,7 @@ calibrate {base}/strip.las {base}/packed.laz --targets {input} -o {out}/c.toml -
 """,
     "targets.csv": "calibrate {base}/strip.las --targets {input} -o {out}/c.toml --flight-height 500",
     "polygons.geojson": f"""
-stats {{base}}/cloud.laz --polygons {{input}} -o {{out}}/a.csv
+stats {{base}}/cloud.laz --polygon {{input}} -o {{out}}/a.csv
 run {{base}}/strip.las -o {{out}} --polygon {{input}} {FAST}
 """,
     "list.txt": f"""
@@ -232,6 +233,8 @@ def build_inputs(base: Path) -> None:
     _sound("voxelize", base / "strip.las", "-o", base / "voxels.npz", "--size", "2")
     _sound("slice", base / "strip.las", "--cube", base / "cube.npz", "--lines", "0:2")
     _write_places(base)
+    echoes = [Pulse([[(2000, bell(50, 10 + 0.1 * i, 90, 2.0))]], time=10 * i) for i in range(60)]
+    PulseFile({1: (Sampling(scale=0.5, duration_bits=32),)}, echoes).write(base / "strip.pls")
     target = ["--targets", base / "targets.csv", "-o", base / "calibrated.toml"]
     _sound("calibrate", base / "strip.las", *target)
 

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 import click
 from fuzz_damage import _damage_text, apply_edits
 
+from wavebatch.batch.options import EXCLUSIVE
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.options import OutputPath
-from wavebatch.cli.program.settings import EXCLUSIVE
 
 SOUND = {
     "run": "run {base}/strip.las -o {out} --profile fast", "info": "info {base}/strip.las",
@@ -26,6 +26,7 @@ SOUND = {
     "grid": "grid {base}/cloud.laz --column z -o {out}/a.tif",
     "calibrate": "calibrate {base}/strip.las --targets {base}/targets.csv -o {out}/a.toml --flight-height 500",
     "bench": "bench --scene flat --waveforms 100 --pulses 0 --repeat 1 -o {out}",
+    "import": "import {base}/strip.pls -o {out}/a.las", "export": "export {base}/strip.las -o {out}/a.las",
     "plot waveform": "plot waveform {base}/strip.las -o {out}/a.csv --echoes --profile fast",
     "plot histogram": "plot histogram {base}/cloud.laz --column amplitude -o {out}/a.svg",
     "plot map": "plot map {base}/cloud.laz --column amplitude -o {out}/a.png",
@@ -63,7 +64,7 @@ _PLACES = [
 ]  # fmt: skip
 _READ = ["{base}", "{base}/strip.las", "{base}/cloud.laz", "{base}/truth.npz", "{base}/cal.toml", "{base}/system.toml",
          "{base}/chain.toml", "{base}/targets.csv", "{base}/trajectory.txt", "{base}/beside.wdp", "{base}/cube.npz",
-         "{base}/voxels.npz", "{base}/polygons.geojson"]  # fmt: skip
+         "{base}/voxels.npz", "{base}/polygons.geojson", "{base}/strip.pls"]  # fmt: skip
 
 _NEVER = ("debug", "scheduler", "help", "against", "real", "promises", "large", "all_methods", "peers", "stability")
 """Print tracebacks, wait for a network, or take minutes by design."""

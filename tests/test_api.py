@@ -232,7 +232,7 @@ def test_a_strip_that_fails_is_in_the_result(strips, tmp_path):
         ({"columns": "+echo_tim"}, "did you mean 'echo_time'"),
         ({"chain": "fast", "tolerance": 0.02}, "exclude each other"),
         ({"memory": 1000}, "too little"),
-        ({"chain": "fast", "sensor": wb.SensorRequest(height=800.0)}, None),
+        ({"chain": "fast", "flight_height": 800.0}, None),
     ],
 )
 def test_wrong_options_start_nothing(strips, tmp_path, options, words):

@@ -54,7 +54,7 @@ def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
     told = subprocess.run(
         [*command, "-n", f"CHAIN={chain}"], check=True, env=environment, capture_output=True, text=True
     )
-    assert told.stdout.count(f"--chain {chain} --resume --quiet {strips.name}/b.las") == 1
+    assert told.stdout.count(f"--chain {chain} --resume --quiet '{strips.name}/b.las'") == 1
     (strips / "b.las").rename(strips / "b.LAS")
     (strips / "c.laz").write_bytes(b"no strip")
     (out / "summary.json").unlink()
@@ -64,5 +64,12 @@ def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
     assert {Path(one["strip"]).name: one["status"] for one in summary["strips"]} == {
         "a.las": "skipped", "b.LAS": "skipped", "c.laz": "failed"
     }  # fmt: skip
+    (strips / "c.laz").unlink()
+    (strips / "two words ü.las").write_bytes((strips / "a.las").read_bytes())
+    (strips / "-dash.las").write_bytes((strips / "a.las").read_bytes())
+    for _ in range(2):
+        subprocess.run(command, check=True, env=environment, capture_output=True)
+        assert (out / "two words ü.laz").exists() and (out / "-dash.laz").exists()
+    assert len(json.loads((out / "summary.json").read_text())["strips"]) == 4
     nothing = subprocess.run([*command, "STRIPS=none"], env=environment, capture_output=True, text=True)
     assert nothing.returncode != 0 and "none holds no .las or .laz file; say STRIPS=FOLDER" in nothing.stderr

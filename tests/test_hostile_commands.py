@@ -136,7 +136,7 @@ def test_polygons_that_are_none_are_told_without_the_words_of_python(tmp_path, t
     strip, path = tmp_path / "a.las", tmp_path / "p.geojson"
     simulate_strip("flat", strip, pulses=60, seed=1)
     path.write_text(text)
-    done = CliRunner().invoke(main, ["stats", str(strip), "--polygons", str(path)])
+    done = CliRunner().invoke(main, ["stats", str(strip), "--polygon", str(path)])
     assert done.exit_code == 2 and why in done.stderr and done.stderr.count("\n") == 1
     assert "Error:" not in done.stderr and "object" not in done.stderr
 
@@ -209,7 +209,7 @@ def test_a_chain_can_come_through_a_pipe(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "code"),
     [("run {a} -o {o} --chain /dev/zero", 2), ("run @/dev/zero -o {o}", 2), ("info /dev/zero", 1),
-     ("run {a} -o {o} --trajectory /dev/zero", 2), ("stats {a} --polygons /dev/zero", 2)],
+     ("run {a} -o {o} --trajectory /dev/zero", 2), ("stats {a} --polygon /dev/zero", 2)],
 )  # fmt: skip
 def test_a_device_that_never_ends_is_no_input(tmp_path, words, code):
     strip = make_raw(60).write(tmp_path / "a.las")

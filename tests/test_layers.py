@@ -16,7 +16,7 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 
 INSIDE = {
     "batch": [
-        {"counts", "output_rows", "workers"}, {"selection"}, {"job"}, {"unit"},
+        {"counts", "options", "output_rows", "workers"}, {"selection"}, {"job"}, {"unit"},
         {"explain", "neighbour_pass", "row_transfer"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
     ],
     "surveying/measuring": [{"lone_echoes"}, {"noise_and_width"}, {"residuals"}, {"misfit", "learn_pulse"}],
@@ -24,7 +24,7 @@ INSIDE = {
     "surveying": [
         {"measuring"}, {"flat_ground"}, {"survey", "sensor"},
         {"system_file", "auto_chain", "predict_error"}, {"outgoing"},
-        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"},
+        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"prepare"},
     ],
 }
 """The same within packages whose modules do one thing after another."""

@@ -19,12 +19,12 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # not from typing: Ctrl-C must find this import done (core/interrupts.py)
 if TYPE_CHECKING:
+    from wavebatch.batch.options import RunOptions
     from wavebatch.batch.run import BatchResult, Outcome
     from wavebatch.core.echoes import COLUMNS, Column, EchoFlag, EchoTable
     from wavebatch.core.errors import ConfigError, InputError, StageError
     from wavebatch.core.waveforms import Digitizer, Noise, ReturnTable, SystemPulse, WaveformBlock
     from wavebatch.stages.chain import Chain, Range, Step, stage
-    from wavebatch.surveying.sensor import SensorRequest
     from wavebatch.surveying.survey import Decision, Survey
     from wavebatch.tools.api.chain import auto_chain, load_chain
     from wavebatch.tools.api.cloud import read_cloud
@@ -39,7 +39,7 @@ _MODULES = {
     "core.errors": ("ConfigError", "InputError", "StageError"),
     "core.waveforms": ("Digitizer", "Noise", "ReturnTable", "SystemPulse", "WaveformBlock"),
     "stages.chain": ("Chain", "Range", "Step", "stage"),
-    "surveying.sensor": ("SensorRequest",),
+    "batch.options": ("RunOptions",),
     "surveying.survey": ("Decision", "Survey"),
     "tools.api.chain": ("auto_chain", "load_chain"),
     "tools.api.cloud": ("read_cloud",),
@@ -63,7 +63,7 @@ __all__ = [
     "Outcome",
     "Range",
     "ReturnTable",
-    "SensorRequest",
+    "RunOptions",
     "StageError",
     "Step",
     "Strip",

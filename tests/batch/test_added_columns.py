@@ -53,8 +53,8 @@ def test_a_chain_of_the_user_stays_as_it_is(tiny_strip, tmp_path):
 
 def test_a_flight_height_is_used_named_or_refused(tiny_strip, tmp_path):
     def run(height, folder):
-        sensor = wb.SensorRequest(height=height)
-        return wb.run(tiny_strip, tmp_path / folder, chain="fast", columns="+range", sensor=sensor).outcomes[0]
+        result = wb.run(tiny_strip, tmp_path / folder, chain="fast", columns="+range", flight_height=height)
+        return result.outcomes[0]
 
     known = run(None, "none")
     seen = known.report
@@ -65,6 +65,5 @@ def test_a_flight_height_is_used_named_or_refused(tiny_strip, tmp_path):
     assert not [line for line in seen.remarks if "--flight-height" in line]
     error = run(8000.0, "far").error
     assert "--flight-height 8000 m contradicts the strip: by its direction vectors" in str(error)
-    both = wb.SensorRequest(trajectory=tiny_strip, height=800.0)
     with pytest.raises(wb.ConfigError, match="--trajectory and --flight-height exclude each other"):
-        wb.run(tiny_strip, tmp_path / "both", columns="+range", sensor=both)
+        wb.run(tiny_strip, tmp_path / "both", columns="+range", trajectory=tiny_strip, flight_height=800.0)

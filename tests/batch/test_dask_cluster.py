@@ -123,14 +123,14 @@ def test_spooled_packets_travel_through_the_output_folder(dask, strips, tmp_path
     """What one worker puts into a temporary file, the others read; nothing of it remains."""
     from batch_tools import make_job
 
+    from wavebatch.batch.options import RunOptions
     from wavebatch.batch.run import run_batch
-    from wavebatch.batch.strip_task import BatchOptions
 
     with distributed.Client(dask.address, set_as_default=False) as client:
         client.wait_for_workers(2)
         client.run(_spool_everything)
         try:
-            result = run_batch([make_job(strips / "b.las")], BatchOptions(tmp_path, scheduler=dask.address))
+            result = run_batch([make_job(strips / "b.las")], RunOptions(tmp_path, scheduler=dask.address))
         finally:
             made = [folder for folders in client.run(_spool_as_ever).values() for folder in folders]
     assert result.outcomes[0].error is None

@@ -30,6 +30,15 @@ def test_a_plain_strip_has_none(tiny_strip, tmp_path):
     assert remarks(tiny_strip, tmp_path) == []
 
 
+def test_fits_that_fail_far_more_than_usual_are_said_with_quiet_too(leica, tiny_strip, tmp_path):
+    """77 % of the fits of --profile fast did not converge, and nothing was said."""
+    done = CliRunner().invoke(main, ["run", str(leica), "-o", str(tmp_path / "a"), "-q", "--profile", "fast"])
+    (line,) = done.stderr.splitlines()
+    assert "% of" not in line and "are NOT_CONVERGED, far more than usual" in line and "use --profile auto" in line
+    done = CliRunner().invoke(main, ["run", str(tiny_strip), "-o", str(tmp_path / "b"), "-q", "--profile", "fast"])
+    assert done.stderr == ""
+
+
 @pytest.mark.parametrize("factor", [0.0, 1e-3], ids=["none", "ns for ps"])
 def test_return_locations_that_are_not_those_of_echoes_are_doubted(tiny_strip, tmp_path, edit_points, factor):
     def change(points):

@@ -211,8 +211,8 @@ from pathlib import Path
 sys.path.insert(0, {tests!r})
 import wavebatch.batch.strip_task, wavebatch.batch.unit
 from batch_tools import make_job
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.strip_task import BatchOptions
 
 def prepare(job):
     once = Path({once!r})
@@ -225,7 +225,7 @@ if __name__ == "__main__":
     wavebatch.batch.strip_task.prepare_strip = prepare
     folder = Path({strips!r})
     jobs = [make_job(folder / name) for name in ("a.las", "b.las", "c.las")]
-    result = run_batch(jobs, BatchOptions(Path({out!r}), jobs=2))
+    result = run_batch(jobs, RunOptions(Path({out!r}), jobs=2))
     print([outcome.status for outcome in result.outcomes])
     print(result.outcomes[1].error)
 """

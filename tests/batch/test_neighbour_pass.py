@@ -15,10 +15,10 @@ from strips import descriptor, make_raw, vlr
 from writer_tools import plan_output
 
 from wavebatch.batch import neighbour_pass
-from wavebatch.batch.job import RunOptions, StripJob, choose_columns
+from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.neighbour_pass import SecondPass, process_tile
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.strip_task import BatchOptions
 from wavebatch.cli import main
 from wavebatch.core.echoes import RAY
 from wavebatch.core.errors import ConfigError
@@ -46,8 +46,8 @@ def strips(tmp_path_factory):
 
 def run_strip(path, folder, *, columns=None, text=CHAIN, batch=None, **options):
     chain = parse_chain(text, "test")
-    job = StripJob(Path(path), chain, RunOptions(columns=choose_columns(chain, columns), **options))
-    outcome = run_batch([job], BatchOptions(Path(folder), **(batch or {}))).outcomes[0]
+    job = StripJob(Path(path), chain, RunOptions(**options), choose_columns(chain, columns))
+    outcome = run_batch([job], RunOptions(Path(folder), **(batch or {}))).outcomes[0]
     assert outcome.error is None, outcome.error
     return outcome.report
 
@@ -184,8 +184,8 @@ def test_a_failure_in_the_second_pass_leaves_nothing(strips, tmp_path, monkeypat
 
     monkeypatch.setattr(SecondPass, "take", fail)
     chain = parse_chain(CHAIN, "test")
-    job = StripJob(strips / "slope.las", chain, RunOptions(columns=choose_columns(chain)))
-    assert run_batch([job], BatchOptions(tmp_path)).failed == 1
+    job = StripJob(strips / "slope.las", chain, columns=choose_columns(chain))
+    assert run_batch([job], RunOptions(tmp_path)).failed == 1
     assert not list(tmp_path.iterdir())
 
 
@@ -301,9 +301,9 @@ def test_memory_does_not_grow_with_the_strip(layout, tmp_path, monkeypatch):
 def test_the_second_pass_is_not_told_as_units(strips, tmp_path, monkeypatch):
     monkeypatch.setattr(neighbour_pass, "TILE_POINTS", 2000)
     chain = parse_chain(CHAIN, "test")
-    job = StripJob(strips / "slope.las", chain, RunOptions(columns=choose_columns(chain)))
+    job = StripJob(strips / "slope.las", chain, columns=choose_columns(chain))
     events = []
-    run_batch([job], BatchOptions(tmp_path), events.append)
+    run_batch([job], RunOptions(tmp_path), events.append)
     units = [(event["done"], event["of"]) for event in events if event["event"] == "unit"]
     assert units == [(number + 1, units[0][1]) for number in range(len(units))] and len(units) == units[0][1]
 
@@ -313,6 +313,6 @@ def test_strips_that_are_not_in_metres_are_refused(tmp_path):
     raw.vlrs = [descriptor(1), vlr(b"LASF_Projection", 34735, np.array([1, 1, 0, 1, 1024, 0, 1, 2], "<u2").tobytes())]
     raw.write(tmp_path / "s.las")
     chain = parse_chain(CHAIN, "test")
-    job = StripJob(tmp_path / "s.las", chain, RunOptions(columns=choose_columns(chain)))
-    error = run_batch([job], BatchOptions(tmp_path / "out")).outcomes[0].error
+    job = StripJob(tmp_path / "s.las", chain, columns=choose_columns(chain))
+    error = run_batch([job], RunOptions(tmp_path / "out")).outcomes[0].error
     assert "coordinates are degrees" in str(error) and "project the strip to metres" in str(error)

@@ -11,8 +11,8 @@ import pytest
 from batch_tools import make_job, run_one
 from click.testing import CliRunner
 
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.strip_task import BatchOptions
 from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk import publish
@@ -200,7 +200,7 @@ def test_two_runs_never_mix_their_outputs(place, batch):
             done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
             said.append(done.stdout + done.stderr)
 
-    result = run_batch([make_job("good.las")], BatchOptions(Path("out"), **batch), begin)
+    result = run_batch([make_job("good.las")], RunOptions(Path("out"), **batch), begin)
     assert result.failed == 0
     assert said[0].startswith("failed") and "good: another run makes this output now" in said[0]
     report = json.loads(Path("out/good.report.json").read_text())

@@ -170,7 +170,7 @@ def test_resume_makes_it_anew_when_the_calibration_changes(tmp_path, tiny_strip)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--lever-arm", "1,2"), "--lever-arm: '1,2' must be three numbers"),
+        (("--lever-arm", "1,2"), "invalid value for '--lever-arm': '1,2' is not X,Y,Z"),
         (("--lever-arm", "1,2,3"), "--lever-arm is of no use without --trajectory"),
         (("--calibration", "none.toml"), "none.toml: calibration file cannot be read"),
     ],

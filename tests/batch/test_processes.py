@@ -115,6 +115,54 @@ def test_calls_that_nobody_has_taken_are_given_up_when_all_processes_are_dead():
         assert all(isinstance(future.exception(), WorkerDied) for future in futures)
 
 
+_SCRIPT = """
+import wavebatch as wb
+print("script runs")
+result = wb.run({strip!r}, {out!r}, profile="fast", jobs=2)
+print(result)
+"""
+
+_STAGE_SCRIPT = """
+import wavebatch as wb
+from wavebatch.core.waveforms import Noise
+from wavebatch.stages.chain import STAGES
+
+@wb.stage("noise")
+def mine(block: wb.WaveformBlock, system: wb.SystemPulse) -> Noise:
+    \"\"\"Noise of this script.\"\"\"
+    from wavebatch.stages.noise import pooled
+    return pooled(block, system)
+
+def work():
+    chain = wb.load_chain("fast")
+    steps = (wb.Step(STAGES["noise.mine"]), *chain.steps[1:])
+    print(wb.run({strip!r}, {out!r}, chain=wb.Chain(steps, "mine"), jobs=2).failed)
+{call}
+"""
+
+
+def _run_script(tmp_path, tiny_strip, text, **more):
+    script = tmp_path / "script.py"
+    script.write_text(text.format(strip=str(tiny_strip), out=str(tmp_path / "out"), **more))
+    return subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
+
+
+def test_a_script_needs_no_main_guard(tiny_strip, tmp_path):
+    """Every process ran the user's script: 250 lines of traceback and no cloud."""
+    done = _run_script(tmp_path, tiny_strip, _SCRIPT)
+    assert done.returncode == 0 and done.stderr == "" and (tmp_path / "out" / "tiny.laz").exists()
+    assert done.stdout.splitlines() == ["script runs", "BatchResult(1 strip written, 0 skipped, 0 failed)"]
+
+
+def test_a_script_with_a_stage_needs_one_and_says_so(tiny_strip, tmp_path):
+    done = _run_script(tmp_path, tiny_strip, _STAGE_SCRIPT, call='if __name__ == "__main__":\n    work()')
+    assert done.returncode == 0 and done.stdout == "0\n", done.stderr
+    (tmp_path / "out" / "tiny.laz").unlink()
+    (tmp_path / "out" / "tiny.report.json").unlink()
+    done = _run_script(tmp_path, tiny_strip, _STAGE_SCRIPT, call="work()")
+    assert "Traceback" not in done.stderr and done.stderr.startswith("error: this script has a stage")
+
+
 _INTERRUPTED = """
 import os, signal, sys, threading, time
 sys.path.insert(0, {tests!r})

@@ -121,22 +121,33 @@ def test_a_chunk_that_fails_names_the_cloud(tmp_path):
 needs_memory = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="a place for files in memory")
 
 
-_ELSEWHERE = """
-import os, signal
+_PLACE = """
 from pathlib import Path
 from wavebatch.files.disk import shared_rows, temp_folders
-temp_folders.MEMORY_PLACE = Path({place!r})  # in the worker processes too, which run this script up to here
+temp_folders.MEMORY_PLACE = Path({place!r})
 shared_rows.LEAST = 0
+"""
+
+
+def _elsewhere(tmp_path, place):
+    """Environment in which processes and their workers have another place in memory: Python reads sitecustomize."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(_PLACE.format(place=str(place)))
+    return {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+
+
+_KILLED = """
+import os, signal
+from wavebatch.files.disk import temp_folders
 
 def kill(stream, rows):
-    assert list(Path({place!r}).glob("*/tmp*"))
+    assert list(temp_folders.MEMORY_PLACE.glob("*/tmp*"))
     os.kill(os.getpid(), signal.SIGKILL)
 
-if __name__ == "__main__":
-    from wavebatch.__main__ import main
-    from wavebatch.batch.row_transfer import RowStream
-    RowStream.add = kill
-    main()
+from wavebatch.__main__ import main
+from wavebatch.batch.row_transfer import RowStream
+RowStream.add = kill
+main()
 """
 
 
@@ -147,10 +158,10 @@ def test_a_killed_run_leaves_nothing_in_memory(tiny_strip, tmp_path):
     place = tmp_path / "memory"
     place.mkdir()
     script = tmp_path / "run.py"
-    script.write_text(_ELSEWHERE.format(place=str(place)))
+    script.write_text(_KILLED)
     command = [sys.executable, str(script), "run", str(tiny_strip), "-o", str(tmp_path / "out")]
-    done = subprocess.run([*command, "--profile", "fast", "--quiet", "--jobs", "2"])
-    assert done.returncode == -signal.SIGKILL
+    command += ["--profile", "fast", "--quiet", "--jobs", "2"]
+    assert subprocess.run(command, env=_elsewhere(tmp_path, place)).returncode == -signal.SIGKILL
     _wait_until_empty(place)
 
 
@@ -163,9 +174,6 @@ def _wait_until_empty(place):
 
 _IDLE = """
 import os, signal
-from pathlib import Path
-from wavebatch.files.disk import temp_folders
-temp_folders.MEMORY_PLACE = Path({place!r})
 if __name__ == "__main__":
     from wavebatch.batch.workers.processes import Workers
     with Workers(2) as workers:
@@ -183,8 +191,8 @@ def test_workers_that_wait_for_calls_clean_up_before_they_end(tmp_path):
     place = tmp_path / "memory"
     place.mkdir()
     script = tmp_path / "idle.py"
-    script.write_text(_IDLE.format(place=str(place)))
-    assert subprocess.run([sys.executable, str(script)]).returncode == -signal.SIGKILL
+    script.write_text(_IDLE)
+    assert subprocess.run([sys.executable, str(script)], env=_elsewhere(tmp_path, place)).returncode == -signal.SIGKILL
     _wait_until_empty(place)
 
 

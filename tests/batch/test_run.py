@@ -9,10 +9,11 @@ import pytest
 from batch_tools import make_job, read_cloud, run_one
 from writer_tools import read_provenance
 
-from wavebatch.batch.job import RunOptions, choose_columns
+from wavebatch.batch.job import choose_columns
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.preflight import LEAST_MEMORY, check_outputs, plan_memory, plan_strip
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.strip_task import BatchOptions, StripTask
+from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import ConfigError, InputError
 
@@ -108,7 +109,7 @@ def test_one_bad_strip_does_not_stop_the_others(tiny_strip, tmp_path):
     broken.write_bytes(tiny_strip.read_bytes()[:1000])
     jobs = [make_job(broken), make_job(tmp_path / "none.las"), make_job(tiny_strip)]
     events = []
-    result = run_batch(jobs, BatchOptions(tmp_path / "out", jobs=2), events.append)
+    result = run_batch(jobs, RunOptions(tmp_path / "out", jobs=2), events.append)
     assert [outcome.status for outcome in result.outcomes] == ["failed", "failed", "written"]
     assert result.failed == 2
     for outcome in result.outcomes[:2]:
@@ -197,7 +198,7 @@ def test_an_account_that_does_not_add_up_is_a_failure_not_a_cloud(tiny_strip, tm
 def test_a_strip_that_changes_while_it_is_read_is_not_written(tiny_strip, tmp_path):
     strip = tmp_path / "tiny.las"
     shutil.copyfile(tiny_strip, strip)
-    task = StripTask(make_job(strip), BatchOptions(tmp_path), alone=False)
+    task = StripTask(make_job(strip), RunOptions(tmp_path), alone=False)
     assert task.start() is None
     from wavebatch.batch.workers.processes import Workers
 
@@ -213,16 +214,16 @@ def test_a_strip_that_changes_while_it_is_read_is_not_written(tiny_strip, tmp_pa
 
 
 def test_outputs_never_replace_inputs(tiny_strip, riegl, tmp_path):
-    options = BatchOptions(tiny_strip.parent)
+    options = RunOptions(tiny_strip.parent)
     with pytest.raises(ConfigError, match="would replace this input"):
         check_outputs([make_job(tiny_strip, format="las")], options)
     check_outputs([make_job(tiny_strip)], options)
     with pytest.raises(ConfigError, match=r"\.wdp: the output would replace"):
-        check_outputs([make_job(riegl, keep_packets=True)], BatchOptions(riegl.parent))
+        check_outputs([make_job(riegl, keep_packets=True)], RunOptions(riegl.parent))
     link = tmp_path / "link"
     link.symlink_to(tiny_strip.parent)
     with pytest.raises(ConfigError, match="would replace this input"):
-        run_batch([make_job(tiny_strip, format="las")], BatchOptions(link, overwrite=True))
+        run_batch([make_job(tiny_strip, format="las")], RunOptions(link, overwrite=True))
 
 
 def test_memory_decides_jobs_and_blocks():
@@ -237,13 +238,13 @@ def test_memory_decides_jobs_and_blocks():
 
 
 def test_the_plan_of_a_strip_touches_nothing(tiny_strip, tmp_path):
-    plan = plan_strip(make_job(tiny_strip), BatchOptions(tmp_path / "out"))
+    plan = plan_strip(make_job(tiny_strip), RunOptions(tmp_path / "out"))
     assert plan["action"] == "write" and plan["points"] > 400 and plan["estimated_bytes"] > 0
     assert not (tmp_path / "out").exists()
     run_one(tiny_strip, tmp_path / "out")
-    assert plan_strip(make_job(tiny_strip), BatchOptions(tmp_path / "out", resume=True))["action"] == "skip"
+    assert plan_strip(make_job(tiny_strip), RunOptions(tmp_path / "out", resume=True))["action"] == "skip"
     with pytest.raises(InputError, match="exists already"):
-        plan_strip(make_job(tiny_strip), BatchOptions(tmp_path / "out"))
+        plan_strip(make_job(tiny_strip), RunOptions(tmp_path / "out"))
 
 
 def test_columns_are_chosen_and_added():
@@ -273,7 +274,7 @@ def test_a_prepared_strip_travels_between_processes(tiny_strip):
     prepared = prepare_strip(make_job(tiny_strip))
     again = pickle.loads(pickle.dumps(prepared))
     assert again.system == prepared.system and again.layout.dtype == prepared.layout.dtype
-    assert again.job.options == RunOptions(columns=prepared.job.options.columns)
+    assert again.job.options == RunOptions(profile="fast") and again.job.columns == prepared.job.columns
     prepared.scan.close()
 
 

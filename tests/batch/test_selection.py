@@ -277,5 +277,5 @@ def test_the_workers_of_a_cluster_need_not_see_the_polygons(tiny_strip, tmp_path
     energy.write_text("time energy\n0 1\n1 1\n")
     with pytest.raises(ConfigError, match="stop"):
         wb.run(tiny_strip, tmp_path, polygon=_area(tmp_path / "a.json", (0, 0, 1, 1)), energy=energy,
-               sensor=wb.SensorRequest(trajectory=path), scheduler="tcp://there:8786")  # fmt: skip
+               trajectory=path, scheduler="tcp://there:8786")  # fmt: skip
     assert sorted(seen) == sorted([tiny_strip, path, energy])

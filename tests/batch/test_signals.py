@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from batch_tools import make_job
 
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.strip_task import BatchOptions
 from wavebatch.files.disk.publish import Draft
 from wavebatch.tools.simulate import simulate_strip
 
@@ -119,7 +119,7 @@ def test_ctrl_c_inside_the_compressor_reaches_a_program_that_uses_the_library(st
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_batch([make_job(strip)], BatchOptions(tmp_path))
+            run_batch([make_job(strip)], RunOptions(tmp_path))
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)

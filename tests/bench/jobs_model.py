@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from bench.against import simulate_strips
 
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.batch.workers.processes import Workers
@@ -185,7 +186,7 @@ def measure_worker() -> float:
 
 def time_preparation(strip: Path, folder: Path) -> float:
     """Processor seconds of scan and survey."""
-    (job,), _ = plan_run([strip], folder, overwrite=True)
+    (job,), _ = plan_run([strip], RunOptions(folder, overwrite=True))
     begin = time.process_time()
     prepare_strip(job).scan.close()
     return time.process_time() - begin
@@ -193,7 +194,7 @@ def time_preparation(strip: Path, folder: Path) -> float:
 
 def run_lap(strip: Path, folder: Path, jobs: int) -> Lap:
     """Take the strip from file to file."""
-    planned = plan_run([strip], folder, jobs=jobs, overwrite=True)
+    planned = plan_run([strip], RunOptions(folder, jobs=jobs, overwrite=True))
     before = _usage()
     result = run_batch(*planned)
     after = _usage()
@@ -208,7 +209,7 @@ def run_small(strip: Path, folder: Path) -> float:
     copies = [folder / f"{number}{strip.suffix}" for number in range(SMALL_STRIPS)]
     for copy in copies:
         copy.write_bytes(strip.read_bytes())
-    planned = plan_run(copies, folder / "clouds", jobs=2)
+    planned = plan_run(copies, RunOptions(folder / "clouds", jobs=2))
     _, before, _ = _usage()
     result = run_batch(*planned)
     _, after, _ = _usage()

@@ -69,7 +69,7 @@ def test_every_shell_has_its_script(shell):
     ("words", "number", "offers"),
     [
         ("wavebatch run a --drop-flags weak,ring", 4, ["weak,RINGING_SUSPECT"]),
-        ("wavebatch plot map a --flags-without NO_E", 5, ["NO_ECHO"]),
+        ("wavebatch plot map a --drop-flags NO_E", 5, ["NO_ECHO"]),
         ("wavebatch run a --columns +ran", 4, ["+range", "+range_err", "+range_error"]),
         ("wavebatch run a --columns +range,+rang", 4, ["+range,+range_err", "+range,+range_error"]),
         ("wavebatch grid a --column echo_w", 4, ["echo_width", "echo_width_err"]),

@@ -109,6 +109,7 @@ CASES = {
     "check STRIP": "check/1",
     "survey STRIP --waveforms 200": "system/1",
     "stages": "stages/1",
+    "calibrate STRIP --targets TARGETS -o cal.toml -q": "calibration-report/1",
     "simulate slope -o s.las --pulses 300 -q": "simulate/1",
     "import PULSES -o i.las -q": "import/1",
     "export STRIP -o e.npz -q": "export/1",
@@ -124,7 +125,8 @@ def test_documents_of_commands(folder, riegl, tmp_path, monkeypatch, line):
     monkeypatch.chdir(tmp_path)
     names = {"STRIP": riegl, "PULSES": riegl.with_suffix(".pls"), "CLOUD": folder / f"{riegl.stem}.laz",
              "ROOT": PAGE.parents[1], "SIM": folder / "sim.las", "CUBE": folder / "cube.npz",
-             "VOXELS": folder / "voxels.npz"}  # fmt: skip
+             "VOXELS": folder / "voxels.npz", "TARGETS": "t.csv"}  # fmt: skip
+    Path("t.csv").write_text("name,reflectance,x,y,radius\ngrey,0.3,548363.742,5389952.964,3\n")
     if line.startswith("grid"):
         pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     found = _print(*(names.get(word, word) for word in line.split()))

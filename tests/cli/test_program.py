@@ -1,5 +1,6 @@
 """The program as a whole: help with examples, manual pages, version, settings from outside, log files."""
 
+import inspect
 import re
 import shlex
 import shutil
@@ -10,12 +11,14 @@ import click
 import pytest
 from click.testing import CliRunner
 
+import wavebatch as wb
+from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.program import log_file
 from wavebatch.cli.program.about import roff
 from wavebatch.cli.program.command import ProgramCommand
 from wavebatch.cli.program.examples import EXAMPLES, GROUPS
-from wavebatch.cli.program.settings import EXCLUSIVE, NEVER
+from wavebatch.cli.program.settings import NEVER, OLD_NAMES
 
 
 def invoke(*arguments, **environment):
@@ -55,10 +58,51 @@ def test_examples_are_right_usage(title, line):
 def test_groups_name_options_that_exist_and_each_once():
     known = {option.name for _, command in _commands() for option in command.params} | {"help"}
     named = [name for names in GROUPS.values() for name in names]
-    assert len(named) == len(set(named))
-    rivals = {name for group in EXCLUSIVE for name in group}
-    assert [name for name in {*rivals, *NEVER} if name not in known] == []
+    assert len(named) == len(set(named)) and not set(named) & set(OPTIONS)
+    rivals = {name for group in (*EXCLUSIVE, *NEEDS.values(), NEEDS) for name in group}
+    assert [name for name in {*rivals, *NEVER, *ELSEWHERE} if name not in known] == []
     assert set(named) - known == set()
+
+
+def test_run_has_the_options_of_runoptions_and_python_the_same():
+    command = dict(_commands())["run"]
+    names = {option.name: option for option in command.params}
+    keywords = inspect.signature(wb.run).parameters
+    for name, told in OPTIONS.items():
+        assert max(names[name].opts, key=len) == f"--{name.replace('_', '-')}"
+        assert name in keywords and names[name].help.startswith(told.help.split("  [")[0])
+        if name != "output":
+            assert f"{name} : " in wb.run.__doc__ and keywords[name].default == getattr(RunOptions(), name)
+    extra = {"strips", "dry_run", "report", "html_file", "progress", "verbose", "as_json", "quiet", "log_path",
+             "log_level", "debug"}  # fmt: skip
+    assert names.keys() - OPTIONS.keys() == extra and keywords.keys() - OPTIONS.keys() == {"strips", "on_event"}
+
+
+def test_help_of_run_begins_with_the_options_that_most_need():
+    shown = invoke("run", "--help").stdout
+    headings = re.findall(r"(?m)^([A-Z][\w ]+):\n  -", shown)
+    assert headings[0] == "Options that most runs need"
+    first = shown.split(headings[0])[1].split(f"\n{headings[1]}:")[0]
+    assert len(re.findall(r"(?m)^  (?:-\w, )?--", first)) <= 11 and "--jobs" in first and "--crs" not in first
+
+
+@pytest.mark.parametrize(
+    ("variable", "words"),
+    [
+        ("WAVEBATCH_RUN_FORMTA", "no command has this option; did you mean WAVEBATCH_RUN_FORMAT?"),
+        ("WAVEBATCH_JBOS", "did you mean WAVEBATCH_JOBS?"),
+        ("WAVEBATCH_SURVEY_OVERWRITE", "this option can be given on the command line only"),
+        ("WAVEBATCH_PLOT_MAP_QQQQQQQQQQQQQQQQ", "see --help for the names"),
+    ],
+)
+def test_a_variable_that_no_command_reads_is_said(folder, variable, words):
+    shown = _dry(folder, **{variable: "3"})
+    assert shown.exit_code == 0 and shown.stderr.startswith(f"warning: {variable} is ignored: ")
+    assert words in shown.stderr and shown.stderr.count("\n") == 1
+
+
+def test_variables_of_other_commands_and_of_others_are_not_said(folder):
+    assert _dry(folder, WAVEBATCH_SURVEY_WAVEFORMS="9", WAVEBATCH_DATA="x", WAVEBATCH_SEED="1").stderr == ""
 
 
 def test_options_that_take_a_number_name_its_unit():
@@ -68,6 +112,29 @@ def test_options_that_take_a_number_name_its_unit():
                 unit = option.metavar and option.metavar not in ("FLOAT", None)
                 none = option.help.startswith(("Correlation", "Share"))
                 assert unit or none or re.search(r"\[[^\]]+\]", option.help), (title, option.name)
+
+
+def test_options_of_several_commands_mean_the_same():
+    seen = {}
+    for title, command in _commands():
+        for option in command.params:
+            if isinstance(option, click.Option):
+                name = max(option.opts, key=len)
+                kind = (type(option.type).__name__, option.is_flag)
+                seen.setdefault(name, {}).setdefault(kind, []).append(title)
+    mixed = {name: kinds for name, kinds in seen.items() if len(kinds) > 1}
+    # Files that are written in one command are read by others; other names stand for numbers of different things.
+    read_or_written = {"--chain", "--truth", "--angles"}
+    numbers = {"--tolerance", "--point-format", "--no-data", "--pulses", "--width", "--most"}
+    assert mixed.keys() <= read_or_written | numbers
+    assert not seen.keys() & OLD_NAMES.keys() and set(OLD_NAMES.values()) <= seen.keys()
+
+
+def test_old_names_of_options_work_with_a_remark(tiny_strip, tmp_path):
+    (tmp_path / "a.las").write_bytes(tiny_strip.read_bytes())
+    old = invoke("stats", tmp_path / "a.las", "--where", "flag(WEAK) or z > 0", "--polygons=none.json")
+    assert old.exit_code == 2 and old.stderr.startswith("remark: --polygons is now --polygon; ")
+    assert "none.json" in old.stderr.splitlines()[1]
 
 
 def test_version_names_python_and_the_libraries():
@@ -178,7 +245,7 @@ def test_a_log_has_what_quiet_hides_and_is_appended(folder, tmp_path):
     assert any("INFO" in line and "tiny.las" in line and "waveforms" in line for line in lines)
     assert any("ERROR" in line and "broken.las" in line for line in lines)
     assert invoke(*arguments, "--resume", "--log-level", "error").exit_code == 3
-    assert log.read_text().count("broken.las") == 2 and log_file._log is None
+    assert log.read_text().count("broken.las") == 2 and not log_file.is_open()
 
 
 @pytest.mark.parametrize("words", ["run in -o out", "plot map in --column z -o m.png"])

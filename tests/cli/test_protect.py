@@ -62,7 +62,7 @@ _CASES = [
     "stats @list.txt -o s.las --overwrite",
     "stats @list.txt -o list.txt --overwrite",
     "stats s.las --area 5 -o link.las --overwrite",
-    "stats s.las --polygons areas.json -o areas.json --overwrite",
+    "stats s.las --polygon areas.json -o areas.json --overwrite",
     "calibrate s.las --targets targets.csv -o targets.csv --overwrite",
     "calibrate s.las --targets targets.csv -o s.las --overwrite",
     "calibrate s.las --targets targets.csv --system sys.toml -o sys.toml --overwrite",

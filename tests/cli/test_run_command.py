@@ -218,3 +218,13 @@ def test_an_unknown_command_names_the_nearest():
 def test_python_m_wavebatch_is_the_command():
     done = subprocess.run([sys.executable, "-m", "wavebatch", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("wavebatch ")
+
+
+def test_what_lies_under_the_output_is_made(tiny_strip, tmp_path):
+    """README's line for cron was refused: folder `new` does not exist."""
+    new = tmp_path / "new"
+    words = ["run", str(tiny_strip), "-o", str(new), "-q", "--profile", "fast"]
+    done = CliRunner().invoke(main, [*words, "--report", str(new / "sub" / "sum.json"), "--html", str(new / "p.html")])
+    assert done.exit_code == 0 and (new / "sub" / "sum.json").exists() and (new / "p.html").exists(), done.stderr
+    done = CliRunner().invoke(main, [*words, "--overwrite", "--report", str(tmp_path / "other" / "sum.json")])
+    assert done.exit_code == 2 and "other does not exist; make it first" in done.stderr

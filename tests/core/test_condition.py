@@ -85,6 +85,22 @@ def test_errors_have_the_place(text, place, word):
     assert message.startswith(f"--where: character {place}: ") and word in message and "\n" not in message
 
 
+@pytest.mark.parametrize(
+    ("text", "chosen"),
+    [
+        ("flag(SATURATED)", [0, 1, 0, 1]), ("echo_flags has saturated and z > 0", [0, 0, 0, 1]),
+        ("not flag( WEAK ) or flag(SATURATED)", [1, 1, 0, 1]), ("not (echo_flags has WEAK)", [1, 1, 0, 0]),
+    ],
+)  # fmt: skip
+def test_flags_have_names(text, chosen):
+    bits = {"echo_flags": np.array([0, 8, 32, 40, np.nan]), "z": np.array([1.0, -1, 1, 1, 1])}
+    condition = parse_condition(text)
+    found = condition.choose({name: bits[name] for name in condition.columns})
+    assert found.astype(int).tolist() == [*chosen, 0]
+    with pytest.raises(ConfigError, match=r"character 6: flag 'WEEK' does not exist; did you mean 'WEAK'"):
+        parse_condition("flag(WEEK)")
+
+
 def test_length_and_depth_are_bounded():
     with pytest.raises(ConfigError, match=f"at most {MOST_CHARACTERS}"):
         parse_condition("a == 1 or " * 300 + "a == 1")

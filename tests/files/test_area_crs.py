@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from strips import add_record
 
 import wavebatch
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.selection import build_selection
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
@@ -268,7 +269,7 @@ def test_run_stats_and_calibrate_use_placed_areas(strip, tmp_path):
         result = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / name), "--polygon", str(file), "-q"])
         assert result.exit_code == 0, result.output
         numbers.append(read_header(tmp_path / name / "utm.laz").point_count)
-        result = CliRunner().invoke(main, ["stats", str(strip), "--polygons", str(file), "--json"])
+        result = CliRunner().invoke(main, ["stats", str(strip), "--polygon", str(file), "--json"])
         counted.append([area["points"] for area in json.loads(result.stdout)["files"][0]["areas"]])
         again = ["run", str(strip), "-o", str(tmp_path / name), "--polygon", str(file), "--resume"]
         assert "skipped" in CliRunner().invoke(main, again).stderr  # the report has the corners of the file
@@ -288,13 +289,13 @@ def test_an_area_that_misses_the_strip_is_named_with_both_extents(strip, tmp_pat
     away = _write(tmp_path / "away.geojson", _box(strip) + 1e4)
     result = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "o"), "--polygon", str(away), "-q"])
     assert "no point is written" in result.stderr and "lies outside the strip (x " in result.stderr
-    result = CliRunner().invoke(main, ["stats", str(strip), "--polygons", str(away)])
+    result = CliRunner().invoke(main, ["stats", str(strip), "--polygon", str(away)])
     assert "lies outside the strip (x " in result.output
 
 
 def test_a_selection_keeps_the_corners_of_its_file_for_the_report(strip, tmp_path):
     degrees = _write(tmp_path / "deg.geojson", _project(_box(strip), "EPSG:32633", "EPSG:4326"))
-    chosen = build_selection(polygon=degrees)
+    chosen = build_selection(RunOptions(polygon=degrees))
     facts = type("F", (), {"path": strip, "header": read_header(strip)})()
     placed = chosen.place(facts)
     assert placed.describe() == chosen.describe() and placed.areas != chosen.areas

@@ -239,7 +239,7 @@ def test_table_text_and_json_say_the_same(tmp_path):
     make_cloud(tmp_path / "c.las")
     path = write_features(tmp_path / "p.json", feature("Polygon", [[[300_000, -30], [300_050, -30], [300_050, 30]]],
                                                        name="a, \"b\""))  # fmt: skip
-    arguments = [str(tmp_path / "c.las"), "--area", "12", "--polygons", str(path), "-o", str(tmp_path / "t.csv")]
+    arguments = [str(tmp_path / "c.las"), "--area", "12", "--polygon", str(path), "-o", str(tmp_path / "t.csv")]
     document = json.loads(CliRunner().invoke(stats, [*arguments, "--json"]).stdout)
     found = document["files"][0]["areas"]
     with open(tmp_path / "t.csv", newline="") as file:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.batch.job import RunOptions, StripJob, choose_columns
+from wavebatch.batch.job import StripJob, choose_columns
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.strip_task import BatchOptions
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import buckets
@@ -34,9 +34,9 @@ def clouds(tmp_path_factory):
     chain = parse_chain(CHAIN, "test")
     for name, columns in (("both", "+echo_flags"), ("widths", ",".join([NAMES[0], f"{NAMES[0]}_err"])),
                           ("normals", ",".join([NAMES[1], f"{NAMES[1]}_err"]))):  # fmt: skip
-        options = RunOptions(columns=choose_columns(chain, columns), format="las")
-        job = StripJob(folder / "village.las", chain, options, sensor=SensorRequest(height=640.0))
-        outcome = run_batch([job], BatchOptions(folder / name)).outcomes[0]
+        options, written = RunOptions(format="las"), choose_columns(chain, columns)
+        job = StripJob(folder / "village.las", chain, options, written, sensor=SensorRequest(height=640.0))
+        outcome = run_batch([job], RunOptions(folder / name)).outcomes[0]
         assert outcome.error is None, outcome.error
     return {name: folder / name / "village.las" for name in ("both", "widths", "normals")}
 

@@ -15,7 +15,6 @@ import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.files.las.header import Vlr
 from wavebatch.tools.inspect.file_facts import describe_file
-from wavebatch.tools.inspect.provenance import describe_provenance
 
 
 @pytest.mark.parametrize("point_format", [0, 1, 3, 6, 8])
@@ -48,7 +47,8 @@ def test_a_cloud_shows_how_it_was_made(tiny_strip, tmp_path):
     counts = result.report.counts
     facts = describe_file(tmp_path / "tiny.laz")
     (account,) = facts["provenance"]
-    assert account["command"] == "wavebatch run tiny.las -o DIR --chain CHAIN.toml --names pdal --no-data nan"
+    typed = "wavebatch run tiny.las -o DIR --profile fast --columns +range --names pdal --no-data nan"
+    assert account["command"] == typed
     assert "decompose.closed_form" in account["chain"] and account["columns"]["range"] == "EchoRange"
     assert account["version"] == wb.__version__ and account["input"] == "tiny.las"
     assert facts["counts"]["echoes"] == counts["echoes"] and facts["counts"]["added"] == counts["added_echoes"]
@@ -77,17 +77,19 @@ def test_the_command_that_is_shown_makes_the_cloud_again(tiny_strip, tmp_path, m
     first = _make(words, "one")
     again = shlex.split(describe_file(Path("one/a strip.laz"))["provenance"][0]["command"])
     assert again[:2] == ["wavebatch", "run"] and again[3:5] == ["-o", "DIR"]
-    again = ["energy.txt" if word == "FILE" else word for word in again]  # an account has no names of such files
-    second = _make(["run", again[2], *again[5:], "--columns", "+amplitude_normalized"], "two")
+    second = _make(["run", again[2], *again[5:]], "two")
     assert first["counts"]["left_out"]["where"] and second["output"]["size"] == first["output"]["size"]
     for key in ("options", "request", "counts"):
         assert second[key] == first[key]
 
 
-def test_the_command_names_where_the_sensor_was():
-    sensor = {"trajectory": {"size": 9}, "lever_arm": [0.1, -0.2, 0.3], "crs": "EPSG:32633", "height": None}
-    command = describe_provenance({"request": {"chain": "auto", "sensor": sensor}})["command"]
-    assert command.endswith("--trajectory FILE --lever-arm 0.1,-0.2,0.3 --crs EPSG:32633")
+def test_the_command_is_what_was_typed_without_folders():
+    """A profile was recorded as `--chain CHAIN.toml`."""
+    options = wb.RunOptions("there", profile="accurate", trajectory="a/b c.txt", lever_arm=(0.1, -0.2, 0.3), jobs=4)
+    typed = "wavebatch run 'a strip.las' -o DIR --profile accurate --trajectory 'b c.txt' --lever-arm 0.1,-0.2,0.3"
+    assert options.command("a strip.las") == typed
+    options = wb.RunOptions("there", tolerance=0.02, chain=None, calibration="x/cal.toml", strict=True, resume=True)
+    assert options.command("s.las").endswith("-o DIR --tolerance 0.02m --calibration cal.toml --strict")
 
 
 def _make(words, folder):

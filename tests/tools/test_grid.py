@@ -120,7 +120,7 @@ def test_more_buckets_than_tiles_are_fine(rasterio, rng, tmp_path, monkeypatch):
 
 def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rasterio, rng, tmp_path):
     x, _, _ = _cloud(tmp_path / "a.las", rng)
-    _run(tmp_path / "a.las", "--statistic", "count", "--size", 7, "--bounds", "500100,5400100,500200.5,5400150", "-o",
+    _run(tmp_path / "a.las", "--statistic", "count", "--size", 7, "--bbox", "500100,5400100,500200.5,5400150", "-o",
          tmp_path / "x.tif")  # fmt: skip
     with rasterio.open(tmp_path / "x.tif") as found:
         assert all(abs(edge / 7 - round(edge / 7)) < 1e-9 for edge in found.bounds)
@@ -156,7 +156,7 @@ def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(r
         (["--column", "height", "--crs", "EPSG:0", "-o", "x.tif"], "give it with --crs"),
         (["--column", "height", "--no-data", "1e39", "-o", "x.tif"], "float32"),
         (["--statistic", "count", "--no-data", "1", "-o", "x.tif"], "choose another with --no-data"),
-        (["--statistic", "count", "--flags-with", "WEAK", "-o", "x.tif"], "has no column echo_flags"),
+        (["--statistic", "count", "--flags", "WEAK", "-o", "x.tif"], "has no column echo_flags"),
     ],
 )  # fmt: skip
 def test_wrong_use_is_one_line_and_writes_nothing(rasterio, rng, tmp_path, monkeypatch, arguments, words):

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from plot_tools import POINTS, write_cloud
 
 from wavebatch.cli import main
+from wavebatch.core.condition import read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
-from wavebatch.core.flag_names import read_flags
 from wavebatch.files.cloud import echo_reader as io_cloud
 from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.tools.plots import raster, values
@@ -395,9 +395,9 @@ def test_what_cannot_be_drawn_is_one_line(tmp_path, cloud, kind):
         (tmp_path / "none.las", "z", 1, "none.las"),
         (cloud, "amplitud", 2, "did you mean 'amplitude'? Columns of the file: amplitude, echo_flags"),
         (cloud, "qqqqqq", 2, "known are amplitude"),
-        (nothing, "intensity --flags-with WEAK", 2, "no column echo_flags"),
-        (cloud, "intensity --flags-with WEEK", 2, "did you mean 'WEAK'"),
-        (cloud, "intensity --flags-with NO_WAVEFORM", 1, "5000 of 5000 points are left out by their flags"),
+        (nothing, "intensity --flags WEAK", 2, "no column echo_flags"),
+        (cloud, "intensity --flags WEEK", 2, "did you mean 'WEAK'"),
+        (cloud, "intensity --flags NO_WAVEFORM", 1, "5000 of 5000 points are left out by their flags"),
     ]
     for path, column, code, message in cases:
         result = run(kind, path, "-o", tmp_path / "p.png", "--column", *column.split())
@@ -480,9 +480,9 @@ def test_names_from_files_are_text_and_no_formulas(tmp_path):
         (["histogram", "--column", "z", "-o", "p.png", "--range", "5:1"], "does not go up"),
         (["histogram", "--column", "z", "-o", "p.png", "--range", "nan:1"], "does not go up"),
         (["histogram", "--column", "echo_flags", "-o", "p.png", "--bins", "3"], "--bins"),
-        (["map", "--column", "echo_flags", "-o", "p.png"], "--statistic count --flags-with"),
+        (["map", "--column", "echo_flags", "-o", "p.png"], "--statistic count --flags"),
         (["map", "-o", "p.png"], "needs a --column"),
-        (["map", "--column", "z", "-o", "p.png", "--bounds", "1,2,3"], "WEST,SOUTH,EAST,NORTH"),
+        (["map", "--column", "z", "-o", "p.png", "--bbox", "1,2,3"], "WEST,SOUTH,EAST,NORTH"),
         (["histgram"], "did you mean 'histogram'?"),
     ],
 )

@@ -15,13 +15,18 @@ from strips import make_raw
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.strip import reader as io_strip
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.stages.decompose.rebuild import MODELS
+from wavebatch.surveying import survey_block
 from wavebatch.tools.bench.plot import _draw_panel
+from wavebatch.tools.compare.chains import ChainRun
+from wavebatch.tools.compare.goodness import measure_fit
+from wavebatch.tools.html.strip_views import measure_residuals
 from wavebatch.tools.plots.draw_sheet import draw_sheet
 from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels
 from wavebatch.tools.plots.echo_table import list_echoes
@@ -34,6 +39,28 @@ KAPPA = 0.15
 
 def run(*words):
     return CliRunner().invoke(main, ["plot", "waveform", *map(str, words)])
+
+
+def test_residuals_are_those_of_the_cleaned_samples():
+    """The noise stage ran again on the raw samples: residuals of sloping baselines were 3.6 times the noise."""
+    rng = np.random.default_rng(8)
+    at = np.arange(120)
+    time, height = rng.uniform(40, 60, (1000, 1)), rng.uniform(6, 100, (1000, 1))
+    slope = 0.08 * rng.standard_normal((1000, 1))
+    exact = 40 + slope * (at - 59.5) + height * np.exp(-0.125 * (at - time) ** 2)
+    counts = np.clip(np.rint(exact + 0.7 * rng.standard_normal((1000, 120))), 0, 255).astype(np.uint8)
+    block = WaveformBlock.from_samples(counts)
+    system, chain = survey_block(block).system, load_profile("accurate")
+    chain = replace(chain, steps=chain.steps[:3])
+    assert system.slope_spread > 0.05
+    views = build_views(block, chain, system, range(1000))
+    residual = np.array([np.sqrt(np.nanmean(view.residual**2)) for view in views])
+    assert np.median(residual) == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(measure_residuals(block, chain, system), residual, rtol=1e-3)
+    found = ChainRun(chain, system, 1.0)
+    solved = found.find(block)
+    misfit, floor = measure_fit(solved.cleaned, solved.noise, solved.system, chain.steps[2], solved.echoes)
+    assert np.nanmedian(misfit / floor) == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.parametrize("name", [name for name, shape in MODELS.items() if shape is not None])
@@ -165,8 +192,8 @@ def test_without_a_wish_a_few_are_spread_over_the_strip(tiny_strip):
         (f"--packet 0:{MOST + 1}", 2, f"{MOST} fit"),
         ("--point 99999", 2, "there is no point 99999"),
         ("--gps-time 3", 2, "no pulse lies within"),
-        ("--flags-with SATURATED --packet 3", 2, "--flags-with"),
-        ("--flags-with SATURATD", 2, "did you mean 'SATURATED'"),
+        ("--flags SATURATED --packet 3", 2, "--flags"),
+        ("--flags SATURATD", 2, "did you mean 'SATURATED'"),
         ("--profile fastt", 2, "did you mean 'fast'"),
         ("--times 5", 2, "LOW:HIGH"),
         ("--chain none.toml", 2, "none.toml"),

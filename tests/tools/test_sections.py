@@ -96,7 +96,7 @@ def test_sections_of_voxels(voxels):
         ("section {cloud} --line 0,0,1,1", 1, "of 5000 points lies within"),
         ("section {cloud} --width 0", 2, "above 0"),
         ("section {voxels} --column reflectance", 2, "has no column"), ("section {voxels} {cloud}", 2, "drawn alone"),
-        ("section {voxels} --flags-with WEAK", 2, "no echo_flags"), ("profile {cloud} --size -1", 2, "above 0"),
+        ("section {voxels} --flags WEAK", 2, "no echo_flags"), ("profile {cloud} --size -1", 2, "above 0"),
         ("profile {cloud} --size 1e-9", 2, "more than 5000 bins"),
         ("profile {cloud} --statistic sum", 2, "needs a --column"),
         ("section {cloud} --where z<-99", 1, "5000 of 5000 points are left out by --where"),
@@ -264,7 +264,7 @@ def test_profile_of_the_segments_of_a_strip(riegl, tmp_path):
     ("words", "code", "message"),
     [
         ("s.csv c.las", 2, "without clouds"), ("s.csv --where z<3", 2, "--where selects points"),
-        ("s.csv --flags-with WEAK", 2, "--flags-with selects points"), ("s.csv --column lenght", 2, "'length'"),
+        ("s.csv --flags WEAK", 2, "--flags selects points"), ("s.csv --column lenght", 2, "'length'"),
         ("s.csv --statistic mean", 2, "needs a --column"), ("empty.csv", 1, "holds no segment"),
         ("other.csv", 1, "'z1' is missing"), ("bad.csv", 1, "holds no segments"), ("nan.csv", 1, "segment 1 holds"),
         ("bad.geojson", 1, "holds no segments"), ("list.geojson", 1, "holds no segments"),

@@ -472,7 +472,7 @@ def test_calibration_without_divergence_or_sensor_is_refused(level, tmp_path):
     with pytest.raises(ConfigError, match="divergence"):
         voxelize(level, tmp_path / "v.npz", 1.0, calibration=replace(CALIBRATION, divergence=None))
     strip = write_strip(tmp_path / "s.las", [[(100.0, 50.0)]] * 30)
-    with pytest.raises(InputError, match="where the sensor was"):
+    with pytest.raises(InputError, match="the sensor's position is unknown: give --trajectory"):
         voxelize(strip, tmp_path / "v.npz", 1.0, calibration=CALIBRATION)
     assert not (tmp_path / "v.npz").exists()
     summary, _ = voxelize(

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
 from wavebatch.batch.selection import describe_extent
 from wavebatch.batch.unit import Prepared
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_names import describe_roundings
@@ -26,6 +27,10 @@ LEAST_JUDGED = 20
 
 LEAST_MATCHED = 0.5
 """Share of the returns in waveforms with echoes that an echo should match."""
+
+MOST_FAILED = 0.25
+"""Share of echoes whose fit did not converge, or ended at a bound, that is far above usual: 4 % at most of a chain that
+suits a strip; 35 % on a RIEGL and 80 % on a Leica strip of Gaussians in place of the learned pulse."""
 
 INVERTED = 5.0
 """Signals are inverted where counts reach this many times further below the baseline than above it."""
@@ -124,6 +129,7 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _miss_all(prepared, report)
     lines += _find_nothing(prepared, report)
     lines += _doubt_pulse(prepared, report)
+    lines += () if choice.doubted else _doubt_fits(prepared, report)
     lines += _doubt_reflectance(report)
     if not choice.doubted or not echoes:
         return tuple(lines)
@@ -134,6 +140,20 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         f"pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
     )
     return tuple(lines)
+
+
+def _doubt_fits(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """A line for each flag of failed fits that far more echoes have than usual."""
+    written = report.count("points_out") - sum(report.passed_through.values())
+    for flag in (EchoFlag.NOT_CONVERGED, EchoFlag.AT_BOUND):
+        number = report.flags.get(flag.name, 0)
+        if written >= LEAST_JUDGED and number > MOST_FAILED * written:
+            auto = prepared.job.request.describe(prepared.job.chain) is not None
+            remedy = "draw some with `wavebatch plot waveform --flags`" if auto else "use --profile auto"
+            yield (
+                f"{number} of {written} echoes ({100 * number / written:.0f} %) are {flag.name}, far more than usual: "
+                f"their errors cannot be trusted; {remedy}, or leave them out with --drop-flags {flag.name}"
+            )
 
 
 def _miss_all(prepared: Prepared, report: RunReport) -> Iterator[str]:

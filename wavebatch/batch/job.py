@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.output_rows import NEEDED
 from wavebatch.batch.selection import WITHOUT_STAGE, Selection
 from wavebatch.core.echoes import COLUMNS
@@ -25,31 +26,15 @@ from wavebatch.surveying.sensor import SensorRequest
 
 
 @dataclass(frozen=True, slots=True)
-class RunOptions:
-    """Options of a run that change what is written."""
-
-    direction: str = "auto"
-    headerless: bool = False
-    points: str = "echoes"
-    format: str = "laz"
-    point_format: int | None = None
-    las_version: str = "1.4"
-    names: str = "wavebatch"
-    no_data: str = "-9999"
-    strict: bool = False
-    columns: tuple[str, ...] = ()
-    """Columns to write, in order; see `choose_columns`."""
-    keep_packets: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class StripJob:
     """A strip to process and how; picklable."""
 
     path: Path
     chain: Chain
     """The chain, or the widest that may be chosen."""
-    options: RunOptions
+    options: RunOptions = RunOptions()
+    columns: tuple[str, ...] = ()
+    """Columns to write, in order; see `choose_columns`."""
     request: Request = Request()
     """How pulse and chain are chosen."""
     sensor: SensorRequest = SensorRequest()
@@ -57,9 +42,6 @@ class StripJob:
     calibration: Calibration | None = None
     attenuation: tuple[float, float] | None = None
     """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
-
-    pulse_energy: str | None = None
-    """Extra byte, or text file by GPS time, with the energy of each emitted pulse; see `find_pulse_energy`."""
     selection: Selection = Selection()
     """What is written."""
 
@@ -71,7 +53,7 @@ class StripJob:
         divergence = any(source is not None and source.divergence is not None for source in sources)
         given = self.sensor != SensorRequest()
         chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
-        return with_columns(chain, (*self.options.columns, *self.selection.list_wanted()))
+        return with_columns(chain, (*self.columns, *self.selection.list_wanted()))
 
     def calibrate(self, system: SystemPulse) -> SystemPulse:
         """Return the system pulse with the job's calibration and air, if it has them."""
@@ -82,9 +64,14 @@ class StripJob:
         return replace(system, attenuation=value, attenuation_error=error)
 
     @property
+    def energy(self) -> str | None:
+        """Where the energy of each emitted pulse comes from; see `find_pulse_energy`."""
+        return None if self.options.energy is None else str(self.options.energy)
+
+    @property
     def energy_file(self) -> Path | None:
-        """The file of `pulse_energy`; None where that names an extra byte."""
-        file = None if self.pulse_energy is None else Path(self.pulse_energy)
+        """The file of --energy; None where that names an extra byte."""
+        file = None if self.energy is None else Path(self.energy)
         return file if file is not None and file.is_file() else None
 
     @property
@@ -96,8 +83,9 @@ class StripJob:
         """Return the job with absolute paths, for processes that work in another folder."""
         file = self.sensor.trajectory
         sensor = replace(self.sensor, trajectory=None if file is None else file.absolute())
-        energy = self.pulse_energy if self.energy_file is None else str(self.energy_file.absolute())
-        return replace(self, path=self.path.absolute(), sensor=sensor, pulse_energy=energy)
+        energy = self.energy if self.energy_file is None else str(self.energy_file.absolute())
+        options = replace(self.options, energy=energy)
+        return replace(self, path=self.path.absolute(), sensor=sensor, options=options)
 
     def open(self) -> StripReader:
         """Open the strip; raises InputError where it cannot be read."""
@@ -165,7 +153,7 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
     options = job.options
     return plan_output(
         facts,
-        options.columns,
+        job.columns,
         point_format=options.point_format,
         las_version=options.las_version,
         packets=facts if options.keep_packets else None,

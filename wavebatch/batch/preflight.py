@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.batch.job import StripJob, plan_layout
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.report_file import cloud_path, report_path
 from wavebatch.batch.selection import RowSelector
-from wavebatch.batch.strip_task import BatchOptions, StripTask
+from wavebatch.batch.strip_task import StripTask
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.surveying.flight import read_flight
@@ -65,7 +66,7 @@ def plan_memory(options_jobs: int, memory: int | None) -> tuple[int, int | None]
     return jobs, SMALL_BLOCK if memory // processes < FULL_MEMORY else None
 
 
-def check_outputs(jobs: Sequence[StripJob], options: BatchOptions) -> None:
+def check_outputs(jobs: Sequence[StripJob], options: RunOptions) -> None:
     """Raise ConfigError where an output would replace an input."""
     with protecting(find_inputs(jobs)):
         for job in jobs:
@@ -92,13 +93,13 @@ def flight_path(folder: Path) -> Path:
     return folder / "flight.system.toml"
 
 
-def load_flight(jobs: Sequence[StripJob], options: BatchOptions) -> SavedSurvey | None:
+def load_flight(jobs: Sequence[StripJob], options: RunOptions) -> SavedSurvey | None:
     """Load the survey of a flight that an earlier run has kept.
 
     Parameters
     ----------
     jobs : sequence of StripJob
-    options : BatchOptions
+    options : RunOptions
 
     Returns
     -------
@@ -126,13 +127,13 @@ def with_flight(jobs: Sequence[StripJob], saved: SavedSurvey | None) -> list[Str
     return [replace(job, request=replace(job.request, system=saved)) if job.request.flight else job for job in jobs]
 
 
-def plan_strip(job: StripJob, options: BatchOptions) -> dict[str, Any]:
+def plan_strip(job: StripJob, options: RunOptions) -> dict[str, Any]:
     """Describe what `run_batch` would do with a strip, from its headers alone.
 
     Parameters
     ----------
     job : StripJob
-    options : BatchOptions
+    options : RunOptions
 
     Returns
     -------

@@ -29,6 +29,11 @@ from wavebatch.surveying.system_file import format_survey
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 MOST_REPORT = 64 << 20
 """Most bytes of a report that are read; 255 digitizers take less than one."""
+WRITING = (
+    "direction", "headerless", "points", "format", "point_format", "las_version", "names", "no_data", "strict",
+    "keep_packets",
+)  # fmt: skip
+"""Options of a run that decide the output by their values; those that name files are in a report's `request`."""
 BATCH_SCHEMA = "wavebatch.batch-report/1"
 
 
@@ -58,13 +63,13 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     """
     saved, sensor = job.request.system, job.sensor
     trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
-    energy = job.pulse_energy if job.energy_file is None else take_fingerprint(job.energy_file)
+    energy = job.energy if job.energy_file is None else take_fingerprint(job.energy_file)
     # The hash is that of the flight's survey also for a strip that does not belong to it: another survey may take it.
     flight = {"survey": "flight"} if job.request.flight else {}
     return {
         "version": __version__,
         "input": {"file": job.path.name, **fingerprint},
-        "options": asdict(job.options),
+        "options": {name: getattr(job.options, name) for name in WRITING} | {"columns": list(job.columns)},
         "request": {
             "chain": job.request.describe(job.chain) or effective(job.chain),
             "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
@@ -141,6 +146,7 @@ def build_document(
         Plain values for JSON; all but `timing` is the same for every run.
     """
     facts, layout = prepared.facts, prepared.layout
+    job = prepared.job
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
     found = {
         "schema": STRIP_SCHEMA,
@@ -153,6 +159,7 @@ def build_document(
             "packets": {"file": file.name if file else None, "internal": packets.internal, "bytes": stored},
             **describe_strip(prepared, described),
         },
+        "command": job.options.command(job.path.name),
         "output": {
             "file": cloud.name,
             "size": size,

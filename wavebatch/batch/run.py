@@ -18,11 +18,12 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.preflight import check_outputs, find_inputs, flight_path, load_flight, with_flight
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
-from wavebatch.batch.strip_task import BatchOptions, StripTask
+from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.workers.dask_cluster import Cluster
-from wavebatch.batch.workers.processes import WorkerDied, Workers
+from wavebatch.batch.workers.processes import WorkerDied, Workers, refuse_import
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.protect import protecting
@@ -53,6 +54,12 @@ class BatchResult:
 
     outcomes: tuple[Outcome, ...]
     seconds: float
+
+    def __repr__(self) -> str:
+        """One line: a prompt or a notebook prints it."""
+        names = [outcome.status for outcome in self.outcomes]
+        written = f"{names.count('written')} strip{'s' * (names.count('written') != 1)} written"
+        return f"BatchResult({written}, {names.count('skipped')} skipped, {names.count('failed')} failed)"
 
     @property
     def failed(self) -> int:
@@ -94,14 +101,14 @@ class BatchResult:
 
 
 def run_batch(
-    jobs: Sequence[StripJob], options: BatchOptions, on_event: Callable[[dict[str, Any]], None] | None = None
+    jobs: Sequence[StripJob], options: RunOptions, on_event: Callable[[dict[str, Any]], None] | None = None
 ) -> BatchResult:
     """Write cloud and report of every strip; a strip that fails does not stop the others.
 
     Parameters
     ----------
     jobs : sequence of StripJob
-    options : BatchOptions
+    options : RunOptions
     on_event : callable, optional
         Called with a dictionary for each event; its key `event` is flight, worker (one that does not fit),
         start, unit, written, skipped or failed.
@@ -120,6 +127,7 @@ def run_batch(
     KeyboardInterrupt
         After temporary files were removed.
     """
+    refuse_import()
     start = time.perf_counter()
     check_outputs(jobs, options)
     load_kernels()
@@ -151,7 +159,7 @@ def _drop_flight(folder: Path) -> None:
 
 def _survey_flight(
     jobs: Sequence[StripJob],
-    options: BatchOptions,
+    options: RunOptions,
     workers: Workers | Cluster,
     on_event: Callable[[dict[str, Any]], None] | None,
 ) -> SavedSurvey | None:
@@ -184,7 +192,7 @@ class _Batch:
     def __init__(
         self,
         jobs: Sequence[StripJob],
-        options: BatchOptions,
+        options: RunOptions,
         workers: Workers | Cluster,
         on_event: Callable[[dict[str, Any]], None] | None,
     ) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from wavebatch.batch.counts import LEFT_OUT, RunReport, count_flags
-from wavebatch.core.condition import Condition, parse_condition
+from wavebatch.batch.options import RunOptions
+from wavebatch.core.condition import Condition, parse_condition, read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.flag_names import read_flags
 from wavebatch.core.suggest import nearest
 from wavebatch.files.area_crs import describe_miss
 from wavebatch.files.cloud.column_names import normalise
@@ -28,7 +27,7 @@ from wavebatch.files.cloud.echo_reader import describe_dimension, list_fields, r
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.files.las.checked_header import CheckedHeader
-from wavebatch.files.las.point_formats import ANGLE_UNIT
+from wavebatch.files.las.point_formats import read_angles
 from wavebatch.stages.chain import STAGES, Chain
 
 WITHOUT_STAGE = ("echo_time", "echo_flags")
@@ -230,32 +229,17 @@ class RowSelector:
         if found in ("x", "y", "z"):
             header, axis = self.layout.source.header, "xyz".index(found)
             return rows[found.upper()] * header.scales[axis] + header.offsets[axis]
-        modern = self.layout.point_format >= 6
         if found == "scan_angle":
-            return rows["scan_angle"] * ANGLE_UNIT if modern else rows["scan_angle_rank"].astype(np.float64)
+            return read_angles(rows)
         return read_field(rows, self.layout.point_format, found)
 
 
-def build_selection(
-    *,
-    where: Condition | str | None = None,
-    drop_flags: str | None = None,
-    classes: Sequence[int] | None = None,
-    bbox: Sequence[float] | None = None,
-    polygon: Path | str | None = None,
-) -> Selection:
+def build_selection(options: RunOptions) -> Selection:
     """Check the options of a selection.
 
     Parameters
     ----------
-    where : Condition or str, optional
-    drop_flags : str, optional
-        Names of flags with commas.
-    classes : sequence of int, optional
-    bbox : sequence of float, optional
-        West, south, east, north.
-    polygon : path, optional
-        GeoJSON file with the areas.
+    options : RunOptions
 
     Returns
     -------
@@ -266,7 +250,8 @@ def build_selection(
     ConfigError
         For whatever is wrong with them.
     """
-    flags = 0 if drop_flags is None else read_flags([drop_flags], "--drop-flags")
+    classes, bbox, polygon, where = options.classes, options.bbox, options.polygon, options.where
+    flags = 0 if options.drop_flags is None else read_flags([options.drop_flags], "--drop-flags")
     chosen = () if classes is None else tuple(sorted({int(number) for number in classes}))
     if classes is not None and not (chosen and 0 <= chosen[0] <= chosen[-1] <= 255):
         raise ConfigError(f"--classes: {list(classes)} must be numbers from 0 to 255, e.g. 2,6")

@@ -12,7 +12,6 @@ import pickle
 import time
 from collections import deque
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from wavebatch.batch.counts import RunReport
 from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.neighbour_pass import SecondPass, process_tile
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.row_transfer import RowStream, process_unit_shared
 from wavebatch.batch.unit import Prepared, prepare_strip
 from wavebatch.batch.workers.dask_cluster import Cluster
@@ -34,33 +34,18 @@ from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.text_file import draft_text
 
 
-@dataclass(frozen=True, slots=True)
-class BatchOptions:
-    """Options of a run that change how it works, never what it writes."""
-
-    folder: Path
-    """Of the outputs."""
-    jobs: int = 1
-    scheduler: str | None = None
-    """Address of a dask cluster to use instead of `jobs` processes."""
-    block_size: int | None = None
-    """Waveforms that go through a chain at a time; None: chosen by their length."""
-    overwrite: bool = False
-    resume: bool = False
-
-
 class StripTask:
     """The work on one strip.
 
     Parameters
     ----------
     job : StripJob
-    options : BatchOptions
+    options : RunOptions
     alone : bool
         Whether no other strip may be under way: it is tried again after a worker process died.
     """
 
-    def __init__(self, job: StripJob, options: BatchOptions, alone: bool) -> None:
+    def __init__(self, job: StripJob, options: RunOptions, alone: bool) -> None:
         self.job = job
         self.alone = alone
         self.pending: deque[Future] = deque()
@@ -202,7 +187,8 @@ class StripTask:
     def _open(self, workers: Workers | Cluster) -> None:
         options, prepared = self._options, self.prepared
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
-        provenance = {**self._described, **report_file.describe_chain(prepared)}
+        command = self.job.options.command(self.job.path.name)
+        provenance = {**self._described, "command": command, **report_file.describe_chain(prepared)}
         provenance |= report_file.describe_strip(prepared, self._described)
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)

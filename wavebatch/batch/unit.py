@@ -29,13 +29,11 @@ from wavebatch.stages.chain import Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
 from wavebatch.surveying.calibrating.setting import check_energies
-from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import needs_sensor
-from wavebatch.surveying.choose_chain import Choice, make_choice, try_chain
+from wavebatch.surveying.choose_chain import Choice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius, measure_slope
-from wavebatch.surveying.flight import hold_strip
-from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, judge_scale, refuse_units
-from wavebatch.surveying.systems.saved_check import check_saved
+from wavebatch.surveying.prepare import prepare
+from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, judge_scale, refuse_units
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block by default: a unit of 50,000 waveforms of 80. Smaller blocks are slower: NumPy's cost per call."""
@@ -103,7 +101,7 @@ class Prepared:
     @property
     def _wanted(self) -> set[str]:
         """Columns that are written, or that decide what is written."""
-        return {*self.job.options.columns, *self.selector.needed}
+        return {*self.job.columns, *self.selector.needed}
 
 
 def list_carried(late: Iterable[Step]) -> tuple[str, ...]:
@@ -139,26 +137,24 @@ def prepare_strip(job: StripJob) -> Prepared:
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
-            stranger, forced = _hold(reader, scan, job)
-            if stranger:
+            setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, calibration=job.calibration,
+                            air=job.attenuation and job.attenuation[0], extend=job.extend)  # fmt: skip
+            sensor, doubts = setup.sensor, setup.doubts
+            if setup.stranger:
                 job = replace(job, request=replace(job.request, system=None))
-            choice = try_chain(reader, scan, make_choice(reader, scan, job.chain, job.request), job.request)
-            if job.request.describe(job.chain) is not None:
-                choice = replace(choice, chain=job.extend(choice.chain))
-            columns = without_columns(job.options.columns, job.chain, choice.chain)
-            job = replace(job, chain=choice.chain, options=replace(job.options, columns=columns))
+            choice = try_chain(reader, scan, setup.choice, job.request)
+            columns = without_columns(job.columns, job.chain, choice.chain)
+            job = replace(job, chain=choice.chain, columns=columns, calibration=setup.calibration)
             surveyed = time.perf_counter()
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
-            sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
-            job, doubts = _fit_calibration(reader, scan, job, choice, sensor)
             doubts += judge_scale(reader, scan) if job.options.points == "echoes" else ()
             _hold_height(reader, job.sensor, sensor)
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += more
             job = replace(job, chain=_set_parameters(reader, scan, job.chain))
-            energy = find_pulse_energy(reader, scan, job.pulse_energy) if needs_sensor(job.chain) else None
-            if job.pulse_energy is not None and energy is not None:
+            energy = find_pulse_energy(reader, scan, job.energy) if needs_sensor(job.chain) else None
+            if job.energy is not None and energy is not None:
                 check_energies(reader, scan, energy)
             layout = plan_layout(job, facts)
             RowSelector(job.selection, job.chain, layout).check()
@@ -167,10 +163,8 @@ def prepare_strip(job: StripJob) -> Prepared:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    prepared = Prepared(
-        job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, energy, doubts
-    )
-    return replace(prepared, forced=forced)
+    found = choice, layout, RunReport(timing=timing), sensor, setup.stranger, energy, doubts, setup.forced
+    return Prepared(job, facts, scan, units, *found)
 
 
 def _set_parameters(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
@@ -198,27 +192,6 @@ def _hold_height(reader: StripReader, request: SensorRequest, sensor: SensorSour
             f"{reader.facts.path}: --flight-height {request.height:g} m contradicts the strip: {where}; leave "
             "--flight-height out"
         )
-
-
-def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> tuple[str, str]:
-    """Why the strip does not belong to the flight whose survey the job has, and what contradicts a saved survey."""
-    request = job.request
-    if request.system is None:
-        return "", ""
-    if request.flight:
-        return hold_strip(reader, scan, request.system.survey), ""
-    return "", check_saved(reader, scan, request.system.survey, force=request.force)
-
-
-def _fit_calibration(
-    reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource
-) -> tuple[StripJob, tuple[str, ...]]:
-    """The job with the calibration as it holds for this strip, and warnings; InputError where it does not fit."""
-    if job.calibration is None:
-        return job, ()
-    air = None if job.attenuation is None else job.attenuation[0]
-    fitted = match_strip(job.calibration, reader, scan, choice.survey.system, sensor, job.chain, air)
-    return replace(job, calibration=fitted.calibration), fitted.warnings
 
 
 def _see_level(

@@ -6,14 +6,15 @@ Only reads options and prints; the work is in `wavebatch.surveying.calibrating.t
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from wavebatch.batch.options import RunOptions
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, format_json, talk
+from wavebatch.cli.messages import count, format_json, print_json, talk
 from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.figure_file import check_picture
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("strips", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP...")
-@shared.recursive_option
+@shared.declared("recursive")
 @shared.file_option("--targets", required=True,
                     text="Targets: GeoJSON polygons with the property reflectance, in WGS 84, in the CRS that the file "
                     "names, or in the coordinates of the strips; or CSV with reflectance and x, y, radius or vertices, "
@@ -48,11 +49,11 @@ if TYPE_CHECKING:
                       required=False)
 @shared.chain_options
 @shared.system_option
-@shared.energy_option
+@shared.declared("energy")
 @shared.sensor_options
-@shared.direction_option
+@shared.declared("direction")
 @shared.html_option
-@shared.common_options("overwrite")
+@shared.common_options("overwrite", "json", "quiet")
 def calibrate(
     strips: tuple[Path, ...], targets: Path, output: Path, html_file: Path | None, overwrite: bool, **options: Any
 ) -> None:
@@ -99,6 +100,12 @@ def calibrate(
         from wavebatch.tools.plots.draw_flight import draw_flight
 
         draw_flight(flight, options["plot"], overwrite=overwrite)
+    if options["as_json"]:
+        print_json(_list_report(flight))
+    for note in found.notes:
+        talk(f"warning: {note}")
+    if options["quiet"]:
+        return
     for line in [*map(_describe_target, found.targets), *map(_describe_channel, found.channels)]:
         talk(line)
     for line in [*map(_describe_strip, found.strips), *map(_describe_pair, flight.pairs)]:
@@ -106,8 +113,6 @@ def calibrate(
     if found.swath:
         edge = math.expm1(-sum(found.swath[1:]))
         talk(f"scan angle: {100 * edge:+.1f} % light at {math.degrees(found.swath[0]):.1f} deg against straight down")
-    for note in found.notes:
-        talk(f"warning: {note}")
     numbers = f"constant {format_relative(found.constant, found.relative_error)} +- {100 * found.relative_error:.1f} %"
     if len(found.channels) > 1:
         numbers = f"constants of {len(found.channels)} channels"
@@ -117,13 +122,13 @@ def calibrate(
 def _read_options(options: dict[str, Any]) -> CalibrationOptions:
     """How to measure; pulse and chain are chosen as `wavebatch run` chooses them."""
     from wavebatch.surveying.calibrating.targets import CalibrationOptions
-    from wavebatch.tools.api.run import find_request
+    from wavebatch.tools.api.run import find_request, read_sensor
 
-    chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
-    request = replace(request, force=options["force"])
+    asked = shared.from_options(RunOptions, options)
+    chain, request = find_request(asked)
     names = ("attenuation", "divergence", "reflectance_error", "direction", "energy", "scan_angle")
     figures = {name: options[name] for name in names}
-    return CalibrationOptions(sensor=shared.read_sensor(options), chain=chain, request=request, **figures)
+    return CalibrationOptions(sensor=read_sensor(asked), chain=chain, request=request, **figures)
 
 
 def _list_report(flight: FlightCalibration) -> dict[str, Any]:

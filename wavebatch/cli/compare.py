@@ -20,7 +20,6 @@ from wavebatch.cli.options import (
     file_option,
     html_option,
     output_option,
-    read_system,
     system_option,
     where_option,
 )
@@ -142,9 +141,9 @@ def _tolerance(options: dict) -> dict[str, float]:
 
 
 def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
-    for name in ("system_file", "force", "limit"):
+    for name in ("system", "force", "limit"):
         if options[name] not in (None, False):
-            raise click.UsageError(f"--{name.removesuffix('_file')} is for chains; give --strip STRIP too")
+            raise click.UsageError(f"--{name} is for chains; give --strip STRIP too")
     if (b is None) == (truth is None):
         raise click.UsageError("give either B or --truth FILE.npz")
     for side in (a, b):
@@ -166,13 +165,14 @@ def _is_chain(side: Path) -> bool:
 def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: dict) -> Matchup:
     from wavebatch.core.suggest import nearest
     from wavebatch.surveying.choose_chain import COSTS
+    from wavebatch.surveying.system_file import load_survey
     from wavebatch.tools.compare.chains import AUTO, find_contender, match_sides
 
     if truth is not None:
         raise click.UsageError("--truth is for a cloud; `wavebatch bench` compares chains with a truth")
     if options["where"] is not None:
         raise click.UsageError("--where is for two clouds; leave --strip out")
-    saved = read_system(options)
+    saved = None if options["system"] is None else load_survey(options["system"])
     sides = [None if side is None else find_contender(str(side)) for side in (a, b)]
     for side in sides:
         if side is not None and side.is_cloud and not Path(side.name).exists():

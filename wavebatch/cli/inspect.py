@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from wavebatch.cli.messages import count, print_json, print_text, printable, talk
-from wavebatch.cli.options import common_options, for_each, recursive_option, strip_options, strips_argument
+from wavebatch.cli.options import common_options, declared, for_each, strip_options, strips_argument
 from wavebatch.cli.program.completion import complete_files
 from wavebatch.files.inputs import find_files
 from wavebatch.surveying.inspect_strip import check_file
@@ -84,7 +84,7 @@ def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, A
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP_OR_CHAIN...",
                 shell_complete=complete_files)
-@recursive_option
+@declared("recursive")
 @strip_options
 @click.option("--strict", is_flag=True, help="Count notes as problems.")
 @common_options("json")

@@ -7,28 +7,25 @@ Every command of `wavebatch.cli` is built from these. An option with a short for
 from __future__ import annotations
 
 import functools
+import math
 import os
 import re
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
+from wavebatch.batch.options import DEFAULTS, OPTIONS, SCHEMA, check_together
 from wavebatch.cli.messages import one_line, report_errors, talk
-from wavebatch.cli.program.completion import complete_files, complete_flags, complete_profiles
+from wavebatch.cli.program.completion import complete_files, complete_flags, complete_profiles, complete_written
 from wavebatch.cli.program.log_file import LEVELS, LOG, begin_log, keep_level
-from wavebatch.cli.program.settings import EXCLUSIVE, READ
+from wavebatch.cli.program.settings import READ
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import protecting, refuse_input
-
-if TYPE_CHECKING:
-    from wavebatch.core.condition import Condition
-    from wavebatch.surveying.calibration import Calibration
-    from wavebatch.surveying.sensor import SensorRequest
-    from wavebatch.surveying.system_file import SavedSurvey
 
 _Options = TypeVar("_Options")
 
@@ -66,27 +63,150 @@ def together(*options: Callable) -> Callable:
     return decorate
 
 
-def _read_where(context: click.Context, parameter: click.Parameter, text: str | None) -> Condition | None:
+_LENGTH_UNITS = {"m": 100.0, "cm": 1.0, "mm": 0.1}
+
+
+def parse_length(text: str) -> float:
+    """A length in cm from text such as `0.02m`, `2cm`, `15 mm`; raises ConfigError for anything else."""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(mm|cm|m)\s*", text)
+    if match is None or not float(match[1]) > 0:
+        raise ConfigError(f"{text!r} is no length; write for example 0.02m, 2cm or 20mm")
+    return float(match[1]) * _LENGTH_UNITS[match[2]]
+
+
+_SIZE_UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+
+
+def _parse_size(text: str) -> int:
+    """Bytes from `800M`, `2G` or a plain number."""
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)([KMGT]?)(I?B)?", text.strip().upper())
+    size = int(float(found[1]) * _SIZE_UNITS[found[2]]) if found else 0
+    if not size:
+        raise click.BadParameter(f"{text!r} is not a size such as 800M or 2G")
+    return size
+
+
+def _parse_classes(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is no list of numbers such as 2,6") from None
+
+
+def _parse_where(text: str) -> Any:
     from wavebatch.core.condition import parse_condition
 
+    return parse_condition(text)
+
+
+def parse_span(text: str) -> tuple[int, int | None]:
+    """`7` or `5:20` as the first number and the end, which is not included; `:20` starts at 0, `5:` has no end."""
+    found = re.fullmatch(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", text)
+    if not found or text == ":":
+        raise click.BadParameter(f"{text!r} is neither a number nor FIRST:END")
+    if found[1]:
+        return int(found[1]), int(found[1]) + 1
+    first, end = int(found[2] or 0), int(found[3]) if found[3] else None
+    if end is not None and end <= first:
+        raise click.BadParameter(f"{text!r} is empty; END is the number after the last one")
+    return first, end
+
+
+def parse_floats(text: str, form: str) -> tuple[float, ...]:
+    """As many numbers as the form has, e.g. `LOW:HIGH` or `W,S,E,N`."""
+    mark = ":" if ":" in form else ","
     try:
-        return None if text is None else parse_condition(text)
-    except ConfigError as error:
-        raise click.UsageError(str(error), context) from error
+        numbers = tuple(float(part) for part in text.split(mark))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != form.count(mark) + 1:
+        raise click.BadParameter(f"{text!r} is not {form}")
+    return numbers
+
+
+def floats_option(name: str, form: str, text: str) -> Callable:
+    """An option that takes numbers of this form; text: its help."""
+    return click.option(name, type=Text(form, lambda value: parse_floats(value, form)), metavar=form, help=text)
+
+
+def bbox_option(text: str) -> Callable:
+    """`--bbox` of a picture or a raster; text: what is done with the part."""
+    return declared("bbox", f"{text} only this part: west, south, east, north [m].  [default: all]")
+
+
+_READERS: dict[str, Callable[[str], Any]] = {
+    "bbox": lambda text: parse_floats(text, "WEST,SOUTH,EAST,NORTH"),
+    "lever_arm": lambda text: parse_floats(text, OPTIONS["lever_arm"].form),
+    "tolerance": lambda text: parse_length(text) / 100.0,
+    "memory": _parse_size,
+    "classes": _parse_classes,
+    "where": _parse_where,
+}
+"""Values of options of RunOptions from their texts."""
+
+
+_COMPLETE = {"profile": complete_profiles, "drop_flags": complete_flags, "columns": complete_written}
+"""What shells offer after these options."""
+
+
+class Text(click.ParamType):
+    """The type of an option whose value is read from text; form: as in --help; read: gives the value, or raises
+    click.BadParameter or ConfigError."""
+
+    def __init__(self, form: str, read: Callable[[str], Any]) -> None:
+        self.name, self._read = form, read
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The value of a text."""
+        if not isinstance(value, str):
+            return value
+        try:
+            return self._read(value)
+        except ConfigError as error:
+            place = "" if param is None or str(error).startswith("--") else f"{param.opts[-1]}: "
+            raise click.UsageError(f"{place}{error}", ctx) from error
+
+
+def declared(name: str, text: str = "", **more: Any) -> Callable:
+    """An option that is declared in RunOptions; text: its help in this command; more: what differs for click."""
+    one, (kinds, choices, limits) = OPTIONS[name], SCHEMA[name]
+    parts = [text or one.help, f"[default: {one.unset}]" if one.unset and "default" not in more else ""]
+    how: dict[str, Any] = {} if more.get("required") else {"default": DEFAULTS[name]}
+    how |= {"help": "  ".join(filter(None, parts)), "metavar": one.form or None, "shell_complete": _COMPLETE.get(name)}
+    how["show_default"] = not one.unset and {**how, **more}.get("default") not in (None, False)
+    if kinds == (bool,):
+        how |= {"is_flag": True, "show_default": False}
+    else:
+        how["type"] = _find_type(name, kinds, choices, limits)
+    names = [f"-{one.short}"] * bool(one.short) + [f"--{name.replace('_', '-')}"]
+    return click.option(*names, name, **{**how, **more})
+
+
+def _find_type(name: str, kinds: Sequence[type], choices: Sequence[Any] | None, limits: Any) -> Any:
+    """Click's type of an option of RunOptions."""
+    form = OPTIONS[name].form
+    if choices is not None:
+        return click.Choice(choices)
+    if name in _READERS:
+        return Text(form, _READERS[name])
+    if limits is not None:
+        low, high = (None if math.isinf(limit) else limit for limit in limits)
+        return (click.IntRange if int in kinds else click.FloatRange)(low, high)
+    if name == "output":
+        return OutputPath(file_okay=False, path_type=Path)
+    is_path = Path in kinds and name != "energy"
+    return click.Path(path_type=Path) if is_path else str
 
 
 def where_option(text: str) -> Callable:
     """`--where`; text: what is done with the points that meet the condition."""
-    more = "that meet this, e.g. \"number_of_returns == 2 and not (classification == 7 or echo_width >= 8)\"; points"
-    more += " without data in a column meet nothing on it."
-    return click.option("--where", callback=_read_where, metavar="CONDITION", help=f"{text} {more}")
+    return declared("where", OPTIONS["where"].help.replace("Write only points", text, 1))
 
 
 selection_options = together(
-    click.option("--flags-with", multiple=True, metavar="NAMES", shell_complete=complete_flags,
+    click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete_flags,
                  help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
-    click.option("--flags-without", multiple=True, metavar="NAMES", shell_complete=complete_flags,
-                 help="Use only points with none of these flags."),
+    declared("drop_flags", "Leave out points with one of these flags.", multiple=True, default=()),
     where_option("Use only points"),
 )  # fmt: skip
 """Options that select points by their flags and columns."""
@@ -98,9 +218,12 @@ html_option = output_option(
 )  # fmt: skip
 
 
-def check_html(target: Path | None) -> None:
-    """Raises ConfigError, before the work, if the page of --html cannot be written; does nothing without it."""
-    if target is not None:
+def check_html(target: Path | None, *, will_exist: bool = False) -> None:
+    """Raises ConfigError, before the work, if the page of --html cannot be written; does nothing without it.
+
+    will_exist: its folder will be made.
+    """
+    if target is not None and not (will_exist and not target.parent.exists()):
         from wavebatch.tools.html.page import check_page
 
         check_page(target)
@@ -109,71 +232,20 @@ def check_html(target: Path | None) -> None:
 strip_argument = click.argument("strip", type=click.Path(path_type=Path))
 
 
-recursive_option = click.option("--recursive", is_flag=True, help="Also take the files in subfolders of folders.")
 strips_argument = together(
     click.argument("strips", nargs=-1, required=True, metavar="STRIP...", shell_complete=complete_files),
-    recursive_option,
+    declared("recursive"),
 )
 clouds_argument = click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...",
                                 shell_complete=complete_files)  # fmt: skip
 
-direction_option = click.option(
-    "--direction",
-    type=click.Choice(["auto", "toward", "away"]),
-    default="auto",
-    show_default=True,
-    help="Direction of the packet vectors: toward or away from the sensor; auto finds it from the file.",
-)
-strip_options = together(
-    direction_option,
-    click.option("--headerless", is_flag=True, help="Read a .wdp file that lacks its 60-byte header."),
-)
-system_option = together(
-    file_option("--system", "system_file",
-                text="Use this saved survey (`wavebatch survey -o FILE`) instead of surveying the strip."),
-    click.option("--force", is_flag=True, help="Use the survey of --system also where bits, noise or echo width of the "
-                 "strip contradict it."),
-)  # fmt: skip
-energy_option = click.option(
-    "--energy", metavar="COLUMN|FILE|none",
-    help="Energy of each emitted pulse, which backscatter and normalized amplitudes are divided by: an extra byte of "
-    "the strips, or a text file with columns time (GPS time of the points) and energy; none: not divided.  [default: "
-    "the extra byte pulse_energy, where it is there]",
-)  # fmt: skip
-calibration_option = file_option(
-    "--calibration", "calibration_file",
-    text="Calibration file of `wavebatch calibrate`: adds calibrated columns; cross sections need its divergence.",
-)  # fmt: skip
-air_options = together(
-    click.option("--attenuation", type=click.FloatRange(0.0, 100.0), metavar="DB_KM",
-                 help="Attenuation of the air during the flight, one way [dB/km].  [default: that of --calibration, "
-                 "else 0.22]"),
-    click.option("--visibility", type=click.FloatRange(0.5, 400.0), metavar="KM",
-                 help="Meteorological visibility during the flight [km], in place of --attenuation."),
-    click.option("--wavelength", type=click.FloatRange(300.0, 2500.0), metavar="NM",
-                 help="Wavelength of the laser [nm], for --visibility.  [default: 1064]"),
-    energy_option,
-    click.option("--attenuation-error", type=click.FloatRange(0.0, 100.0), metavar="DB_KM",
-                 help="Standard deviation of the attenuation [dB/km]: goes into the errors.  [default: 0]"),
-)  # fmt: skip
-chain_options = together(
-    file_option("-c", "--chain", "chain_file", text="Run the chain of this chain file (TOML)."),
-    click.option("--profile", metavar="auto|fast|balanced|accurate", shell_complete=complete_profiles,
-                 help="Run a shipped chain; auto surveys the strip and chooses the cheapest chain that suits it.  "
-                 "[default: auto]"),
-)  # fmt: skip
-sensor_options = together(
-    file_option("--trajectory", text="Trajectory of the sensor: text with columns time, x, y, z, or SBET. Without it "
-                "the sensor position is estimated from the packet vectors."),
-    click.option("--lever-arm", metavar="X,Y,Z", help="Offset from trajectory to scanner: forward, right, down [m]."),
-    click.option("--crs", metavar="CRS", help="CRS of the strip, e.g. EPSG:32632; for a trajectory in degrees."),
-    click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
-                 help="Flight height above ground [m], used if the packet vectors do not give the position; not with "
-                 "--trajectory."),
-)  # fmt: skip
+strip_options = together(declared("direction"), declared("headerless"))
+system_option = together(declared("system"), declared("force"))
+chain_options = together(declared("chain"), declared("profile"))
+sensor_options = together(*map(declared, ("trajectory", "lever_arm", "crs", "flight_height")))
 
 _COMMON = {
-    "overwrite": click.option("--overwrite", is_flag=True, help="Replace existing files."),
+    "overwrite": declared("overwrite"),
     "json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout."),
     "quiet": click.option("-q", "--quiet", is_flag=True,
                           help="Print no progress and no messages, only errors and warnings of wrong results."),
@@ -206,8 +278,10 @@ def _protected(command: Callable) -> Callable:
     @functools.wraps(command)
     def call(*args: Any, **options: Any) -> Any:
         context = click.get_current_context()
-        _check_together(context)
-        inputs: list[Any] = list(context.meta.get(READ, ()))
+        sources = {name: context.get_parameter_source(name) for name in context.params}
+        given = {name for name, source in sources.items() if source is not ParameterSource.DEFAULT}
+        check_together({name: context.params[name] for name in given}, context.params)
+        inputs: list[Any] = [context.meta[READ]] if READ in context.meta else []
         outputs: dict[str, Any] = {}
         if LOG in context.meta:
             outputs[os.path.realpath(context.meta[LOG])] = [context.meta[LOG]]
@@ -226,21 +300,6 @@ def _protected(command: Callable) -> Callable:
             return command(*args, **options)
 
     return call
-
-
-def _check_together(context: click.Context) -> None:
-    """Raises ConfigError for two options of which only one is possible, and for one that another one needs."""
-    given = {
-        option.name: max(option.opts, key=len)
-        for option in context.command.params
-        if context.params.get(option.name) is not None and context.params[option.name] is not False
-    }
-    for rivals in EXCLUSIVE:
-        names = [given[name] for name in rivals if name in given]
-        if len(names) > 1:
-            raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
-    if "force" in given and "system_file" not in given:
-        raise ConfigError("--force is of no use without --system; leave it out")
 
 
 _NO_TOML = (".json", ".csv", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")
@@ -263,47 +322,6 @@ def given_options(options: Mapping[str, Any], names: Iterable[str]) -> dict[str,
 def from_options(kind: type[_Options], options: Mapping[str, Any], **more: Any) -> _Options:
     """A dataclass filled from options named like its fields; those not given keep its defaults. more: other fields."""
     return kind(**{**given_options(options, [field.name for field in fields(kind)]), **more})
-
-
-_LENGTH_UNITS = {"m": 100.0, "cm": 1.0, "mm": 0.1}
-
-
-def parse_length(text: str) -> float:
-    """A length in cm from text such as `0.02m`, `2cm`, `15 mm`; raises ConfigError for anything else."""
-    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(mm|cm|m)\s*", text)
-    if match is None or not float(match[1]) > 0:
-        raise ConfigError(f"{text!r} is no length; write for example 0.02m, 2cm or 20mm")
-    return float(match[1]) * _LENGTH_UNITS[match[2]]
-
-
-def parse_span(text: str) -> tuple[int, int | None]:
-    """`7` or `5:20` as the first number and the end, which is not included; `:20` starts at 0, `5:` has no end."""
-    found = re.fullmatch(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", text)
-    if not found or text == ":":
-        raise click.BadParameter(f"{text!r} is neither a number nor FIRST:END")
-    if found[1]:
-        return int(found[1]), int(found[1]) + 1
-    first, end = int(found[2] or 0), int(found[3]) if found[3] else None
-    if end is not None and end <= first:
-        raise click.BadParameter(f"{text!r} is empty; END is the number after the last one")
-    return first, end
-
-
-def parse_floats(text: str, form: str) -> tuple[float, ...]:
-    """As many numbers as the form has, e.g. `LOW:HIGH` or `W,S,E,N`."""
-    mark = ":" if ":" in form else ","
-    try:
-        numbers = tuple(float(part) for part in text.split(mark))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != form.count(mark) + 1:
-        raise click.BadParameter(f"{text!r} is not {form}")
-    return numbers
-
-
-def floats_reader(form: str) -> Callable[[click.Context, click.Parameter, str | None], tuple[float, ...] | None]:
-    """The callback of an option that takes numbers of this form, as `parse_floats`."""
-    return lambda context, parameter, text: None if text is None else parse_floats(text, form)
 
 
 def for_each(
@@ -345,53 +363,3 @@ def name_outputs(paths: Sequence[Path], output: Path, suffixes: Sequence[str], k
     return named
 
 
-def read_system(options: Mapping[str, Any]) -> SavedSurvey | None:
-    """The survey of --system, None without it."""
-    from wavebatch.surveying.system_file import load_survey
-
-    return load_survey(options["system_file"]) if options["system_file"] else None
-
-
-def read_calibration(options: Mapping[str, Any]) -> Calibration | None:
-    """The calibration of --calibration, None without it."""
-    from wavebatch.surveying.calibrating.calibration_file import load_calibration
-
-    return load_calibration(options["calibration_file"]) if options["calibration_file"] else None
-
-
-def read_air(options: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Attenuation and error of --attenuation or --visibility [dB/km]; ConfigError for options without use."""
-    from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
-
-    given, visibility = options["attenuation"], options["visibility"]
-    if options["wavelength"] is not None and visibility is None:
-        raise ConfigError("--wavelength is of no use without --visibility; give that too")
-    if options["attenuation_error"] is not None and given is None and visibility is None:
-        raise ConfigError("--attenuation-error is of no use without --attenuation or --visibility; give one of them")
-    if visibility is not None:
-        given = attenuation_of_visibility(visibility, options["wavelength"] or 1064.0)
-    return None if given is None else (given, options["attenuation_error"] or 0.0)
-
-
-def read_sensor(options: Mapping[str, Any]) -> SensorRequest:
-    """The request of --trajectory, --crs, --lever-arm and --flight-height; ConfigError where they do not fit."""
-    from wavebatch.surveying.sensor import SensorRequest
-
-    arm = _read_lever_arm(options["lever_arm"])
-    for name in ("lever_arm", "crs"):
-        if options[name] is not None and options["trajectory"] is None:
-            raise ConfigError(f"--{name.replace('_', '-')} is of no use without --trajectory; give that too")
-    return SensorRequest(options["trajectory"], options["crs"], arm, options["flight_height"])
-
-
-def _read_lever_arm(text: str | None) -> tuple[float, ...] | None:
-    """Forward, right, down [m]."""
-    if text is None:
-        return None
-    try:
-        arm = parse_floats(text, "X,Y,Z")
-    except click.BadParameter as error:
-        raise ConfigError(f"--lever-arm: {text!r} must be three numbers in metres, e.g. 0.1,-0.2,0.5") from error
-    if not sum(map(abs, arm)) < 1000:
-        raise ConfigError(f"--lever-arm: {text!r} is too long; a lever arm has a few metres")
-    return arm

@@ -82,7 +82,7 @@ class Extras:
               help="Coordinates of a .geojson: longitude and latitude (needs pyproj), or those of the strip with its "
               "CRS, which GDAL and QGIS read.")
 @click.option("--most", default=20, show_default=True, metavar="N", help="Most segments per slice.")
-@shared.direction_option
+@shared.declared("direction")
 @shared.common_options("overwrite", "json", "quiet")
 def slice_(
     strips: tuple[str, ...],

@@ -20,9 +20,8 @@ from wavebatch.cli.messages import count, print_json, print_text, printable, row
 from wavebatch.cli.options import (
     clouds_argument,
     common_options,
-    file_option,
+    declared,
     output_option,
-    recursive_option,
     where_option,
 )
 from wavebatch.core.condition import Condition
@@ -49,16 +48,16 @@ _ZONE = ("dead_zone_m", "dead_zone_err_m")
 
 @click.command()
 @clouds_argument
-@recursive_option
+@declared("recursive")
 @click.option("--area", "size", type=float, metavar="SIZE",
               help="Also count in square cells with sides of SIZE, in the unit of the coordinates.")
-@file_option("--polygons", text="Also count in the polygons of this GeoJSON file, in WGS 84, in the CRS that the "
-             "file names, or in the coordinates of the clouds; where polygons overlap, the first one counts.")
+@declared("polygon", "Also count in the polygons of this GeoJSON file, in WGS 84, in the CRS that the file names, or "
+          "in the coordinates of the clouds; where polygons overlap, the first one counts.")
 @where_option("Count only points")
 @output_option("Write a table with one row per cloud and area.", "FILE.csv", required=False)
 @common_options("overwrite", "json")
 def stats(
-    clouds: tuple[Path, ...], size: float | None, polygons: Path | None, output: Path | None, overwrite: bool,
+    clouds: tuple[Path, ...], size: float | None, polygon: Path | None, output: Path | None, overwrite: bool,
     as_json: bool, debug: bool, recursive: bool, where: Condition | None,
 ) -> None:
     """Count how many returns the pulses of CLOUDs have, how far apart they are, and which flags they have.
@@ -73,7 +72,7 @@ def stats(
     if output is not None:
         check_target(output, overwrite=overwrite)
     divisions = [] if size is None else [Grid(size)]
-    divisions += [] if polygons is None else [PolygonSet(load_polygons(polygons))]
+    divisions += [] if polygon is None else [PolygonSet(load_polygons(polygon))]
     failed: list[InputError] = []
 
     def skip(error: InputError) -> None:

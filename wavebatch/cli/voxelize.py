@@ -56,8 +56,8 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
               "time.")
 @click.option("--all-crossed", is_flag=True, help="Also write voxels that rays crossed without any signal.")
 @shared.system_option
-@shared.calibration_option
-@shared.energy_option
+@shared.declared("calibration")
+@shared.declared("energy")
 @shared.sensor_options
 @shared.strip_options
 @shared.common_options("overwrite", "json", "quiet")
@@ -93,14 +93,20 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
     """  # fmt: skip
+    from wavebatch.batch.options import RunOptions
+    from wavebatch.surveying.calibrating.calibration_file import load_calibration
+    from wavebatch.surveying.system_file import load_survey
+    from wavebatch.tools.api.run import read_sensor
     from wavebatch.tools.voxels.profile import Deconvolution
     from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
     _check_options(options)
     settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options))
     names = ("direction", "headerless", "overwrite", "force", "profiles")
-    more: dict[str, Any] = {"sensor": shared.read_sensor(options), **{name: options[name] for name in names}}
-    more |= {"system": shared.read_system(options), "calibration": shared.read_calibration(options)}
+    asked = shared.from_options(RunOptions, options)
+    more: dict[str, Any] = {"sensor": read_sensor(asked), **{name: options[name] for name in names}}
+    more["system"] = None if asked.system is None else load_survey(asked.system)
+    more["calibration"] = None if asked.calibration is None else load_calibration(asked.calibration)
     paths = find_files(strips, recursive=options["recursive"])
     if options["profiles"] is not None:
         refuse_input(options["profiles"])
@@ -132,7 +138,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
 def _check_options(options: dict[str, Any]) -> None:
     """Refuses options that would have no effect."""
     for name in _SENSOR:
-        if options[name] is not None and options["calibration_file"] is None:
+        if options[name] is not None and options["calibration"] is None:
             raise click.UsageError(f"--{name.replace('_', '-')} is of no use without --calibration")
 
 

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
 
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
 
 MOST_CHARACTERS = 2000
 """Longest text; longer ones are made by programs, and would be slow on every point."""
@@ -55,7 +57,7 @@ class Condition:
         As the user wrote it.
     tree : tuple
         Nested: ("and" | "or", left, right), ("not", part) or (comparison, left, right), whose sides are a number or
-        the name of a column.
+        the name of a column; ("has", column, bit) for a flag.
     places : dict of str to int
         Every column with the character, from 1, at which it is first named.
     """
@@ -97,7 +99,8 @@ def parse_condition(text: str) -> Condition:
     ----------
     text : str
         Comparisons (== != < <= > >=) of columns and numbers, `and`, `or`, `not` and parentheses; `2 < x < 5` is both
-        comparisons. Names with spaces or signs stand in quotes.
+        comparisons. `flag(NAME)` or `echo_flags has NAME` is true for points with that flag. Names with spaces or signs
+        stand in quotes.
 
     Returns
     -------
@@ -184,7 +187,12 @@ class _Parser:
         return tree
 
     def _read_comparison(self) -> tuple:
+        if (self._kind, self._value) == ("name", "flag") and self._text[self._at :].lstrip().startswith("("):
+            return self._read_flag()
         left, tree = self._read_operand(), None
+        if (self._kind, self._value) == ("name", "has") and isinstance(left, str):
+            self._advance()
+            return ("has", left, self._read_bits())
         if self._kind != "sign" or self._value not in _COMPARISONS:
             self._fail("a comparison (== != < <= > >=) is missing before")
         while self._kind == "sign" and self._value in _COMPARISONS:
@@ -194,6 +202,25 @@ class _Parser:
             part = (sign, left, right)
             tree, left = part if tree is None else ("and", tree, part), right
         return tree or ()
+
+    def _read_flag(self) -> tuple:
+        """`flag(NAME)`, which is `echo_flags has NAME`."""
+        self.places.setdefault("echo_flags", self._place)
+        self._advance()
+        self._advance()
+        tree = ("has", "echo_flags", self._read_bits())
+        if (self._kind, self._value) != ("sign", ")"):
+            self._fail("a closing parenthesis is missing before")
+        self._advance()
+        return tree
+
+    def _read_bits(self) -> float:
+        """The bit of a flag by its name."""
+        if self._kind != "name":
+            self._fail("the name of a flag is missing before")
+        bits = read_flags([self._value], f"--where: character {self._place}")
+        self._advance()
+        return float(bits)
 
     def _read_operand(self) -> float | str:
         factor = 1.0
@@ -241,6 +268,38 @@ def _compare(tree: tuple, values: Mapping[str, np.ndarray], n: int) -> Truth:
     left, right = (
         np.asarray(values[side], np.float64) if isinstance(side, str) else np.float64(side) for side in names
     )
+    if sign == "has":
+        known = ~np.isnan(left)
+        met = (np.where(known, left, 0).astype(np.int64) & int(right)) != 0
+        return known & met, known & ~met
     known = np.broadcast_to(~(np.isnan(left) | np.isnan(right)), n)
     met = np.broadcast_to(_COMPARISONS[sign](left, right), n)
     return known & met, known & ~met
+
+
+def read_flags(names: Sequence[str], option: str = "") -> int:
+    """Return the bits of flags given by names.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Each one name, or several separated by commas; in any case of letters.
+    option : str, optional
+        For the message, e.g. "--drop-flags".
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    ConfigError
+        For an unknown name.
+    """
+    bits = 0
+    for name in (part.strip().upper() for text in names for part in text.split(",")):
+        if name not in EchoFlag.__members__:
+            where = f"{option}: " if option else ""
+            raise ConfigError(f"{where}flag {name!r} does not exist; {nearest(name, EchoFlag.__members__)}")
+        bits |= int(EchoFlag[name])
+    return bits

@@ -1,6 +1,6 @@
 """Areas of a GeoJSON file in the coordinates of a strip or cloud.
 
-`run --polygon`, `stats --polygons` and `calibrate --targets` place their areas with `place_rings`, once per strip. The
+`run --polygon`, `stats --polygon` and `calibrate --targets` place their areas with `place_rings`, once per strip. The
 standard of GeoJSON (RFC 7946) knows longitude and latitude in WGS 84 only. Files of GDAL, QGIS and wavebatch with
 another CRS name it in the member `crs`; others, which have coordinates of the strip and do not say so, are known by
 where they lie. Before you change it: areas in the wrong place are worse than none. Coordinates that name another CRS

@@ -9,7 +9,6 @@ from __future__ import annotations
 import inspect
 import re
 import time
-import types
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,6 +18,7 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
+from wavebatch.core.schema import Range, read_hint
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.clean import clean_block
 
@@ -33,13 +33,6 @@ KINDS: dict[str, tuple[tuple[str, ...], type]] = {
 _SECTION = re.compile(r"^(\w[\w ]*)\n-{3,}$", re.MULTILINE)
 _ENTRY = re.compile(r"^(\w+)(?: :.*)?$", re.MULTILINE)
 """Heading of a section of a numpydoc docstring, and of a parameter in it."""
-
-
-class Range(NamedTuple):
-    """Least and largest value of a number, as in `threshold: Annotated[float, Range(0, 1e6)] = 4.0`."""
-
-    low: float
-    high: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,25 +169,9 @@ def _read_parameters(name: str, kind: str, function: Callable) -> dict[str, Para
             continue
         if parameter.default is parameter.empty or not meanings.get(key):
             raise StageError(f"stage {name}: parameter {key} needs a default and an entry under Parameters")
-        kinds, choices, limits = _read_hint(hints[key])
+        kinds, choices, limits = read_hint(hints[key])
         parameters[key] = Parameter(key, kinds, parameter.default, meanings[key], choices, limits)
     return parameters
-
-
-def _read_hint(hint: Any) -> tuple[tuple[type, ...], tuple[Any, ...] | None, Range | None]:
-    """Types, choices and range that an annotation allows."""
-    if typing.get_origin(hint) is typing.Annotated:
-        hint, *notes = typing.get_args(hint)
-        limits = next((note for note in notes if isinstance(note, Range)), None)
-        return (*_read_hint(hint)[:2], limits)
-    if typing.get_origin(hint) is typing.Literal:
-        choices = typing.get_args(hint)
-        return tuple({type(choice) for choice in choices}), choices, None
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        kinds, choices, limits = zip(*map(_read_hint, typing.get_args(hint)), strict=True)
-        chosen = next((choice for choice in choices if choice is not None), None)
-        return sum(kinds, ()), chosen, next((limit for limit in limits if limit is not None), None)
-    return (hint,), None, None
 
 
 def _split_docstring(function: Callable) -> tuple[str, dict[str, str]]:
@@ -219,6 +196,18 @@ class Step:
         """Attribute columns that earlier stages must have added."""
         more = [by_value.get(self.effective()[name], ()) for name, by_value in self.stage.needs_if.items()]
         return (*self.stage.needs, *(column for columns in more for column in columns))
+
+
+class Solved(NamedTuple):
+    """The echoes of a block, and what the stages found them in."""
+
+    block: WaveformBlock
+    """Without the strip's defects: slopes, patterns, spikes, transients."""
+    noise: Noise
+    """Of that block."""
+    system: SystemPulse
+    """Of the block's digitizer."""
+    echoes: EchoTable
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,27 +300,52 @@ class Chain:
         StageError
             Where a stage fails: a bug.
         """
-        system = system.of(block)
-        self.check(system)
-        data: dict[str, Any] = {"block": clean_block(block, system), "system": system}
-        slot = {"noise": "noise", "detect": "echoes", "decompose": "echoes", "attribute": "echoes"}
-        for step in self.steps:
-            start = time.perf_counter()
-            arguments = [data[name] for name in KINDS[step.stage.kind][0]]
-            try:
-                result = step.stage.function(*arguments, **step.parameters)
-            except ConfigError as error:
-                raise ConfigError(f"chain {self.name or '(unnamed)'}: {step.stage.name}: {error}") from error
-            except (ArithmeticError, IndexError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
-                raise StageError(
-                    f"stage {step.stage.name} failed on the {len(block)} waveforms from point {block.first}: "
-                    f"{type(error).__name__}: {error}; this is a bug, please report it with the strip"
-                ) from error
-            data[slot[step.stage.kind]] = result
+        return self.solve(block, system, timing).echoes
+
+    def solve(self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None) -> Solved:
+        """Find the echoes of a block, and keep what they were found in: for residuals and pictures.
+
+        Parameters
+        ----------
+        block, system, timing
+            As for `run`.
+
+        Returns
+        -------
+        Solved
+        """
+        cleaned, noise, system = self.estimate_noise(block, system, timing)
+        used, echoes = system, None
+        for step in self.steps[1:]:
+            data = {"block": cleaned, "noise": noise, "system": used, "echoes": echoes}
+            echoes = self._call(step, data, timing)
             if step.stage.fits is not None:
                 fitted = step.stage.fits(system, step.effective())
                 other = (fitted.components, fitted.kappa) != (system.components, system.kappa)
-                data["system"] = replace(fitted, other_pulse=other)
-            if timing is not None:
-                timing[step.stage.name] = timing.get(step.stage.name, 0.0) + time.perf_counter() - start
-        return data["echoes"]
+                used = replace(fitted, other_pulse=other)
+        return Solved(cleaned, noise, system, echoes)
+
+    def estimate_noise(
+        self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None
+    ) -> tuple[WaveformBlock, Noise, SystemPulse]:
+        """Return the block without the strip's defects, its noise, and the system of its digitizer."""
+        system = system.of(block)
+        self.check(system)
+        cleaned = clean_block(block, system)
+        return cleaned, self._call(self.steps[0], {"block": cleaned, "system": system}, timing), system
+
+    def _call(self, step: Step, data: Mapping[str, Any], timing: dict[str, float] | None) -> Any:
+        """The result of a stage."""
+        start, block = time.perf_counter(), data["block"]
+        try:
+            result = step.stage.function(*(data[name] for name in KINDS[step.stage.kind][0]), **step.parameters)
+        except ConfigError as error:
+            raise ConfigError(f"chain {self.name or '(unnamed)'}: {step.stage.name}: {error}") from error
+        except (ArithmeticError, IndexError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+            raise StageError(
+                f"stage {step.stage.name} failed on the {len(block)} waveforms from point {block.first}: "
+                f"{type(error).__name__}: {error}; this is a bug, please report it with the strip"
+            ) from error
+        if timing is not None:
+            timing[step.stage.name] = timing.get(step.stage.name, 0.0) + time.perf_counter() - start
+        return result

@@ -15,8 +15,10 @@ import os
 import pickle
 import queue
 import signal
+import sys
 import threading
 import time
+import types
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
@@ -33,6 +35,9 @@ from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, use
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
+
+_MAIN = b"__main__"
+"""Module of the user's script in a pickled call: a stage that is defined there."""
 
 _NAME = "wavebatch"
 """Start of the names of our processes."""
@@ -65,6 +70,8 @@ class Workers:
         self._workers: list[_Worker] = []
         self._stack = contextlib.ExitStack()
         self._scratch: Path | None = None
+        self._needs_main = False
+        """Whether calls use functions of the user's script, which the processes then import."""
         self.compresses = jobs > 1
         """Whether the processes compress chunks for this one."""
         self.memory: Path | None = None
@@ -84,14 +91,16 @@ class Workers:
         """Return the future result of `function(*arguments)`; both must be picklable."""
         if self.jobs == 1:
             return settle(Future(), function, *arguments)
+        payload = pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL)
+        self._needs_main = self._needs_main or _MAIN in payload
         self._workers = [worker for worker in self._workers if worker.serves]
         if len(self._workers) < self.jobs:
             with uninterrupted():
-                start_early(self.jobs - len(self._workers))
+                start_early(self.jobs - len(self._workers), self._needs_main)
                 while len(self._workers) < self.jobs:
                     self._workers.append(_Worker(_early.pop(0), self._calls, self._scratch))
                 end_early()
-        call = _Call(pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL))
+        call = _Call(payload)
         self._calls.put(call)
         return call.future
 
@@ -158,12 +167,33 @@ def _kill_all() -> None:
             process.kill()
 
 
-def start_early(jobs: int) -> None:
+def refuse_import() -> None:
+    """End this process where it only imports the user's script, and so would run it again."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(
+            "error: this script has a stage, so that each process imports it: write what it does under "
+            'if __name__ == "__main__":, or put the stage into a module'
+        )
+
+
+def start_early(jobs: int, needs_main: bool = False) -> None:
     """Start processes that the next Workers will take: they import their modules while this process imports its own.
 
-    Raises InputError where the system has no more processes.
+    Parameters
+    ----------
+    jobs : int
+        Number of processes.
+    needs_main : bool
+        Whether they import the user's script. It would run again in each of them, so they do so only for stages that
+        are defined in it.
+
+    Raises
+    ------
+    InputError
+        Where the system has no more processes.
     """
-    with uninterrupted(), _single_threaded(), _ctrl_c_held():  # half a start would leave a process that complains
+    # Half a start would leave a process that complains.
+    with uninterrupted(), _single_threaded(), _ctrl_c_held(), contextlib.nullcontext() if needs_main else _no_main():
         while len(_early) < jobs:
             try:
                 _early.append(_Process())
@@ -266,6 +296,17 @@ def _unpack(answer: bytes) -> tuple[Any, BaseException | None]:
         return pickle.loads(answer)
     except Exception as error:
         return None, error
+
+
+@contextlib.contextmanager
+def _no_main() -> Iterator[None]:
+    """Processes that are started inside do not import the user's script: multiprocessing finds an empty one."""
+    before = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = before
 
 
 @contextlib.contextmanager

@@ -14,11 +14,11 @@ import click
 from wavebatch.cli.messages import count, counting, print_json, printable, talk
 from wavebatch.cli.options import (
     common_options,
+    declared,
     for_each,
     from_options,
     name_outputs,
     output_option,
-    recursive_option,
 )
 from wavebatch.cli.program.completion import complete_files
 from wavebatch.files.inputs import find_files
@@ -30,7 +30,7 @@ EXIT_SOME, EXIT_NONE = 3, 4
 
 @click.command("import")
 @click.argument("files", nargs=-1, required=True, metavar="FILE...", shell_complete=complete_files)
-@recursive_option
+@declared("recursive")
 @output_option("Strip to write, .las or .laz, or a folder.  [default: X.las beside each X.pls]", "FILE|DIR",
                required=False, folder=None)
 @click.option("--returns", type=click.Choice(["strongest", "detect"]), default="strongest", show_default=True,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @shared.clouds_argument
-@shared.recursive_option
+@shared.declared("recursive")
 @click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete_columns,
               help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "std", "count", "density"]),
@@ -32,8 +32,7 @@ if TYPE_CHECKING:
               help="Side of a cell, in the unit of the coordinates. Borders are multiples of it, so that neighbouring "
               "rasters fit together.")
 @shared.output_option("Raster to write: .tif.", "X.tif")
-@click.option("--bounds", callback=shared.floats_reader("WEST,SOUTH,EAST,NORTH"), metavar="W,S,E,N",
-              help="Part to write: west, south, east, north [m].  [default: all]")
+@shared.bbox_option("Write")
 @shared.selection_options
 @click.option("--crs", metavar="CRS", help="CRS of the clouds, e.g. EPSG:32632.  [default: that of their headers]")
 @click.option("--no-data", type=float, default=-9999.0, show_default=True, metavar="VALUE",
@@ -48,14 +47,15 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
 
     Exit code: 0 done, 1 a cloud cannot be read or the raster cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.core.flag_names import read_flags
+    from wavebatch.core.condition import read_flags
     from wavebatch.files.geotiff_file import check_raster
     from wavebatch.tools.rasters.grid import GridOptions, write_grid
 
     paths = find_files(map(str, clouds), recursive=options["recursive"])
     check_raster(output, overwrite=options["overwrite"])
-    flags = {name: read_flags(options[name]) for name in ("flags_with", "flags_without")}
-    given = {name: options[name] for name in ("statistic", "size", "bounds", "where", "crs", "no_data")}
+    flags = {"flags_with": read_flags(options["flags"]), "flags_without": read_flags(options["drop_flags"])}
+    given = {name: options[name] for name in ("statistic", "size", "where", "crs", "no_data")}
+    given["bounds"] = options["bbox"]
     found = write_grid(paths, output, GridOptions(columns, **given, **flags), overwrite=options["overwrite"])
     layout = found.layout
     if layout.crs is None:

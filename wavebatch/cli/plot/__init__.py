@@ -58,10 +58,10 @@ def plot() -> None:
               help="Draw the packet of this point, counted from 0; may be repeated.")
 @click.option("--gps-time", "times", multiple=True, type=float, metavar="T",
               help="Draw the pulse nearest to this GPS time [s]; may be repeated.")
-@click.option("--flags-with", multiple=True, metavar="NAMES", shell_complete=complete_flags,
+@click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete_flags,
               help="Draw the first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
 @click.option("--most", type=click.IntRange(1, 24), default=6, show_default=True, metavar="N",
-              help="Most waveforms of --flags-with or of the default.")
+              help="Most waveforms of --flags or of the default.")
 @click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
 @shared.seed_option("Seed of the random packets.")
 @click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
@@ -83,13 +83,13 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
 
     Exit code: 0 done, 1 the strip cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.core.flag_names import read_flags
+    from wavebatch.core.condition import read_flags
     from wavebatch.tools.plots.packets import Wanted
 
-    if options["flags_with"] and (options["packets"] or options["point_numbers"] or options["times"]):
-        raise ConfigError("--flags-with chooses the waveforms; leave out --packet, --point and --gps-time")
-    if options["random"] and any(options[name] for name in ("packets", "point_numbers", "times", "flags_with")):
-        raise ConfigError("--random chooses the waveforms; leave out --packet, --point, --gps-time and --flags-with")
+    if options["flags"] and (options["packets"] or options["point_numbers"] or options["times"]):
+        raise ConfigError("--flags chooses the waveforms; leave out --packet, --point and --gps-time")
+    if options["random"] and any(options[name] for name in ("packets", "point_numbers", "times", "flags")):
+        raise ConfigError("--random chooses the waveforms; leave out --packet, --point, --gps-time and --flags")
     if options["sheet"] and (options["show"] or options["table"]):
         raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
     tabular = output.suffix.lower() == ".csv"
@@ -97,7 +97,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         if options[name]:
             raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
     check_target(output, overwrite=options["overwrite"]) if tabular else _check(output, options)
-    flags = read_flags(options["flags_with"])
+    flags = read_flags(options["flags"])
     wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
     if tabular:
@@ -138,18 +138,17 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 
     ranges: compute the distances of the echoes from the sensor, too, if its position is known.
     """
+    from wavebatch.batch.options import RunOptions
     from wavebatch.files.strip.reader import StripReader
-    from wavebatch.surveying.choose_chain import make_choice
-    from wavebatch.surveying.systems.saved_check import check_saved
+    from wavebatch.surveying.prepare import Positions, prepare
     from wavebatch.tools.api.run import find_request
     from wavebatch.tools.plots.packets import find_places
     from wavebatch.tools.plots.waveform import add_ranges, describe_chain, read_views
 
-    chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
+    chain, request = find_request(shared.from_options(RunOptions, options))
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
     with opened as reader, reader.scan() as scan:
-        check_saved(reader, scan, request.system and request.system.survey, force=options["force"])
-        choice = make_choice(reader, scan, chain, request)
+        choice = prepare(reader, scan, chain, request, positions=Positions.NONE).choice
         system = choice.survey.system
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))
         run, fill = choice.chain, None
@@ -162,7 +161,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 
 @plot.command()
 @shared.clouds_argument
-@shared.recursive_option
+@shared.declared("recursive")
 @_output
 @click.option("--column", "columns", required=True, multiple=True, shell_complete=complete_columns,
               help="Extra dimension or standard field; echo_flags counts flags. May be repeated: columns of one unit "
@@ -260,15 +259,14 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 
 @plot.command(name="map")
 @shared.clouds_argument
-@shared.recursive_option
+@shared.declared("recursive")
 @_output
 @click.option("--column", shell_complete=complete_columns,
               help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
               show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
-@click.option("--bounds", callback=shared.floats_reader("WEST,SOUTH,EAST,NORTH"), metavar="W,S,E,N",
-              help="Part to show: west, south, east, north [m].  [default: all]")
+@shared.bbox_option("Show")
 @shared.selection_options
 @shared.common_options("overwrite", "json", "quiet")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
@@ -287,7 +285,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     if column is None and statistic not in ("count", "density"):
         raise ConfigError(f"--statistic {statistic} needs a --column; only count and density need none")
     selection = select(column, options)
-    found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bounds"])
+    found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bbox"])
     from wavebatch.tools.plots.draw_cloud import draw_map
 
     draw_map(found, output, names=tuple(path.name for path in clouds), overwrite=options["overwrite"])

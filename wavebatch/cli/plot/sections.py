@@ -22,10 +22,10 @@ _output = shared.output_option("Picture to write: .png, .svg or .pdf.")
 
 def select(column: str | None, options: dict[str, Any]) -> Any:
     """The selection of a column and of the flags in the options."""
-    from wavebatch.core.flag_names import read_flags
+    from wavebatch.core.condition import read_flags
     from wavebatch.tools.plots.values import Selection
 
-    flags = read_flags(options["flags_with"]), read_flags(options["flags_without"])
+    flags = read_flags(options["flags"]), read_flags(options["drop_flags"])
     return Selection(column, *flags, where=options["where"])
 
 
@@ -68,10 +68,10 @@ def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool 
 
 @click.command()
 @shared.clouds_argument
-@shared.recursive_option
+@shared.declared("recursive")
 @_output
-@click.option("--line", callback=shared.floats_reader("X0,Y0,X1,Y1"), metavar="X0,Y0,X1,Y1",
-              help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]")
+@shared.floats_option("--line", "X0,Y0,X1,Y1",
+                      "Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]")
 @click.option("--width", type=float, metavar="W",
               help="Show what lies within half of W from the line.  [default: a fiftieth of its length]")
 @click.option("--column", shell_complete=complete_columns,
@@ -112,7 +112,7 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
 
 @click.command()
 @shared.clouds_argument
-@shared.recursive_option
+@shared.declared("recursive")
 @_output
 @click.option("--column", shell_complete=complete_columns, help="Column for --statistic sum and mean, e.g. energy.")
 @click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import click
 
-from wavebatch.cli.program.examples import EXAMPLES, FEWEST, GROUPS
-from wavebatch.cli.program.settings import find_settings
+from wavebatch.batch.options import HEADINGS, OPTIONS
+from wavebatch.cli.messages import talk
+from wavebatch.cli.program.examples import ALSO_USUAL, EXAMPLES, FEWEST, GROUPS, MANY, USUAL
+from wavebatch.cli.program.settings import OLD_NAMES, add_variables, drop_rivals, read_settings, tell_settings
 
 MAYBE_NAN = ("no_data",)
 """Options whose number may be NaN."""
@@ -24,25 +25,35 @@ class ProgramCommand(click.Command):
     title: str = ""
     """Name with that of its group, e.g. `plot map`."""
 
-    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> click.Context:
-        """Parses the arguments; options that they do not give come from settings, if there are any."""
-        wants_help = not {"-h", "--help"}.isdisjoint(args)
-        settings = None if wants_help or extra.get("resilient_parsing") else find_settings(self, args)
-        if settings is None or not settings.values:
-            return super().make_context(info_name, args, parent, **extra)
-        context = super().make_context(info_name, args, parent, **{**extra, "default_map": settings.values})
-        settings.tell(context)
-        return context
-
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parses the arguments; numbers must be finite, because no limit of an option holds for NaN."""
+        """Parses the arguments; options that they do not give come from settings, if there are any.
+
+        Numbers must be finite, because no limit of an option holds for NaN.
+        """
+        args = [self._rename(word) for word in args]
+        is_real = not ctx.resilient_parsing and {"-h", "--help"}.isdisjoint(args)
+        if is_real:
+            read_settings(self, self.title, ctx, args)
         rest = super().parse_args(ctx, args)
         for option in self.params:
             value = ctx.params.get(option.name or "")
             for number in value if isinstance(value, tuple) else (value,):
                 if isinstance(number, float) and not math.isfinite(number) and option.name not in MAYBE_NAN:
                     raise click.BadParameter(f"{number} is not a finite number.", ctx, option)
+        if is_real:
+            drop_rivals(ctx)
+            tell_settings(ctx)
         return rest
+
+    def _rename(self, word: str) -> str:
+        """A word of the command line with the new name of an option, and a remark."""
+        old, mark, value = word.partition("=")
+        new = OLD_NAMES.get(old, "")
+        names = {name for option in self.params for name in option.opts}
+        if new not in names or old in names:
+            return word
+        talk(f"remark: {old} is now {new}; the old name goes with the next version")
+        return new + mark + value
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes the options by group, then the examples."""
@@ -58,21 +69,25 @@ class ProgramCommand(click.Command):
 
 
 def group_options(command: click.Command, ctx: click.Context) -> Iterator[tuple[str, list[tuple[str, str]]]]:
-    """Headings, and names and texts of their options; every option once."""
-    shown = (option for option in command.get_params(ctx) if isinstance(option, click.Option))
-    records = {option.opts[-1]: record for option in shown if (record := option.get_help_record(ctx))}
-    names = {option.opts[-1]: option.name for option in command.get_params(ctx)} | {"--help": "help"}
+    """Headings, and names and texts of their options; every option once.
+
+    A page of very many options begins with those that most users need.
+    """
+    shown = [option for option in command.get_params(ctx) if isinstance(option, click.Option)]
+    names = ["help" if "--help" in option.opts else option.name for option in shown]
+    found = zip(names, (option.get_help_record(ctx) for option in shown), strict=True)
+    records = {name: record for name, record in found if record}
     if len(records) < FEWEST:
         yield "Options", list(records.values())
         return
-    grouped = {name for members in GROUPS.values() for name in members}
-    rest = [record for key, record in records.items() if names[key] not in grouped]
-    if rest:
-        yield "Options", rest
-    for heading, members in GROUPS.items():
-        found = [record for key, record in records.items() if names[key] in members]
+    heading = {name: title for title, names in GROUPS.items() for name in names}
+    heading |= {name: one.group for name, one in OPTIONS.items()}
+    if len(records) > MANY:
+        heading |= {name: USUAL for name, one in OPTIONS.items() if one.usual} | dict.fromkeys(ALSO_USUAL, USUAL)
+    for title in ("Options", USUAL, *HEADINGS):
+        found = [record for name, record in records.items() if heading.get(name, "Options") == title]
         if found:
-            yield heading, found
+            yield title, found
 
 
 def dress(command: click.Command, title: str) -> click.Command:
@@ -86,4 +101,5 @@ def dress(command: click.Command, title: str) -> click.Command:
              "add_help_option", "no_args_is_help", "hidden", "deprecated")  # fmt: skip
     dressed = ProgramCommand(**{name: getattr(command, name) for name in names})
     dressed.title = title
+    add_variables(dressed, title)
     return dressed

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from wavebatch.batch.options import AIR, CHAIN, OUTPUT, RUNNING, WHICH
+
 EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "run": (
         ("wavebatch run strip.las -o clouds", "one strip; the chain is chosen by a survey of it"),
@@ -55,7 +57,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "plot": (),
     "plot waveform": (
         ("wavebatch plot waveform strip.las -o fits.png", "six waveforms, spread over the strip"),
-        ("wavebatch plot waveform strip.las -o bad.svg --flags-with NOT_CONVERGED,AT_BOUND", "fits to look at"),
+        ("wavebatch plot waveform strip.las -o bad.svg --flags NOT_CONVERGED,AT_BOUND", "fits to look at"),
         ("wavebatch plot waveform strip.las -o sheet.png --random 100 --sheet", "a sheet of 100 random waveforms"),
     ),
     "plot histogram": (
@@ -97,30 +99,16 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
 """Per command: a line to type, and what it is for."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "Chain and pulse": (
-        "chain_file", "profile", "tolerance", "system_file", "force", "survey", "calibration_file", "waveforms",
-        "divergence",
-    ),
-    "Reading": ("direction", "headerless", "recursive"),
-    "Position of the sensor": ("trajectory", "lever_arm", "crs", "flight_height"),
-    "Air and light": (
-        "attenuation", "attenuation_error", "visibility", "wavelength", "energy", "reflectance_error", "scan_angle",
-    ),
-    "Which points": (
-        "where", "flags_with", "flags_without", "drop_flags", "bbox", "polygon", "classes", "bounds", "packets",
-        "point_numbers", "times", "most", "random", "limit",
-    ),
-    "Output": (
-        "output", "points", "columns", "column", "names", "file_format", "point_format", "las_version", "keep_packets",
-        "no_data", "html_file", "report", "as_json", "plot", "overwrite",
-    ),
-    "Speed and memory": ("jobs", "scheduler", "memory", "block_size"),
-    "How it runs": (
-        "resume", "dry_run", "strict", "progress", "verbose", "quiet", "log_path", "log_level",
-        "debug", "help",
-    ),
-}  # fmt: skip
-"""Heading of a group: names of its options. Options of no group come first, under Options."""
+    CHAIN: ("waveforms", "divergence"),
+    AIR: ("reflectance_error", "scan_angle"),
+    WHICH: ("flags", "packets", "point_numbers", "times", "most", "random", "limit"),
+    OUTPUT: ("column", "html_file", "report", "as_json", "plot"),
+    RUNNING: ("dry_run", "progress", "verbose", "quiet", "log_path", "log_level", "debug", "help"),
+}
+"""Names of options under a heading of --help, besides those of RunOptions. Others come first, under Options."""
 
 FEWEST = 8
 """Pages with fewer options than this have no groups."""
+
+MANY, USUAL, ALSO_USUAL = 40, "Options that most runs need", ("html_file",)
+"""Pages with more options than MANY begin with those that RunOptions calls usual, and these."""

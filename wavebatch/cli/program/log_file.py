@@ -6,14 +6,14 @@ Lines are appended, so that the runs of a night stand in one file.
 from __future__ import annotations
 
 import contextlib
-import datetime
+import logging
 import os
 import re
 import shlex
 import stat
 import sys
+import time
 from pathlib import Path
-from typing import IO
 
 import click
 
@@ -24,8 +24,24 @@ _LEVEL, LOG = "wavebatch.log_level", "wavebatch.log_path"
 
 LEVELS = ("error", "warning", "info")
 
-_log: tuple[IO[str], int] | None = None
-"""The open file and the last level that is written; None without --log-file."""
+_logger = logging.getLogger("wavebatch.log")
+_logger.propagate = False  # a program that calls commands has its own log
+
+
+class _LogFile(logging.FileHandler):
+    """A file of lines with time and level. A full disk ends the log, not the work; it is said once."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "a", "utf-8", errors="backslashreplace")
+        form = logging.Formatter("%(asctime)sZ %(levelname)-7s %(message)s", "%Y-%m-%dT%H:%M:%S")
+        form.converter = time.gmtime
+        self.setFormatter(form)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Ends the log."""
+        error = sys.exc_info()[1]
+        _logger.removeHandler(self)
+        click.echo(f"warning: --log-file: cannot be written, so it ends here: {error}", err=True)
 
 
 def open_log(path: Path, level: str, command: str) -> None:
@@ -33,7 +49,6 @@ def open_log(path: Path, level: str, command: str) -> None:
 
     Raises ConfigError if the file cannot be written, or is something else than a log.
     """
-    global _log
     from wavebatch import __version__
 
     close_log()
@@ -42,50 +57,36 @@ def open_log(path: Path, level: str, command: str) -> None:
         if os.path.isfile(path):
             with open(path, "rb") as old:
                 begin = old.read(20)
-        elif stat.S_ISFIFO(_mode(path)):  # opening it would wait for a reader, for ever
+        elif os.path.lexists(path) and stat.S_ISFIFO(os.stat(path).st_mode):  # opening it would wait for a reader
             raise ConfigError(f"--log-file: {path} is a pipe; choose a file")
         if begin and not re.fullmatch(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", begin):
             raise ConfigError(f"--log-file: {path} exists and is no log; choose another name")
-        file = open(path, "a", encoding="utf-8", errors="backslashreplace", buffering=1)  # noqa: SIM115
+        _logger.addHandler(_LogFile(path))
     except OSError as error:
         raise ConfigError(f"--log-file: {path}: cannot be written: {error.strerror or error}") from error
-    _log = file, LEVELS.index(level)
+    _logger.setLevel(level.upper())
     log(f"wavebatch {__version__}: {command}")
-
-
-def _mode(path: Path) -> int:
-    try:
-        return os.stat(path).st_mode
-    except FileNotFoundError:
-        return 0
 
 
 def close_log() -> None:
     """End the log; harmless without one."""
-    global _log
-    if _log is not None:
+    for handler in [one for one in _logger.handlers if isinstance(one, _LogFile)]:
+        _logger.removeHandler(handler)
         with contextlib.suppress(OSError):
-            _log[0].close()
-        _log = None
+            handler.close()
+
+
+def is_open() -> bool:
+    """Whether a log is written."""
+    return any(isinstance(one, _LogFile) for one in _logger.handlers)
 
 
 def log(message: str, level: str | None = None) -> None:
     """A line with time and level; the level is found from the message if it is not given. Does nothing without a log.
-
-    A full disk ends the log, not the work; it is said once.
     """
-    global _log
-    if _log is None:
-        return
-    level = level or next((name for name in LEVELS[:2] if f"{name}: " in message), "info")
-    if LEVELS.index(level) > _log[1]:
-        return
-    time = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    try:
-        _log[0].write(f"{time} {level.upper():7} {message}\n")
-    except (OSError, ValueError) as error:
-        _log = None
-        click.echo(f"warning: --log-file: cannot be written, so it ends here: {error}", err=True)
+    if is_open():
+        level = level or next((name for name in LEVELS[:2] if f"{name}: " in message), "info")
+        _logger.log(getattr(logging, level.upper()), "%s", message)
 
 
 def typed_command(context: click.Context) -> str:

@@ -1,27 +1,36 @@
 """Defaults of options from outside of the command line: WAVEBATCH_* variables, and wavebatch.toml beside the strips.
 
-An option on the command line counts first, then the variable, then the file, then the default. `ProgramCommand` asks
-here before it parses. What changes results is never silent: the settings in force are printed in one line.
+Click reads both (`envvar` of an option, `default_map` of a context): an option on the command line counts first, then
+the variable, then the file, then the default. Here is what click lacks: where the file lies, what it must not give
+because it may have come with the data, and what is said of it. What changes results is never silent: the settings in
+force are printed in one line.
 """
 
 from __future__ import annotations
 
+import difflib
 import glob
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
+from wavebatch.batch.options import EXCLUSIVE
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
 
 FILE = "wavebatch.toml"
 PREFIX = "WAVEBATCH_"
 
 READ = "wavebatch.settings_read"
-"""Key of a context's `meta`: names of the files from which settings are in force."""
+"""Key of a context's `meta`: the file that was read."""
+
+_ORDER = (ParameterSource.COMMANDLINE, ParameterSource.ENVIRONMENT, ParameterSource.DEFAULT_MAP)
+"""What counts first."""
 
 NEVER = ("overwrite", "force", "help", "debug")
 """Options that are given on the command line only: they may destroy files, or hide that a result is wrong."""
@@ -30,78 +39,118 @@ IN_NO_FILE = {"run": ("report", "resume", "scheduler")}
 """Options by command that replace files without --overwrite, or trust other machines: wavebatch.toml may have come with
 the data."""
 
-EXCLUSIVE = (
-    ("chain_file", "profile", "tolerance"), ("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"),
-    ("scheduler", "memory"), ("attenuation", "visibility"), ("trajectory", "flight_height"),
-)  # fmt: skip
-"""Options of which only one is possible: one on the command line, or in a variable, takes the place of the others in
-what counts less."""
+SIMILAR = 0.74
+"""Least similarity of a variable that no command reads to one that is read, for a warning: JBOS to JOBS is 0.75."""
+
+OLD_NAMES = {"--bounds": "--bbox", "--polygons": "--polygon", "--flags-with": "--flags",
+             "--flags-without": "--drop-flags", "--pulse-energy": "--energy"}  # fmt: skip
+"""Names of earlier versions, and what they are now."""
 
 _INPUTS = ("strips", "strip", "clouds", "files", "cloud", "a")
 """Names of the arguments that are files to read; settings lie beside the first."""
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Values of options from outside of the command line."""
-
-    values: Mapping[str, Any]
-    """By name of the parameter."""
-    sources: Mapping[str, str]
-    """Where each comes from."""
-    names: Mapping[str, str]
-    """The option of each."""
-
-    def lines(self) -> Iterator[str]:
-        """One text per setting: option, value and source."""
-        for name, value in self.values.items():
-            yield f"{self.names[name]} {value} ({self.sources[name]})"
-
-    def tell(self, context: click.Context) -> None:
-        """Print the settings in one line, and keep them for --dry-run.
-
-        With --quiet those of a file are printed still: who types the command may not know of the file.
-        """
-        from wavebatch.cli.messages import talk
-
-        context.meta["wavebatch.settings"] = tuple(self.lines())
-        context.meta[READ] = [source for source in self.sources.values() if not source.startswith(PREFIX)]
-        shown = [line for name, line in zip(self.values, self.lines(), strict=True)
-                 if not context.params.get("quiet") or not self.sources[name].startswith(PREFIX)]  # fmt: skip
-        if shown:
-            talk(f"settings: {', '.join(shown)}")
+def add_variables(command: click.Command, title: str) -> None:
+    """Let each option of a command be given by a variable: WAVEBATCH_RUN_JOBS counts before WAVEBATCH_JOBS."""
+    for option in command.params:
+        if isinstance(option, click.Option) and option.name not in NEVER:
+            words = re.sub("[- ]", "_", f"{title} {_option_name(option)}").upper()
+            general = _option_name(option).replace("-", "_").upper()
+            own = [option.envvar] if isinstance(option.envvar, str) else []
+            option.envvar = [*own, f"{PREFIX}{words}", f"{PREFIX}{general}"]
 
 
-def find_settings(command: click.Command, arguments: list[str]) -> Settings | None:
-    """The settings for a command with these arguments; None without any. Raises click's errors for wrong ones."""
-    context = click.Context(command)
+def read_settings(command: click.Command, title: str, context: click.Context, arguments: list[str]) -> None:
+    """Take the command's table of wavebatch.toml beside the inputs as defaults; click's errors for a wrong one."""
     try:
-        parsed, _, order = command.make_parser(context).parse_args(list(arguments))
+        parsed, _, _ = command.make_parser(click.Context(command)).parse_args(list(arguments))
     except click.UsageError:
-        return None  # the real parsing says what is wrong
-    options = {one.name: one for one in command.params if isinstance(one, click.Option)}
-    given = {one.name for one in order if one.name in options}
+        return  # the real parsing says what is wrong
     path = _find_file(parsed)
-    in_file = {} if path is None else _read_file(path, command, options)
-    found = {name: (value, str(path)) for name, value in in_file.items()}
-    in_variables = {name: (value, variable) for name, variable, value in _read_variables(command, options)}
-    found = {**_without_rivals(found, in_variables), **in_variables}
-    found = _without_rivals({name: one for name, one in found.items() if name not in given}, given)
-    if not found:
-        return None
-    values, sources = ({name: one[place] for name, one in found.items()} for place in (0, 1))
-    return Settings(values, sources, {name: _option_name(options[name]) for name in values})
+    if path is not None:
+        context.meta[READ] = path
+        context.default_map = _read_file(path, title, _list_options(command))
 
 
-def _without_rivals(found: Mapping[str, Any], stronger: Iterable[str]) -> dict[str, Any]:
-    """The settings without those that exclude one of the names that count more."""
-    names = set(stronger)
-    taken = {name for rivals in EXCLUSIVE if names & set(rivals) for name in rivals if name not in names}
-    return {name: value for name, value in found.items() if name not in taken}
+def drop_rivals(context: click.Context) -> None:
+    """Put settings aside that exclude an option that counts more: of the command line, or of a variable."""
+    options = {one.name: one for one in context.command.params}
+    for rivals in EXCLUSIVE:
+        given = {name: _ORDER.index(source) for name in rivals
+                 if (source := context.get_parameter_source(name)) in _ORDER}  # fmt: skip
+        for name in [name for name, place in given.items() if place > min(given.values())]:
+            (context.default_map or {}).pop(name, None)
+            default = options[name].get_default(context)
+            context.params[name] = default if isinstance(default, bool | int | str) else None
+            context.set_parameter_source(name, ParameterSource.DEFAULT)
+
+
+def tell_settings(context: click.Context) -> None:
+    """Print the settings in force in one line, keep them for --dry-run, and name variables without use.
+
+    With --quiet those of a file are printed still: who types the command may not know of the file.
+    """
+    from wavebatch.cli.messages import talk
+
+    lines, shown = [], []
+    for name, option in _list_options(context.command).items():
+        source = context.get_parameter_source(name)
+        if source is ParameterSource.DEFAULT_MAP:
+            value, place = context.default_map[name], str(context.meta[READ])
+        elif source is ParameterSource.ENVIRONMENT:
+            place = next(variable for variable in option.envvar if os.environ.get(variable))
+            value = os.environ[place]
+        else:
+            continue
+        lines.append(f"--{_option_name(option)} {value} ({place})")
+        shown += lines[-1:] if source is ParameterSource.DEFAULT_MAP or not context.params.get("quiet") else []
+    context.meta["wavebatch.settings"] = tuple(lines)
+    for line in _find_strangers(context):
+        talk(f"warning: {line}")
+    if shown:
+        talk(f"settings: {', '.join(shown)}")
+
+
+def _find_strangers(context: click.Context) -> Iterator[str]:
+    """What is wrong with variables of our name that no command reads."""
+    given = [name for name in os.environ if name.startswith(PREFIX)]
+    if set(given) <= _list_variables(context.command):  # nearly always: the other commands need not be imported
+        return
+    commands = dict(_load_all(context.find_root()))
+    known = {name.removeprefix(PREFIX) for one in commands.values() for name in _list_variables(one)}
+    prefixes = tuple(f"{name.upper().replace(' ', '_')}_" for name in commands)
+    for name in sorted(name.removeprefix(PREFIX) for name in given):
+        near = difflib.get_close_matches(name, known, 1, SIMILAR)
+        if name in known:
+            continue
+        if name.lower().rpartition("_")[2] in NEVER:
+            yield f"{PREFIX}{name} is ignored: this option can be given on the command line only"
+        elif near or name.startswith(prefixes):
+            meant = f"did you mean {PREFIX}{near[0]}?" if near else "see --help for the names"
+            yield f"{PREFIX}{name} is ignored: no command has this option; {meant}"
+
+
+def _load_all(root: click.Context) -> Iterator[tuple[str, click.Command]]:
+    """All commands of the program: name, with that of its group, and command."""
+    group = root.command
+    for name in group.list_commands(root) if isinstance(group, click.Group) else ():
+        command = group.get_command(root, name)
+        yield name, command
+        for inner, one in getattr(command, "commands", {}).items():
+            yield f"{name} {inner}", one
+
+
+def _list_options(command: click.Command) -> dict[str, click.Option]:
+    return {one.name: one for one in command.params if isinstance(one, click.Option)}
+
+
+def _list_variables(command: click.Command) -> set[str]:
+    return {name for option in _list_options(command).values() for name in option.envvar or ()}
 
 
 def _option_name(option: click.Option) -> str:
-    return max(option.opts, key=len)
+    """The long name without its hyphens."""
+    return max(option.opts, key=len).removeprefix("--")
 
 
 def _find_file(parsed: Mapping[str, Any]) -> Path | None:
@@ -133,9 +182,8 @@ def _folder(word: str) -> Path:
     return parent
 
 
-def _read_file(path: Path, command: click.Command, options: Mapping[str, click.Option]) -> dict[str, Any]:
+def _read_file(path: Path, title: str, options: Mapping[str, click.Option]) -> dict[str, Any]:
     """Values of the command's table in the file, by name of the parameter; ConfigError becomes wrong usage."""
-    from wavebatch.core.suggest import nearest
     from wavebatch.files.text_file import read_text
     from wavebatch.files.toml_file import parse_toml
 
@@ -143,20 +191,21 @@ def _read_file(path: Path, command: click.Command, options: Mapping[str, click.O
         table: Any = parse_toml(read_text(path, "settings file"), str(path)).values
     except ConfigError as error:
         raise click.UsageError(str(error)) from error
-    for part in _title(command).split():
+    for part in title.split():
         table = table.get(part, {}) if isinstance(table, dict) else {}
     if not isinstance(table, dict):
-        raise click.UsageError(f"{path}: [{_title(command)}] must be a table of options")
-    known = {_option_name(one).removeprefix("--"): name for name, one in options.items()}
+        raise click.UsageError(f"{path}: [{title}] must be a table of options")
+    known = {_option_name(one): name for name, one in options.items()}
     found = {}
     for key, value in table.items():
-        if isinstance(value, dict) or isinstance(command, click.Group):
+        if isinstance(value, dict):
             continue
+        key = OLD_NAMES.get(f"--{key}", key).removeprefix("--") if key not in known else key
         if key not in known:
-            raise click.UsageError(f"{path}: [{_title(command)}] has no option {key!r}; {nearest(key, list(known))}")
+            raise click.UsageError(f"{path}: [{title}] has no option {key!r}; {nearest(key, list(known))}")
         if known[key] in NEVER:
             raise click.UsageError(f"{path}: {key} can be given on the command line only; remove it from the file")
-        if known[key] in IN_NO_FILE.get(_title(command), ()):
+        if known[key] in IN_NO_FILE.get(title, ()):
             where = "on the command line or in a variable only, since the file may have come with the data"
             raise click.UsageError(f"{path}: {key} can be given {where}; remove it")
         found[known[key]] = _convert(value, options[known[key]], path)
@@ -170,23 +219,3 @@ def _convert(value: Any, option: click.Option, path: Path) -> Any:
     if isinstance(value, list):
         return [str(one) for one in value] if option.multiple else ",".join(map(str, value))
     return value if isinstance(value, bool) else str(value)
-
-
-def _read_variables(
-    command: click.Command, options: Mapping[str, click.Option]
-) -> Iterator[tuple[str, str, str | list[str]]]:
-    """Name, variable and value: WAVEBATCH_RUN_JOBS counts before WAVEBATCH_JOBS."""
-    title = _title(command).upper().replace(" ", "_")
-    for name, option in options.items():
-        if name in NEVER:
-            continue
-        words = _option_name(option).removeprefix("--").upper().replace("-", "_")
-        for variable in (f"{PREFIX}{title}_{words}", f"{PREFIX}{words}"):
-            value = os.environ.get(variable)
-            if value:
-                yield name, variable, value.split() if option.multiple else value
-                break
-
-
-def _title(command: click.Command) -> str:
-    return getattr(command, "title", "") or command.name or ""

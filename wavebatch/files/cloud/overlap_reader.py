@@ -8,8 +8,7 @@ import numpy as np
 
 from wavebatch.core.echoes import PASSED_THROUGH, UNCLEAN
 from wavebatch.files.cloud.echo_reader import CloudReader, find_columns
-from wavebatch.files.disk.raw_bytes import widen
-from wavebatch.files.las.point_formats import ANGLE_UNIT, split_numbers
+from wavebatch.files.las.point_formats import read_angles, split_numbers
 
 LIGHT_COLUMNS = ("backscatter_coefficient", "relative_backscatter")
 """Columns that depend on the angle of incidence, as the cosine does on matt surfaces."""
@@ -45,8 +44,7 @@ class OverlapReader(CloudReader):
             single &= (flags & np.uint16(PASSED_THROUGH | UNCLEAN)) == 0
         raw = raw[single]
         rows = self._place(raw, OVERLAP_DTYPE)
-        long = "scan_angle" in raw.dtype.names
-        rows["scan_angle"] = widen(raw["scan_angle" if long else "scan_angle_rank"]) * (ANGLE_UNIT if long else 1.0)
+        rows["scan_angle"] = read_angles(raw)
         rows["angle"] = self._read_column(raw, self._columns.get(ANGLE))
         for name in OVERLAP_COLUMNS:
             for end in ("", "_err"):

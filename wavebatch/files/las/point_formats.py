@@ -46,6 +46,12 @@ def read_classes(points: np.ndarray) -> np.ndarray:
     return points["classification"] if modern else points["raw_classification"] & 31
 
 
+def read_angles(points: np.ndarray) -> np.ndarray:
+    """Return the scan angles of records (n,) of any point format [deg], f8 (n,)."""
+    modern = "classification_flags" in points.dtype.names
+    return points["scan_angle"] * ANGLE_UNIT if modern else points["scan_angle_rank"].astype(np.float64)
+
+
 def choose_format(path: Path, header: LasHeader, wanted: int | None, keep: bool) -> int:
     """Return the point format of the output: that of the input without waveforms, or the `wanted` one.
 

@@ -19,7 +19,8 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
-from wavebatch.surveying.calibrating.strip_echoes import ECHO, SCANNERS, EchoSource, see_channels
+from wavebatch.surveying.calibrating.strip_channels import SCANNERS, see_channels
+from wavebatch.surveying.calibrating.strip_echoes import ECHO, EchoSource
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.targets import (
     MOST_ECHOES,

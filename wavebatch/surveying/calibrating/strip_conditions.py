@@ -16,7 +16,7 @@ from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.attribute.light import AIR_DOUBT
 from wavebatch.surveying.calibrating.setting import measure_setting
-from wavebatch.surveying.calibrating.strip_echoes import read_day, read_sensor_name
+from wavebatch.surveying.calibrating.strip_channels import read_day, read_sensor_name
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.sensor import SensorSource
 

@@ -9,28 +9,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.las.header import decode_text
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy, read_blocks
-from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.calibrating.setting import Setting, check_energies, measure_setting
-from wavebatch.surveying.choose_chain import Choice, Request, make_choice
-from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
-from wavebatch.surveying.systems.saved_check import check_saved
-
-SCANNERS = 4
-"""Scanner channels of LAS points (0 to 3). A channel number here is SCANNERS x digitizer + scanner channel."""
+from wavebatch.surveying.calibrating.strip_channels import SCANNERS
+from wavebatch.surveying.choose_chain import Choice, Request
+from wavebatch.surveying.prepare import Positions, prepare
+from wavebatch.surveying.sensor import SensorRequest, SensorSource
 
 ECHO = np.dtype([
     ("xyz", "<f8", 3), ("ray", "<f8", 3), ("distance", "<f8"), ("light", "<f8"), ("light_err", "<f8"),
@@ -42,15 +36,7 @@ time [s]."""
 _BLOCK = 8192
 """Waveforms that are read at a time."""
 
-_CHANNEL_SAMPLE = 4096
-"""Waveforms that show which scanner channels a strip has."""
-
 _LIGHT = "relative_backscatter"
-_GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-_ADJUSTED = 1e9
-"""Seconds that LAS takes off standard GPS time."""
-_WEEK = 604_800.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EchoSource:
@@ -120,18 +106,14 @@ def open_source(
         Where the strip cannot be read or the sensor's position is unknown.
     """
     with StripReader(path, direction=direction) as reader, reader.scan() as scan:
-        source = find_sensor(reader, scan, sensor)
-        if source.kind == "none":
-            raise InputError(f"{path}: the sensor's position is unknown: give --trajectory or --flight-height")
-        check_saved(reader, scan, request.system and request.system.survey, force=request.force)
-        choice = make_choice(reader, scan, chain or widest_chain(), request)
+        setup = prepare(reader, scan, chain or widest_chain(), request, sensor=sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
-        system = replace(choice.survey.system, attenuation=attenuation, sensor_error=0.0)
-        setting = measure_setting(reader, scan, source, attenuation)
+        system = replace(setup.system, attenuation=attenuation, sensor_error=0.0)
+        setting = measure_setting(reader, scan, setup.sensor, attenuation)
         sent = find_pulse_energy(reader, scan, energy)
         if energy is not None and sent is not None:
             check_energies(reader, scan, sent)
-        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source, setting, sent)
+        yield EchoSource(reader, scan, setup.choice, with_energy(setup.chain), system, setup.sensor, setting, sent)
 
 
 def with_energy(chain: Chain) -> Chain:
@@ -160,34 +142,3 @@ def take_clean(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     rows["channel"] = SCANNERS * block.digitizer.index + scanner
     known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & np.isfinite(rows["light_err"])
     return rows[known]
-
-
-def read_day(reader: StripReader) -> str:
-    """Return the day of the flight as 2026-11-22; empty where GPS times are not standard ones."""
-    header = reader.facts.header
-    if not header.point_count or not header.global_encoding & 1:
-        return ""
-    second = float(reader.read_points(0, 1)["gps_time"][0]) + _ADJUSTED
-    if not _WEEK < second < 4e9:
-        return ""
-    return (_GPS_EPOCH + timedelta(seconds=second)).date().isoformat()
-
-
-def read_sensor_name(facts: StripFacts) -> str:
-    """Return the system identifier of the header; empty where it names no sensor."""
-    name = decode_text(facts.header.system_identifier).strip()
-    return "" if name.upper() in ("OTHER", "MERGE", "MODIFICATION", "EXTRACTION", "TRANSFORMATION", "") else name
-
-
-def see_channels(reader: StripReader, scan: StripScan) -> dict[tuple[int, int], float]:
-    """Return the share of the waveforms of each digitizer and scanner channel, by a sample for the scanner channels."""
-    total = sum(scan.by_descriptor.values())
-    counts: dict[int, np.ndarray] = {}
-    for block in reader.sample_blocks(scan, _CHANNEL_SAMPLE):
-        scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
-        counts[block.digitizer.index] = counts.get(block.digitizer.index, 0) + np.bincount(scanner, minlength=SCANNERS)
-    shares = {}
-    for index, number in sorted(scan.by_descriptor.items()):
-        of = counts.get(index, np.eye(SCANNERS)[0])
-        shares |= {(index, scanner): number / total * of[scanner] / of.sum() for scanner in np.flatnonzero(of).tolist()}
-    return shares

@@ -21,6 +21,7 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import sample_reference
+from wavebatch.surveying.calibrating.strip_channels import see_channels
 from wavebatch.surveying.calibrating.strip_conditions import (
     compare_air,
     compare_divergence,
@@ -28,7 +29,6 @@ from wavebatch.surveying.calibrating.strip_conditions import (
     doubt_calibration,
     find_growth,
 )
-from wavebatch.surveying.calibrating.strip_echoes import see_channels
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.sensor import SensorSource
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.geometry.facets import fit_facet
-from wavebatch.surveying.calibrating.strip_echoes import SCANNERS
+from wavebatch.surveying.calibrating.strip_channels import SCANNERS
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibration import ChannelConstant, TargetResult
 

@@ -20,12 +20,8 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.las.header import decode_text
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying.calibrating.strip_echoes import (
-    EchoSource,
-    open_source,
-    read_day,
-    read_sensor_name,
-)
+from wavebatch.surveying.calibrating.strip_channels import read_day, read_sensor_name
+from wavebatch.surveying.calibrating.strip_echoes import EchoSource, open_source
 from wavebatch.surveying.calibrating.target_constants import (
     LEAST_ECHOES,
     MOST_STRANGE,

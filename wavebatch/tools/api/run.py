@@ -5,22 +5,23 @@
 
 from __future__ import annotations
 
+import inspect
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from wavebatch.batch.job import RunOptions, StripJob, choose_columns, name_columns
+from wavebatch.batch.job import StripJob, choose_columns, name_columns
+from wavebatch.batch.options import RunOptions, describe_options
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.selection import build_selection
-from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
 from wavebatch.files.inputs import find_strips
 from wavebatch.files.pulse_energy import NONE
+from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
 from wavebatch.surveying.calibrating.calibration_file import load_calibration
@@ -31,131 +32,26 @@ from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
 from wavebatch.tools.api.chain import AUTO, load_chain
 
-ChainLike = Chain | Path | str | None
+Strips = Iterable[Path | str] | Path | str
 
 
 def run(
-    strips: Iterable[Path | str] | Path | str,
-    out: Path | str,
-    *,
-    chain: ChainLike = None,
-    tolerance: float | None = None,
-    system: Survey | Path | str | None = None,
-    force: bool = False,
-    survey: Literal["each", "flight"] = "each",
-    sensor: SensorRequest | None = None,
-    calibration: Path | str | None = None,
-    attenuation: float | tuple[float, float] | None = None,
-    energy: Path | str | None = None,
-    where: Condition | str | None = None,
-    drop_flags: str | None = None,
-    classes: Sequence[int] | None = None,
-    bbox: Sequence[float] | None = None,
-    polygon: Path | str | None = None,
-    columns: str | None = None,
-    points: Literal["echoes", "returns"] = "echoes",
-    format: Literal["laz", "las"] = "laz",
-    point_format: int | None = None,
-    las_version: Literal["1.4", "1.3", "keep"] = "1.4",
-    no_data: Literal["-9999", "nan"] = "-9999",
-    strict: bool = False,
-    names: Literal["wavebatch", "asprs", "riegl", "pdal", "opals"] = "wavebatch",
-    keep_packets: bool = False,
-    direction: Literal["auto", "toward", "away"] = "auto",
-    headerless: bool = False,
-    jobs: int = 1,
-    scheduler: str | None = None,
-    memory: int | None = None,
-    block_size: int | None = None,
-    overwrite: bool = False,
-    resume: bool = False,
-    recursive: bool = False,
-    on_event: Callable[[dict[str, Any]], None] | None = None,
+    strips: Strips, output: Path | str, *, on_event: Callable[[dict[str, Any]], None] | None = None, **options: Any
 ) -> BatchResult:
     """Write a point cloud and a report for every strip; what `wavebatch run` does.
 
-    With more than one job, call it under `if __name__ == "__main__":`, since new processes import your script.
+    The keywords are the options of the command, with `_` for `-`; `help(wavebatch.run)` lists them.
 
     Parameters
     ----------
     strips : iterable of path or str, path or str
         Files, folders, globs, or "@list.txt" with one of these per line.
-    out : path or str
+    output : path or str
         Folder of the clouds and reports; made if it is not there.
-    chain : Chain, path or str, optional
-        A chain, the path of a chain file, or the name of a shipped chain; "auto", the default, lets the survey of each
-        strip choose.
-    tolerance : float, optional
-        Range error [m]; the cheapest shipped chain that meets it runs, in place of `chain`.
-    system : Survey, path or str, optional
-        A survey, or the file of a saved one (`wavebatch survey -o`), in place of one of each strip. A strip whose
-        samples contradict it fails.
-    force : bool
-        Use the survey of `system` also for strips that contradict it.
-    survey : {"each", "flight"}
-        Survey each strip alone, or all of them once; that survey is kept as flight.system.toml in `out`, and used
-        again by later runs into it. A strip that does not fit it gets one of its own.
-    sensor : SensorRequest, optional
-        Where the sensor was: trajectory file, lever arm, CRS, flight height. Default: from the packets' vectors.
-    calibration : path or str, optional
-        A file of `wavebatch calibrate`.
-    attenuation : float or (float, float), optional
-        Of the air during the flight, one way, and its standard deviation [dB/km]; default: that of the calibration,
-        else 0.22.
-    energy : path or str, optional
-        Energy of each emitted pulse, by which columns of light are divided: name of an extra byte of the strips, or a
-        text file with columns time and energy; "none" divides by nothing. Default: the extra byte pulse_energy, where
-        it is there.
-    where : str, optional
-        Write only points that meet this, e.g. "classification == 2 and echo_width < 8"; see docs/selection.md.
-    drop_flags : str, optional
-        Leave out points with one of these flags, e.g. "RINGING_SUSPECT,WEAK"; return numbers are counted without them.
-    classes : sequence of int, optional
-        Write only points of these classes.
-    bbox : (float, float, float, float), optional
-        Write only points from west, south to east, north, in the coordinates of the strips.
-    polygon : path or str, optional
-        Write only points inside the polygons of this GeoJSON file, in WGS 84, in the CRS that the file names, or in the
-        coordinates of the strips.
-    columns : str, optional
-        "a,b" writes these columns only, "+a,+b" adds them to the usual ones. Shipped chains get the stages that make
-        them.
-    points : {"echoes", "returns"}
-        One point per echo found, or the points of the input with new columns.
-    format : {"laz", "las"}
-        Of the clouds.
-    point_format : int, optional
-        LAS point format of the clouds; default: 6, or 7 or 8 where the strip has colours.
-    las_version : {"1.4", "1.3", "keep"}
-        LAS version of the clouds; "keep": that of the strip, with its point format.
-    no_data : {"-9999", "nan"}
-        What floating-point columns hold where an echo has no value.
-    strict : bool
-        Fail where extra bytes of a strip have no free value to mark added echoes.
-    names : {"wavebatch", "asprs", "riegl", "pdal", "opals"}
-        Names and units of the extra bytes.
-    keep_packets : bool
-        Keep the waveforms.
-    direction : {"auto", "toward", "away"}
-        Where packet vectors point.
-    headerless : bool
-        Accept a .wdp file without its 60-byte header.
-    jobs : int
-        Processes; 0 means one per processor. The result is the same for any number.
-    scheduler : str, optional
-        Address of a dask cluster whose workers replace `jobs`.
-    memory : int, optional
-        Most memory of all processes together [bytes].
-    block_size : int, optional
-        Waveforms processed at a time. The result is the same for any number.
-    overwrite : bool
-        Replace existing outputs.
-    resume : bool
-        Keep outputs that are complete and up to date, make all others again.
-    recursive : bool
-        Take the strips in subfolders of folders too.
     on_event : callable, optional
         Called with a dictionary when a strip starts, advances, is written, skipped or fails.
+    **options
+        Fields of `RunOptions`. `chain` may be a Chain, a path, or the name of a shipped chain, `system` a Survey.
 
     Returns
     -------
@@ -167,114 +63,79 @@ def run(
     ConfigError
         For wrong options, before anything starts.
     """
-    plan = plan_run(
-        strips, out, chain=chain, tolerance=tolerance, system=system, force=force, survey=survey, sensor=sensor,
-        calibration=calibration, attenuation=attenuation, energy=energy, where=where, drop_flags=drop_flags,
-        classes=classes, bbox=bbox, polygon=polygon, columns=columns, points=points,
-        format=format, point_format=point_format, las_version=las_version, no_data=no_data, strict=strict, names=names,
-        keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
-        memory=memory, block_size=block_size, overwrite=overwrite, resume=resume, recursive=recursive,
-    )  # fmt: skip
-    return run_batch(*plan, on_event)
+    return run_batch(*plan_run(strips, RunOptions(output, **options)), on_event)
 
 
-def plan_run(
-    strips: Iterable[Path | str] | Path | str,
-    out: Path | str,
-    *,
-    chain: ChainLike = None,
-    tolerance: float | None = None,
-    system: Survey | Path | str | None = None,
-    force: bool = False,
-    survey: Literal["each", "flight"] = "each",
-    sensor: SensorRequest | None = None,
-    calibration: Path | str | None = None,
-    attenuation: float | tuple[float, float] | None = None,
-    energy: Path | str | None = None,
-    where: Condition | str | None = None,
-    drop_flags: str | None = None,
-    classes: Sequence[int] | None = None,
-    bbox: Sequence[float] | None = None,
-    polygon: Path | str | None = None,
-    columns: str | None = None,
-    jobs: int = 1,
-    scheduler: str | None = None,
-    memory: int | None = None,
-    block_size: int | None = None,
-    overwrite: bool = False,
-    resume: bool = False,
-    recursive: bool = False,
-    **output: Any,
-) -> tuple[list[StripJob], BatchOptions]:
+def _sign(function: Callable) -> None:
+    """Give `run` the keywords of RunOptions, for help() and editors that run the code."""
+    given = inspect.signature(function).parameters
+    keywords = inspect.signature(RunOptions).parameters
+    shown = [given["strips"], given["output"], given["on_event"]]
+    shown += [one.replace(kind=one.KEYWORD_ONLY) for one in list(keywords.values())[1:]]
+    function.__signature__ = inspect.Signature(shown, return_annotation=BatchResult)
+    before, mark, after = (function.__doc__ or "").partition("    **options\n")
+    lines = "".join(f"    {line}\n" for line in describe_options().split("\n"))
+    function.__doc__ = before + lines + after[after.find("\n\n") + 1 :] if mark else before
+
+
+_sign(run)
+
+
+def plan_run(strips: Strips, options: RunOptions) -> tuple[list[StripJob], RunOptions]:
     """Check the options of `run` and turn them into jobs; nothing is started or written.
 
     Parameters
     ----------
-    strips, out, chain, tolerance, system, force, survey, sensor, calibration, attenuation, energy, columns, jobs
+    strips : iterable of path or str, path or str
         As for `run`.
-    where, drop_flags, classes, bbox, polygon
-        As for `run`.
-    scheduler, memory
-        As for `run`.
-    block_size, overwrite, resume, recursive
-        As for `run`.
-    **output
-        The remaining ones: fields of RunOptions.
+    options : RunOptions
 
     Returns
     -------
     jobs : list of StripJob
         One per strip, in the order given.
-    options : BatchOptions
-        For `run_batch`.
+    options : RunOptions
+        For `run_batch`, with the number of processes and the block size that the memory allows.
 
     Raises
     ------
     ConfigError
         For whatever is wrong with the options.
     """
-    if scheduler is not None and not scheduler.strip():
-        raise ConfigError("--scheduler: the address is empty; leave it out to work on this machine")
-    found, request = find_request(chain, tolerance=tolerance, system=system)
-    if force and system is None:
-        raise ConfigError("--force is of no use without --system; leave it out")
-    request = replace(request, force=force)
-    if survey == "flight":
-        if system is not None:
-            raise ConfigError("--system and --survey flight exclude each other; give one of them")
-        request = replace(request, flight=True)
-    sensor = sensor or SensorRequest()
-    known = None if calibration is None else load_calibration(Path(calibration))
-    air = None if attenuation is None else _read_air(attenuation)
-    template = StripJob(Path(), found, RunOptions(columns=name_columns(columns)), request, sensor, known, air)
-    chosen = build_selection(where=where, drop_flags=drop_flags, classes=classes, bbox=bbox, polygon=polygon)
-    template = replace(template, pulse_energy=None if energy is None else str(energy), selection=chosen)
+    options.check()
+    widest_chain, request = find_request(options)
+    template = StripJob(
+        Path(),
+        widest_chain,
+        options,
+        name_columns(options.columns),
+        request,
+        read_sensor(options),
+        None if options.calibration is None else load_calibration(Path(options.calibration)),
+        read_air(options),
+        build_selection(options),
+    )
     # A chain that the user wrote stays as it is; a shipped one gets the stages that the given files allow.
-    if chain is None or isinstance(chain, str) and chain in (AUTO, *list_profiles()):
-        found = template.extend(found)
-    _check_use(found, sensor, known, air, None if energy == NONE else energy)
-    options = RunOptions(columns=choose_columns(found, columns), **output)
-    paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips), recursive=recursive)
-    processes, block = plan_memory(jobs or os.cpu_count() or 1, memory)
-    batch_options = BatchOptions(Path(out), processes, scheduler, block_size or block, overwrite, resume)
-    plan = [replace(template, path=path, chain=found, options=options) for path in paths]
-    check_outputs(plan, batch_options)
-    return plan, batch_options
+    asked = options.chain or options.profile
+    shipped = asked is None or isinstance(asked, str) and asked in (AUTO, *list_profiles())
+    found = template.extend(template.chain) if shipped else template.chain
+    _check_use(found, template)
+    paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips),
+                        recursive=options.recursive)  # fmt: skip
+    processes, block = plan_memory(options.jobs or os.cpu_count() or 1, options.memory)
+    columns = choose_columns(found, options.columns)
+    plan = [replace(template, path=path, chain=found, columns=columns) for path in paths]
+    how = replace(options, jobs=processes, block_size=options.block_size or block)
+    check_outputs(plan, how)
+    return plan, how
 
 
-def find_request(
-    chain: ChainLike, *, tolerance: float | None = None, system: Survey | Path | str | None = None
-) -> tuple[Chain, Request]:
+def find_request(options: RunOptions) -> tuple[Chain, Request]:
     """Find the chain to run with, or the widest one that a survey may choose, and the request that goes with it.
 
     Parameters
     ----------
-    chain : Chain, path or str, optional
-        As for `run`.
-    tolerance : float, optional
-        Range error [m] by which a chain is chosen.
-    system : Survey, path or str, optional
-        A survey, or the file of a saved one.
+    options : RunOptions
 
     Returns
     -------
@@ -288,35 +149,40 @@ def find_request(
     ConfigError
         For a chain or a saved survey that cannot be read.
     """
-    if tolerance is not None and chain is not None:
-        raise ConfigError("chain and tolerance exclude each other; give one of them")
-    auto = chain in (None, AUTO) and tolerance is None
-    if isinstance(system, Survey):
-        saved: SavedSurvey | None = SavedSurvey(system)
-    else:
-        saved = None if system is None else load_survey(system)
-    request = Request(auto, tolerance, saved)
-    if chain is None or auto:
+    system, asked = options.system, options.chain or options.profile or AUTO
+    if system is not None:
+        system = SavedSurvey(system) if isinstance(system, Survey) else load_survey(system)
+    auto = asked == AUTO and options.tolerance is None
+    request = Request(auto, options.tolerance, system, options.survey == "flight", options.force)
+    if asked == AUTO:
         return widest(request), request
-    return chain if isinstance(chain, Chain) else load_chain(chain), request
+    return asked if isinstance(asked, Chain) else load_chain(asked), request
 
 
-def _read_air(attenuation: float | tuple[float, float]) -> tuple[float, float]:
-    """Attenuation and its error [dB/km]; ConfigError where they cannot be."""
-    value, error = attenuation if isinstance(attenuation, tuple) else (attenuation, 0.0)
-    if not (0 <= value <= 100 and 0 <= error <= 100):
-        raise ConfigError(f"attenuation: {value:g} +- {error:g} dB/km must lie in 0 to 100; clear air has 0.1 to 0.5")
-    check_attenuation(value)
-    return float(value), float(error)
+def read_sensor(options: RunOptions) -> SensorRequest:
+    """Return where the sensor's positions shall come from; raises ConfigError for a lever arm that cannot be."""
+    arm, file = options.lever_arm, options.trajectory
+    if arm is not None and not sum(map(abs, arm)) < 1000:
+        raise ConfigError(f"--lever-arm: {','.join(map(str, arm))} is too long; a lever arm has a few metres")
+    return SensorRequest(None if file is None else Path(file), options.crs, arm, options.flight_height)
 
 
-def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any, air: Any, energy: Any) -> None:
-    """Raise ConfigError for files that the chain, or another option, would ignore."""
-    if sensor.trajectory is not None and sensor.height is not None:
-        raise ConfigError("--trajectory and --flight-height exclude each other; give one of them")
+def read_air(options: RunOptions) -> tuple[float, float] | None:
+    """Return attenuation and error by --attenuation or --visibility [dB/km]; None without them."""
+    given = options.attenuation
+    if options.visibility is not None:
+        given = attenuation_of_visibility(options.visibility, options.wavelength or 1064.0)
+    if given is not None:
+        check_attenuation(given)
+    return None if given is None else (float(given), float(options.attenuation_error or 0.0))
+
+
+def _check_use(chain: Chain, job: StripJob) -> None:
+    """Raise ConfigError for files that the chain would ignore, and for a trajectory that cannot be read."""
+    sensor = job.sensor
     _check_trajectory(sensor)
-    given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration,
-             "--attenuation": air, "--energy": energy}  # fmt: skip
+    given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": job.calibration,
+             "--attenuation": job.attenuation, "--energy": None if job.energy == NONE else job.energy}  # fmt: skip
     option = next((name for name, value in given.items() if value is not None), None)
     if option is not None and not needs_sensor(chain):
         stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized",

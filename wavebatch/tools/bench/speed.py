@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from wavebatch.batch.job import RunOptions, StripJob, choose_columns
+from wavebatch.batch.job import StripJob, choose_columns
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.strip_task import BatchOptions
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import Chain
 from wavebatch.tools.bench.worker import Worker, peak_memory
@@ -94,9 +94,9 @@ def run_kernels(chain: Chain, block: WaveformBlock, system: SystemPulse) -> floa
 
 def run_file(chain: Chain, strip: Path, folder: Path, jobs: int) -> FileRun:
     """Times the strip through the batch, as `wavebatch run` does it."""
-    job = StripJob(strip, chain, RunOptions(columns=choose_columns(chain)))
+    job = StripJob(strip, chain, columns=choose_columns(chain))
     begin = time.perf_counter()
-    result = run_batch([job], BatchOptions(folder, jobs=jobs, overwrite=True))
+    result = run_batch([job], RunOptions(folder, jobs=jobs, overwrite=True))
     seconds = time.perf_counter() - begin
     for outcome in result.outcomes:
         if outcome.error is not None:

@@ -21,9 +21,9 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import widest_chain
-from wavebatch.surveying.choose_chain import Request, make_choice
+from wavebatch.surveying.choose_chain import Request
+from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
-from wavebatch.surveying.systems.saved_check import check_saved
 from wavebatch.tools.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.tools.compare.differences import SPEED
 from wavebatch.tools.compare.goodness import FitQuality, Goodness, measure_fit
@@ -111,9 +111,9 @@ def match_sides(
         raise ConfigError(f"{clouds[0].name}: a cloud has the echoes of all waveforms; leave --limit out")
     check_tolerance(tolerance_ns)
     with StripReader(strip) as reader, reader.scan() as scan:
-        check_saved(reader, scan, survey, force=force)
         saved = None if survey is None else SavedSurvey(survey)
-        choice = make_choice(reader, scan, widest_chain(), Request(auto=True, system=saved))
+        request = Request(auto=True, system=saved, force=force)
+        choice = prepare(reader, scan, widest_chain(), request, positions=Positions.NONE).choice
         chains = {key: side for key, side in (("a", a), ("b", b)) if side is not None and not side.is_cloud}
         system = choice.survey.system
         runs = {key: ChainRun(side.chain or choice.chain, system, tolerance_ns) for key, side in chains.items()}
@@ -175,9 +175,11 @@ def _match_cloud(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """Noise and echoes of a chain in a block."""
+    """Noise and echoes of a chain in a block; as Solved of the chain."""
 
+    cleaned: WaveformBlock
     noise: Noise
+    system: SystemPulse
     echoes: EchoTable
 
     def rows(self, block: WaveformBlock) -> np.ndarray:
@@ -220,10 +222,10 @@ class _Found:
         inside = np.flatnonzero((sample >= 0) & (sample < block.samples.shape[1]))
         waveform = returns.waveform[inside]
         at = sample[inside].astype(np.int64)
-        level = np.broadcast_to(self.noise.level, block.samples.shape)[waveform, at]
-        rows["amplitude"][inside] = block.samples[waveform, at] - level
-        if block.missing is not None:
-            rows["amplitude"][inside[block.missing[waveform, at]]] = np.nan
+        level = np.broadcast_to(self.noise.level, self.cleaned.samples.shape)[waveform, at]
+        rows["amplitude"][inside] = self.cleaned.samples[waveform, at] - level
+        if self.cleaned.missing is not None:
+            rows["amplitude"][inside[self.cleaned.missing[waveform, at]]] = np.nan
         return rows
 
 
@@ -238,14 +240,12 @@ class ChainRun:
 
     def find(self, block: WaveformBlock) -> _Found:
         """Runs the chain on a block."""
-        echoes = self.chain.run(block, self.system)
-        estimate = self.chain.steps[0]
-        return _Found(estimate.stage.function(block, self.system.of(block), **estimate.parameters), echoes)
+        return _Found(*self.chain.solve(block, self.system))
 
     def add(self, block: WaveformBlock, found: _Found, both: np.ndarray) -> None:
         """Adds the result of a block; both: waveforms in which the other side has an echo, bool (n,)."""
         number = found.echoes.count(len(block))
-        misfit, floor = measure_fit(block, found.noise, self.system.of(block), self.chain.steps[2], found.echoes)
+        misfit, floor = measure_fit(found.cleaned, found.noise, found.system, self.chain.steps[2], found.echoes)
         self.fit.add(misfit, floor, number, both & (number > 0))
         self.vendor.pair_by_time(found.rows(block), found.vendor_rows(block), _keys(block))
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import Chain
@@ -81,11 +80,8 @@ def measure_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -
 
     Samples that are missing, or at the digitizer's limit, are left out.
     """
-    system = system.of(block)
-    first, decomposer = chain.steps[0], chain.steps[2]
-    noise = first.stage.function(block, system, **first.parameters)
-    echoes: EchoTable = chain.run(block, system)
-    fit = rebuild_waveforms(block, system, decomposer, echoes)
+    block, noise, system, echoes = chain.solve(block, system)
+    fit = rebuild_waveforms(block, system, chain.steps[2], echoes)
     if fit is None:
         return np.full(len(block), np.nan)
     samples = block.samples.astype(np.float64)

@@ -22,7 +22,7 @@ from wavebatch.files.las.checked_header import CheckedHeader, read_checked_heade
 from wavebatch.files.las.crs import read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
-from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES, locate, read_classes, split_numbers
+from wavebatch.files.las.point_formats import WITHOUT_WAVES, locate, read_angles, read_classes, split_numbers
 from wavebatch.surveying.inspect_strip import describe_strip
 from wavebatch.tools.inspect.provenance import describe_provenance
 
@@ -124,9 +124,7 @@ class _Totals:
         self.count += len(raw)
         for name, values in zip("xyz", locate(raw, header).T, strict=True):
             self.widen(name, values)
-        modern = "classification_flags" in raw.dtype.names
-        angle = raw["scan_angle"] * ANGLE_UNIT if modern else raw["scan_angle_rank"]
-        self.widen("scan_angle_deg", angle)
+        self.widen("scan_angle_deg", read_angles(raw))
         self.widen("intensity", raw["intensity"])
         if "gps_time" in raw.dtype.names:
             self.widen("gps_time", raw["gps_time"])

@@ -195,7 +195,7 @@ def _survey(columns: Sequence[Clouds], each: bool, by: str | None) -> tuple[dict
     total = Tally()
     for column, clouds in enumerate(columns):
         if by is not None and clouds.other_facts[0].is_flags:
-            raise ConfigError(f"{clouds.paths[0]}: {by} are bits and form no groups; --flags-with selects them")
+            raise ConfigError(f"{clouds.paths[0]}: {by} are bits and form no groups; --flags selects them")
         for cloud, rows, tally in clouds.read():
             total += tally
             if by is None:

@@ -101,7 +101,7 @@ def grid_values(
     if clouds.facts.is_flags and statistic in ("mean", "median", "min", "max"):
         raise ConfigError(
             f"{paths[0]}: {clouds.facts.name} are bits, which have no {statistic}; count the points with a flag: "
-            "--statistic count --flags-with NAME"
+            "--statistic count --flags NAME"
         )
     crs, unit = check_crs(paths)
     total, sample, box = _survey(clouds, bounds)
@@ -190,7 +190,7 @@ def _refuse_far(paths: Sequence[Path], places: Sequence[np.ndarray]) -> None:
         raise ConfigError(
             f"{paths[away[0]]}: lies {float(np.hypot(*(middle[1] - middle[0]))):.6g} from {paths[known[0]]}, and the "
             f"largest cloud is {reach / FAR:.4g} long: a map of both would show neither; draw them one by one, or give "
-            "--bounds"
+            "--bbox"
         )
 
 
@@ -224,7 +224,7 @@ def choose_grid(
         south, north = robust_limits(places[:, 1], south, north)
     extent = max(east - west, north - south)
     if not extent <= LARGEST_EXTENT:
-        raise InputError(f"{where}: points lie {extent:g} m apart, which must be damage; give --bounds to draw a part")
+        raise InputError(f"{where}: points lie {extent:g} m apart, which must be damage; give --bbox to draw a part")
     if size is None:
         size = _choose_size(places, sample.seen, (west, south), extent, most)
     grid = Grid.cover((west, south, east, north), size)

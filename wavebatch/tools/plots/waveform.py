@@ -158,11 +158,8 @@ def build_views(
     block: WaveformBlock, chain: Chain, system: SystemPulse, packets: Sequence[int], show: str | None = None
 ) -> list[WaveformView]:
     """One view per waveform of the block; packets: their numbers in the strip; show: as for `read_views`."""
-    system = system.of(block)
-    first, decomposer = chain.steps[0], chain.steps[2]
-    noise = first.stage.function(block, system, **first.parameters)
-    echoes = chain.run(block, system)
-    shape = fitted_pulse(decomposer, system, block.spacing)
+    block, noise, system, echoes = chain.solve(block, system)
+    shape = fitted_pulse(chain.steps[2], system, block.spacing)
     level = clip_level(block, system)
     seen: Sequence[DetectorSignal | None] = [None] * len(block)
     if show is not None:

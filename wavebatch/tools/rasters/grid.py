@@ -91,7 +91,7 @@ def _check(options: GridOptions) -> None:
     if options.bounds is not None:
         west, south, east, north = options.bounds
         if not (math.isfinite(east - west) and math.isfinite(north - south) and west < east and south < north):
-            raise ConfigError("--bounds must be WEST,SOUTH,EAST,NORTH, west of east and south of north")
+            raise ConfigError("--bbox must be WEST,SOUTH,EAST,NORTH, west of east and south of north")
 
 
 def _grow(
@@ -133,7 +133,7 @@ def _find_facts(paths: Sequence[Path], columns: Sequence[str]) -> tuple[ColumnFa
                                       "a raster of each")  # fmt: skip
                 if mine.is_flags:
                     raise ConfigError(f"{path}: {mine.name} are bits, which have no statistic; count the points with a "
-                                      "flag: --statistic count --flags-with NAME")  # fmt: skip
+                                      "flag: --statistic count --flags NAME")  # fmt: skip
             known = known or reader.facts
     return known or ()
 
@@ -152,7 +152,7 @@ def _find_extent(
             largest = np.maximum(largest, np.nan_to_num(np.abs(rows["values"])).max(axis=0, initial=0.0))
             points += len(rows)
     if not points:
-        wanted = ["a position within --bounds" if options.bounds else "a position"]
+        wanted = ["a position within --bbox" if options.bounds else "a position"]
         wanted += ["the chosen flags"] if options.flags_with or options.flags_without else []
         wanted += ["what --where asks for"] if options.where is not None else []
         raise InputError(f"{paths[0]}: no raster: no point has {' and '.join(wanted)}")
@@ -173,7 +173,7 @@ def _lay_out(where: str, box: tuple[float, float, float, float], options: GridOp
     if max(east - west, north - south) / size > MOST_SIDE:
         raise ConfigError(
             f"{where}: {(east - west) / size:.3g} x {(north - south) / size:.3g} cells of {size:g} are too many; a "
-            "coordinate may be damaged: give --bounds, or a larger --size"
+            "coordinate may be damaged: give --bbox, or a larger --size"
         )
     if options.bounds is not None:  # they end at a border, where no other cell begins
         first = round(west / size), round(south / size)

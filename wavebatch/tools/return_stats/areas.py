@@ -1,6 +1,6 @@
 """Counts of returns per area: cells of a grid, or polygons.
 
-`returns` has one AreaTally per division and cloud; `wavebatch stats --area` and `--polygons` choose the divisions.
+`returns` has one AreaTally per division and cloud; `wavebatch stats --area` and `--polygon` choose the divisions.
 """
 
 from __future__ import annotations

@@ -136,6 +136,6 @@ def check_alone(paths: Sequence[Path], options: dict) -> None:
     mixed = [path for path in paths if not is_segments(path)]
     if mixed:
         raise ConfigError(f"{mixed[0]}: segments are drawn without clouds; draw these in a picture of their own")
-    for name in ("flags_with", "flags_without", "where"):
+    for name in ("flags", "drop_flags", "where"):
         if options[name]:
             raise ConfigError(f"{paths[0]}: --{name.replace('_', '-')} selects points; segments have none")

@@ -27,12 +27,11 @@ from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
 from wavebatch.surveying.auto_chain import widest_chain
-from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.choose_chain import Request, make_choice
-from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.choose_chain import Request
+from wavebatch.surveying.prepare import Positions, prepare
+from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
-from wavebatch.surveying.systems.saved_check import check_saved
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.floor import Floor
 from wavebatch.tools.voxels.gap import SAMPLED, RatioFacts, find_rule
@@ -164,9 +163,19 @@ def voxelize_strip(
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: is the output of the voxels too; give it another name")
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
-        check_saved(reader, scan, system and system.survey, force=force)
-        source = _seek_sensor(reader, scan) if calibration is None else _find_sensor(reader, scan, sensor)
-        pulse, doubts = _find_pulse(reader, scan, system, calibration, source)
+        if not scan.packets:
+            raise InputError(f"{strip}: holds no waveform to put into voxels; see `wavebatch check`")
+        positions = Positions.IF_KNOWN if calibration is None else Positions.REQUIRED
+        setup = prepare(reader, scan, widest_chain(), Request(auto=True, system=system, force=force), sensor=sensor,
+                        positions=positions, calibration=calibration)  # fmt: skip
+        source, pulse, doubts = setup.sensor, replace(setup.system, sensor_error=0.0), setup.doubts
+        if calibration is not None:
+            doubts += tuple(filter(None, [source.doubt()]))
+            if pulse.divergence is None:
+                raise ConfigError(
+                    "--calibration: cross sections need the beam's divergence: add divergence_mrad to the calibration "
+                    "or give a --system file that has it"
+                )
         middle = _find_middle(reader, scan, options)
         floor = Floor(middle)
         ceiling = find_ceiling(reader, scan, middle, options.size, floor)
@@ -234,49 +243,6 @@ def _write_both(
     except BaseException:
         writer.withdraw()
         raise
-
-
-def _find_pulse(
-    reader: StripReader,
-    scan: StripScan,
-    saved: SavedSurvey | None,
-    calibration: Calibration | None,
-    sensor: SensorSource,
-) -> tuple[SystemPulse, tuple[str, ...]]:
-    """The system pulse that `wavebatch run` would use, with the calibration of each channel, and warnings."""
-    path = reader.facts.path
-    if not scan.packets:
-        raise InputError(f"{path}: holds no waveform to put into voxels; see `wavebatch check`")
-    choice = make_choice(reader, scan, widest_chain(), Request(auto=True, system=saved))
-    system = choice.survey.system
-    if calibration is None:
-        return system, ()
-    fitted = match_strip(calibration, reader, scan, system, sensor, choice.chain)
-    system = fitted.calibration.apply(system)
-    if system.divergence is None:
-        raise ConfigError(
-            "--calibration: cross sections need the beam's divergence: add divergence_mrad to the calibration or give "
-            "a --system file that has it"
-        )
-    return system, (*fitted.warnings, *filter(None, [sensor.doubt()]))
-
-
-def _find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest | None) -> SensorSource:
-    source = find_sensor(reader, scan, request or SensorRequest())
-    if source.kind == "none":
-        raise InputError(
-            f"{reader.facts.path}: where the sensor was is unknown, but cross sections need it: give --trajectory or "
-            "--flight-height, or leave --calibration out"
-        )
-    return source
-
-
-def _seek_sensor(reader: StripReader, scan: StripScan) -> SensorSource:
-    """Positions of the sensor for ranges within a ray, which are left as they are where the strip does not give any."""
-    try:
-        return find_sensor(reader, scan, SensorRequest())
-    except InputError:
-        return UNKNOWN
 
 
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:

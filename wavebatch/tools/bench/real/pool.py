@@ -53,11 +53,11 @@ class Solver:
         return EchoTable.concatenate(parts)
 
     def expect(self, block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
-        """Samples without their noise, f4 (n, s): baseline and fitted echoes; the baseline where nothing is fitted."""
-        system, (first, _, decomposer) = self.system.of(block), self.chain.steps
-        baseline = first.stage.function(block, system, **first.parameters).level
-        model = rebuild_waveforms(block, system, decomposer, echoes)
-        return np.broadcast_to(baseline, block.samples.shape) if model is None else baseline + model
+        """Samples without their noise, f4 (n, s): fitted echoes over the baseline, with its slope and its defects."""
+        cleaned, noise, system = self.chain.estimate_noise(block, self.system)
+        model = rebuild_waveforms(cleaned, system, self.chain.steps[2], echoes)
+        level = noise.level if cleaned is block else noise.level + (block.samples - cleaned.samples)
+        return np.broadcast_to(level, block.samples.shape) if model is None else level + model
 
 
 @dataclass(frozen=True, eq=False)

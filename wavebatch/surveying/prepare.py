@@ -1,0 +1,141 @@
+"""Pulse, chain, sensor and calibration of a strip: one preparation for every command that decomposes waveforms.
+
+`run`, `calibrate`, `voxelize`, `compare --strip` and `plot waveform` call `prepare`, so that all see the echoes that a
+run sees. Before you change it: the result must depend on the strip and the request alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.stages.chain import Chain
+from wavebatch.surveying.calibrating.strip_match import match_strip
+from wavebatch.surveying.calibration import Calibration, needs_sensor
+from wavebatch.surveying.choose_chain import Choice, Request, make_choice
+from wavebatch.surveying.flight import hold_strip
+from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.systems.saved_check import check_saved
+
+
+class Positions(Enum):
+    """Whether the sensor's positions are looked for."""
+
+    IF_NEEDED = "where the chain needs them"
+    IF_KNOWN = "where the strip gives them"
+    REQUIRED = "always: without them the strip fails"
+    NONE = "never"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """What a strip is decomposed with; picklable."""
+
+    choice: Choice
+    """Chain and survey, with the reasons."""
+    sensor: SensorSource = UNKNOWN
+    calibration: Calibration | None = None
+    """As it holds for this strip."""
+    doubts: tuple[str, ...] = ()
+    """Why the calibration may not fit."""
+    stranger: str = ""
+    """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
+    forced: str = ""
+    """What contradicts the saved survey with which the strip is run, by --force or in doubt; empty for nothing."""
+
+    @property
+    def chain(self) -> Chain:
+        """The chain that was chosen."""
+        return self.choice.chain
+
+    @property
+    def system(self) -> SystemPulse:
+        """The pulse with its calibration and the error of the sensor's position."""
+        system = replace(self.choice.survey.system, sensor_error=self.sensor.error)
+        return system if self.calibration is None else self.calibration.apply(system)
+
+
+def prepare(
+    reader: StripReader,
+    scan: StripScan,
+    chain: Chain,
+    request: Request,
+    *,
+    sensor: SensorRequest | None = None,
+    positions: Positions = Positions.IF_NEEDED,
+    calibration: Calibration | None = None,
+    air: float | None = None,
+    extend: Callable[[Chain], Chain] | None = None,
+) -> Setup:
+    """Choose pulse and chain of a strip, find its sensor, and see whether its calibration fits.
+
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    chain : Chain
+        Used where the request does not choose one.
+    request : Request
+    sensor : SensorRequest, optional
+        Where positions shall come from; by default from the strip.
+    positions : Positions
+    calibration : Calibration, optional
+    air : float, optional
+        Attenuation during the flight [dB/km]; None: that of the calibration.
+    extend : callable, optional
+        Adds stages to a chain that the request chose.
+
+    Returns
+    -------
+    Setup
+
+    Raises
+    ------
+    InputError
+        Where the strip contradicts the saved survey or the calibration, or its sensor is required and not known.
+    ConfigError
+        Where no chain meets the tolerance.
+    """
+    stranger, forced = _hold(reader, scan, request)
+    used = replace(request, system=None) if stranger else request
+    choice = make_choice(reader, scan, chain, used)
+    if extend is not None and used.describe(chain) is not None:
+        choice = replace(choice, chain=extend(choice.chain))
+    source = UNKNOWN
+    if positions is not Positions.IF_NEEDED or needs_sensor(choice.chain):
+        source = _find_sensor(reader, scan, sensor or SensorRequest(), positions)
+    if calibration is None:
+        return Setup(choice, source, stranger=stranger, forced=forced)
+    fitted = match_strip(calibration, reader, scan, choice.survey.system, source, choice.chain, air)
+    return Setup(choice, source, fitted.calibration, fitted.warnings, stranger, forced)
+
+
+def _hold(reader: StripReader, scan: StripScan, request: Request) -> tuple[str, str]:
+    """Why the strip does not belong to the flight whose survey is given, and what contradicts a saved survey."""
+    if request.system is None:
+        return "", ""
+    if request.flight:
+        return hold_strip(reader, scan, request.system.survey), ""
+    return "", check_saved(reader, scan, request.system.survey, force=request.force)
+
+
+def _find_sensor(
+    reader: StripReader, scan: StripScan, request: SensorRequest, positions: Positions
+) -> SensorSource:
+    if positions is Positions.NONE:
+        return UNKNOWN
+    try:
+        source = find_sensor(reader, scan, request)
+    except InputError:  # coordinates in feet or degrees
+        if positions is not Positions.IF_KNOWN:
+            raise
+        return UNKNOWN
+    if source.kind == "none" and positions is Positions.REQUIRED:
+        raise InputError(
+            f"{reader.facts.path}: the sensor's position is unknown: give --trajectory or --flight-height"
+        )
+    return source
