@@ -89,7 +89,7 @@ def test_the_survey_finds_the_colour_of_the_noise(shape, width, rho):
     correlation = np.array(system.correlation)
     assert correlation[0] == pytest.approx(rho / (1 + rho * rho), abs=0.015)
     assert correlation[1:] == pytest.approx(np.zeros(len(correlation) - 1), abs=0.012)
-    assert system.noise_by_kind["outside"] == pytest.approx(NOISE, rel=0.015)
+    assert system.noise_by_kind["quiet"] == pytest.approx(NOISE, rel=0.015)
     assert scatter(block, system, *truth, 1) == pytest.approx(np.ones(3), abs=0.12)
 
 
@@ -101,4 +101,4 @@ def test_whole_counts_are_no_correlation_no_tail_and_no_less_noise(unit):
     assert not system.components
     assert system.noise_std == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)
     assert system.correlation == pytest.approx(np.zeros(len(system.correlation)), abs=0.02)
-    assert system.noise_by_kind["outside"] == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)
+    assert system.noise_by_kind["quiet"] == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)

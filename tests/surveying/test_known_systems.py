@@ -17,7 +17,13 @@ from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems import known_systems as module
-from wavebatch.surveying.systems.known_systems import compare_pulses, find_likeness, find_source, known_systems
+from wavebatch.surveying.systems.known_systems import (
+    compare_pulses,
+    draw_pulse,
+    find_likeness,
+    find_source,
+    known_systems,
+)
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
 KNOWN = {one.name: one for one in known_systems()}
@@ -37,17 +43,29 @@ def _count_echoes(path, survey) -> int:
     return number
 
 
+def _half_width(system: SystemPulse) -> float:
+    """Full width of a pulse at half of its height [ns]."""
+    lag = np.arange(-40.0, 60.0, 0.01)
+    height = draw_pulse(system, lag)
+    return 0.01 * np.count_nonzero(height > 0.5 * height.max())
+
+
 def test_what_is_shipped():
     assert {name: one.sensor for name, one in KNOWN.items()} == {
-        "riegl-q680i": "RIEGL LMS-Q680i", "leica-als": "Leica ALS"
+        "riegl-q680i": "RIEGL LMS-Q680i", "leica-als": "Leica ALS", "geolas-q560": "GeoLas (RIEGL LMS-Q560)",
+        "nasa-lvis": "NASA LVIS", "neon-gemini": "Optech Gemini of NEON AOP",
     }  # fmt: skip
     folder = Path(module.__file__).parent
     for one in KNOWN.values():
         text = (folder / f"{one.name}.toml").read_text("utf-8")
         assert "wavebatch survey " in text and "licence" in text, "how it was made and what it may be used for"
         assert load_survey(folder / f"{one.name}.toml").survey.system == one.system, "--system takes it"
-        assert one.spacing == 1.0 and len(one.system.components) > 1 and find_source(one.system) is one
-    # The outgoing pulse of the flight that it was measured on has 4.55 ns.
+        assert one.spacing == (2.0 if one.name == "nasa-lvis" else 1.0)
+        assert len(one.system.components) > 1 and find_source(one.system) is one
+    # The outgoing pulses of the flights that they were measured on, and the impulse response of the Gemini's receiver.
+    for name, width in (("geolas-q560", 4.05), ("neon-gemini", 15.1)):
+        assert _half_width(KNOWN[name].system) == pytest.approx(width, rel=0.03)
+    assert _half_width(KNOWN["nasa-lvis"].system) == pytest.approx(6.6, rel=0.05)
     assert FWHM_PER_SIGMA * KNOWN["riegl-q680i"].system.sigma_ref == pytest.approx(4.55, rel=0.05)
 
 
@@ -61,24 +79,22 @@ def test_a_shipped_pulse_is_that_of_its_strip(strip, name, request):
 
 
 @pytest.mark.quick_cases("11-0.03")
-@pytest.mark.parametrize(("points", "error"), [(11, 0.03), (54, 0.03), (100, 0.05)])
-def test_a_small_strip_of_a_known_sensor_gets_its_pulse(riegl, tmp_path, points, error):
-    """54 points are 53 packets. With a Gaussian they had 116 echoes, since each after-pulse became one.
-
-    100 points have 102 and 106 echoes: what is left outside of the echoes of so few says 3.5 DN of noise, not 1.7.
-    """
+@pytest.mark.parametrize(("points", "error"), [(11, 0.03), (54, 0.03), (100, 0.03)])
+def test_a_small_strip_has_the_echoes_of_the_whole_strip(riegl, tmp_path, points, error):
+    """54 points are 53 packets. With a Gaussian they had 116 echoes, since each after-pulse became one."""
     path = cut_strip(riegl, tmp_path / "cut.las", points)
     small, whole = _survey(path), _survey(riegl)
-    assert find_source(small.system).name == "riegl-q680i"
-    reason = next(one.reason for one in small.decisions if one.part == "learned pulse")
-    assert reason.startswith("pulse from the shipped riegl-q680i")
-    assert small.figures["known_pulse_misfit"] < 0.5 * small.figures["known_pulse_gaussian_misfit"]
     assert _count_echoes(path, small) == pytest.approx(_count_echoes(path, whole), rel=error)
+    if small.figures["isolated_echoes"] < 20:
+        assert find_source(small.system).name == "riegl-q680i"
+        reason = next(one.reason for one in small.decisions if one.part == "learned pulse")
+        assert reason.startswith("pulse from the shipped riegl-q680i")
+        assert small.figures["pulse_cost"] < small.figures["isolated_pulse_cost"]
 
 
-def test_a_small_strip_of_the_other_known_sensor_gets_the_other_pulse(leica, tmp_path):
+def test_a_small_strip_of_the_other_known_sensor_looks_like_it(leica, tmp_path):
     small = _survey(cut_strip(leica, tmp_path / "cut.las", 100))
-    assert find_source(small.system).name == "leica-als"
+    assert find_likeness(small.system, 1.0).known.name == "leica-als"
 
 
 OTHERS = {
@@ -103,7 +119,7 @@ def test_a_small_strip_of_another_sensor_gets_no_known_pulse(name, scene):
 @pytest.mark.parametrize(("share", "delay"), [(0.04, 8.0), (0.06, 13.0)])
 def test_after_pulses_of_an_unknown_sensor_are_flagged(share, delay):
     pulse = PulseModel(1.85, 0.0, ((share, delay, 1.8),))
-    block = make_block(make_scene("flat", pulse=pulse, n_samples=100), 40, seed=5)[0]
+    block = make_block(make_scene("flat", pulse=pulse, n_samples=100), 18, seed=5)[0]
     system = survey_block(block).system
     assert not system.components and 0.8 * share < system.ringing < 1.6 * share
     echoes = decompose_sample(block, system)

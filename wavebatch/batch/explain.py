@@ -184,7 +184,7 @@ def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
     """A system pulse that is a guess, because the survey had too few echoes to measure it."""
     figures, system = prepared.choice.survey.figures, prepared.system
     alone = figures.get("isolated_echoes")
-    if report.count("echoes") and alone is not None and alone < FEW and "known_pulse_echoes" not in figures:
+    if report.count("echoes") and alone is not None and alone < FEW and "pulse_cost" not in figures:
         yield (
             f"the survey found too few isolated echoes, {int(alone)} where {FEW} are needed: the system pulse is a "
             f"guess, a Gaussian of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns, and widths, errors and the number of "

@@ -214,7 +214,7 @@ def _find_likeness(saved: SavedSurvey) -> dict[str, Any] | None:
     found = find_likeness(survey.system, survey.figures.get("spacing_ns", 0.0))
     if found is None:
         return None
-    taken = "known_pulse_misfit" in survey.figures and find_source(survey.system) is not None
+    taken = "pulse_cost" in survey.figures and find_source(survey.system) is not None
     return {"sensor": found.known.sensor, "name": found.known.name, "difference": found.difference, "taken": taken,
             "sentence": found.describe()}  # fmt: skip
 
@@ -259,7 +259,6 @@ def _line(name: str, text: str) -> str:
 
 NOISE_KINDS = {
     "quiet": "quiet samples",
-    "quiet_smoothed": "quiet samples, filtered 1 2 1",
     "quiet_pulse": "quiet samples, as a pulse sees it",
     "outside": "outside of echoes",
     "outside_pulse": "outside, as a pulse sees it",

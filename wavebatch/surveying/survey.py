@@ -13,10 +13,16 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import find_levels
-from wavebatch.kernels.signal.signal import quiet_mean, transpose_samples
+from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, find_strong, learn_pulse, refine_pulse
+from wavebatch.surveying.measuring.learn_pulse import (
+    find_clear,
+    find_isolated,
+    find_strong,
+    learn_pulse,
+    refine_pulse,
+)
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.misfit import measure_misfit
 from wavebatch.surveying.measuring.noise_and_width import (
@@ -30,7 +36,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
-from wavebatch.surveying.systems.known_systems import find_source, take_pulse
+from wavebatch.surveying.systems.known_systems import choose_pulse, find_source, guess_pulse
 from wavebatch.surveying.systems.skew import measure_skew
 
 SAMPLE = 8192
@@ -229,13 +235,16 @@ def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
     _, quiet, _ = find_levels(signal, plain.noise_std, reach)
     if block.missing is not None:
         quiet &= ~block.missing.T
-    # Only what comes before the strongest echo: tails are as high as the targets, which long packets see more of.
-    quiet &= np.arange(len(signal))[:, None] < np.argmax(signal, axis=0) - reach
+    # Only what comes before the first signal: long packets have more echoes, and what lies between them is no level.
+    quiet = accumulate(np.logical_and, quiet)
     level, number = quiet_mean(signal, quiet)
     used = number >= LEAST_QUIET_SAMPLES
-    deviation = np.where(quiet, signal - level, np.float32(0))[:, used]
-    freedom = max(int((number[used] - 1).sum()), 1)
-    std = float(np.sqrt(np.sum(deviation * deviation, dtype=np.float64) / freedom))
+    # From differences of neighbours: a variance about the mean of so few correlated samples depends on their number.
+    pairs = quiet[1:] & quiet[:-1]
+    step = np.where(pairs, signal[1:] - signal[:-1], np.float32(0))
+    freedom = max(int(np.count_nonzero(pairs)), 1)
+    unlike = 2 * max(1 - (plain.correlation[0] if plain.correlation else 0.0), 0.1)
+    std = float(np.sqrt(np.sum(step * step, dtype=np.float64) / (unlike * freedom)))
     mean, spread = (float(np.mean(level[used])), float(np.std(level[used]))) if used.any() else (0.0, 0.0)
     clip = find_saturation(block.samples, block.digitizer.max_count)
     return Level(int(used.sum()), mean, spread, max(std, QUANTISATION_STD), freedom, clip)
@@ -344,18 +353,19 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         clear = find_clear(block, system)
         main = find_isolated(block, system, clear)
         figures["isolated_echoes"] = len(main)
-        if len(main) >= ENOUGH_TO_LEARN:
+        learned = len(main) >= ENOUGH_TO_LEARN
+        if learned:
             system = learn_pulse(block, system, main, figures)
         else:
-            taken = take_pulse(block, system, guess=len(main) < FEW)
-            system = taken.system
-            figures.update(taken.figures)
+            system = guess_pulse(block, system, guess=len(main) < FEW)
         part = thin_block(block, RESIDUAL_LOOK)
         for _ in range(REFINEMENTS):
             last = system.sigma_ref
             system, chosen = refine_pulse(part, system, decompose_sample(part, system), figures)
             if len(chosen) < ENOUGH_TO_LEARN or abs(system.sigma_ref / last - 1) < SETTLED:
                 break
+        learned |= len(chosen) >= ENOUGH_TO_LEARN
+        system = choose_pulse(part, system, learned=learned, figures=figures)
         before, echoes = system, decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
         # The strongest echoes are the same, and clear, whatever pulse is learned from them.
@@ -476,11 +486,11 @@ def _decide_defects(system: SystemPulse) -> Iterator[Decision]:
 
 def _explain_pulse(system: SystemPulse, figures: Mapping[str, float]) -> str:
     """Why the pulse is, or is not, a sum of Gaussians."""
-    source = find_source(system) if "known_pulse_misfit" in figures else None
-    if source is not None:
-        known, gaussian = (figures.get(f"known_pulse_{name}", 0.0) for name in ("misfit", "gaussian_misfit"))
-        misfits = f"it misses strong echoes by {known:.4f} of the amplitude, a Gaussian by {gaussian:.4f}"
-        return f"pulse from the shipped {source.name}: {misfits}"
+    source = find_source(system) if "pulse_cost" in figures else None
+    if "pulse_cost" in figures:
+        cost, isolated = figures["pulse_cost"], figures["isolated_pulse_cost"]
+        name = f"the shipped {source.name}" if source else "the isolated echoes, drawn together"
+        return f"pulse from {name}: echoes and misfit of a waveform cost {cost:.0f} with it, {isolated:.0f} without"
     if "misfit_1_gaussians" not in figures:
         few = f"{int(figures.get('isolated_echoes', 0))} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
         ringing = f"after-pulses of {100 * system.ringing:.1f} % that strong echoes show are flagged"

@@ -10,8 +10,8 @@ import numpy as np
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
-STEP = 0.2
-"""Grid of the stack [samples]."""
+STEP, IN_BIN = 0.2, 10.0
+"""Grid of the stack [samples]; coarser where fewer echoes would fall into a bin than IN_BIN."""
 
 MOST_COMPONENTS = 5
 
@@ -76,11 +76,12 @@ def stack_pulse(
     std: error of a sample that counts have without any noise; where they are rounded more coarsely than they scatter,
     the values of a bin may all be equal without being exact.
     """
+    step = float(np.clip(IN_BIN / max(len(amplitude), 1), STEP, 1.0))
     least = max(std / float(np.median(amplitude)), 1e-6) if len(amplitude) else 1e-6
     lag = np.reshape(first, (-1, 1)) + np.arange(signal.shape[1]) - time[:, None]
     used = (lag >= -before) & (lag <= after) & np.isfinite(signal)
     values = ((signal + _dither(time, signal.shape[1], std)) / amplitude[:, None])[used]
-    bins = np.floor((lag[used] + before) / STEP).astype(np.int64)
+    bins = np.floor((lag[used] + before) / step).astype(np.int64)
     order = np.argsort(bins, kind="stable")
     bins, values = bins[order], values[order]
     starts = np.flatnonzero(np.r_[True, np.diff(bins) > 0])
@@ -90,7 +91,7 @@ def stack_pulse(
         if len(part) >= LEAST_BIN:
             middle = np.median(part)
             spread = MAD_TO_STD * np.median(np.abs(part - middle))
-            centre = (bins[begin] + 0.5) * STEP - before
+            centre = (bins[begin] + 0.5) * step - before
             stack.append((centre, middle, MEDIAN_ERROR * max(spread, least) / np.sqrt(len(part))))
     return Stack(*np.array(stack).reshape(-1, 3).T)
 

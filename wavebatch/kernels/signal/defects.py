@@ -53,14 +53,30 @@ def find_spikes(above: np.ndarray, std: float, width: float) -> np.ndarray:
     """
     drop = np.float32(CURVATURE * (1 - np.exp(-0.5 / width**2)))
     spikes = np.zeros(above.shape, bool)
-    if len(above) < 3:
+    if len(above) < 5:
         return spikes
     middle, left, right = above[1:-1], above[:-2], above[2:]
-    high, low = np.maximum(left, right), np.minimum(left, right)
+    high = np.maximum(left, right)
     spikes[1:-1] = middle - high > np.float32(SPIKE * std) + drop * np.maximum(middle, 0)
     spikes[1:-1] &= middle > np.float32(HEIGHT * std)
-    spikes[1:-1] |= low - middle > np.float32(HOLE * std) + drop * np.maximum(high, 0)
+    low = _least_between(above, np.float32(width))
+    spikes[2:-2] |= low - above[2:-2] > np.float32(HOLE * std) + drop * np.maximum(high, 0)[1:-1]
     return spikes
+
+
+def _least_between(above: np.ndarray, width: np.float32) -> np.ndarray:
+    """Least value (s - 4, n) that a sum of pulses can have at a sample, as its two neighbours on either side say.
+
+    The logarithm of a sum of Gaussians of a width w or more bends down by at most 1 / w^2 at any place. So a sample is
+    at least the square of its neighbour over the next one, less that: between two strong echoes, whose sum falls to the
+    valley, next to nothing. The neighbour itself is the most that it says.
+    """
+    bend = np.exp(np.float32(-CURVATURE) / (width * width))
+    sides = []
+    for near, far in ((above[1:-3], above[:-4]), (above[3:-1], above[4:])):
+        falls = np.maximum(near, np.float32(0)) / np.maximum(np.maximum(near, far), np.float32(1e-6))
+        sides.append(near * np.where(near > 0, bend * falls, np.float32(1)))
+    return np.minimum(*sides)
 
 
 def fill_spikes(signal: np.ndarray, spikes: np.ndarray) -> None:

@@ -11,17 +11,54 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.kernels.signal.signal import SMOOTH_GAIN, STRONG, accumulate, find_quiet, quiet_mean, smooth_121
+from wavebatch.kernels.signal.signal import (
+    SMOOTH_GAIN,
+    STRONG,
+    accumulate,
+    find_quiet,
+    quiet_mean,
+    smooth_121,
+    sum_samples,
+)
 
-ROUNDS, SETTLED = 4, 0.001
-"""Times, at most, that level and quiet samples are found from each other; change in noise that ends it."""
-
+ROUNDS = 2
+"""Times that quiet samples and their noise are found from each other, after the first look at the edges."""
 
 DRIFT = 1.0
 """Spread of the baselines, over the noise, from which each waveform's level is found from itself."""
 
-BELOW_QUARTILE = 0.773
-"""Root mean square distance from the lower quartile of what lies below it, for normal noise of unit variance."""
+EDGE = 6
+"""First and last samples of a waveform that may be quiet: the least from which a level and a scatter can be seen."""
+
+ALIKE = 5.0
+"""Variance of an edge, over the mean of the quieter ones, from which it holds signal: of six correlated samples of
+noise one in a hundred has more."""
+
+QUIET_EDGES = 0.25
+"""Share of the edges that noise begins from: at least these are taken to be quiet."""
+
+BEFORE_SIGNAL = 3
+"""Part of the reach that is left out before a signal: a pulse rises faster than its tail falls."""
+
+LAGS = 12, 20
+"""Lags of the noise's covariance that are measured, for narrow and for wide pulses: beyond them a drift of the baseline
+takes over, and each lag adds its own error to the noise of a pulse."""
+
+CLIPPED = 3.5
+"""Robust standard deviations at which residuals are cut off."""
+
+LEAST_PAIRS = 2000
+"""Pairs of residuals from which a correlation is measured."""
+
+LEAST_QUIET_PAIRS = 100
+"""Pairs of quiet neighbours from which a covariance is measured: their variance is then known to a seventh."""
+
+
+CHANCE = 3.0
+"""Standard errors up to which a covariance is none: those of many lags add up in the noise of a wide pulse."""
+
+LEAST_SHARE = 0.25
+"""Pairs at a lag, over those of neighbours, from which it counts: the few longest runs are not like the others."""
 
 
 class PooledNoise(NamedTuple):
@@ -31,48 +68,20 @@ class PooledNoise(NamedTuple):
     """Mean of the quiet samples."""
     std: float
     """Standard deviation of a quiet sample about its waveform's baseline, at least 0.289."""
-    smoothed_std: float
-    """Standard deviation after the [1 2 1]/4 filter over 0.61237: larger than std where noise is coloured."""
     spread: float
     """Standard deviation of the true baseline between waveforms."""
     share: float
-    """Share of quiet samples."""
+    """Share of quiet samples; 0 where too few are quiet for the noise to be known."""
     correlation: np.ndarray = np.empty(0)
     """Correlation of quiet samples 1, 2, ... apart (k,)."""
     recovery: int = 0
     """Samples after a strong signal until the level is back to what it was before it."""
 
 
-def first_level(signal: np.ndarray) -> tuple[float, float]:
-    """Most frequent value among the lower half of signal (s, n), and the spread below it: a start, echoes ignored.
-
-    Where nothing lies below it, because counts end there, the spread up to the third quartile of all values: too large
-    a start becomes smaller later.
-    """
-    median = np.median(signal, axis=0)
-    low = signal[signal <= np.median(median) + 1]
-    values, counts = np.unique(low, return_counts=True)
-    level = float(values[np.argmax(counts)])
-    below = low[low <= level] - level
-    if not below.any():
-        return level, max(float(np.quantile(signal, 0.75) - level) / 0.674, QUANTISATION_STD)
-    return level, max(float(np.sqrt(np.mean(below * below))), QUANTISATION_STD)
-
-
-LAGS = 12
-"""Lags of the noise's correlation that are measured: beyond them a drift of the baseline takes over."""
-
-CLIPPED = 3.5
-"""Robust standard deviations at which residuals are cut off."""
-
-LEAST_PAIRS = 2000
-"""Pairs of quiet samples from which a correlation is measured."""
-
-
 def estimate_noise(
     signal: np.ndarray, reach: int, limit: float = 4.0, missing: np.ndarray | None = None
 ) -> PooledNoise:
-    """Level, variance and correlation of quiet samples, right for rounded data.
+    """Level, variance and correlation of the samples before the first and after the last signal of each waveform.
 
     Parameters
     ----------
@@ -91,61 +100,184 @@ def estimate_noise(
 
     Notes
     -----
-    docs/algorithms.md H10 (rounding) and H11 (correlation).
+    The noise begins from the quieter edge of each waveform: those that scatter like the quietest of them. No level of
+    the strip and no threshold is needed for it, so that a canopy is not taken for noise. Between echoes nothing is
+    quiet. The covariance is the sill of the variogram, half the mean square difference of samples 1, 2, ... apart,
+    less its value at each lag: a baseline's error, which spoils variances of few correlated samples, is in neither
+    (docs/algorithms.md H10, H11).
     """
     if missing is not None:
         recorded = ~missing.all(axis=0)
         if not recorded.all():  # a short waveform may be all transient; zeros in its place would count as quiet
             signal, missing = (np.compress(recorded, values, axis=1) for values in (signal, missing))
     if not signal.size:
-        return PooledNoise(0.0, QUANTISATION_STD, QUANTISATION_STD, 0.0, 0.0)
+        return PooledNoise(0.0, QUANTISATION_STD, 0.0, 0.0)
     if missing is not None:
         signal = np.where(missing, np.float32(np.nan), signal)
         signal = np.where(missing, np.nanmedian(signal, axis=0), signal)
     signal = signal.astype(np.float32)
-    first, std = first_level(signal)
-    found = _estimate_from(signal, first, std, 0.0, reach, limit, missing, 0)
-    recovery = measure_recovery(signal, found, reach, limit, missing)
+    found = _estimate_from(signal, reach, limit, missing, 0)
+    recovery = measure_recovery(signal, found, reach, limit, missing) if found.share else 0
     if not recovery:
         return found
-    again = _estimate_from(signal, found.level, found.std, found.spread, reach, limit, missing, recovery)
+    again = _estimate_from(signal, reach, limit, missing, recovery)
     return again if again.share > 0 else found
 
 
 def _estimate_from(
-    signal: np.ndarray,
-    level: float,
-    std: float,
-    spread: float,
-    reach: int,
-    limit: float,
-    missing: np.ndarray | None,
-    recovery: int,
+    signal: np.ndarray, reach: int, limit: float, missing: np.ndarray | None, recovery: int
 ) -> PooledNoise:
-    """The noise of quiet samples, found from each other from a first level, noise and spread of baselines on."""
-    for _ in range(ROUNDS):
-        width = limit * np.hypot(SMOOTH_GAIN * std, spread) + 0.25
-        deviation = signal - np.float32(level)
-        quiet = find_quiet(deviation, width, reach, recovery)
+    """The noise of quiet samples, found from each other from the quiet edges on."""
+    level, std = quiet_edges(signal, missing)
+    covariance = np.array([std**2])
+    number = np.zeros(len(level), np.int32)
+    for turn in range(ROUNDS):
+        # The first level is that of few samples, and as wrong as they may be together.
+        width = limit * (_smoothed_std(covariance) + (0.0 if turn else std)) + 0.25
+        quiet = find_ends(signal - level, width, reach, recovery)
         if missing is not None:
             quiet &= ~missing
-        mean, number = quiet_mean(deviation, quiet)
-        if not number.any():
-            return PooledNoise(level, std, std, 0.0, 0.0, recovery=recovery)
-        last = level, std, spread
-        level += float(np.sum(mean * number, dtype=np.float64) / np.sum(number))
-        np.subtract(signal, np.float32(level), out=deviation)
-        deviation *= quiet
-        std, spread = _split_variance(deviation, quiet, number, reach)
-        if max(abs(new - old) for new, old in zip((level, std, spread), last, strict=True)) < SETTLED * std:
+        mean, number = quiet_mean(signal - np.nan_to_num(level), quiet)
+        measured = measure_covariance(signal, quiet, int(np.clip(2 * reach, *LAGS)))
+        if measured is None:
+            known = level[np.isfinite(level)].astype(np.float64)
+            middle = float(np.mean(known)) if len(known) else float(np.median(signal))
+            return PooledNoise(middle, max(std, QUANTISATION_STD), 0.0, 0.0, recovery=recovery)
+        covariance = measured
+        level = np.where(number > 0, np.nan_to_num(level) + mean, np.float32(np.nan))
+    known = number > 0
+    middle, spread = _spread_of_levels(level[known].astype(np.float64), number[known], covariance)
+    std = max(float(np.sqrt(covariance[0])), QUANTISATION_STD)
+    correlation = covariance[1:] / std**2
+    return PooledNoise(middle, std, spread, float(quiet.mean()), correlation, recovery)
+
+
+def quiet_edges(signal: np.ndarray, missing: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """Level of each waveform at its lower edge, and the scatter of such edges, to begin with.
+
+    Parameters
+    ----------
+    signal : float32 (s, n), count
+        Waveforms.
+    missing : bool (s, n), optional
+        Samples that were not recorded.
+
+    Returns
+    -------
+    level : float32 (n,), count
+        NaN where no edge is quiet.
+    std : float, count
+        Of the samples of quiet edges about their mean.
+    """
+    s, n = signal.shape
+    size = min(EDGE, s)
+    first = np.zeros(n, np.int64) if missing is None else np.argmax(~missing, axis=0)
+    last = np.full(n, s) if missing is None else s - np.argmax(~missing[::-1], axis=0)
+    edges = []
+    for begin in (np.minimum(first, s - size), np.maximum(last - size, 0)):
+        part = signal[begin + np.arange(size)[:, None], np.arange(n)]
+        mean = sum_samples(part) / np.float32(size)
+        deviation = part - mean
+        edges.append((mean, sum_samples(deviation * deviation) / np.float32(max(size - 1, 1))))
+    lower = edges[1][0] < edges[0][0]
+    level, power = (np.where(lower, edges[1][i], edges[0][i]) for i in (0, 1))
+    least = QUANTISATION_STD**2
+    mean = max(float(np.quantile(power, QUIET_EDGES)), least)
+    for _ in range(8):
+        quiet = power <= ALIKE * mean
+        last_mean, mean = mean, max(float(np.mean(power[quiet], dtype=np.float64)), least)
+        if mean == last_mean:
             break
-    if spread > DRIFT * std:
-        drifting = _estimate_drifting(signal, reach, limit, missing, recovery)
-        return drifting or PooledNoise(level, std, std, spread, float(quiet.mean()), recovery=recovery)
-    correlation = correlate_quiet(signal, quiet, std)
-    # About means of few samples both are too small.
-    smoothed = _smoothed_std(signal, quiet, std) * std / _within_waveforms(deviation, number)
-    return PooledNoise(level, std, smoothed, spread, float(quiet.mean()), correlation, recovery)
+    return np.where(quiet, level, np.float32(np.nan)), float(np.sqrt(mean))
+
+
+def find_ends(above: np.ndarray, width: float, reach: int, recovery: int = 0) -> np.ndarray:
+    """Samples before the first and after the last signal of each waveform.
+
+    Parameters
+    ----------
+    above : float32 (s, n), count
+        Waveforms above their level; all NaN where that is not known: nothing is quiet then.
+    width : float, count
+        A smoothed sample beyond +-width is signal.
+    reach : int, samples
+        Samples after a signal that are not quiet; a third as many before it.
+    recovery : int, samples
+        The same after strong signal.
+
+    Returns
+    -------
+    bool (s, n)
+    """
+    s = len(above)
+    smoothed = np.abs(smooth_121(above))
+    busy = ~(smoothed <= np.float32(width))
+    place = np.arange(s, dtype=np.int32)[:, None]
+    any_busy = busy.any(axis=0)
+    first = np.where(any_busy, np.argmax(busy, axis=0), s + reach)
+    last = np.where(any_busy, s - 1 - np.argmax(busy[::-1], axis=0), -1 - reach)
+    quiet = (place < first - -(-reach // BEFORE_SIGNAL)) | (place > last + reach)
+    if recovery > reach:
+        strong = smoothed > np.float32(STRONG * width)
+        last = np.where(strong.any(axis=0), s - 1 - np.argmax(strong[::-1], axis=0), -1 - recovery)
+        quiet &= (place < first) | (place > last + recovery)
+    return quiet
+
+
+def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0]) -> np.ndarray | None:
+    """Covariance of quiet samples 0, 1, 2, ... apart, from their differences.
+
+    Parameters
+    ----------
+    signal : float32 (s, n), count
+        Waveforms.
+    quiet : bool (s, n)
+        Samples without signal.
+    lags : int, samples
+        Largest lag.
+
+    Returns
+    -------
+    float64 (k,) or None
+        k <= 1 + lags. None where fewer than LEAST_QUIET_PAIRS neighbours are quiet.
+    """
+    used = quiet.astype(np.float32)
+    half, pairs = [], []
+    for lag in range(1, min(lags, len(signal) - 1) + 1):
+        both = used[lag:] * used[:-lag]
+        number = float(np.sum(both, dtype=np.float64))
+        if number < (LEAST_SHARE * pairs[0] if pairs else LEAST_QUIET_PAIRS):
+            break
+        step = signal[lag:] - signal[:-lag]
+        step *= both
+        half.append(0.5 * float(np.einsum("sn,sn->", step, step, dtype=np.float64)) / number)
+        pairs.append(number)
+    if not half:
+        return None
+    # Noise of one sensor has forgotten itself by then; where runs are short their longest lags must do.
+    far = len(half) // 2
+    sill = float(np.average(half[far:], weights=pairs[far:]))
+    rest = sill - np.array(half)
+    chance = CHANCE * sill / np.sqrt(pairs)
+    return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
+
+
+def _smoothed_std(covariance: np.ndarray) -> float:
+    """Standard deviation of noise after the [1 2 1]/4 filter."""
+    own, next_, second = (float(covariance[k]) if k < len(covariance) else 0.0 for k in range(3))
+    return float(np.sqrt(max(6 * own + 8 * next_ + 2 * second, 6 * QUANTISATION_STD**2))) / 4
+
+
+def _spread_of_levels(level: np.ndarray, number: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """Mean and true spread of the levels of waveforms, each the mean of `number` samples of noise."""
+    many = np.arange(1, int(number.max()) + 1, dtype=np.float64)
+    chance = np.full(len(many), covariance[0])
+    for lag, value in enumerate(covariance[1:], 1):
+        chance += 2 * value * np.maximum(1 - lag / many, 0.0)
+    chance = np.maximum(chance, 0.0) / many
+    middle = float(np.sum(level * number) / np.sum(number))
+    scatter = float(np.average((level - middle) ** 2 - chance[number - 1], weights=number))
+    return middle, float(np.sqrt(max(scatter, 0.0)))
 
 
 RECOVERED = 0.1
@@ -229,51 +361,6 @@ def measure_recovery(
     return int(np.argmax(np.r_[right, True])) * step
 
 
-def correlate_quiet(signal: np.ndarray, quiet: np.ndarray, std: float, lags: int = LAGS) -> np.ndarray:
-    """Correlation of quiet samples at lags 1, 2, ...
-
-    Parameters
-    ----------
-    signal : float32 (s, n)
-        Raw counts.
-    quiet : bool (s, n)
-        Samples without signal.
-    std : float
-        Standard deviation of a quiet sample [count].
-    lags : int
-        Largest lag [samples].
-
-    Returns
-    -------
-    float64 (k,)
-        k <= lags; empty where there are too few pairs. What the mean of a waveform's few quiet samples takes away is
-        added again: without this every correlation is too low by the variance of that mean.
-    """
-    number = quiet.sum(axis=0)
-    several = number >= 4 * lags
-    if not several.any():
-        return np.empty(0)
-    part, used = signal[:, several], quiet[:, several]
-    mean = (part * used).sum(axis=0, dtype=np.float64) / number[several]
-    deviation = (part - mean.astype(np.float32)) * used
-    found = []
-    for lag in range(min(lags, len(part) - 1) + 1):
-        pairs = np.count_nonzero(used[lag:] & used[: len(used) - lag]) if lag else np.count_nonzero(used)
-        if pairs < LEAST_PAIRS:
-            break
-        head, tail = deviation[lag:], deviation[: len(deviation) - lag]
-        found.append(np.einsum("sn,sn->", head, tail, dtype=np.float64) / pairs)
-    if len(found) < 2:
-        return np.empty(0)
-    covariance = np.array(found)
-    # The variance of the mean is sum(covariance at all lags) / samples; two rounds settle it.
-    share = float(np.mean(1 / number[several]))
-    raw = covariance.copy()
-    for _ in range(3):
-        covariance = raw + share * max(covariance[0] + 2 * covariance[1:].sum(), 0.0)
-    return covariance[1:] / max(covariance[0], std * std)
-
-
 def find_levels(
     signal: np.ndarray, std: float, reach: int, limit: float = 4.0, recovery: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -298,88 +385,6 @@ def find_levels(
     return level, quiet, number
 
 
-def _estimate_drifting(
-    signal: np.ndarray, reach: int, limit: float, missing: np.ndarray | None = None, recovery: int = 0
-) -> PooledNoise | None:
-    """As `estimate_noise` for baselines that scatter by more than the noise; None without quiet samples."""
-    quartile = np.partition(signal, len(signal) // 4, axis=0)[len(signal) // 4]
-    below = signal[signal < quartile] - np.broadcast_to(quartile, signal.shape)[signal < quartile]
-    std = max(float(np.sqrt(np.mean(below * below))) / BELOW_QUARTILE, QUANTISATION_STD) if len(below) else 1.0
-    for _ in range(ROUNDS):
-        levels, quiet, number = find_levels(signal, std, reach, limit, recovery)
-        if missing is not None:
-            quiet &= ~missing
-            number = quiet.sum(axis=0, dtype=np.int32)
-        several = number >= 8
-        if not several.any():
-            return None
-        std = _within_waveforms((signal - levels) * quiet, number)
-    known = levels[several].astype(np.float64)
-    scatter = np.mean((known - known.mean()) ** 2) - std**2 * np.mean(1 / number[several])
-    spread = float(np.sqrt(max(scatter, 0.0)))
-    smoothed, correlation = _smoothed_std(signal, quiet, std), correlate_quiet(signal, quiet, std)
-    return PooledNoise(float(known.mean()), std, smoothed, spread, float(quiet.mean()), correlation, recovery)
-
-
-def _split_variance(deviation: np.ndarray, quiet: np.ndarray, number: np.ndarray, apart: int) -> tuple[float, float]:
-    """Standard deviation within waveforms and between their levels, from deviations (0 where not quiet).
-
-    What two samples more than `apart` from each other have in common is their waveform's level: neighbours also share
-    coloured noise, and so do the means of few samples.
-    """
-    several = np.flatnonzero(number > 1)
-    part, used = deviation, quiet
-    if len(several) < len(number):
-        part, used = np.take(deviation, several, axis=1), np.take(quiet, several, axis=1)
-    gap = min(apart + 1, len(part))
-    used = used.astype(np.float32)
-    earlier, partners = (accumulate(np.add, values[: len(values) - gap]) for values in (part, used))
-    products = np.einsum("sn,sn->n", part[gap:], earlier)
-    pairs = np.einsum("sn,sn->n", used[gap:], partners)
-    if np.count_nonzero(pairs) < LEAST_WAVEFORMS:
-        return _within_waveforms(deviation, number), _between_waveforms(deviation, number)
-    weight = 1 / number[several]
-    between = max(float(products @ weight / (pairs @ weight)), 0.0)
-    total = float(np.sum(part * part, dtype=np.float64) / np.sum(number[several]))
-    return max(float(np.sqrt(max(total - between, 0.0))), QUANTISATION_STD), float(np.sqrt(between))
-
-
-def _within_waveforms(deviation: np.ndarray, number: np.ndarray) -> float:
-    """Standard deviation of quiet samples about the mean of their waveform; about 0 where all have too few."""
-    several = number >= 8
-    if not several.any():
-        total = np.sum(deviation.astype(np.float64) ** 2) / max(number.sum(), 1)
-        return max(float(np.sqrt(total)), QUANTISATION_STD)
-    part, count = deviation[:, several].astype(np.float64), number[several].astype(np.float64)
-    total, squares = part.sum(axis=0), (part * part).sum(axis=0)
-    within = np.sum(squares - total * total / count) / np.sum(count - 1)
-    return max(float(np.sqrt(max(within, 0.0))), QUANTISATION_STD)
-
-
-def _between_waveforms(deviation: np.ndarray, number: np.ndarray) -> float:
-    """Standard deviation of the levels of waveforms with at least 8 quiet samples, from their means."""
-    several = number >= 8
-    if not several.any():
-        return 0.0
-    count = number[several].astype(np.float64)
-    means = deviation[:, several].sum(axis=0, dtype=np.float64) / count
-    within = _within_waveforms(deviation, number) ** 2
-    between = np.average(means * means, weights=count) - within * len(count) / np.sum(count)
-    return float(np.sqrt(max(between, 0.0)))
-
-
-def _smoothed_std(signal: np.ndarray, quiet: np.ndarray, std: float) -> float:
-    """Standard deviation of the smoothed quiet samples about their waveform's mean, as that of white noise."""
-    smoothed = smooth_121(signal)[1:-1]
-    inside = quiet[2:] & quiet[1:-1] & quiet[:-2]
-    if not inside.any():
-        return std
-    mean, number = quiet_mean(smoothed, inside)
-    deviation = (smoothed - mean) * inside
-    freedom = np.maximum(number - 1, 0).sum()
-    return float(np.sqrt(np.sum(deviation * deviation, dtype=np.float64) / freedom) / SMOOTH_GAIN) if freedom else std
-
-
 def keep_longest(missing: np.ndarray) -> np.ndarray:
     """Mark all recordings of a packet but its longest as missing: others may have a level of their own.
 
@@ -401,7 +406,7 @@ def keep_longest(missing: np.ndarray) -> np.ndarray:
 
 
 def residual_noise(
-    residual: np.ndarray, used: np.ndarray, lost: np.ndarray, lags: int = LAGS
+    residual: np.ndarray, used: np.ndarray, lost: np.ndarray, lags: int = LAGS[0]
 ) -> tuple[float, np.ndarray] | None:
     """Standard deviation and correlation of what fits leave outside of their echoes.
 

@@ -63,8 +63,13 @@ def find_isolated(block: WaveformBlock, system: SystemPulse, clear: EchoTable) -
 
     The half of them nearest to the lower edge of the widths: flat targets, whose echoes slopes do not widen.
     """
+    return _nearest_to_edge(clear.take(np.flatnonzero(clear.amplitude <= _highest(block, system, clear.amplitude))))
+
+
+def _highest(block: WaveformBlock, system: SystemPulse, amplitude: np.ndarray) -> float:
+    """Amplitude up to which clear echoes teach the pulse: at least half of them, where all are nearly as high."""
     top = system.saturation or float(block.samples.max())
-    return _nearest_to_edge(clear.take(np.flatnonzero(clear.amplitude < FAR_FROM_LIMIT * top)))
+    return max(FAR_FROM_LIMIT * top, float(np.median(amplitude)) if len(amplitude) else 0.0)
 
 
 def _nearest_to_edge(echoes: EchoTable) -> EchoTable:
@@ -140,7 +145,7 @@ def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     """Rows of clear echoes whose neighbours are at least SEPARATE widths away, or a tenth as high."""
     top = system.saturation or float(block.samples.max())
     good = (echoes.amplitude > MIN_SNR * system.noise_std) & (echoes.amplitude > 0.08 * top)
-    good &= echoes.amplitude < FAR_FROM_LIMIT * top
+    good &= echoes.amplitude <= _highest(block, system, echoes.amplitude[good])
     good &= (echoes.flags & np.uint16(UNCLEAN & ~int(EchoFlag.OVERLAPPED))) == 0
     gap = np.diff(echoes.time) / system.sigma_ref
     close = (np.diff(echoes.waveform) == 0) & (gap < SEPARATE)

@@ -15,8 +15,9 @@ from wavebatch.stages.detect.maximum import maximum
 ALONE = 0.1
 """Share of an echo up to which others of its waveform are no disturbance ..."""
 
-LEAST_ALONE, ALONE_BEFORE_RINGING = 0.15, 0.3
-"""... unless less than this share of the echoes are alone; then others may be as high as this."""
+LEAST_ALONE, ENOUGH_ALONE, ALONE_BEFORE_RINGING = 0.15, 40, 0.3
+"""... unless less than this share of the echoes are alone, or so few; then others may be as high as this: a Gaussian
+fitted to a pulse with a tail leaves a second one."""
 
 MIN_SNR = 20.0
 """Amplitude over noise of a clear echo."""
@@ -71,7 +72,8 @@ def _alone_share(amplitude: np.ndarray, second: np.ndarray, floor: float) -> flo
     """How high, as a share of the strongest echo (m,) of a waveform, the second strongest (m,) may be."""
     clear = amplitude > floor
     alone = clear & (second < ALONE * amplitude)
-    return ALONE if alone.sum() >= LEAST_ALONE * clear.sum() else ALONE_BEFORE_RINGING
+    enough = max(LEAST_ALONE * clear.sum(), min(ENOUGH_ALONE, clear.sum()))
+    return ALONE if alone.sum() >= enough else ALONE_BEFORE_RINGING
 
 
 def find_strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -107,7 +107,8 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     (docs/algorithms.md R3, H10, H12).
     """
     n, s = block.samples.shape
-    system = _measure_outside(block, system, echoes)
+    if not system.noise_by_kind["quiet"]:
+        system = _measure_outside(block, system, echoes)
     alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
     alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise_std))
     if len(alone) < ENOUGH_TO_LEARN:
@@ -126,7 +127,8 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     if kinds.get("outside", kinds["quiet"]) < UNDITHERED and np.count_nonzero(weak) >= ENOUGH_TO_LEARN:
         kinds["weak_echoes"] = _robust_std(residual[weak][np.abs(lag[weak]) < 2.5])
         std = max(std, kinds["weak_echoes"])
-    gain = _noise_gain(residual, model, lag, width, std, std > COLOURED * kinds.get("outside", std))
+    sample = kinds.get("outside") or kinds["quiet"] or std
+    gain = _noise_gain(residual, model, lag, width, std, std > COLOURED * sample)
     return replace(system, noise_std=std, noise_by_kind=kinds, noise_gain=gain)
 
 

@@ -26,8 +26,7 @@ from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
-from wavebatch.surveying.measuring.noise_and_width import measure_gaussian
-from wavebatch.surveying.measuring.residuals import subtract_echoes
+from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
 from wavebatch.surveying.systems.system_table import read_system
 
 LEAST_ECHOES = 8
@@ -39,15 +38,31 @@ LEAST_SNR = 10.0
 MOST_ECHOES = 200
 """Echoes, the strongest ones, in which pulses are compared; more do not change the answer."""
 
-CLEARLY_BETTER = 0.5
-"""Misfit of a known pulse, over that of a Gaussian, up to which it is taken; the median over the echoes. It is 0.3 on
-10 to 200 packets of the shipped sensors, and 0.7 to 1.9 for the RIEGL's pulse on simulated sensors with other ones."""
+COMPARED = 256
+"""Waveforms in which pulses are compared."""
 
-MOSTLY = 0.9
-"""Share of the echoes that the known pulse must fit better than a Gaussian does."""
+SURE, SCALES, STEEP = 1.05, (0.88, 1.12), 1.06
+"""Cost of the strip's pulse over that of a known one (`measure_cost`), times what the known one costs more at the best
+of these widths, from which it is taken: a pulse that serves as well stretched is another one. It is 1.05 to 2.5 for the
+right one in strips of all sizes. Where the strip's is a guess, the second factor alone must be STEEP: any pulse with a
+tail serves better than a guess."""
 
-NOISE_LEFT = 1.3
-"""Most that the known pulse may leave of these echoes, over the noise (median); 1 is a perfect fit in white noise."""
+LESS = 0.9
+"""Cost of a strip's pulse drawn together, over that of it as it is, from which it is taken."""
+
+SHRUNK = 0.7, 0.75, 0.8, 0.85, 0.9, 0.95
+"""Widths, over that of the isolated echoes, at which a strip's pulse is tried where isolated echoes are canopies."""
+
+NEARLY = 1.03
+"""Cost of a narrower known pulse, over that of a learned one, up to which it is taken where it is STEEP: slopes within
+a large footprint widen all echoes of a strip, so that they explain themselves as well."""
+
+ALMOST = 1.1
+"""Cost of a known pulse, over that of the strip's drawn together, up to which it is taken in its place: in a canopy a
+pulse that is too narrow costs hardly more than the right one."""
+
+SHORT = 5.0
+"""Misfit in chi2 per echo from which a learned pulse is doubted: a third of what pays for one more echo."""
 
 BEFORE, AFTER = 4.0, 9.0
 """Widths of the pulse before and after an echo in which the misfit is measured: both shipped pulses with their
@@ -56,8 +71,9 @@ after-pulses lie within."""
 SAME_SPACING = 0.01
 """How far the spacing of a strip may be from that of a known sensor, as a share of it."""
 
-NEAR_WIDTH = 0.15
-"""The same for the width of the Gaussian that fits the pulse best: few echoes give it to some 5 %, slopes widen it."""
+WIDTHS = 0.6, 1.25
+"""Width of a known pulse, over that of the isolated echoes, within which it is tried: echoes of a canopy are wider than
+the pulse."""
 
 ALIKE = 0.05
 """Difference of two pulses, as `compare_pulses` measures it, up to which one looks like the other ..."""
@@ -145,19 +161,8 @@ def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tup
     return np.where(number > 0, np.sqrt(power.sum(axis=1) / np.maximum(number, 1)), NO_FIT), left, lag
 
 
-@dataclass(frozen=True, slots=True)
-class Taken:
-    """What `take_pulse` gives a strip whose echoes are too few to learn a pulse from."""
-
-    system: SystemPulse
-    known: KnownSystem | None
-    """Where its pulse comes from; None: it stays a Gaussian."""
-    figures: dict[str, float]
-    """Misfits of the pulse that was taken, for the survey."""
-
-
-def take_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Taken:
-    """Take the pulse of a known sensor, or a careful Gaussian, where echoes are too few to learn a pulse from.
+def guess_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> SystemPulse:
+    """Take a careful Gaussian where echoes are too few to learn a pulse from.
 
     Parameters
     ----------
@@ -169,27 +174,13 @@ def take_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Tak
 
     Returns
     -------
-    Taken
-
-    Notes
-    -----
-    Known sensors of the strip's spacing (SAME_SPACING) are tried. The strongest single echoes, LEAST_ECHOES or more,
-    are fitted with a Gaussian and with the known pulse; their Gaussian width must be near that of the known pulse
-    (NEAR_WIDTH). It is taken if the median of misfit over misfit of the Gaussian is at most CLEARLY_BETTER, MOSTLY of
-    the echoes agree, and at most NOISE_LEFT times the noise remains; the one with the least misfit wins. Else the
-    pulse stays a Gaussian, with the width of these echoes if it was a guess. What they all show at one lag after them
-    is then ringing, so that echoes there get the flag RINGING_SUSPECT (docs/algorithms.md R2).
+    SystemPulse
+        With the width of the strongest single echoes if it was a guess. What they all show at one lag after them is
+        ringing, so that echoes there get the flag RINGING_SUSPECT (docs/algorithms.md R2).
     """
-    best: tuple[float, Taken] | None = None
-    for known in known_systems():
-        taken = _try_pulse(block, known) if abs(block.spacing / known.spacing - 1) < SAME_SPACING else None
-        if taken is not None and (best is None or taken[0] < best[0]):
-            best = taken
-    if best is not None:
-        return best[1]
     lone = find_lone(block, system)
     if len(lone) < LEAST_ECHOES:
-        return Taken(system, None, {})
+        return system
     if guess:
         # Not below half a sample, as for isolated echoes: spikes are no pulses.
         # The lower quartile, without what noise takes off it: widths of one surface then give their median. Of all
@@ -199,28 +190,91 @@ def take_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Tak
         width = min(low + 0.674 * float(np.median(every.sigma_err)), middle)
         system = replace(system, sigma_ref=max(float(width), 0.5 * block.spacing))
         lone = find_lone(block, system)
-    return Taken(replace(system, ringing=_find_ringing(block, system, lone)), None, {})
+    return replace(system, ringing=_find_ringing(block, system, lone))
 
 
-def _try_pulse(block: WaveformBlock, known: KnownSystem) -> tuple[float, Taken] | None:
-    """The misfit of a known pulse over that of a Gaussian, and the system with it; None where it does not fit."""
-    width = gaussian_width(known.system)
-    plain = measure_gaussian(block, width / block.spacing)
-    lone = find_lone(block, replace(plain, sigma_ref=width))
-    if len(lone) < LEAST_ECHOES or abs(np.quantile(lone.sigma, 0.25) / width - 1) > NEAR_WIDTH:
-        return None
-    system = with_pulse(plain, known.system)
-    misfit, gaussian = fit_alone(block, system, lone)[0], fit_alone(block, plain, lone)[0]
-    ratio = float(np.median(misfit / np.maximum(gaussian, 1 / NO_FIT)))
-    left = float(np.median(misfit * lone.amplitude)) / plain.noise_std
-    if ratio > CLEARLY_BETTER or np.mean(misfit < gaussian) < MOSTLY or left > NOISE_LEFT:
-        return None
-    figures = {
-        "known_pulse_echoes": float(len(lone)),
-        "known_pulse_misfit": float(np.median(misfit)),
-        "known_pulse_gaussian_misfit": float(np.median(gaussian)),
-    }
-    return ratio, Taken(system, known, figures)
+def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, figures: dict[str, float]) -> SystemPulse:
+    """Compare the strip's pulse with those of known sensors, and with itself drawn together.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+        With the pulse of the isolated echoes.
+    learned : bool
+        Whether it was learned; a Gaussian that is a guess is never drawn together.
+    figures : dict
+        Gets the costs of the two pulses, where one was taken for another.
+
+    Returns
+    -------
+    SystemPulse
+
+    Notes
+    -----
+    A pulse is right if it explains all waveforms, not only isolated echoes, with the fewest echoes and the least misfit
+    (`measure_cost`): in a canopy isolated echoes are several, and a pulse learned from them is too wide. Nothing is
+    tried where a learned pulse leaves less than SHORT per echo. A known pulse of the strip's spacing is taken if it
+    costs less than the strip's, and less than it does when it is stretched or drawn together (SURE); if it is narrower
+    and costs hardly more (NEARLY); or where the strip's must be drawn together and costs hardly less then (ALMOST).
+    """
+    part = block.rows(np.unique(np.linspace(0, len(block) - 1, COMPARED).astype(np.int64)))
+    own = measure_cost(part, system)
+    if own.echoes < LEAST_ECHOES or (learned and own.misfit < SHORT * own.echoes):
+        return system
+    shrunk = [scale_pulse(system, scale) for scale in SHRUNK] if learned else []
+    costs = [(measure_cost(part, pulse).typical, "", pulse) for pulse in shrunk]
+    best = min(costs, default=None, key=lambda one: one[0])
+    if best is not None and best[0] > LESS * own.typical:
+        best = None
+    tried = []
+    for known in known_systems():
+        ratio = known.system.sigma_ref / system.sigma_ref
+        if abs(block.spacing / known.spacing - 1) < SAME_SPACING and WIDTHS[0] < ratio < WIDTHS[1]:
+            taken = with_pulse(system, known.system)
+            cost = measure_cost(part, taken).typical
+            if cost < NEARLY * own.typical:
+                rest = min(measure_cost(part, scale_pulse(taken, scale)).typical for scale in SCALES)
+                sure = own.typical * rest > SURE * cost**2 and (learned or rest > STEEP * cost)
+                sure &= cost < own.typical
+                sure |= learned and ratio < 1 and rest > STEEP * cost
+                sure |= best is not None and cost < ALMOST * best[0]
+                tried += [(cost, known.name, taken)] if sure else []
+    if tried:
+        best = min(tried, key=lambda one: one[:2])
+    if best is None:
+        return system
+    cost, _, pulse = best
+    figures |= {"pulse_cost": cost, "isolated_pulse_cost": own.typical}
+    return pulse
+
+
+class Cost(NamedTuple):
+    """What a pulse leaves unexplained of waveforms, as a fall of chi2."""
+
+    misfit: float
+    """Sum of squares left beyond the noise of quiet samples, over the noise of a pulse squared."""
+    echoes: int
+    typical: float
+    """Of a waveform: its misfit, and for each echo what it has to explain; the geometric mean of waveforms, so that the
+    few that no pulse explains do not decide."""
+
+
+def measure_cost(block: WaveformBlock, system: SystemPulse) -> Cost:
+    """Measure how well a pulse explains waveforms, all echoes fitted together."""
+    echoes = decompose_sample(block, system)
+    left = np.nan_to_num(subtract_echoes(block, system, echoes)).astype(np.float64)
+    noise = min(system.noise_by_kind.get("quiet") or system.noise_std, system.noise_std)
+    samples = left.shape[1] if block.missing is None else (~block.missing).sum(axis=1)
+    misfit = (np.einsum("ns,ns->n", left, left) - samples * noise**2) / system.noise_std**2
+    cost = np.maximum(misfit, 0.0) + system.acceptance * (1 + echoes.count(len(block)))
+    return Cost(max(float(np.sum(misfit)), 0.0), len(echoes), float(np.exp(np.mean(np.log(cost)))))
+
+
+def scale_pulse(system: SystemPulse, ratio: float) -> SystemPulse:
+    """Return a system with its pulse stretched in time."""
+    components = tuple((weight, delay * ratio, sigma * ratio) for weight, delay, sigma in system.components)
+    return replace(system, sigma_ref=system.sigma_ref * ratio, components=components)
 
 
 def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
