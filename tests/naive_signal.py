@@ -1,10 +1,11 @@
 """Slow, plain references for kernels/signal: noise, defects, runs and profiles of one waveform after the other."""
 
-from collections import Counter
 from itertools import groupby
 
 import naive
 import numpy as np
+
+from wavebatch.kernels.signal import noise
 
 QUANTISATION_STD = 1 / np.sqrt(12)
 
@@ -70,15 +71,20 @@ def lobe_edges(x, curve, level):
 
 
 def find_spikes(above, std, width):
-    """(s, n) True where a sample is higher than its higher neighbour, or lower than its lower one, by too much."""
-    spikes = np.zeros(above.shape, bool)
+    """(s, n) True where no pulse of this width explains a sample: far above both neighbours, or below both sides."""
     drop = 1.5 * (1 - np.exp(-0.5 / width**2))
+    spikes = np.zeros(above.shape, bool)
     for w, y in enumerate(above.T.astype(float)):
         for i in range(1, len(y) - 1):
-            high, low = max(y[i - 1], y[i + 1]), min(y[i - 1], y[i + 1])
-            spike = y[i] - high > 4.5 * std + drop * max(y[i], 0) and y[i] > 5.5 * std
-            hole = low - y[i] > 6.5 * std + drop * max(high, 0)
-            spikes[i, w] = spike or hole
+            high = max(y[i - 1], y[i + 1])
+            spikes[i, w] = y[i] - high > 4.5 * std + drop * max(y[i], 0) and y[i] > 5.5 * std
+            if not 2 <= i < len(y) - 2:
+                continue
+            sides = []
+            for near, far in ((y[i - 1], y[i - 2]), (y[i + 1], y[i + 2])):
+                falls = np.exp(-1.5 / width**2) * near / max(near, far) if near > 0 else 1.0
+                sides.append(near * falls)
+            spikes[i, w] |= min(sides) - y[i] > 6.5 * std + drop * max(high, 0)
     return spikes
 
 
@@ -140,18 +146,6 @@ def fit_slope(y, std, reach, limit=4.0, missing=None):
     return slope, error
 
 
-def first_level(signal):
-    """Most frequent count of the lower half of all counts, and the root mean square of what lies below it."""
-    middle = np.median([np.median(column) for column in signal.T]) + 1
-    counts = Counter(value for value in signal.ravel().tolist() if value <= middle)
-    most = max(counts.values())
-    level = min(value for value, number in counts.items() if number == most)
-    below = [value - level for value in signal.ravel().tolist() if value <= min(level, middle)]
-    if any(below):
-        return level, max(np.sqrt(np.mean(np.square(below))), QUANTISATION_STD)
-    return level, max((np.quantile(signal, 0.75) - level) / 0.674, QUANTISATION_STD)
-
-
 def find_level(y, std, reach, limit=4.0, recovery=0):
     """Level of one waveform from itself alone, and its quiet samples."""
     level = sorted(y)[len(y) // 4]
@@ -167,26 +161,18 @@ def find_level(y, std, reach, limit=4.0, recovery=0):
     return level, quiet
 
 
-def correlate_quiet(signal, quiet, std, lags):
-    """Correlation at lags 1, 2, ... of quiet samples about their waveform's mean, with what the mean takes away."""
-    products = [[] for _ in range(lags + 1)]
-    shares = []
-    for y, used in zip(signal.T, quiet.T, strict=True):
-        if used.sum() < 4 * lags:
-            continue
-        shares.append(1 / used.sum())
-        y = y - y[used].mean()
-        for lag in range(lags + 1):
-            products[lag] += [y[i] * y[i + lag] for i in range(len(y) - lag) if used[i] and used[i + lag]]
-    if not shares:
-        return np.empty(0)
-    raw = np.array([np.mean(values) for values in products])
-    share = np.mean(shares)
-    # All lags lose the same, share (c0 + 2 c1 + 2 c2 ...): three rounds of it are nearly its solution.
-    covariance = raw
-    for _ in range(3):
-        covariance = raw + share * max(covariance[0] + 2 * covariance[1:].sum(), 0.0)
-    return covariance[1:] / max(covariance[0], std**2)
+def measure_covariance(signal, quiet, lags):
+    """Sill, and what is left of it at lags 1, 2, ...: half the mean square steps of quiet samples so far apart."""
+    half, pairs = [], []
+    for lag in range(1, lags + 1):
+        steps = [y[i + lag] - y[i] for y, used in zip(signal.T, quiet.T, strict=True)
+                 for i in range(len(y) - lag) if used[i] and used[i + lag]]  # fmt: skip
+        half.append(0.5 * np.mean(np.square(steps)))
+        pairs.append(len(steps))
+    far = lags // 2
+    sill = np.average(half[far:], weights=pairs[far:])
+    rest = sill - np.array(half)
+    return np.r_[sill, np.where(np.abs(rest) > noise.CHANCE * sill / np.sqrt(pairs), rest, 0.0)]
 
 
 def keep_longest(missing):
@@ -283,72 +269,3 @@ def fit_height(profile, waveform, taps, support):
     """One profile scaled so that its sum of pulses has the energy of the waveform over the support."""
     made = (naive.pulse_matrix(len(waveform), taps) @ profile)[support].sum()
     return profile * (max(waveform[support].sum(), 0.0) / made if made > 0 else 0.0)
-
-
-def within_waveforms(signal, quiet):
-    """Standard deviation of quiet samples about the mean of their waveform, of waveforms with eight of them or more."""
-    parts = [y[used] for y, used in zip(signal.T.astype(float), quiet.T, strict=True) if used.sum() >= 8]
-    squares = sum(np.sum((part - part.mean()) ** 2) for part in parts)
-    return max(np.sqrt(squares / sum(len(part) - 1 for part in parts)), QUANTISATION_STD)
-
-
-def smoothed_within(signal, quiet):
-    """The same of smoothed samples whose neighbours are quiet too, as the standard deviation of white noise."""
-    squares = freedom = 0
-    for y, used in zip(signal.T.astype(float), quiet.T, strict=True):
-        smoothed = naive.smooth_121(y)
-        inside = [smoothed[i] for i in range(1, len(y) - 1) if used[i - 1 : i + 2].all()]
-        if inside:
-            squares += np.sum((np.array(inside) - np.mean(inside)) ** 2)
-            freedom += len(inside) - 1
-    return np.sqrt(squares / freedom) / (np.sqrt(6) / 4)
-
-
-def split_variance(signal, level, quiet, apart):
-    """Noise of a sample, and spread of levels by the products of quiet samples of a waveform far from each other."""
-    products = pairs = squares = number = 0
-    for y, used in zip(signal.T.astype(float) - level, quiet.T, strict=True):
-        count = used.sum()
-        if count < 2:
-            continue
-        squares, number = squares + np.sum(y[used] ** 2), number + count
-        for i in np.flatnonzero(used):
-            earlier = y[: max(i - apart, 0)][used[: max(i - apart, 0)]]
-            products, pairs = products + y[i] * earlier.sum() / count, pairs + len(earlier) / count
-    between = max(products / pairs, 0.0)
-    return max(np.sqrt(max(squares / number - between, 0.0)), QUANTISATION_STD), np.sqrt(between)
-
-
-def estimate_noise(signal, reach, limit=4.0, recovery=0, start=None):
-    """Level, std, std of smoothed samples, spread, share and correlation of quiet samples about one common level.
-
-    For levels that scatter by less than the noise, at least 50 waveforms, and none missing; `start`: (level, std,
-    spread) to begin with.
-    """
-    level, std, spread = start or (*first_level(signal), 0.0)
-    for _ in range(4):
-        width = limit * np.hypot(np.sqrt(6) / 4 * std, spread) + 0.25
-        quiet = find_quiet(signal - level, width, reach, recovery)
-        last = level, std, spread
-        level = signal[quiet].astype(float).mean()
-        std, spread = split_variance(signal, level, quiet, reach)
-        if max(abs(new - old) for new, old in zip((level, std, spread), last, strict=True)) < 0.001 * std:
-            break
-    smoothed = smoothed_within(signal, quiet) * std / within_waveforms(signal, quiet)
-    return level, std, smoothed, spread, quiet.mean(), correlate_quiet(signal.astype(float), quiet, std, 12)
-
-
-def estimate_drifting(signal, reach, limit=4.0):
-    """The same for levels that scatter by more than the noise: each waveform's level is found from itself."""
-    quartile = np.array([sorted(y)[len(y) // 4] for y in signal.T.astype(float)])
-    below = (signal - quartile)[signal < quartile]
-    std = max(np.sqrt(np.mean(below**2)) / 0.773, QUANTISATION_STD)
-    for _ in range(4):
-        found = [find_level(y, std, reach, limit) for y in signal.T.astype(float)]
-        levels, quiet = np.array([one for one, _ in found]), np.stack([used for _, used in found], axis=1)
-        std = within_waveforms(signal, quiet)
-    number = quiet.sum(axis=0)
-    known = levels[number >= 8]
-    scatter = np.var(known) - std**2 * np.mean(1 / number[number >= 8])
-    correlation = correlate_quiet(signal.astype(float), quiet, std, 12)
-    return known.mean(), std, smoothed_within(signal, quiet), np.sqrt(max(scatter, 0.0)), quiet.mean(), correlation

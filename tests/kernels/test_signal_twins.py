@@ -12,13 +12,13 @@ from wavebatch.kernels.signal.filters import curvature_taps, filter_autocorrelat
 from wavebatch.kernels.signal.noise import (
     PooledNoise,
     colour_factors,
-    correlate_quiet,
     correlation_matrix,
-    estimate_noise,
+    find_ends,
     find_levels,
-    first_level,
     keep_longest,
+    measure_covariance,
     measure_recovery,
+    quiet_edges,
     residual_noise,
 )
 from wavebatch.kernels.signal.profiles import fit_height
@@ -125,10 +125,32 @@ def test_slopes_are_those_of_lines_through_quiet_samples(rng):
     assert np.isinf(error[50:]).all() and np.isfinite(error[:50]).all()
 
 
-def test_the_first_level_is_the_most_frequent_low_count(rng):
-    for signal in (record(rng), record(rng, level=0.0, std=0.3), record(rng, level=0.0, std=5.0)):
-        assert first_level(signal) == pytest.approx(naive_signal.first_level(signal))
-    assert first_level(np.full((9, 4), 7, np.float32)) == pytest.approx((7, naive_signal.QUANTISATION_STD))
+def test_edges_give_level_and_noise_before_anything_is_known(rng):
+    signal = record(rng, n=400, level=rng.uniform(10, 90, 400))
+    signal[:12, ::5] += np.float32(40)  # begins within an echo
+    level, std = quiet_edges(signal)
+    for w in range(400):
+        first, last = signal[:noise_kernels.EDGE, w], signal[-noise_kernels.EDGE:, w]
+        lower = last if last.mean() < first.mean() else first
+        assert np.isnan(level[w]) or level[w] == pytest.approx(lower.mean(), abs=1e-3)
+    assert np.isfinite(level).mean() > 0.9 and std == pytest.approx(np.hypot(1.2, 12**-0.5), rel=0.1)
+
+
+@pytest.mark.parametrize("recovery", [0, 25])
+def test_ends_lie_before_the_first_and_after_the_last_signal(rng, recovery):
+    above = record(rng, level=0.0) - np.float32(0.3)
+    above[:, 3] = 0
+    found = find_ends(above, 3.1, 6, recovery)
+    for w in range(above.shape[1]):
+        height = np.abs(naive.smooth_121(above[:, w]))
+        busy, strong = np.flatnonzero(height > 3.1), np.flatnonzero(height > 9.3)
+        quiet = np.ones(len(above), bool)
+        if len(busy):
+            quiet[max(busy[0] - 2, 0) : busy[-1] + 7] = False
+        if len(strong) and recovery:
+            quiet[busy[0] : strong[-1] + recovery + 1] = False
+        np.testing.assert_array_equal(found[:, w], quiet)
+    assert not find_ends(np.full((20, 2), np.nan, np.float32), 3.0, 6).any()
 
 
 @pytest.mark.parametrize("recovery", [0, 30])
@@ -148,9 +170,9 @@ def test_correlations_are_those_of_pairs(rng, monkeypatch):
     signal = (12 + white[3:] + 0.6 * white[2:-1] - 0.2 * white[:-3]).astype(np.float32)
     quiet = rng.random(signal.shape) < 0.8
     quiet[15:, :10] = False  # too few
-    found = correlate_quiet(signal, quiet, 0.5, lags=6)
-    assert found == pytest.approx(naive_signal.correlate_quiet(signal, quiet, 0.5, 6), abs=1e-5)
-    assert correlate_quiet(signal, quiet & False, 0.5).size == 0
+    found = measure_covariance(signal, quiet, lags=6)
+    assert found == pytest.approx(naive_signal.measure_covariance(signal, quiet, 6), rel=1e-4, abs=1e-4)
+    assert measure_covariance(signal, quiet & False) is None
     residual, used = signal.T - 12, quiet.T
     residual = residual + 30 * (rng.random(residual.shape) < 0.01)  # echoes that nobody fitted
     std, correlation = residual_noise(residual.astype(np.float32), used, np.array([0.1, 0.05]), lags=5)
@@ -186,36 +208,6 @@ def test_the_recovery_is_that_of_a_loop(rng, tail):
 def assert_same_noise(found, expected):
     assert found[:5] == pytest.approx(expected[:5], rel=1e-3, abs=2e-4)
     assert found.correlation == pytest.approx(expected[5], abs=2e-4)
-
-
-@pytest.mark.parametrize("spread", [0.0, 0.5])
-def test_pooled_noise_is_that_of_a_loop(rng, monkeypatch, spread):
-    """Coloured, so that samples near each other share more than their level; some waveforms have few quiet samples."""
-    monkeypatch.setattr(noise_kernels, "LEAST_PAIRS", 50)
-    white = rng.standard_normal((65, 90))
-    colour = np.where(np.arange(90) < 5, 60.0 * (np.arange(64) % 60 > 3)[:, None], 0.0)
-    signal = record(rng, n=90, std=0.0, level=12 + spread * rng.standard_normal(90))
-    signal = (signal + white[1:] + 0.6 * white[:-1] + colour).astype(np.float32)
-    found = estimate_noise(signal, 3)
-    assert found.recovery == 0
-    assert_same_noise(found, naive_signal.estimate_noise(signal, 3))
-
-
-def test_drifting_noise_is_that_of_a_loop(rng, monkeypatch):
-    monkeypatch.setattr(noise_kernels, "LEAST_PAIRS", 50)
-    signal = record(rng, n=80, level=60 + 8 * rng.standard_normal(80))
-    assert_same_noise(estimate_noise(signal, 3), naive_signal.estimate_drifting(signal, 3))
-
-
-def test_tails_of_strong_echoes_are_left_out_of_pooled_noise(rng):
-    signal = record_tails(rng, 0.04, n=150)
-    found = estimate_noise(signal, 4)
-    level, std, smoothed, spread, share, _ = naive_signal.estimate_noise(signal, 4)
-    pooled = PooledNoise(level, std, smoothed, spread, share)
-    assert found.recovery == naive_signal.measure_recovery(signal, pooled, 4, 4.0) > 0
-    assert found.level < level - 0.05
-    again = naive_signal.estimate_noise(signal, 4, recovery=found.recovery, start=(level, std, spread))
-    assert_same_noise(found, again)
 
 
 def test_coloured_noise_widens_errors_as_its_covariance_says():

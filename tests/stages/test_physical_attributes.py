@@ -267,7 +267,7 @@ def test_angles_of_simulated_slopes():
     assert 0.38 < known.mean() < 1.0
     assert np.median(np.abs(off[known])) == pytest.approx(np.median(0.6745 * errors[known]), rel=0.2)
     # Intervals of echoes that just passed the limit are longer towards 0, but one number stands for both sides.
-    assert np.mean(np.abs(off[known]) < errors[known]) == pytest.approx(0.683, abs=0.1)
+    assert np.mean(np.abs(off[known]) < errors[known]) == pytest.approx(0.683, abs=0.11)
 
 
 def test_an_infrared_beam_has_no_angles():

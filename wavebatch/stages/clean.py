@@ -148,21 +148,25 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     return replace(system, transient=find_transient(above, std) * block.spacing)
 
 
+ONE_SIDED = 0.1
+"""Median of slopes, over the width of their middle two thirds, above which they may be tails: these all fall."""
+
+
 def _slope_spread(signal: np.ndarray, system: SystemPulse, std: float, reach: int, missing: np.ndarray | None) -> float:
     """Standard deviation of the slopes of baselines [count per sample]; 0 where chance and tails explain them.
 
-    A tail looks like a slope: where tails were found (`recovery`), slopes are not looked for.
+    A tail looks like a slope that falls: where tails were found (`recovery`), slopes must be of both signs.
     """
-    if system.recovery > 0:
-        return 0.0
     slope, error = fit_slopes(signal, std, reach, missing=missing)
     known = np.isfinite(error)
     if np.count_nonzero(known) < LEAST_WAVEFORMS:
         return 0.0
     slope, error = slope[known], error[known]
     share = np.mean(np.abs(slope) > STEEP * error)
-    low, high = np.quantile(slope, [0.1587, 0.8413])
-    excess = max(0.25 * (high - low) ** 2 + np.median(slope) ** 2 - np.median(error) ** 2, 0.0)
+    low, middle, high = np.quantile(slope, [0.1587, 0.5, 0.8413])
+    if system.recovery > 0 and abs(middle) > ONE_SIDED * (high - low):
+        return 0.0
+    excess = max(0.25 * (high - low) ** 2 + middle**2 - np.median(error) ** 2, 0.0)
     few = np.mean(slope**2) if share < 0.3 else 0.0
     spread = float(np.sqrt(max(excess, few - np.median(error) ** 2)))
     return spread if share > SLOPES and spread * 0.5 * len(signal) > LEAST_RISE * std else 0.0
