@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
 STEP, IN_BIN = 0.2, 10.0
@@ -177,14 +178,14 @@ def _weights(stack: Stack) -> np.ndarray:
 
 def _sum(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
     weight, delay, sigma = parameters.reshape(-1, 3).T
-    return np.exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2) @ weight
+    return np.einsum("bc,c->b", exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2), weight)
 
 
 def _slopes(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
     """Derivatives of `_sum` by weight, delay and sigma of every component (b, 3 c)."""
     weight, delay, sigma = parameters.reshape(-1, 3).T
     z = (lag[:, None] - delay) / sigma
-    bell = np.exp(-0.5 * z * z)
+    bell = exp(-0.5 * z * z)
     steep = weight * bell * z / sigma
     return np.stack([bell, steep, steep * z], axis=2).reshape(len(lag), -1)
 
@@ -251,19 +252,19 @@ def fit_bounded(
     than the model.
     """
     at, rest = start, misfit(start)
-    cost, damping = float(rest @ rest), FIRST_DAMPING
+    cost, damping = float(np.einsum("b,b->", rest, rest)), FIRST_DAMPING
     jacobian = slopes(at)
     for _ in range(most - 1):
-        downhill = -(jacobian.T @ rest)
+        downhill = -np.einsum("bp,b->p", jacobian, rest)
         free = ~(((at <= low) & (downhill < 0)) | ((at >= high) & (downhill > 0)))
         part = jacobian[:, free]
-        normal = part.T @ part
+        normal = np.einsum("bp,bq->pq", part, part)
         scale = np.maximum(normal.diagonal(), 1e-12 * max(float(normal.diagonal().max(initial=0)), 1e-300))
         step = np.zeros_like(at)
-        step[free] = np.linalg.solve(normal + np.diag(damping * scale), downhill[free])
+        step[free] = solve(normal + np.diag(damping * scale), downhill[free])
         there = np.clip(at + step, low, high)
         new = misfit(there)
-        new_cost = float(new @ new)
+        new_cost = float(np.einsum("b,b->", new, new))
         if new_cost < cost:
             small = cost - new_cost < FIT_SETTLED * cost
             at, rest, cost, damping = there, new, new_cost, max(damping / 5, 1e-9)
@@ -301,7 +302,7 @@ def _add_component(stack: Stack, weight: np.ndarray, parameters: np.ndarray, res
 def _as_fit(parameters: np.ndarray, rms: float) -> PulseFit:
     components = parameters.reshape(-1, 3)
     # Stacks are aligned at the peak: the main component is the one that makes most of it.
-    main = int(np.argmax(components[:, 0] * np.exp(-0.5 * (components[:, 1] / components[:, 2]) ** 2)))
+    main = int(np.argmax(components[:, 0] * exp(-0.5 * (components[:, 1] / components[:, 2]) ** 2)))
     order = np.r_[main, np.delete(np.arange(len(components)), main)]
     components = components[order]
     weight, delay, _ = components[0]

@@ -13,6 +13,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.signal.noise import estimate_noise, keep_longest
 from wavebatch.kernels.signal.signal import transpose_samples
@@ -152,7 +153,7 @@ def find_edge(widths: np.ndarray, errors: np.ndarray | None = None) -> float:
     """
     typical = 0.0 if errors is None else float(np.median(errors / widths))
     allowed, climb = max(REPEAT_SPAN, 3 * typical), max(CLIMB, 5 * typical)
-    ordered = np.log(np.sort(widths.astype(np.float64)))
+    ordered = log(np.sort(widths.astype(np.float64)))
     hold = min(max(LEAST_REPEATED, int(np.ceil(REPEATED * len(ordered)))), len(ordered))
     span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
     close = span <= allowed
@@ -161,7 +162,7 @@ def find_edge(widths: np.ndarray, errors: np.ndarray | None = None) -> float:
     half = max(len(near) // 2, min(2, len(near)))
     inner = near[half - 1 :] - near[: len(near) - half + 1]
     begin = int(np.argmin(inner))
-    return float(np.exp(np.median(near[begin : begin + half])))
+    return float(exp(np.median(near[begin : begin + half])))
 
 
 def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
