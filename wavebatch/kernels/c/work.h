@@ -35,12 +35,10 @@ typedef struct {
     int64_t reach;                             /* of the taps of a new pulse */
 } Work;
 
-static void *const NO_MEMORY = 0;
-
 /* Enlarges a buffer and keeps what is in it; false where there is no memory. */
 static int enlarge(void *buffer, size_t bytes) {
     void *larger = realloc(*(void **)buffer, bytes);
-    if (larger == NO_MEMORY) return 0;
+    if (!larger) return 0;
     *(void **)buffer = larger;
     return 1;
 }
