@@ -51,7 +51,8 @@ def reference(
 ) -> EchoTable:  # fmt: skip
     """Sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
 
-    Time and amplitude are those of the pulse's peak, the width is its full width at half maximum over 2.354820.
+    The amplitude is that of the pulse's peak, the time that of its datum (the Gaussian that fits a flat target's echo),
+    the width its full width at half maximum over 2.354820.
 
     Parameters
     ----------

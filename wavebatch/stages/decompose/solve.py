@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,11 +11,10 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.cluster import Clusters
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Settings, Solution
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, measure_pulse
-from wavebatch.kernels.library import Samples
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
@@ -31,12 +29,10 @@ from wavebatch.stages.pulse_tables import (
     clip_level,
     describe_echoes,
     error_factors,
+    matched_gaussian,
     pulse_shape,
     shape_limits,
 )
-
-PER_WIDTH = 16
-"""Samples per width of a pulse to which a Gaussian is fitted: more change its width by less than 1e-4."""
 
 LeastWidth = Annotated[float, Range(0.05, 1.0)]
 MostWidth = Annotated[float, Range(1.0, BROADEST)]
@@ -61,22 +57,8 @@ def fit_gaussian(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPu
     shape = pulse_shape(system, 1.0)
     if shape == GAUSSIAN:
         return system
-    ref = _gaussian_width(shape, shape_limits(system, 1.0).ref)
+    ref = matched_gaussian(shape, shape_limits(system, 1.0).ref)[1]
     return replace(system, components=(), kappa=0.0, sigma_ref=ref)
-
-
-@lru_cache(maxsize=16)
-def _gaussian_width(shape: PulseShape, width: float) -> float:
-    """Width of the Gaussian that is fitted to a pulse of this width, within three widths of its peak [its unit]."""
-    unit = width / PER_WIDTH
-    measures = measure_pulse(shape, width, 1.001 * width)
-    x = np.arange(-3 * PER_WIDTH, 3 * PER_WIDTH + 1, dtype=np.float64)
-    whole = evaluate_pulse(shape, x[:, None] * unit + measures.delay[0], np.zeros(1), np.full(1, width))[0][:, 0]
-    samples = Samples(whole[None].astype(np.float32), np.zeros(1, np.float32), np.full(1, 1e-3, np.float32))
-    start = Candidates(np.zeros(1, int), x[-1:], measures.peak[:1], np.full(1, float(PER_WIDTH)))
-    one = Clusters(*(np.array([value]) for value in (0, 0, len(x), 0, 1)))
-    limits = Settings(PER_WIDTH, 0.3 * PER_WIDTH, 5.0 * PER_WIDTH, tolerance=1e-6, grow=False)
-    return float(decompose_clusters(samples, start, one, limits).parameters[0, 2] * unit)
 
 
 def make_settings(
