@@ -260,6 +260,8 @@ class SystemPulse:
     """Spikes of one sample per waveform; 0 where they are not taken off."""
     transient: float = 0.0
     """Time at the start of every waveform in which its receiver is not at rest [ns]."""
+    seams: Mapping[int, int] = field(default_factory=dict)
+    """Sample between two recordings of a packet that was interpolated, by the number of samples of such packets."""
     ringing: float = 0.0
     """Largest after-pulse as a share of the amplitude."""
     saturation: float | None = None

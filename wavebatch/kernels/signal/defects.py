@@ -127,6 +127,47 @@ def find_transient(above: np.ndarray, std: float) -> int:
     return 0 if jumps.all() else int(np.argmin(jumps))
 
 
+SEAM_ROWS, SEAM_SPAN, SEAM_REACH = 20, 20.0, 3
+"""Waveforms with signal at a seam, their least difference of counts near it, and how near it is [samples]."""
+
+SEAM_SHARE, USUAL_SHARE = 0.95, 0.5
+"""Share of them in which the sample is the mean of its neighbours, and how often that is so elsewhere, at most."""
+
+LEAST_RECORDING, MOST_SEAM_VALUES = 12, 1 << 20
+"""Samples of a recording at least, and samples of all waveforms in which a seam is looked for."""
+
+
+def find_seam(samples: np.ndarray) -> int:
+    """Sample between two recordings of a packet that was interpolated, not recorded; 0 for none.
+
+    It is the mean of its neighbours, up to rounding, in all waveforms that have signal there; echoes are bent.
+
+    Parameters
+    ----------
+    samples : uint (n, s), count
+        Packets of one length.
+
+    Returns
+    -------
+    int
+        Index of the sample.
+    """
+    n, s = samples.shape
+    values = samples[:: max(n * s // MOST_SEAM_VALUES, 1)].astype(np.int64)
+    if len(values) < SEAM_ROWS or s < 2 * LEAST_RECORDING:
+        return 0
+    near = np.lib.stride_tricks.sliding_window_view(values, 2 * SEAM_REACH + 1, axis=1)
+    active = near.max(axis=2) - near.min(axis=2) >= SEAM_SPAN
+    middle = values[:, SEAM_REACH:-SEAM_REACH]
+    bend = 2 * middle - values[:, SEAM_REACH - 1 : -SEAM_REACH - 1] - values[:, SEAM_REACH + 1 : 1 - SEAM_REACH]
+    number = active.sum(axis=0)
+    share = ((np.abs(bend) <= 1) & active).sum(axis=0) / np.maximum(number, 1)
+    known = number >= SEAM_ROWS
+    at = np.flatnonzero(known & (share >= SEAM_SHARE)) + SEAM_REACH
+    at = at[(at >= LEAST_RECORDING) & (at < s - LEAST_RECORDING)]
+    return int(at[0]) if len(at) == 1 and np.median(share[known]) <= USUAL_SHARE else 0
+
+
 def fit_slopes(
     signal: np.ndarray, std: float, reach: int, limit: float = 4.0, missing: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
