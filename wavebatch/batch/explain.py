@@ -89,7 +89,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _find_gaps(prepared.sensor, report.no_data)
     lines += _doubt_units(prepared)
     lines += _name_height(prepared)
-    lines += _name_model(prepared)
+    lines += [*_name_model(prepared), *_name_raised(prepared)]
     lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
@@ -140,6 +140,20 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         f"pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
     )
     return tuple(lines)
+
+
+def _name_raised(prepared: Prepared) -> Iterator[str]:
+    """A threshold of the residual loop that lies below the noise, which the stage takes in its place."""
+    step, survey = prepared.choice.chain.steps[2], prepared.choice.survey
+    if step.stage.name != "decompose.residual_loop":
+        return
+    given, noise = step.effective(), survey.system.noise_std
+    unit = {"count": 1.0, "amplitude": survey.figures.get("amplitude_50", 0.0)}.get(given["t_unit"], 0.0)
+    if 0 < unit * given["t_diff"] < noise:
+        yield (
+            f"decompose.residual_loop: t_diff = {given['t_diff']:g} (unit {given['t_unit']}) lies below the noise of "
+            f"{noise:.2f} DN and was raised to it"
+        )
 
 
 def _doubt_fits(prepared: Prepared, report: RunReport) -> Iterator[str]:

@@ -58,7 +58,8 @@ def residual_loop(
         The pulse that the survey chose (auto: learned, skewed or Gaussian); Gaussians, as in the paper; skewed pulses
         with the skew of the survey; generalized Gaussians; or the learned pulse.
     t_diff : float
-        Largest residual that adds no echo, T_diff of the paper, in the unit below.
+        Largest residual that adds no echo, T_diff of the paper, in the unit below; at least the noise, and the report
+        says so where it was raised.
     t_unit : {"noise", "count", "amplitude"}
         Standard deviations of the noise, counts of the digitizer, or shares of the waveform's largest sample above the
         baseline.
