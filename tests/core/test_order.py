@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wavebatch.core.echoes import find_order
+from wavebatch.core.order import find_order
 
 
 def test_any_rows_get_the_order_of_a_full_sort(rng):

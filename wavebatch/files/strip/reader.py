@@ -152,7 +152,9 @@ class StripReader(Closing):
     def read_unit(self, number: int, scan: StripScan) -> Unit:
         """Return unit `number` (from 0): its points and their packets; `read_blocks` reads the samples."""
         start, stop = int(scan.borders[number]), int(scan.borders[number + 1])
-        points = self._points.read(start, stop)
+        points = scan.decoded.read(number)
+        if not len(points):
+            points = self._points.read(start, stop)
         judged = self._judge.judge(points, scan.vectors.form, scan.overfull)
         entries = unique_entries(scan.context.read(number))
         near = self._judge.judge(entries["record"], scan.vectors.form, scan.overfull)
