@@ -20,7 +20,9 @@ INSIDE = {
         {"explain", "neighbour_pass", "row_transfer"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
     ],
     "surveying/measuring": [{"lone_echoes"}, {"noise_and_width"}, {"residuals"}, {"misfit", "learn_pulse"}],
-    "batch/workers": [{"processor"}, {"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"}],
+    "batch/workers": [
+        {"processor"}, {"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"},
+    ],
     "surveying": [
         {"measuring"}, {"flat_ground"}, {"survey", "sensor"},
         {"system_file", "auto_chain", "predict_error"}, {"outgoing"},

@@ -61,7 +61,9 @@ def find_nearest(
     # Most waveforms have one return: only the others need an order.
     echoes = np.flatnonzero(number[echo_waveform] > 1)
     if len(echoes):
-        returns = np.flatnonzero(number[return_waveform] > 1)
+        asked = np.zeros(len(number), bool)
+        asked[echo_waveform[echoes]] = True
+        returns = np.flatnonzero(asked[return_waveform])
         found = _find_nearest_of_many(
             echo_waveform[echoes], echo_time[echoes], return_waveform[returns], return_time[returns]
         )
