@@ -99,9 +99,10 @@ def test_a_pulse_that_is_a_guess_warns_in_cron_too(tiny_strip, tmp_path):
 def test_a_residual_threshold_below_the_noise_is_said(tiny_strip, tmp_path):
     stages = ("noise.pooled", "detect.maximum", "decompose.residual_loop")
     text = "\n".join(f'[[chain]]\nstage = "{name}"' for name in stages)
+    rest = '[[chain]]\nstage = "attribute.position"\n'
     for t_diff, raised in ((0.1, True), (50.0, False)):
         chain = tmp_path / f"{t_diff}.toml"
-        chain.write_text(f'{text}\nt_diff = {t_diff}\nt_unit = "count"\n')
+        chain.write_text(f'{text}\nt_diff = {t_diff}\nt_unit = "count"\n{rest}')
         folder = tmp_path / f"out-{t_diff}"
         done = CliRunner().invoke(main, ["run", str(tiny_strip), "-o", str(folder), "-c", str(chain)])
         assert done.exit_code == 0, done.stderr
