@@ -22,6 +22,10 @@ from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape, 
 CLOSED_VALUES = 1 << 21
 """Samples around peaks that the closed form takes at a time: noise has a peak at every fourth sample."""
 
+SINGLE_PRECISION = 2.0**-23
+"""Share of an amplitude that the fit, in single precision, cannot tell from none: it counts as misfit of the pulse. With
+amplitudes of 4e9 counts rounding is 200 times a noise of one count."""
+
 
 @stage("decompose")
 def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
@@ -166,7 +170,7 @@ def adaptive(
         max_iterations=max_iterations,
         grow=True,
         acceptance=acceptance or system.acceptance,
-        misfit=system.misfit,
+        misfit=max(system.misfit, SINGLE_PRECISION),
         max_echoes=max_echoes,
         prior_spread=width_prior * ref,
         gate_residual=gate_residual,
