@@ -235,7 +235,8 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     yield from _pulse_lines(saved)
     if "divergence_seen_mrad" in figures:
         seen = format_measure(figures["divergence_seen_mrad"], figures["divergence_seen_error_mrad"])
-        yield _line("beam", f"{seen} mrad by the widths of echoes over the slopes of their surfaces, if these are plane")
+        words = "mrad by the widths of echoes over the slopes of their surfaces, if these are plane"
+        yield _line("beam", f"{seen} {words}")
     yield from _digitizer_lines(saved)
     yield from _scene_lines(saved)
     yield "decisions"

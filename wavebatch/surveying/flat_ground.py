@@ -54,8 +54,8 @@ GROUPS = 12
 """Groups of echoes by angle, through whose median widths the first line for the divergence goes."""
 
 LEAST_DIVERGENCE_ERROR = 0.03
-"""Relative error of a divergence from widths at best: rough ground widens echoes too, by a little. It holds for surfaces
-that are plane over a footprint and several points; on two real strips (.5 mrad) the widths gave .563 and .375."""
+"""Relative error of a divergence from widths at best: rough ground widens echoes too, by a little. It holds where
+surfaces are plane over a footprint and several points: on two real strips (.5 mrad) the widths gave .563 and .375."""
 
 LARGEST_DIVERGENCE_ERROR = 0.25
 """A divergence that is known less well than this is not given."""

@@ -23,7 +23,7 @@ CLOSED_VALUES = 1 << 21
 """Samples around peaks that the closed form takes at a time: noise has a peak at every fourth sample."""
 
 SINGLE_PRECISION = 2.0**-23
-"""Share of an amplitude that the fit, in single precision, cannot tell from none: it counts as misfit of the pulse. With
+"""Share of an amplitude that a fit in single precision cannot tell from none: it counts as misfit of the pulse. With
 amplitudes of 4e9 counts rounding is 200 times a noise of one count."""
 
 
