@@ -13,11 +13,10 @@ from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import format_step, parse_chain
 from wavebatch.surveying import Decision, Part, Survey
 
-LOST = 0.0025
+LOST = 0.005
 """Largest share of overlapping echoes, among the waveforms with echoes, at which growth is turned off.
 
-Without growth about half of the echoes in such waveforms are lost: 0.13 % of all echoes at most. A sample of 1,000
-waveforms without any does not prove so few; growth costs nothing on strips of that size.
+Without growth about half of the echoes in such waveforms are lost: 0.25 % of all echoes at most.
 """
 
 _NAME = "profile auto"
@@ -56,9 +55,9 @@ def _decide_growth(survey: Survey) -> Decision:
     if not filled or all(decision.part != Part.GROWTH for decision in survey.decisions):
         return Decision(Part.GROWTH, True, "the survey does not say how many echoes overlap")
     number = share * filled
-    # Upper limit of the share: two standard deviations of the count above it, and at least four waveforms more,
-    # because a small sample without overlaps proves little.
-    most = min((number + 2 + 2 * math.sqrt(number + 1)) / filled, 1.0)
+    # Upper limit of the share: two standard deviations of the count above it, and at least six waveforms more, because
+    # a small sample without overlaps proves little: with four, tiles of 1,000 waveforms grew or not by one pair.
+    most = min((number + 4 + 2 * math.sqrt(number + 1)) / filled, 1.0)
     found = f"of the {filled:.0f} waveforms with echoes {100 * share:.2f} % hold overlapping ones"
     limit = f"at most {100 * most:.2f} % by this sample, the limit is {100 * LOST:g} %"
     return Decision(Part.GROWTH, most >= LOST, f"{found}; {limit}")
