@@ -14,24 +14,24 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy, read_blocks
+from wavebatch.files.pulse_energy import PulseEnergy, find_column, find_pulse_energy, name_columns, take_records
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
-from wavebatch.surveying.calibrating.setting import Setting, check_energies, measure_setting
-from wavebatch.surveying.calibrating.strip_channels import SCANNERS
+from wavebatch.surveying.calibrating.setting import SCANNERS, Setting, check_energies, measure_setting
 from wavebatch.surveying.choose_chain import Choice, Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 
 ECHO = np.dtype([
     ("xyz", "<f8", 3), ("ray", "<f8", 3), ("distance", "<f8"), ("light", "<f8"), ("light_err", "<f8"),
-    ("channel", "<i4"), ("time", "<f8"),
+    ("channel", "<i4"), ("time", "<f8"), ("given", "<f8"),
 ])  # fmt: skip
 """An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel, GPS
-time [s]."""
+time [s], value of the column that was asked for."""
 
 _BLOCK = 8192
 """Waveforms that are read at a time."""
@@ -51,6 +51,8 @@ class EchoSource:
     sensor: SensorSource
     setting: Setting
     energy: PulseEnergy | None = None
+    column: PulseEnergy | None = None
+    """The extra byte whose values go with the echoes, if one was asked for."""
 
     @property
     def path(self) -> Path:
@@ -62,11 +64,14 @@ class EchoSource:
 
         wanted: which returns at positions f8 (k, 3) are of interest, bool (k,); only their waveforms are decomposed.
         """
-        for block in read_blocks(self.reader, self.scan, _BLOCK, self.energy):
-            near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
-            if len(near):
-                part = self.sensor.fill(block.rows(near))
-                yield take_clean(part, self.chain.run(part, self.system))
+        for unit in self.reader.read_units(self.scan):
+            for block, _ in self.reader.read_blocks(unit, _BLOCK, owned_only=True):
+                near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
+                if len(near):
+                    part = block.rows(near)
+                    given = None if self.column is None else self.column.values(take_records(part, unit))
+                    part = self.sensor.fill(part if self.energy is None else self.energy.fill(part, unit))
+                    yield take_clean(part, self.chain.run(part, self.system), given)
 
 
 @contextmanager
@@ -79,6 +84,7 @@ def open_source(
     attenuation: float,
     direction: str,
     energy: str | None,
+    column: str | None,
 ) -> Iterator[EchoSource]:
     """Open a strip, choose pulse and chain as `wavebatch run` does, and find the sensor.
 
@@ -95,6 +101,8 @@ def open_source(
         Where packet vectors point: auto, toward or away.
     energy : str or None
         Of each emitted pulse; see `find_pulse_energy`.
+    column : str or None
+        Extra byte whose values go with the echoes.
 
     Yields
     ------
@@ -113,7 +121,12 @@ def open_source(
         sent = find_pulse_energy(reader, scan, energy)
         if energy is not None and sent is not None:
             check_energies(reader, scan, sent)
-        yield EchoSource(reader, scan, setup.choice, with_energy(setup.chain), system, setup.sensor, setting, sent)
+        given = find_column(reader, column) if column else None
+        if column and given is None:
+            hint = name_columns(reader, column)
+            raise InputError(f"{path}: --from-column: no extra byte is called {column!r}; {hint}")
+        chain = with_energy(setup.chain)
+        yield EchoSource(reader, scan, setup.choice, chain, system, setup.sensor, setting, sent, given)
 
 
 def with_energy(chain: Chain) -> Chain:
@@ -125,8 +138,11 @@ def with_energy(chain: Chain) -> Chain:
     return replace(chain, steps=tuple(steps))
 
 
-def take_clean(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
-    """Take the echoes of a block that are alone in their waveform and whose place and energy are sure, as ECHO."""
+def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None = None) -> np.ndarray:
+    """Take the echoes of a block that are alone in their waveform and whose place and energy are sure, as ECHO.
+
+    given: values of a column for each waveform, f8 (n,).
+    """
     alone = echoes.count(len(block))[echoes.waveform] == 1
     echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.UNANCHORED)) == 0)))
     rows = np.zeros(len(echoes), ECHO)
@@ -139,6 +155,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     rows["light_err"] = echoes.attributes[f"{_LIGHT}_err"]
     scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(np.int32)
     rows["time"] = block.gps_time[echoes.waveform]
+    rows["given"] = np.nan if given is None else given[echoes.waveform]
     rows["channel"] = SCANNERS * block.digitizer.index + scanner
     known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & np.isfinite(rows["light_err"])
     return rows[known]

@@ -20,12 +20,13 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.las.header import decode_text
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying.calibrating.strip_channels import read_day, read_sensor_name
+from wavebatch.surveying.calibrating.setting import read_day, read_sensor_name
 from wavebatch.surveying.calibrating.strip_echoes import EchoSource, open_source
 from wavebatch.surveying.calibrating.target_constants import (
     LEAST_ECHOES,
     MOST_STRANGE,
     combine_targets,
+    measure_column,
     measure_target,
     summarise,
 )
@@ -58,6 +59,8 @@ class CalibrationOptions:
     """Where packet vectors point: auto, toward or away."""
     scan_angle: bool = False
     """Fit how the light depends on the scan angle, where strips overlap."""
+    column: str | None = None
+    """Extra byte with the vendor's own reflectances, in place of targets."""
     energy: str | None = None
     """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
 
@@ -72,6 +75,7 @@ def open_strip_source(path: Path, options: CalibrationOptions):
         attenuation=options.attenuation,
         direction=options.direction,
         energy=options.energy,
+        column=options.column,
     )
 
 
@@ -89,7 +93,7 @@ def build_calibration(
         The strip.
     targets : sequence of Target
     found : sequence of arrays of ECHO
-        Clean single echoes inside the outline of each target.
+        Clean single echoes inside the outline of each target; all echoes where the options name a column.
     options : CalibrationOptions
 
     Returns
@@ -108,12 +112,14 @@ def build_calibration(
     divergence = options.divergence or source.system.divergence
     measured = [
         measure_target(target, rows, divergence, options.reflectance_error)
-        for target, rows in zip(targets, found, strict=True)
+        for target, rows in zip(targets, found, strict=not options.column)
     ]
+    if options.column:
+        measured = [measure_column(options.column, found[0], options.reflectance_error)]
     results = [result for result, _, _ in measured]
     whole = combine_targets(results, _fit_errors([used for _, used, _ in measured]))
     if whole is None:
-        miss = describe_miss([target.corners for target in targets], source.reader.facts.header)
+        miss = describe_miss([target.corners for target in targets], source.reader.facts.header) if targets else ""
         reasons = miss or "; ".join(f"{result.name}: {result.refused}" for result in results)
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])
