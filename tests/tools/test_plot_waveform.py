@@ -332,6 +332,10 @@ def test_echoes_are_listed_and_written(tiny_strip, tmp_path):
     assert refused.exit_code == 1 and "--overwrite" in refused.stderr
     text = list_echoes(views, most=3)
     assert "more: -o FILE.csv" in text and "packet" in text.split("\n")[0]
+    errors = [view.echoes.amplitude * 1e-6 for view in views]
+    long = [replace(view, echoes=replace(view.echoes, amplitude_err=e)) for view, e in zip(views, errors, strict=True)]
+    lines = list_echoes([*long[:2], *views[2:]]).split("\n")
+    assert len({line.rindex("  ") for line in lines}) == 1, "flags start in one column"
 
 
 def test_real_waveforms(riegl, leica, tmp_path):
