@@ -12,8 +12,8 @@ from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibrating.target_file import Target
-from wavebatch.surveying.calibrating.targets import CalibrationOptions
 
 RINGING = ((1.0, 0.0, 2.0), (0.06, 9.0, 2.2), (0.03, 16.0, 2.5))
 TAIL = ((1.0, 0.0, 2.0), (0.3, 3.0, 3.0))

@@ -23,7 +23,7 @@ from wavebatch.files.inputs import find_files
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
     from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
-    from wavebatch.surveying.calibrating.targets import CalibrationOptions
+    from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
     from wavebatch.surveying.calibration import ChannelConstant, StripConstant, TargetResult
 
 
@@ -135,7 +135,7 @@ def calibrate(
 def _read_options(options: dict[str, Any]) -> CalibrationOptions:
     """How to measure; pulse and chain are chosen as `wavebatch run` chooses them."""
     from wavebatch.kernels.physics.radiometry import usual_attenuation
-    from wavebatch.surveying.calibrating.targets import CalibrationOptions
+    from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
     from wavebatch.tools.api.run import find_request, read_sensor
 
     asked = shared.from_options(RunOptions, options)

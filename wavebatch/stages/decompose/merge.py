@@ -5,6 +5,8 @@ Called after every fit.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable

@@ -19,8 +19,8 @@ from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, a
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
 from wavebatch.surveying.calibrating.flight_strips import FlightStrip, find_box, read_strip
 from wavebatch.surveying.calibrating.setting import SCANNERS
+from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibrating.target_file import Target
-from wavebatch.surveying.calibrating.targets import CalibrationOptions
 from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, measure_ties
 from wavebatch.surveying.calibrating.trends import LEAST_SPREAD, Trend, find_trend, fit_swath
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult, check_attenuation

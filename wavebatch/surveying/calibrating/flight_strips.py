@@ -17,15 +17,13 @@ from wavebatch.core.waveforms import angle_to_vertical
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.calibrating.setting import SCANNERS, see_channels
-from wavebatch.surveying.calibrating.strip_echoes import ECHO, EchoSource
+from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, EchoSource, open_source
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.targets import (
     MOST_ECHOES,
-    CalibrationOptions,
     build_calibration,
     describe_channel,
     measure_ranging,
-    open_strip_source,
 )
 from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, hash_squares
 from wavebatch.surveying.calibration import Calibration, ChannelConstant
@@ -75,7 +73,7 @@ def read_strip(
     options: CalibrationOptions,
 ) -> FlightStrip:
     """Decompose what lies on targets or in the overlap with other strips, in one pass."""
-    with open_strip_source(path, options) as source:
+    with open_source(path, options) as source:
         header = source.reader.facts.header
         targets = [target.place(path, header) for target in targets]
         seen = see_channels(source.reader, source.scan)

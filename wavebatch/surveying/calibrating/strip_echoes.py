@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,33 @@ _BLOCK = 8192
 """Waveforms that are read at a time."""
 
 _LIGHT = "relative_backscatter"
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationOptions:
+    """How a calibration is measured."""
+
+    sensor: SensorRequest = field(default_factory=SensorRequest)
+    """Where the sensor's positions come from; by default from the strip's packets."""
+    chain: Chain | None = None
+    """The chain that decomposes; None: the widest that the request may choose."""
+    request: Request = field(default_factory=lambda: Request(auto=True))
+    """How pulse and chain are chosen: as for `wavebatch run`."""
+    attenuation: float = 0.22
+    """Of the air, one way [dB/km]."""
+    divergence: float | None = None
+    """Full angle of the beam between the 1/e^2 points [mrad]; None: that of a saved survey, if it has one."""
+    reflectance_error: float = 0.03
+    """Standard deviation of the targets' reflectances, relative."""
+    direction: str = "auto"
+    """Where packet vectors point: auto, toward or away."""
+    scan_angle: bool = False
+    """Fit how the light depends on the scan angle, where strips overlap."""
+    column: str | None = None
+    """Extra byte with the vendor's own reflectances, in place of targets."""
+    energy: str | None = None
+    """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EchoSource:
@@ -75,34 +102,13 @@ class EchoSource:
 
 
 @contextmanager
-def open_source(
-    path: Path,
-    *,
-    sensor: SensorRequest,
-    chain: Chain | None,
-    request: Request,
-    attenuation: float,
-    direction: str,
-    energy: str | None,
-    column: str | None,
-) -> Iterator[EchoSource]:
+def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]:
     """Open a strip, choose pulse and chain as `wavebatch run` does, and find the sensor.
 
     Parameters
     ----------
     path : Path
-    sensor : SensorRequest
-    chain : Chain or None
-        None: the widest, for an automatic choice.
-    request : Request
-    attenuation : float
-        Of the air, one way [dB/km].
-    direction : str
-        Where packet vectors point: auto, toward or away.
-    energy : str or None
-        Of each emitted pulse; see `find_pulse_energy`.
-    column : str or None
-        Extra byte whose values go with the echoes.
+    options : CalibrationOptions
 
     Yields
     ------
@@ -113,14 +119,16 @@ def open_source(
     InputError
         Where the strip cannot be read or the sensor's position is unknown.
     """
-    with StripReader(path, direction=direction) as reader, reader.scan() as scan:
-        setup = prepare(reader, scan, chain or widest_chain(), request, sensor=sensor, positions=Positions.REQUIRED)
+    with StripReader(path, direction=options.direction) as reader, reader.scan() as scan:
+        chain = options.chain or widest_chain()
+        setup = prepare(reader, scan, chain, options.request, sensor=options.sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
-        system = replace(setup.system, attenuation=attenuation, sensor_error=0.0)
-        setting = measure_setting(reader, scan, setup.sensor, attenuation)
-        sent = find_pulse_energy(reader, scan, energy)
-        if energy is not None and sent is not None:
+        system = replace(setup.system, attenuation=options.attenuation, sensor_error=0.0)
+        setting = measure_setting(reader, scan, setup.sensor, options.attenuation)
+        sent = find_pulse_energy(reader, scan, options.energy)
+        if options.energy is not None and sent is not None:
             check_energies(reader, scan, sent)
+        column = options.column
         given = find_column(reader, column) if column else None
         if column and given is None:
             hint = name_columns(reader, column)
