@@ -56,12 +56,13 @@ def test_the_cover_is_that_of_a_loop(rng):
     system = SystemPulse(1.5, hidden=((0.1, 0.2, 0.05), (0.4, 0.3, 0.1), (1.6, 0.1, 0.02)))
     waveform = np.sort(rng.integers(0, 40, 60)).astype(np.int32)
     sigma = rng.uniform(1.2, 3.5, 60)
-    errors = rng.uniform(0, 0.1, 60)
-    table = EchoTable.build(waveform, rng.uniform(0, 50, 60), np.full(60, 40.0), sigma, time_err=errors)
+    errors = {"time_err": rng.uniform(0, 0.1, 60), "sigma_err": rng.uniform(0, 0.2, 60)}
+    table = EchoTable.build(waveform, rng.uniform(0, 50, 60), np.full(60, 40.0), sigma, **errors)
     covered = cover_hidden(table, system, 40)
     lone, others = 0, 0
     for i in range(60):
-        excess = max(float(table.sigma[i]) ** 2 / 1.5**2 - 1, 0)
+        variance, its_error = float(table.sigma[i]) ** 2, 2 * float(table.sigma[i]) * float(table.sigma_err[i])
+        excess = max((variance - its_error) / 1.5**2 - 1, 0)
         alone = np.count_nonzero(waveform == waveform[i]) == 1
         lone, others = lone + alone, others + (not alone)
         share = np.interp(excess, [0.1, 0.4, 1.6], [0.2, 0.3, 0.1] if alone else [0.05, 0.1, 0.02])

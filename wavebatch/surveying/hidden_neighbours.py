@@ -12,6 +12,7 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.stages.decompose.merge import excess_variance
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.predict_error import SEED, simulate_again
@@ -86,7 +87,7 @@ def _measure_class(
         groups = len(np.unique(echoes.waveform[source]))
         expected /= 1.0 - min(expected * len(excess) / groups, MOST_LOST)
     clear = (echoes.amplitude > CLEAR * system.noise_std) & ((number > 1) if company else (number == 1))
-    there = np.histogram(_excess(echoes.take(np.flatnonzero(clear)), system), EXCESS)[0]
+    there = np.histogram(excess_variance(echoes.take(np.flatnonzero(clear)), system), EXCESS)[0]
     hidden = expected * np.histogram(excess, EXCESS)[0]
     moved = expected * np.histogram(excess, EXCESS, weights=shift**2 / np.maximum(excess, EXCESS[0]))[0]
     return moved / np.maximum(np.maximum(there, hidden), 1.0)
@@ -115,9 +116,4 @@ def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) ->
     one = (found.count(n)[found.waveform] == 1) & (found.amplitude > CLEAR * system.noise_std)
     found = found.take(np.flatnonzero(one))
     shift = np.abs(time[found.waveform] - found.time[:, None]).min(axis=1)
-    return _excess(found, system), shift / ref
-
-
-def _excess(echoes: EchoTable, system: SystemPulse) -> np.ndarray:
-    """Variance over that of the system pulse, less 1, float64 (m,)."""
-    return (echoes.sigma.astype(np.float64) / system.sigma_ref) ** 2 - 1.0
+    return excess_variance(found, system), shift / ref

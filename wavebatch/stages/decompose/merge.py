@@ -100,11 +100,29 @@ def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
     if not system.hidden:
         return table
     excess, lone, others = np.array(system.hidden).T
-    wider = np.maximum((table.sigma.astype(np.float64) / system.sigma_ref) ** 2 - 1.0, 0.0)
+    wider = np.maximum(excess_variance(table, system), 0.0)
     alone = table.count(n)[table.waveform] == 1
     share = np.where(alone, np.interp(wider, excess, lone), np.interp(wider, excess, others))
     error = np.sqrt(table.time_err**2 + share * wider * system.sigma_ref**2)
     return replace(table, time_err=error.astype(np.float32))
+
+
+def excess_variance(table: EchoTable, system: SystemPulse) -> np.ndarray:
+    """Compute by how much the width of each echo exceeds the system's for sure.
+
+    Parameters
+    ----------
+    table : EchoTable
+        m fitted echoes.
+    system : SystemPulse
+
+    Returns
+    -------
+    float64 array, shape (m,)
+        Variance over that of the system pulse, less 1 and less its standard deviation.
+    """
+    sigma, error = table.sigma.astype(np.float64), np.nan_to_num(table.sigma_err.astype(np.float64))
+    return (sigma * sigma - 2.0 * sigma * error) / system.sigma_ref**2 - 1.0
 
 
 def _unresolved(table: EchoTable) -> np.ndarray:
