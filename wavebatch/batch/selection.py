@@ -1,7 +1,7 @@
 """Which rows of a strip are written: --drop-flags, --classes, --bbox, --polygon and --where of `wavebatch run`.
 
-`cli.run` and the public API build a `Selection`; `unit.process_unit` applies it to the rows of a unit, or `strip_task`
-does once a second pass has filled them. Every row that is left out is counted by the first reason, in the order above.
+`cli.run` and the public API build a `Selection`; workers apply it to the rows of each unit. Every row that is left
+out is counted by the first reason, in the order above.
 Before you change it: a row's values and its neighbours must not depend on what is written, only its return numbers do.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,6 @@ from wavebatch.stages.chain import STAGES, Chain
 
 WITHOUT_STAGE = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
-
-_FLAGS = "echo_flags"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +103,7 @@ class RowSelector:
     chain : Chain
         That makes the rows.
     layout : OutputLayout
-        Of the cloud. Rows have `carrying`: this layout and the columns that the selection needs, at its end.
+        Of the cloud.
     """
 
     selection: Selection
@@ -113,20 +112,9 @@ class RowSelector:
 
     @property
     def needed(self) -> tuple[str, ...]:
-        """The columns that rows carry for the selection, as they were computed, whatever the cloud's names and units.
-
-        echo_flags is always one of them: the flags of rows that are left out are not counted as written.
-        """
-        if not self.selection:
-            return ()
+        """The computed columns that decide what is written."""
         named = () if self.selection.where is None else self.selection.where.columns
-        found = [self._find(name) for name in named]
-        return tuple(dict.fromkeys([_FLAGS, *(name for kind, name in found if kind == "computed")]))
-
-    @property
-    def carrying(self) -> OutputLayout:
-        """The layout of the rows that are given to `select`."""
-        return self.layout.extended(self.needed) if self.needed else self.layout
+        return tuple(found for kind, found in map(self._find, named) if kind == "computed")
 
     def check(self) -> None:
         """Raise ConfigError where --where names a column that the rows do not have, and as `Selection.place`."""
@@ -140,18 +128,20 @@ class RowSelector:
                     remedy = f"chain {self.chain.name} does not compute it; add stage {' or '.join(makers)} to it"
                 raise where.complain(name, f"{self.layout.source.path}: there is no column {name!r}; {remedy}")
 
-    def select(self, rows: np.ndarray) -> tuple[np.ndarray, RunReport]:
+    def select(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, RunReport]:
         """Choose the rows that are written.
 
         Parameters
         ----------
         rows : structured array (m,)
-            In the layout `carrying`.
+            In the cloud's layout.
+        columns : mapping of str to array (m,)
+            Those `needed` and echo_flags as they were computed, whatever the cloud's names and units.
 
         Returns
         -------
         rows : structured array (k,)
-            In the cloud's layout.
+            Those that are written.
         report : RunReport
             What changes in the counts: rows left out by reason, fewer points and flags that are written.
         """
@@ -159,7 +149,7 @@ class RowSelector:
             return rows, RunReport()
         left = np.zeros(len(rows), np.int64)
         for number, reason in enumerate(LEFT_OUT, 1):
-            meets = self._test(reason, rows)
+            meets = self._test(reason, rows, columns)
             if meets is not None:
                 left = np.where((left == 0) & ~meets, number, left)
         out = left > 0
@@ -167,23 +157,22 @@ class RowSelector:
         report = RunReport(
             counts={"points_out": -int(np.count_nonzero(out))},
             left_out={name: number for name, number in zip(LEFT_OUT, numbers, strict=True) if number},
-            flags={name: -number for name, number in count_flags(self._read(_FLAGS, rows[out])).items()},
+            flags={name: -number for name, number in count_flags(columns["echo_flags"][out]).items()},
         )
-        final = self.layout.dtype
-        plain = rows[~out].view(np.uint8).reshape(-1, rows.dtype.itemsize)[:, : final.itemsize]
-        return np.ascontiguousarray(plain).view(final).reshape(-1), report
+        return rows[~out], report
 
-    def _test(self, reason: str, rows: np.ndarray) -> np.ndarray | None:
+    def _test(self, reason: str, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
         """Whether rows (m,) are written as far as one option is concerned, bool (m,); None where it is not given."""
         chosen = self.selection
         if reason == "drop_flags":
-            return (self._read(_FLAGS, rows) & np.uint16(chosen.drop_flags)) == 0 if chosen.drop_flags else None
+            return (columns["echo_flags"] & np.uint16(chosen.drop_flags)) == 0 if chosen.drop_flags else None
         if reason == "classes":
-            return np.isin(self._read("classification", rows), chosen.classes) if chosen.classes else None
+            return np.isin(self._read("classification", rows, {}), chosen.classes) if chosen.classes else None
         if reason == "where":
             where = chosen.where
-            return None if where is None else where.choose({name: self._read(name, rows) for name in where.columns})
-        x, y = self._read("x", rows), self._read("y", rows)
+            values = {} if where is None else {name: self._read(name, rows, columns) for name in where.columns}
+            return None if where is None else where.choose(values)
+        x, y = self._read("x", rows, {}), self._read("y", rows, {})
         if reason == "bbox":
             if chosen.bbox is None:
                 return None
@@ -218,11 +207,11 @@ class RowSelector:
                 return kind, alike[0]
         return "", ""
 
-    def _read(self, name: str, rows: np.ndarray) -> np.ndarray:
-        """Values (m,) of a column of rows in the layout `carrying`, NaN for no data."""
+    def _read(self, name: str, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Values (m,) of a column, NaN for no data."""
         kind, found = self._find(name)
         if kind == "computed":
-            return rows[self.carrying.extra_fields[self.needed.index(found) - len(self.needed)]]
+            return columns[found].astype(COLUMNS[found].dtype, copy=False)
         if kind == "carried":
             at = self.layout.extra_fields.index(found)
             return read_dimension(rows, describe_dimension(found, self.layout.carried[at].record))

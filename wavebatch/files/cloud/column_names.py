@@ -88,10 +88,6 @@ _SHORT = {
     "amplitude_normalized_db_err": "1 sigma, normalized",
     "level_reflectance": "reflectance if level",
     "level_reflectance_err": "1 sigma, slope unknown",
-    "facing_reflectance": "reflectance if facing",
-    "facing_reflectance_err": "1 sigma, facing",
-    "facing_relative_reflectance": "relative, facing",
-    "facing_relative_reflectance_err": "1 sigma, facing",
     **{f"relative_{name}": "relative to strip only" for name in _RELATIVE},
     **{f"relative_{name}_err": "1 sigma, relative" for name in _RELATIVE},
 }
