@@ -6,6 +6,7 @@ file: every keyword argument is a key, its annotation gives type and range, its 
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import re
 import time
@@ -102,6 +103,7 @@ def stage(
     second_pass: Callable[..., Any] | None = None,
     fits: Callable[[SystemPulse, Mapping[str, Any]], SystemPulse] | None = None,
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None,
+    shares: Any = None,
 ) -> Callable[[Callable], Callable]:
     """Register the decorated function as stage `kind.<function name>`.
 
@@ -115,6 +117,9 @@ def stage(
         Attribute columns that earlier stages must have added.
     second_pass, fits, check : optional
         See `Stage`.
+    shares : dataclass instance, optional
+        Parameters that stages share: its fields with their annotations, its values as defaults, its docstring for their
+        meaning. The function takes them as `**options`.
 
     Returns
     -------
@@ -133,7 +138,7 @@ def stage(
         name = f"{kind}.{function.__name__}"
         if name in STAGES:
             raise StageError(f"stage {name} is registered twice")
-        parameters = _read_parameters(name, kind, function)
+        parameters = _read_parameters(name, kind, function, shares)
         if second_pass is not None and "radius" not in parameters:
             raise StageError(f"stage {name} has a second pass, but no parameter radius")
         new = {column.name: column for column in makes if isinstance(column, Column)}
@@ -147,28 +152,37 @@ def stage(
     return register
 
 
-def _read_parameters(name: str, kind: str, function: Callable) -> dict[str, Parameter]:
-    signature = inspect.signature(function)
-    hints = typing.get_type_hints(function, include_extras=True)
-    data = tuple(p.name for p in signature.parameters.values() if p.kind is not p.KEYWORD_ONLY)
+def _read_parameters(name: str, kind: str, function: Callable, shares: Any) -> dict[str, Parameter]:
+    given = inspect.signature(function).parameters.values()
+    data = tuple(p.name for p in given if p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD))
     if data != KINDS[kind][0]:
         raise StageError(f"stage {name} takes {data}, a {kind} stage takes {KINDS[kind][0]}")
-    if hints.get("return") is not KINDS[kind][1]:
+    if typing.get_type_hints(function).get("return") is not KINDS[kind][1]:
         raise StageError(f"stage {name} must be annotated to return {KINDS[kind][1].__name__}")
-    _, *entries = _ENTRY.split(_split_docstring(function)[1].get("Parameters", ""))
-    meanings = {head: " ".join(text.split()) for head, text in zip(entries[::2], entries[1::2], strict=True)}
-    parameters = {}
-    for key, parameter in signature.parameters.items():
-        if parameter.kind is not parameter.KEYWORD_ONLY:
-            continue
-        if parameter.default is parameter.empty or not meanings.get(key):
-            raise StageError(f"stage {name}: parameter {key} needs a default and an entry under Parameters")
-        kinds, choices, limits = read_hint(hints[key])
-        parameters[key] = Parameter(key, kinds, parameter.default, meanings[key], choices, limits)
+    defaults = {p.name: p.default for p in given if p.kind is p.KEYWORD_ONLY}
+    parameters = _declare(name, function, defaults)
+    if shares is not None:
+        values = dataclasses.asdict(shares)
+        for one in type(shares).__mro__[-2::-1]:
+            parameters |= _declare(name, one, {key: values[key] for key in one.__annotations__})
     return parameters
 
 
-def _split_docstring(function: Callable) -> tuple[str, dict[str, str]]:
+def _declare(name: str, source: Callable | type, defaults: Mapping[str, Any]) -> dict[str, Parameter]:
+    """Parameters from the annotations and the docstring of a function or dataclass."""
+    hints = typing.get_type_hints(source, include_extras=True)
+    _, *entries = _ENTRY.split(_split_docstring(source)[1].get("Parameters", ""))
+    meanings = {head: " ".join(text.split()) for head, text in zip(entries[::2], entries[1::2], strict=True)}
+    parameters = {}
+    for key, default in defaults.items():
+        if default is inspect.Parameter.empty or not meanings.get(key):
+            raise StageError(f"stage {name}: parameter {key} needs a default and an entry under Parameters")
+        kinds, choices, limits = read_hint(hints[key])
+        parameters[key] = Parameter(key, kinds, default, meanings[key], choices, limits)
+    return parameters
+
+
+def _split_docstring(function: Callable | type) -> tuple[str, dict[str, str]]:
     """Text before the first section of a numpydoc docstring, and the text of each section."""
     prose, *rest = _SECTION.split(inspect.getdoc(function) or "")
     return prose.strip(), {title: body.strip("\n") for title, body in zip(rest[::2], rest[1::2], strict=True)}
