@@ -124,11 +124,11 @@ def test_reflectance_by_normals_waits_for_the_second_pass():
     assert done.attributes["facing_reflectance"] == pytest.approx(gamma / 4)
     angle, error = np.full(50, 60.0, np.float32), np.full(50, 1.0, np.float32)
     angle[0] = np.nan
-    chain = Chain((*load_profile("fast").steps, *(Step(STAGES[f"attribute.{name}"]) for name in
-                                                  ("incidence_angle_normals", "reflectance"))))  # fmt: skip
+    names = ("backscatter_coefficient", "incidence_angle_normals", "reflectance")
+    chain = Chain((*load_profile("fast").steps, *(Step(STAGES[f"attribute.{name}"]) for name in names)))
     noise = Noise(np.full(len(block), 12, np.float32), np.ones(len(block), np.float32))
     kept = chain.keep_needed(Solved(block, noise, SYSTEM, done))
-    assert not kept.block.samples.size and set(kept.echoes.attributes) == {"x", "y", "z"}
+    assert not kept.block.samples.size and set(kept.echoes.attributes) == {"x", "y", "z", "range_err"}
     full = chain.solve_again(kept._replace(echoes=kept.echoes.with_attributes(
         incidence_angle_normals=angle, incidence_angle_normals_err=error)))  # fmt: skip
     assert reasons(full)["reflectance"] == {"NO_ANGLE": 1, "KNOWN": 49}

@@ -87,7 +87,7 @@ class Prepared:
     @property
     def selector(self) -> RowSelector:
         """Chooses the rows that are written."""
-        return RowSelector(self.job.selection, self.job.chain, self.layout)
+        return RowSelector.plan(self.job.selection, self.job.chain, self.layout)
 
 
 def prepare_strip(job: StripJob) -> Prepared:
@@ -112,8 +112,8 @@ def prepare_strip(job: StripJob) -> Prepared:
     start = time.perf_counter()
     with job.open() as reader:
         facts = reader.facts
-        RowSelector(job.selection, job.chain, plan_layout(job, facts)).check()
         job = replace(job, selection=job.selection.place(facts))
+        RowSelector.plan(job.selection, job.chain, plan_layout(job, facts))
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
@@ -137,7 +137,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.energy is not None and energy is not None:
                 check_energies(reader, scan, energy)
             layout = plan_layout(job, facts)
-            RowSelector(job.selection, job.chain, layout).check()
+            RowSelector.plan(job.selection, job.chain, layout)
             units = reader.unit_count()
         except BaseException:
             scan.close()

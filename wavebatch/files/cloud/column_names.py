@@ -7,8 +7,9 @@ only if the column has the meaning and unit that the other program gives to this
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -139,6 +140,19 @@ def normalise(name: str) -> str:
     PDAL makes `_` of every sign, and takes names that differ in case only as one.
     """
     return re.sub(r"[\W_]", "", name.casefold())
+
+
+def resolve(name: str, *kinds: Mapping[str, Any]) -> Any:
+    """Return what the name of a column stands for: the one way of --where, --column and all readers of clouds.
+
+    kinds: names with what they stand for, the more important first. Exact names of any kind come before names that are
+    alike by `normalise`: `Amplitude` is the vendor's, `amplitude` is ours. None where no name fits.
+    """
+    for known in kinds:
+        if name in known:
+            return known[name]
+    alike = (known[one] for known in kinds for one in known if normalise(one) == normalise(name))
+    return next(alike, None)
 
 
 def describe(column: Column, unit: str | None = None) -> str:

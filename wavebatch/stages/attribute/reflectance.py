@@ -105,7 +105,8 @@ def level_reflectance(
 
 def _reflectance(block: WaveformBlock, echoes: EchoTable, name: str, light: Light, surface: str) -> EchoTable:
     """The column for surfaces struck at the angle that another column has."""
-    known = (echoes.attributes[key] for key in (_ANGLE[surface], f"{_ANGLE[surface]}_err"))
+    unknown = np.full(len(echoes), np.nan)
+    known = (echoes.attributes.get(key, unknown) for key in (_ANGLE[surface], f"{_ANGLE[surface]}_err"))
     angle, angle_err = (np.radians(values.astype(np.float64)) for values in known)
     relative = radiometry.reflectance_error(light.relative_error, angle, angle_err)
     return _divide(block, echoes, name, light, angle, relative)

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.even_sample import EvenSample
-from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.files.cloud.columns_reader import ColumnsReader
+from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.tools.html.charts import draw_histogram, draw_map
 from wavebatch.tools.plots.raster import Raster, choose_grid, find_shown
@@ -31,7 +30,7 @@ BINS = 60
 def picture_cloud(path: Path, columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """Histograms and maps (figures) of the columns that the cloud has; raises InputError if it cannot be read."""
     sample = EvenSample(SAMPLED)
-    with ColumnsReader(path, columns, missing_ok=True) as reader:
+    with ColumnReader(path, *columns, missing_ok=True) as reader:
         for rows in reader.read_pieces():
             good = np.isfinite(rows["x"]) & np.isfinite(rows["y"])
             sample.add({"place": np.stack([rows["x"], rows["y"]], axis=1)[good], "values": rows["values"][good]})

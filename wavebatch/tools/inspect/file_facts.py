@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.core.no_data import without_nan
-from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.cloud.provenance import read_provenance
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
 from wavebatch.files.las.crs import read_crs
@@ -144,24 +144,13 @@ def _count(counter: Counter[int], values: np.ndarray) -> None:
     counter.update(dict(zip(found.tolist(), numbers.tolist(), strict=True)))
 
 
-class _RawReader(ColumnReader):
-    """A ColumnReader whose pieces are the raw records."""
-
-    def flags_of(self, raw: np.ndarray) -> np.ndarray | None:
-        """EchoFlag bits; None without such a column."""
-        return raw[self._sources["echo_flags"].name].astype(np.uint16) if self.has_flags else None
-
-    def _convert(self, raw: np.ndarray) -> np.ndarray:
-        return raw
-
-
 def _describe_points(path: Path, header: LasHeader, is_ours: bool) -> dict[str, Any]:
     """Sums over all points; counts of echoes only of a cloud with provenance, whose flags are known to be ours."""
     totals = _Totals()
-    with _RawReader(path, None) as reader:
+    with CloudReader(path, np.dtype([("flags", "<u2")])) as reader:
         has_flags = reader.has_flags and is_ours
-        for raw in reader.read_pieces():
-            totals.add(raw, header, reader.flags_of(raw) if has_flags else None)
+        for rows in reader.read_pieces():
+            totals.add(reader.records, header, rows["flags"] if has_flags else None)
     found = totals.extremes
     bounds = {}
     if found:

@@ -35,7 +35,7 @@ _CHOSEN_BINS = 60
 
 
 def open_heights(paths: Sequence[Path], selection: Selection) -> Clouds | VoxelFile:
-    """Clouds or one file of voxels, whose rows have the height in `others`."""
+    """Clouds or one file of voxels, whose rows have the height as second value."""
     voxels = [path for path in paths if path.suffix.lower() == ".npz"]
     if voxels and len(paths) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
@@ -128,9 +128,9 @@ def _cut_rows(rows: np.ndarray, start: np.ndarray, along: np.ndarray, length: fl
     """Distance along the line, height and value of the points beside it, f8 (k, 3); along: its unit vector."""
     offset = np.stack([rows["x"], rows["y"]], axis=1) - start
     far, aside = offset @ along, offset @ np.array([-along[1], along[0]])
-    height = rows["others"][:, 0]
+    height = rows["values"][:, 1]
     keep = (far >= 0) & (far <= length) & (np.abs(aside) <= 0.5 * width) & np.isfinite(height)
-    return np.stack([far, height, rows["value"]], axis=1)[keep]
+    return np.stack([far, height, rows["values"][:, 0]], axis=1)[keep]
 
 
 def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
@@ -217,7 +217,7 @@ def measure_profile(
     sample, total, least, largest = EvenSample(), Tally(), math.inf, -math.inf
     for _, rows, tally in clouds.read():
         total += tally
-        height = rows["others"][:, 0]
+        height = rows["values"][:, 1]
         height = height[np.isfinite(height)]
         if len(height):
             sample.add({"height": height})
@@ -229,12 +229,12 @@ def measure_profile(
     series = len(paths) if each else 1
     sums, numbers, outside = np.zeros((series, len(edges) - 1)), np.zeros((series, len(edges) - 1)), 0
     for cloud, rows, _ in clouds.read():
-        at = np.searchsorted(edges, rows["others"][:, 0], side="right") - 1
+        at = np.searchsorted(edges, rows["values"][:, 1], side="right") - 1
         good = (at >= 0) & (at < len(edges) - 1)
         outside += int(np.count_nonzero(~good))
         row = cloud if each else 0
         numbers[row] += np.bincount(at[good], minlength=len(edges) - 1)
-        sums[row] += np.bincount(at[good], rows["value"][good], minlength=len(edges) - 1)
+        sums[row] += np.bincount(at[good], rows["values"][:, 0][good], minlength=len(edges) - 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         values: Any = {"count": numbers, "sum": sums, "mean": np.where(numbers > 0, sums / numbers, np.nan)}[statistic]
     names = name_paths(paths)

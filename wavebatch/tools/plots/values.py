@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.condition import Condition
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike, select_points
 
 OUTER = (0.1, 99.9)
@@ -36,15 +36,6 @@ class Selection:
     """Further columns that are read with it."""
     where: Condition | None = None
     """Points must meet this."""
-
-    def choose(self, rows: np.ndarray) -> np.ndarray:
-        """The rows (VALUE_DTYPE) with the right flags."""
-        if not self.flags_with and not self.flags_without:
-            return rows
-        keep = (rows["flags"] & np.uint16(self.flags_without)) == 0
-        if self.flags_with:
-            keep &= (rows["flags"] & np.uint16(self.flags_with)) != 0
-        return rows[keep]
 
 
 @dataclass(slots=True)
@@ -79,26 +70,22 @@ class Clouds:
         self.paths, self.selection = tuple(paths), selection
         found: list[tuple[Path, ColumnFacts]] = []
         for path in self.paths:
-            with ColumnReader(path, selection.column, selection.others) as reader:
-                found.append((path, reader.facts))
-                self.other_facts = reader.other_facts
-                select_points(reader, selection.where)  # its columns exist
-                if (selection.flags_with or selection.flags_without) and not reader.has_flags:
-                    raise ConfigError(f"{path}: has no column echo_flags to select points by")
+            with ColumnReader(path, selection.column, *selection.others) as reader:
+                found.append((path, reader.facts[0]))
+                self.other_facts = reader.facts[1:]
+                select_points(reader, selection.where, selection.flags_with, selection.flags_without)  # it can
         self.facts: ColumnFacts = check_alike(found)
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
         """Pieces of all clouds: number of the cloud, selected points with a value, and counts of the piece."""
         for number, path in enumerate(self.paths):
-            with ColumnReader(path, self.selection.column, self.selection.others) as reader:
-                select_points(reader, self.selection.where)
+            with ColumnReader(path, self.selection.column, *self.selection.others) as reader:
+                select_points(reader, self.selection.where, self.selection.flags_with, self.selection.flags_without)
                 seen = 0
                 for rows in reader.read_pieces():
-                    chosen = self.selection.choose(rows)
-                    more, seen = reader.left_out - seen, reader.left_out
-                    good = chosen[~np.isnan(chosen["value"])]
-                    left = len(rows) + more - len(chosen)
-                    yield number, good, Tally(len(rows) + more, left, len(chosen) - len(good), len(good))
+                    left, seen = reader.left_out - seen, reader.left_out
+                    good = rows[~np.isnan(rows["values"][:, 0])]
+                    yield number, good, Tally(len(rows) + left, left, len(rows) - len(good), len(good))
 
     def complain(self, tally: Tally) -> InputError:
         """The error that says why nothing can be drawn."""

@@ -14,8 +14,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.files.cloud.columns_reader import ColumnsReader
+from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
@@ -126,7 +125,7 @@ def _find_facts(paths: Sequence[Path], columns: Sequence[str]) -> tuple[ColumnFa
     """The columns' facts, which all clouds must share."""
     known: tuple[ColumnFacts, ...] | None = None
     for path in paths:
-        with ColumnsReader(path, columns) as reader:
+        with ColumnReader(path, *columns) as reader:
             for mine, other in zip(reader.facts, known or reader.facts, strict=True):
                 if mine.unit != other.unit:
                     raise ConfigError(f"{path}: {mine.name} is in [{mine.unit}], in {paths[0]} in [{other.unit}]; make "
