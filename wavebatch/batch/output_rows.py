@@ -102,6 +102,7 @@ class Assembled(NamedTuple):
     counted: np.ndarray
     """Echoes of the table that count in this unit, bool (k,)."""
     report: RunReport
+    """Without the counts of what is written, which the selection adds."""
 
 
 def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray, EchoTable]]) -> UnitEchoes:
@@ -207,7 +208,7 @@ def assemble_echoes(
         time=np.append(table.time, np.nan)[rows.echo],
     )
     counted = np.ones(len(table), bool)
-    report = _count(unit, table, counted, members.packet, found, owned[members.packet], rows.reason, flags)
+    report = _count(unit, table, counted, members.packet, found, owned[members.packet], rows.reason)
     return Assembled(output, rows.echo, columns, counted, report)
 
 
@@ -254,7 +255,7 @@ def assemble_returns(
     # An echo counts in the unit of its point, where the second pass has seen it; without one in that of its packet.
     counted = unit.packets.owned[table.waveform] & (table.attributes["point"] < 0)
     counted[mine] = True
-    report = _count(unit, table, counted, packet, found, packet >= 0, np.where(found, np.uint16(0), reason), flags)
+    report = _count(unit, table, counted, packet, found, packet >= 0, np.where(found, np.uint16(0), reason))
     return Assembled(output, echo, columns, counted, report)
 
 
@@ -337,13 +338,12 @@ def _count(
     found: np.ndarray,
     inside: np.ndarray,
     reason: np.ndarray,
-    flags: np.ndarray,
 ) -> RunReport:
-    """The report of a unit.
+    """The report of a unit, without what is written of it.
 
     counted: echoes of the table (k,) that count in this unit.
     packet, found, inside: of the points (k,) that are counted as returns: row of unit.packets, whether an echo matches,
-    whether it is counted. reason, flags: of the output rows (m,).
+    whether it is counted. reason: of the output rows (m,).
     """
     owned = unit.packets.owned
     per_packet = np.append(table.count(len(owned)), 0)
@@ -360,13 +360,11 @@ def _count(
         "matched_returns": inside & found,
         "no_echo_returns": inside & ~has_echoes,
         "unmatched_returns": inside & has_echoes & ~found,
-        "points_out": len(flags),
     }
     above = np.any([table.attributes[name] > 1 for name in _REFLECTING if name in table.attributes], axis=0)
     report = RunReport(
         counts={name: n if isinstance(n, int) else int(np.count_nonzero(n)) for name, n in counts.items()},
         passed_through=count_flags(reason),
-        flags=count_flags(flags),
         no_data=count_reasons(table.attributes),
         above_one=int(np.count_nonzero(above)),
     )

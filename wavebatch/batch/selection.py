@@ -161,21 +161,19 @@ class RowSelector:
         rows : structured array (k,)
             Those that are written.
         report : RunReport
-            What changes in the counts: rows left out by reason, fewer points and flags that are written.
+            Points and flags that are written, and points left out by reason.
         """
-        if not self.selection:
-            return rows, RunReport()
         left = np.zeros(len(rows), np.int64)
-        for number, meets in enumerate(self._test(rows, columns), 1):
+        for number, meets in enumerate(self._test(rows, columns) if self.selection else (), 1):
             left = np.where((left == 0) & ~np.asarray(meets), number, left)
-        out = left > 0
+        kept = left == 0
         numbers = np.bincount(left, minlength=len(LEFT_OUT) + 1)[1:].tolist()
         report = RunReport(
-            counts={"points_out": -int(np.count_nonzero(out))},
+            counts={"points_out": int(np.count_nonzero(kept))},
             left_out={name: number for name, number in zip(LEFT_OUT, numbers, strict=True) if number},
-            flags={name: -number for name, number in count_flags(columns["echo_flags"][out]).items()},
+            flags=count_flags(columns["echo_flags"][kept]),
         )
-        return rows[~out], report
+        return rows if kept.all() else rows[kept], report
 
     def _test(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> Iterator[np.ndarray | bool]:
         """Whether rows (m,) are written as far as each reason of LEFT_OUT is concerned, bool (m,) or for all."""
