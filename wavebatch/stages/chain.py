@@ -163,7 +163,7 @@ def _read_parameters(name: str, kind: str, function: Callable, shares: Any) -> d
     parameters = _declare(name, function, defaults)
     if shares is not None:
         values = dataclasses.asdict(shares)
-        for one in type(shares).__mro__[-2::-1]:
+        for one in type(shares).__mro__[:-1]:
             parameters |= _declare(name, one, {key: values[key] for key in one.__annotations__})
     return parameters
 
