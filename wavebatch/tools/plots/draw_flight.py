@@ -13,8 +13,6 @@ import numpy as np
 
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
-from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
-from wavebatch.surveying.calibration import StripConstant
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,37 +32,27 @@ def draw_flight(found: FlightCalibration, target: Path, *, overwrite: bool = Fal
     strips, pairs = found.calibration.strips[:MOST_ROWS], found.pairs[:MOST_ROWS]
     height = 1.6 + _ROW * (max(len(strips), 1) + max(len(pairs), 1))
     with open_picture(target, (8.0, height), overwrite=overwrite) as figure:
-        sizes = [max(len(strips), 1), max(len(pairs), 1)]
-        upper, lower = figure.subplots(2, 1, height_ratios=sizes)
-        _draw_drifts(upper, strips)
-        _draw_pairs(lower, pairs)
+        upper, lower = figure.subplots(2, 1, height_ratios=[max(len(strips), 1), max(len(pairs), 1)])
+        names = [f"{row.strip}: {row.digitizer}.{row.scanner}" for row in strips]
+        _draw_rows(upper, names, [row.drift for row in strips], [row.drift_error for row in strips], "#1f5a99", "error")
+        upper.set(title="Drift of each strip (strip: digitizer.scanner channel)",
+                  xlabel="constant off the mean of its channel [%]")  # fmt: skip
+        lower.plot([100 * (pair.ratio - 1) for pair in pairs], range(len(pairs)), "x", color="#b5492f", label="before")
+        names = [f"{_shorten(pair.a)} / {_shorten(pair.b)} ({pair.cells})" for pair in pairs]
+        after, spread = [pair.after - 1 for pair in pairs], [pair.spread for pair in pairs]
+        _draw_rows(lower, names, after, spread, "#2f7d4f", "after; bars: spread of the cells")
+        lower.set(title="Overlaps (number of cells)", xlabel="light of the first over that of the second [%]")
+        lower.legend(loc="best")
 
 
-def _draw_drifts(axes: Axes, strips: Sequence[StripConstant]) -> None:
-    rows = np.arange(len(strips))
-    axes.errorbar(
-        [100 * row.drift for row in strips], rows, xerr=[100 * row.drift_error for row in strips], fmt="o", ms=4,
-        color="#1f5a99", capsize=2,
-    )  # fmt: skip
-    names = [f"{row.strip}: {row.digitizer}.{row.scanner}" for row in strips]
-    axes.set_yticks(rows, [plain_text(name) for name in names])
+def _draw_rows(
+    axes: Axes, names: Sequence[str], values: Sequence[float], errors: Sequence[float], color: str, label: str
+) -> None:
+    """Shares with their errors as per cent, one below the other."""
+    middle, bars = 100 * np.asarray(values), 100 * np.asarray(errors)
+    axes.errorbar(middle, range(len(names)), xerr=bars, fmt="o", ms=4, color=color, capsize=2, label=label)
+    axes.set_yticks(range(len(names)), list(map(plain_text, names)))
     axes.invert_yaxis()
-    axes.set_title("Drift of each strip (strip: digitizer.scanner channel)")
-    axes.set_xlabel("constant off the mean of its channel [%]")
-
-
-def _draw_pairs(axes: Axes, pairs: Sequence[PairOverlap]) -> None:
-    rows = np.arange(len(pairs))
-    axes.plot([100 * (pair.ratio - 1) for pair in pairs], rows, "x", color="#b5492f", label="before")
-    axes.errorbar(
-        [100 * (pair.after - 1) for pair in pairs], rows, xerr=[100 * pair.spread for pair in pairs], fmt="o", ms=4,
-        color="#2f7d4f", capsize=2, label="after; bars: spread of the cells",
-    )  # fmt: skip
-    axes.set_yticks(rows, [plain_text(f"{_shorten(pair.a)} / {_shorten(pair.b)} ({pair.cells})") for pair in pairs])
-    axes.invert_yaxis()
-    axes.set_title("Overlaps (number of cells)")
-    axes.set_xlabel("light of the first over that of the second [%]")
-    axes.legend(loc="best")
 
 
 def _shorten(name: str) -> str:
