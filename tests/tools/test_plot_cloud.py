@@ -262,20 +262,20 @@ def test_rare_far_values_are_outside_and_counted(tmp_path):
 def test_maps_say_their_crs_and_refuse_two(tmp_path, riegl, cloud):
     pytest.importorskip("matplotlib")
     found = grid_values([riegl], Selection("z"))
-    assert "UTM" in found.crs and found.unit == "m"
+    assert "UTM" in found.crs.name and found.crs.unit == "m"
     assert run("map", riegl, "--column", "z", "-o", tmp_path / "r.svg").exit_code == 0
-    assert f"CRS: {found.crs}" in (tmp_path / "r.svg").read_text("utf-8")
+    assert f"CRS: {found.crs.name}" in (tmp_path / "r.svg").read_text("utf-8")
     feet = 'PROJCS["feet",GEOGCS["g"],PROJECTION["x"],UNIT["US survey foot",0.304800609601219]]'
     other = write_cloud(tmp_path / "feet.las")
     las = laspy.read(other)
     las.header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(feet))
     las.header.global_encoding.wkt = True
     las.write(other)
-    assert grid_values([other], Selection("z")).unit == "us-ft"
+    assert grid_values([other], Selection("z")).crs.unit == "us-ft"
     assert grid_values([other], Selection(None), "density").label == "points per area [1/us-ft2]"
     with pytest.raises(ConfigError, match="its CRS is"):
         grid_values([riegl, other], Selection("z"))
-    assert grid_values([cloud], Selection("z")).crs == ""
+    assert grid_values([cloud], Selection("z")).crs.name == ""
 
 
 def test_clouds_far_apart_are_refused(tmp_path, cloud):

@@ -389,6 +389,9 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
         assert len(find_places(reader, scan, Wanted(packets=((0, 60),), sheet=True), None)) == 60
         with pytest.raises(ConfigError, match=f"{MOST} fit"):
             find_places(reader, scan, Wanted(random=40), None)
+        assert len(find_places(reader, scan, Wanted(sheet=True), None)) == 100  # as many as a sheet holds
+        with pytest.raises(ConfigError, match="100 with --sheet"):
+            find_places(reader, scan, Wanted(most=30), None)
     pytest.importorskip("matplotlib")
     target = tmp_path / "sheet.svg"
     words = (tiny_strip, "-o", target, "--random", 9, "--seed", 1, "--sheet", "--profile", "fast", "--overwrite")

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 @shared.sensor_options
 @shared.declared("direction")
 @shared.html_option
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def calibrate(
     strips: tuple[Path, ...], targets: Path, output: Path, html_file: Path | None, overwrite: bool, **options: Any
 ) -> None:

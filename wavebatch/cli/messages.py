@@ -125,6 +125,12 @@ def talk(message: str) -> None:
     log_file.log(printable(message))
 
 
+def tell(message: str) -> None:
+    """`talk`, unless --quiet was given."""
+    if not click.get_current_context().params["quiet"]:
+        talk(message)
+
+
 def write_message(line: str) -> None:
     """One line on stderr; where it cannot be written, later ones are dropped, and the work goes on."""
     try:

@@ -99,7 +99,7 @@ _internal = click.option("--internal/--external", default=True,
 @click.option("--threshold", type=click.FloatRange(0.0, 1e10), metavar="DN",
               help="Discrete: amplitude that triggers a return [DN].  [default: 12]")
 @click.option("--most-returns", "most", type=int, help="Discrete: most returns per pulse.  [default: 4]")
-@common_options("overwrite", "json", "quiet")
+@common_options("overwrite", "json")
 def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | None, **options: Any) -> None:
     """Simulate a full-waveform strip of a SCENE with known echoes.
 
@@ -190,7 +190,7 @@ def _shape_scene(scene: Scene, options: dict[str, Any]) -> Scene:
               help="Reflectance: efficiency of the optics.  [default: 0.5]")
 @click.option("--attenuation", type=click.FloatRange(*RADAR_LIMITS["attenuation"]), metavar="DB_KM",
               help="Reflectance: attenuation of the air [dB/km].  [default: 0.22]")
-@common_options("overwrite", "json", "quiet")
+@common_options("overwrite", "json")
 def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     """Model waveforms from the discrete returns of CLOUD: one Gaussian per return, from its range and intensity.
 

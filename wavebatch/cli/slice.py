@@ -83,7 +83,7 @@ class Extras:
               "CRS, which GDAL and QGIS read.")
 @click.option("--most", default=20, show_default=True, metavar="N", help="Most segments per slice.")
 @shared.declared("direction")
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def slice_(
     strips: tuple[str, ...],
     output: Path | None,

@@ -60,7 +60,7 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @shared.declared("energy")
 @shared.sensor_options
 @shared.strip_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     """Deconvolve the waveforms of each STRIP and sum them in the voxels of a 3D grid.
 

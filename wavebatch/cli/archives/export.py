@@ -30,7 +30,7 @@ from wavebatch.tools.archives.export_strip import SUFFIXES, ExportSummary, expor
 @output_option("File to write: .las or .laz with a .wdp beside it, or .npz; or a folder, which gets STEM.las for each "
                "strip.", "FILE|DIR", folder=None)
 @strip_options
-@common_options("overwrite", "json", "quiet")
+@common_options("overwrite", "json")
 def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: Any) -> None:
     """Write STRIPs as other programs need them: LAS with repaired packets, or waveforms as arrays.
 

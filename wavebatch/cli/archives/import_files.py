@@ -39,7 +39,7 @@ EXIT_SOME, EXIT_NONE = 3, 4
 @click.option("--internal/--external", default=False,
               help="Store packets in the strip or in a .wdp file beside it.  [default: external]")
 @click.option("--resume", is_flag=True, help="Skip files whose strip is there and up to date.")
-@common_options("overwrite", "json", "quiet")
+@common_options("overwrite", "json")
 def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **options: Any) -> None:
     """Import PulseWaves FILEs (.pls with the .wvs beside it) as LAS 1.4 strips of point format 9.
 

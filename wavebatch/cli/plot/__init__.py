@@ -14,8 +14,8 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import NearestGroup, count, print_json, talk
-from wavebatch.cli.plot.sections import cube, describe_picture, list_tally, profile, section, select
+from wavebatch.cli.messages import NearestGroup, count, print_json, tell
+from wavebatch.cli.plot.sections import cube, describe_picture, describe_tally, list_tally, profile, section, select
 from wavebatch.cli.program.completion import complete_columns, complete_flags
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import check_target
@@ -60,8 +60,8 @@ def plot() -> None:
               help="Draw the pulse nearest to this GPS time [s]; may be repeated.")
 @click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete_flags,
               help="Draw the first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
-@click.option("--most", type=click.IntRange(1, 24), default=6, show_default=True, metavar="N",
-              help="Most waveforms of --flags or of the default.")
+@click.option("--most", type=click.IntRange(1, 100), metavar="N",
+              help="Most waveforms of --flags or of the default.  [default: 6; with --sheet: 100]")
 @click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
 @shared.seed_option("Seed of the random packets.")
 @click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
@@ -74,7 +74,7 @@ def plot() -> None:
 @shared.chain_options
 @shared.system_option
 @shared.strip_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def waveform(strip: Path, output: Path, **options: Any) -> None:
     """Draw waveforms of STRIP with their fit, residual and echoes; or write the echoes as a table.
 
@@ -107,8 +107,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     else:
         _draw_waveforms(views, output, strip.name, chain, options)
     echoes = sum(len(view.echoes) for view in views)
-    if not options["quiet"]:
-        talk(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
+    tell(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
     if options["as_json"]:
         print_json({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
 
@@ -175,7 +174,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
 @click.option("--counts", is_flag=True, help="Draw numbers also for several lines, not shares of each line's values.")
 @shared.selection_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
     """Draw histograms of columns of CLOUDs of any size.
 
@@ -195,8 +194,7 @@ def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **
         text, tallies = _draw_flags(clouds, columns, output, options)
     else:
         text, tallies = _draw_histograms(clouds, columns, output, options)
-    if not options["quiet"]:
-        talk(f"{output}: {text}")
+    tell(f"{output}: {text}")
     if options["as_json"]:
         drawn = [{"columns": list(names), **list_tally(tally)} for names, tally in tallies.items()]
         print_json({**describe_picture(output, clouds), "drawn": drawn})
@@ -240,11 +238,7 @@ def _draw_histograms(
 
     how = {name: options[name] for name in ("log", "counts", "overwrite")}
     draw_histograms(every, output, **how)
-    texts = []
-    for found in every:
-        total, outside = found.total, int(found.below.sum() + found.above.sum())
-        parts = f"{total.no_data} without data, {total.left_out} left out, {outside} outside the picture"
-        texts.append(f"{count(total.values, 'value')}, {parts}")
+    texts = [describe_tally(found.total, int(found.below.sum() + found.above.sum())) for found in every]
     names = [tuple(one.column for one in selections) for selections in panels.values()]
     return "; ".join(texts), {columns: found.total for columns, found in zip(names, every, strict=True)}
 
@@ -265,10 +259,11 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
               help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
               show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
-@click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
+@click.option("--size", type=float, metavar="M",
+              help="Side of a cell, in the unit of the coordinates.  [default: gives a few points per cell]")
 @shared.bbox_option("Show")
 @shared.selection_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
     """Draw a map of a column of CLOUDs of any size, over x and y.
 
@@ -289,15 +284,12 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     from wavebatch.tools.plots.draw_cloud import draw_map
 
     draw_map(found, output, names=tuple(path.name for path in clouds), overwrite=options["overwrite"])
-    if not options["quiet"]:
-        grid, total = found.grid, found.total
-        points = f"{count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside"
-        points += f", {total.left_out} left out" * bool(total.left_out)
-        talk(f"{output}: {points}; {grid.columns} x {grid.rows} cells of {grid.size:g} {found.unit}")
+    grid = found.grid
+    cells = f"{grid.columns} x {grid.rows} cells of {grid.size:g} {found.crs.unit}"
+    tell(f"{output}: {describe_tally(found.total, found.outside)}; {cells}")
     if options["as_json"]:
-        cells = {"columns": found.grid.columns, "rows": found.grid.rows, "size": found.grid.size,
-                 "unit": found.unit}
-        more = {"statistic": statistic, "outside": found.outside, **cells}
+        more = {"statistic": statistic, "outside": found.outside, "columns": grid.columns, "rows": grid.rows,
+                "size": grid.size, "unit": found.crs.unit}  # fmt: skip
         print_json({**describe_picture(output, clouds), "column": column, **list_tally(found.total), **more})
 
 

@@ -53,7 +53,8 @@ def _parts(flight: FlightCalibration, found: Calibration) -> Iterator[str]:
                  for one in flight.pairs]  # fmt: skip
         head = ["a", "over b", "cells", "light %", "calibrated %", "spread %", "height m"]
         yield markup.section("Overlaps", markup.table(head, pairs, sortable=True))
-    provenance = {"wavebatch": __version__, "strip": found.strip, "date of the strip": found.date}
+    days = {"day of the flight": found.flight or "not in the strip", "calibrated on": found.date}
+    provenance = {"wavebatch": __version__, "strip": found.strip, **days}
     yield markup.section("Provenance", markup.facts(provenance), markup.code(format_calibration(found)))
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike, select_points
+from wavebatch.files.las.crs import describe_crs
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""
@@ -86,6 +87,10 @@ class Clouds:
                 if (selection.flags_with or selection.flags_without) and not reader.has_flags:
                     raise ConfigError(f"{path}: has no column echo_flags to select points by")
         self.facts: ColumnFacts = check_alike(found)
+        if selection.column in ("x", "y", "z"):
+            words = describe_crs(self.paths[0])
+            unit = words.upright_unit if selection.column == "z" else words.unit
+            self.facts = replace(self.facts, unit=unit)
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
         """Pieces of all clouds: number of the cloud, selected points with a value, and counts of the piece."""
