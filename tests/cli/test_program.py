@@ -57,7 +57,9 @@ def test_examples_are_right_usage(title, line):
 
 def test_groups_name_options_that_exist_and_each_once():
     known = {option.name for _, command in _commands() for option in command.params} | {"help"}
-    named = [name for names in GROUPS.values() for name in names]
+    titled = {(title, option.name) for title, command in _commands() for option in command.params}
+    named = [name for names in GROUPS.values() for name in names if " " not in name]
+    assert {tuple(name.rsplit(" ", 1)) for names in GROUPS.values() for name in names if " " in name} <= titled
     assert len(named) == len(set(named)) and not set(named) & set(OPTIONS)
     rivals = {name for group in (*EXCLUSIVE, *NEEDS.values(), NEEDS) for name in group}
     assert [name for name in {*rivals, *NEVER, *ELSEWHERE} if name not in known] == []
