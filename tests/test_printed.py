@@ -79,6 +79,8 @@ def place(riegl, tmp_path, monkeypatch):
     """A folder with the files that the pages speak of."""
     for suffix in (".las", ".wdp"):
         shutil.copy(riegl.with_suffix(suffix), tmp_path / f"strip{suffix}")
+    for suffix in (".pls", ".wvs"):
+        shutil.copy(riegl.with_suffix(suffix), tmp_path / f"line{suffix}")
     (tmp_path / "cut.las").write_bytes((tmp_path / "strip.las").read_bytes()[:40_000])
     for name, stages in CHAINS.items():
         chain = "".join(f'[[chain]]\nstage = "{stage}"\n' for stage in ("noise.pooled", *stages))
