@@ -28,7 +28,7 @@ from wavebatch.tools.compare.chains import ChainRun
 from wavebatch.tools.compare.goodness import measure_fit
 from wavebatch.tools.html.strip_views import measure_residuals
 from wavebatch.tools.plots.draw_sheet import draw_sheet
-from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels
+from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels, draw_waveforms
 from wavebatch.tools.plots.echo_table import list_echoes
 from wavebatch.tools.plots.labels import place_labels
 from wavebatch.tools.plots.packets import MOST, Wanted, find_places
@@ -402,6 +402,17 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
     assert run(*words).exit_code == 0 and target.read_bytes() == first
     clash = run(tiny_strip, "-o", tmp_path / "p.png", "--random", 3, "--packet", 2)
     assert clash.exit_code == 2 and "--random chooses the waveforms" in clash.stderr
+
+
+def test_titles_name_every_flag_of_many_echoes(tmp_path):
+    pytest.importorskip("matplotlib")
+    peaks = [(400.0, 20.3 + 6 * k, 2.0) for k in range(5)]
+    (view,) = build_views(simulate(PulseShape(), peaks, n=1), make_chain("decompose.gaussian"), PULSE, [0])
+    view.echoes.flags[:] = int(EchoFlag.SATURATED | EchoFlag.OVERLAPPED | EchoFlag.AMPLITUDE_UNRELIABLE)
+    draw_waveforms([view] * 3, tmp_path / "w.svg", strip="s", chain="c")
+    text = (tmp_path / "w.svg").read_text("utf-8")
+    for name in ("SATURATED", "OVERLAPPED", "AMPLITUDE_UNRELIABLE"):
+        assert text.count(f"{name} 1,2") == 3
 
 
 def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):

@@ -169,7 +169,8 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
               help="Draw one line per value of this column, e.g. number_of_returns or classification.")
 @click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
 @click.option("--range", "limits", callback=_read_range, metavar="LOW:HIGH",
-              help="Values to show.  [default: from 0.1 to 99.9 % of each line; what lies outside is counted]")
+              help="Values to show.  [default: 5 to 95 % of each line, and 1.5 times that range on both sides; what "
+              "lies outside is counted]")
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
 @click.option("--counts", is_flag=True, help="Draw numbers also for several lines, not shares of each line's values.")
