@@ -140,7 +140,7 @@ MADE_BEFORE = {
 ELSEWHERE = (
     "wavebatch bench --real 100429_152240_2535pt_UTM.las simple1_3_full_internal.las -o real",
     "wavebatch plot waveform 100429_152240_2535pt_UTM.las --random 64 --seed 1 --sheet -o sheet.png",
-    "wavebatch calibrate strips/*.laz --targets targets.csv -o cal.toml --report cal.json --plot cal.png",
+    "wavebatch calibrate strips/*.laz --targets targets.csv -o cal.toml --report cal.json --html cal.html",
 )
 """Lines on strips that only the page describes, and one that takes many minutes; their commands have tests."""
 

@@ -114,7 +114,7 @@ def test_the_page_of_a_calibration(tmp_path):
     pairs = (PairOverlap("0.las", "1.las", 40, 1.1, 1.01, 0.02, 0.003, 0.01),)
     write_calibrate_page(tmp_path / "c.html", FlightCalibration(found, pairs))
     shown = Page(tmp_path / "c.html").check()
-    assert shown.row("roof <i>")[2] == "50" and shown.row("lake")[-1] == "too few"
+    assert "0.las / 1.las" in shown.text and shown.row("roof <i>")[2] == "50" and shown.row("lake")[-1] == "too few"
     assert "constants differ" in shown.text and shown.row("day of the flight")[1] == "not in the strip"
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wavebatch.cli.messages import one_line, print_json, print_result, talk
+from wavebatch.cli.messages import answer, one_line, print_result, talk
 from wavebatch.cli.options import (
     check_html,
     common_options,
@@ -132,7 +132,6 @@ def _bench_real(
 
         write_real_page(html_file, [(report.strip, format_report(report)) for report in reports])
         talk(f"{html_file}: written")
-    if options["as_json"]:
-        print_json({"strips": [asdict(report) for report in reports]}, "real")
+    answer({"strips": [asdict(report) for report in reports]}, "real")
     if failed:
         sys.exit(1)

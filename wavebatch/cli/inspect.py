@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json, print_text, printable, talk
+from wavebatch.cli.messages import answer, count, print_text, printable, talk
 from wavebatch.cli.options import common_options, declared, for_each, strip_options, strips_argument
 from wavebatch.cli.program.completion import complete_files
 from wavebatch.files.inputs import find_files
@@ -60,8 +60,7 @@ def info(
         return facts
 
     results, failed = for_each(paths, show, debug=debug)
-    if as_json:
-        print_json(results[0] if len(paths) == 1 else results)
+    answer(results[0] if len(paths) == 1 else results)
     sys.exit(EXIT_UNREADABLE if failed or lost else 0)
 
 
@@ -114,8 +113,7 @@ def check(
             print_text(printable(f"{found.file}: note: {line}"))
         if found.is_clean:
             print_text(printable(f"{found.file}: ok ({found.summary})"))
-    if as_json:
-        print_json(results)
+    answer(results)
     sys.exit(0 if clean else EXIT_PROBLEMS)
 
 

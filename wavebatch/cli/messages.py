@@ -13,7 +13,7 @@ import math
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, is_dataclass
 from typing import IO, Any
 
@@ -166,6 +166,12 @@ def print_json(value: Any, mode: str = "") -> None:
     print_text(format_json(named))
 
 
+def answer(document: Any, mode: str = "") -> None:
+    """`print_json`, if --json was given."""
+    if click.get_current_context().params["as_json"]:
+        print_json(document, mode)
+
+
 def print_text(text: str) -> None:
     """Prints the text on stdout; a stdout that cannot be written, such as a full disk, is named as such."""
     try:
@@ -209,13 +215,11 @@ def print_result(as_json: bool, document: Any, lines: Iterable[str], mode: str =
         print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
 
 
-def print_summary(options: Mapping[str, Any], summary: Any, lines: Iterable[str]) -> None:
+def print_summary(summary: Any, lines: Iterable[str]) -> None:
     """The summary (a dataclass or dictionary) as JSON if --json is given, and the lines on stderr unless --quiet."""
-    if options["as_json"]:
-        print_json(summary)
-    if not options["quiet"]:
-        for line in lines:
-            talk(line)
+    answer(summary)
+    for line in lines:
+        tell(line)
 
 
 def count(number: int, name: str) -> str:

@@ -128,7 +128,7 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
             summary = simulate_strip(shaped, output, truth=truth, **common)
             rest = f"{count(summary.packets, 'packet')} with {count(summary.echoes, 'echo')}"
     points = f"{count(summary.points, 'point')} of {count(summary.pulses, 'pulse')}"
-    print_summary(options, summary, [f"{output}: {points}, {rest}"])
+    print_summary(summary, [f"{output}: {points}, {rest}"])
 
 
 def _build_receiver(truth: Path | None, options: dict[str, Any]) -> DiscreteReceiver | None:
@@ -204,7 +204,7 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
     lines = _list_lines(output, summary, settings)
-    print_summary(options, summary.to_json() if options["as_json"] else summary, lines)
+    print_summary(summary.to_json() if options["as_json"] else summary, lines)
 
 
 def _build_radar(options: dict[str, Any]) -> Radar | None:

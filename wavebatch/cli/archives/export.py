@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, counting, print_json, printable, talk
+from wavebatch.cli.messages import answer, count, counting, printable, talk
 from wavebatch.cli.options import (
     common_options,
     for_each,
@@ -58,8 +58,7 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
         return summary
 
     summaries, failed = for_each(paths, work, debug=options["debug"])
-    if options["as_json"]:
-        print_json([asdict(one) for one in summaries])
+    answer([asdict(one) for one in summaries])
     sys.exit(1 if failed else 0)
 
 

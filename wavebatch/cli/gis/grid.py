@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, print_json, talk, tell
+from wavebatch.cli.messages import answer, count, talk, tell
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.files.inputs import find_files
 
@@ -61,9 +61,8 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     if layout.crs is None:
         talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")
     tell(f"{output}: {_summarise(found, columns)}")
-    if options["as_json"]:
-        print_json({"output": str(output), "clouds": [str(path) for path in paths], "statistic": options["statistic"],
-                    **_describe(found, columns)})  # fmt: skip
+    answer({"output": str(output), "clouds": [str(path) for path in paths], "statistic": options["statistic"],
+            **_describe(found, columns)})  # fmt: skip
 
 
 def _summarise(found: GridResult, columns: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import NearestGroup, count, print_json, tell
+from wavebatch.cli.messages import NearestGroup, answer, count, print_json, tell
 from wavebatch.cli.plot.sections import cube, describe_picture, describe_tally, list_tally, profile, section, select
 from wavebatch.cli.program.completion import complete_columns, complete_flags
 from wavebatch.core.errors import ConfigError
@@ -96,7 +96,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
         if options[name]:
             raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
-    check_target(output, overwrite=options["overwrite"]) if tabular else _check(output, options)
+    (check_target if tabular else check_picture)(output, overwrite=options["overwrite"])
     flags = read_flags(options["flags"])
     wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
@@ -108,12 +108,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         _draw_waveforms(views, output, strip.name, chain, options)
     echoes = sum(len(view.echoes) for view in views)
     tell(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
-    if options["as_json"]:
-        print_json({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
-
-
-def _check(output: Path, options: dict[str, Any]) -> None:
-    check_picture(output, overwrite=options["overwrite"])
+    answer({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
 
 
 def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, options: dict[str, Any]) -> None:
@@ -189,7 +184,7 @@ def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **
     from wavebatch.tools.plots.histogram import is_flags
 
     clouds = find_files(map(str, clouds), recursive=options["recursive"])
-    _check(output, options)
+    check_picture(output, overwrite=options["overwrite"])
     columns = tuple(dict.fromkeys(columns))
     if any(is_flags(clouds[0], column) for column in columns):
         text, tallies = _draw_flags(clouds, columns, output, options)

@@ -104,7 +104,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     CHAIN: ("waveforms", "divergence"),
     AIR: ("reflectance_error", "scan_angle"),
     WHICH: ("flags", "packets", "point_numbers", "times", "most", "random", "limit"),
-    OUTPUT: ("html_file", "report", "as_json", "plot"),
+    OUTPUT: ("html_file", "report", "as_json"),
     RUNNING: ("dry_run", "progress", "verbose", "quiet", "log_path", "log_level", "debug", "help"),
 }
 """Names of options under a heading of --help, besides those of RunOptions. Others come first, under Options.
