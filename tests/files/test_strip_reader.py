@@ -1,5 +1,6 @@
 """Units, packets, blocks: what StripReader gives against a plain reading of the same bytes."""
 
+import errno
 import os
 import pickle
 
@@ -10,10 +11,11 @@ from writer_tools import data_file, read_raw
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.disk import spool
+from wavebatch.files.disk import spool, temp_folders
 from wavebatch.files.disk.protect import protecting, refuse_input
+from wavebatch.files.las import laz_decode
 from wavebatch.files.strip import reader as reader_module
-from wavebatch.files.strip import shared_packets
+from wavebatch.files.strip import scanner, shared_packets
 from wavebatch.files.strip.reader import StripReader
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
@@ -352,6 +354,37 @@ def test_facts_scans_and_units_travel_between_processes(tmp_path, monkeypatch):
         assert facts.digitizers == reader.facts.digitizers
         here, there = reader.read_unit(1, scan), reader.read_unit(1, copy)
         assert here.context_index.tolist() == there.context_index.tolist() != []
+
+
+@pytest.mark.parametrize("case", ["kept", "beyond the limit", "no room"])
+def test_compressed_points_are_decoded_once(tmp_path, monkeypatch, case):
+    """But those beyond a limit, and where there is no room for a temporary file."""
+
+    def refuse(*args, **options):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    calls = []
+
+    def decode(points, rows, decode=laz_decode.LazPoints._decode):
+        calls.append(len(rows))
+        decode(points, rows)
+
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
+    monkeypatch.setattr(spool, "KEPT", 0)
+    if case == "beyond the limit":
+        monkeypatch.setattr(scanner, "_KEPT_BYTES", 150 * 57)
+    if case == "no room":
+        monkeypatch.setattr(temp_folders.tempfile, "mkdtemp", refuse)
+    raw = make_raw(200, most_returns=1)
+    plain, path = raw.write(tmp_path / "a.las"), raw.write(tmp_path / "b.laz")
+    with StripReader(plain) as one, StripReader(path) as two, one.scan() as expected, two.scan() as scan:
+        monkeypatch.setattr(laz_decode.LazPoints, "_decode", decode)
+        for number in range(one.unit_count()):
+            units = one.read_unit(number, expected), two.read_unit(number, scan)
+            assert len({unit.points.tobytes() for unit in units}) == 1
+    assert (len(calls) > 0) == (case != "kept")
+    count = scan.decoded.count
+    assert {"kept": count == 200, "no room": count == 0}.get(case, 0 < count < 200)
 
 
 def test_extra_bytes_and_crs_are_told(tmp_path):

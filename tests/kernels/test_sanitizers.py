@@ -43,7 +43,7 @@ try:
     decompose.decompose_clusters(samples, candidates, clusters, settings)
 except ValueError as error:
     print(error)
-decompose._check = lambda *given: given
+decompose._check = lambda samples, candidates, clusters: (candidates, clusters)
 clusters = clusters._replace(**{{name: field.astype(np.int64) for name, field in clusters._asdict().items()}})
 decompose.decompose_clusters(samples, candidates, clusters, settings)
 """

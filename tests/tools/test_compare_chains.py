@@ -206,7 +206,7 @@ def test_what_the_readme_says_of_the_real_strip(riegl):
     }
     one = match_sides(riegl, *(Contender(name, chains[name]) for name in ("maxima", "asdf")))
     two = match_sides(riegl, *(Contender(name, chains[name]) for name in ("maxima", "adaptive")))
-    assert one.between.counts_a[2] > 0.6 * 2375 and one.between.counts_b[1] > 0.9 * 2375
+    assert one.between.counts_a[2] > 0.55 * 2375 and one.between.counts_b[1] > 0.9 * 2375
     for result in (one, two):
         number, of = result.between.extra_by["flag"]["RINGING_SUSPECT"]
         assert number > 0.97 * of and number > 0.75 * result.between.extra

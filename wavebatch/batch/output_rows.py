@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wavebatch.batch.counts import RunReport, count_flags
-from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable, find_order
+from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable
 from wavebatch.core.errors import StageError
 from wavebatch.core.no_data import count_reasons
+from wavebatch.core.order import find_order
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.disk.raw_bytes import take_records, widen
 from wavebatch.files.las.point_formats import locate, split_numbers
 from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, number_returns
 
@@ -41,7 +42,7 @@ class UnitEchoes:
     table: EchoTable
     """`waveform` is the row of unit.packets; sorted by waveform, then time."""
     nearest: np.ndarray
-    """Index in the file of the packet's return nearest to each echo, i8 (m,)."""
+    """Index in the file of each echo's return; of an echo without one, the nearest of its packet, i8 (m,)."""
     read: np.ndarray
     """Whether a packet of the unit was read, bool (packets,)."""
     direction: np.ndarray
@@ -115,10 +116,14 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
     for block, index, table in results:
         times_read += np.bincount(index, minlength=n)
         direction[index] = block.direction
-        row = find_nearest(table.waveform, table.time, block.returns.waveform, block.returns.time)
+        near = table.attributes["point"].astype(np.int64)
+        free = np.flatnonzero(near < 0)
+        returns = block.returns
+        row = find_nearest(table.waveform[free], table.time[free], returns.waveform, returns.time)
         if np.any(row < 0):
             raise _bug(unit, "an echo lies in a packet of no point")
-        nearest.append(block.returns.point[row])
+        near[free] = returns.point[row]
+        nearest.append(near)
         tables.append((replace(table, waveform=index[table.waveform].astype(np.int32)), 0))
     if np.any(times_read > 1) or np.any(unit.packets.owned & (times_read == 0)):
         raise _bug(unit, "its packets were not read exactly once each")
@@ -169,9 +174,9 @@ def assemble_echoes(
     table = echoes.table.with_flags(EchoFlag.ADDED, point < 0)
     found = np.zeros(len(members.index), bool)
     found[members.find(point[point >= 0])] = True
-    rows = _place_rows(unit, members, table, np.where(point >= 0, point, echoes.nearest), found, owned)
+    rows = _place_rows(unit, members, table, echoes.nearest, found, owned)
 
-    records = members.source[rows.source]
+    records = take_records(members.source, rows.source)
     xyz = np.stack([np.append(table.attributes[name], np.nan)[rows.echo] for name in "xyz"], axis=1)
     packet = np.where(rows.echo >= 0, np.append(table.waveform, -1)[rows.echo], members.packet[rows.source])
     direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0)[packet]

@@ -96,8 +96,8 @@ class BatchResult:
         ]
         timing = {**build_timing(report), "elapsed_seconds": round(self.seconds, 3)}
         head = {"schema": BATCH_SCHEMA, "version": __version__, "strips": strips}
-        advice = {"advice": self.advice} if self.advice else {}
-        return {**head, **advice, **report.to_json(), "timing": timing}
+        advice = self.advice
+        return {**head, **({"advice": advice} if advice else {}), **report.to_json(), "timing": timing}
 
 
 def run_batch(

@@ -143,8 +143,8 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
         timing = result.to_json()["timing"]
         parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["seconds"].items()))
         talk(f"{timing['elapsed_seconds']:.1f} s elapsed" + (f"; of the processes' time: {parts}" if parts else ""))
-        if result.advice:
-            talk(result.advice)
+        if advice := result.advice:
+            talk(advice)
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     is_reported = _write_page(result, batch_options.folder, options) and is_reported

@@ -17,7 +17,7 @@ import numpy
 import scipy
 
 import wavebatch
-from wavebatch.core.processor import describe_processor
+from wavebatch.batch.workers.processor import describe_processor
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.files.disk.raw_bytes import read_exactly
+from wavebatch.files.disk.raw_bytes import read_exactly, take_records
 from wavebatch.files.disk.temp_folders import make_folder, reporting_scratch
 
 MEMORY = 1 << 24
@@ -98,9 +98,10 @@ class Spool:
             return np.zeros(self.buckets + 1, np.int64), np.empty(0, self.dtype)
         bucket = np.concatenate([part for part, _ in pending])
         entries = np.concatenate([part for _, part in pending])
-        order = np.argsort(bucket, kind="stable")
-        starts = np.searchsorted(bucket[order], np.arange(self.buckets + 1))
-        return starts.astype(np.int64), entries[order]
+        if np.any(bucket[1:] < bucket[:-1]):
+            order = np.argsort(bucket, kind="stable")
+            bucket, entries = bucket[order], take_records(entries, order)
+        return np.searchsorted(bucket, np.arange(self.buckets + 1)).astype(np.int64), entries
 
     def _flush(self) -> None:
         starts, entries = self._take_pending()

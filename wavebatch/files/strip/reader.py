@@ -152,7 +152,9 @@ class StripReader(Closing):
     def read_unit(self, number: int, scan: StripScan) -> Unit:
         """Return unit `number` (from 0): its points and their packets; `read_blocks` reads the samples."""
         start, stop = int(scan.borders[number]), int(scan.borders[number + 1])
-        points = self._points.read(start, stop)
+        points = scan.decoded.read(number)
+        if not len(points):
+            points = self._points.read(start, stop)
         judged = self._judge.judge(points, scan.vectors.form, scan.overfull)
         entries = unique_entries(scan.context.read(number))
         near = self._judge.judge(entries["record"], scan.vectors.form, scan.overfull)
@@ -292,20 +294,21 @@ class _Geometry:
         xyz = locate(records, self._facts.header)
         location = widen(records["return_point_wave_location"])
         owner = np.cumsum(counts) - counts
-        toward = read_toward(records[owner], self._unit.vectors.direction, self._unit.vectors.form)
+        lead = take_records(records, owner)
+        toward = read_toward(lead, self._unit.vectors.direction, self._unit.vectors.form)
         owners = self._unit.packets.owner[rows]
         return WaveformBlock(
             digitizer=digitizer,
             samples=samples,
             first=int(owners[0]),
             point=owners,
-            gps_time=widen(records["gps_time"][owner]),
+            gps_time=widen(lead["gps_time"]),
             origin=xyz[owner] + location[owner, None] * toward,
             direction=-PS_PER_NS * toward,
             returns=ReturnTable(
                 np.repeat(np.arange(len(rows), dtype=np.int32), counts), location / PS_PER_NS, self._index[place], xyz
             ),
-            scanner=_read_scanner(records[owner]),
+            scanner=_read_scanner(lead),
             missing=missing,
         )
 

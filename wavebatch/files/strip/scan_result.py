@@ -20,7 +20,7 @@ from wavebatch.files.strip.sample_form import SampleForm
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StripScan(Closing):
-    """Result of one pass over the points; picklable. `close` it (or use `with`) to remove its temporary file."""
+    """Result of one pass over the points; picklable. `close` it (or use `with`) to remove its temporary files."""
 
     points: int
     with_waveform: int
@@ -46,6 +46,8 @@ class StripScan(Closing):
     """Sorted keys, u8, of packets with more points than a pulse can have."""
     context: Spool
     """For each unit the points of other units that share packets with it."""
+    decoded: Spool
+    """Points of the first units of a compressed strip, so that they are decoded once; empty for other units."""
     warnings: tuple[str, ...]
     problems: tuple[str, ...]
     """Reasons why the strip cannot be processed; empty unless the scan was `tolerant`."""
@@ -63,8 +65,9 @@ class StripScan(Closing):
         return tuple(describe_oddities(self.reasons, 0))
 
     def close(self) -> None:
-        """Remove the temporary file."""
+        """Remove the temporary files."""
         self.context.close()
+        self.decoded.close()
 
 
 def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]]) -> str:

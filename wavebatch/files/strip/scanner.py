@@ -7,11 +7,12 @@ Borders depend only on the file, so that results are equal for any number of pro
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from wavebatch.core.errors import InputError
 from wavebatch.files.disk.raw_bytes import take_records
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.las.crs import metres_per_unit
@@ -33,6 +34,8 @@ _PAIRS, _VOTERS = 4096, 256
 _FAR_SAMPLES = 32
 """Units of a shuffled strip that vote again with their context."""
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
+_KEPT_BYTES = 1 << 28
+"""Most bytes of decompressed points that a scan keeps for later passes, in a temporary file."""
 
 
 def scan_strip(facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int) -> StripScan:
@@ -73,6 +76,8 @@ class _Scanner:
         self._borders = [0]
         units = -(-facts.header.point_count // unit_points)
         self._context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
+        self._decoded = Spool(units, facts.dtype)
+        self._keeps = facts.header.compressed
         low, high = facts.packets.offsets
         self._near = NearSharing(low, max(low, high), self._context)
         self._window: list[_Part] = []
@@ -100,8 +105,10 @@ class _Scanner:
                 self._vote_far()
             if len(overfull):
                 self._count_overfull(overfull)
+            self._try_keeping(self._decoded.seal)
         except BaseException:
             self._context.close()
+            self._decoded.close()
             raise
         return self._finish(packets - len(overfull), reach, overfull)
 
@@ -123,7 +130,23 @@ class _Scanner:
             self._borders.append(count)
             yield self._borders[-2], held
 
+    def _keep(self, unit: int, points: np.ndarray) -> None:
+        """Keep the points of a compressed strip: to decode them again takes twenty times as long as to read them."""
+        size = (self._decoded.count + len(points)) * self._decoded.dtype.itemsize
+        self._keeps = self._keeps and size <= _KEPT_BYTES
+        if self._keeps:
+            self._try_keeping(lambda: self._decoded.append(np.full(len(points), unit), points))
+
+    def _try_keeping(self, write: Callable[[], object]) -> None:
+        """Do without the kept points where there is no room for them."""
+        try:
+            write()
+        except InputError:
+            self._decoded.close()
+            self._decoded, self._keeps = Spool(self._decoded.buckets, self._decoded.dtype).seal(), False
+
     def _add_unit(self, start: int, points: np.ndarray) -> None:
+        self._keep(len(self._borders) - 2, points)
         judged = self._judge.judge(points, self._form)
         self._tally.add(points, start, judged)
         rows = np.flatnonzero(judged.usable)
@@ -231,6 +254,7 @@ class _Scanner:
             borders=np.array(self._borders),
             overfull=overfull,
             context=self._context,
+            decoded=self._decoded,
             warnings=(*describe_oddities(reasons, tally.short), *decision.warnings),
             problems=tuple(problems),
             forms=find_forms(facts.digitizers, self._packets, self._sample),

@@ -1,7 +1,9 @@
 /* Elementary functions and small systems of equations for Python: NumPy's depend on the processor and on its BLAS. */
 
 EXPORT int64_t exponentials(int64_t n, const double *x, double *out) {
-    for (int64_t i = 0; i < n; i++) out[i] = exp_double(x[i]);
+    int64_t i = 0;
+    for (; i + LANES <= n; i += LANES) *(wide *)(out + i) = exp_wide(*(const wide *)(x + i));
+    for (; i < n; i++) out[i] = exp_double(x[i]);
     return 0;
 }
 

@@ -142,12 +142,12 @@ EXPORT int64_t find_maxima(const Block *b, int64_t n, const Detector *d, int64_t
     for (; w >= 0 && w < n; w++) {
         const float least = (float)d->threshold * b->std[w];
         int64_t here = total;
-        float highest = 0;
+        int is_high = 0;
         if (!read_signal(b, w, r.signal)) continue;
         if (d->broad > 0) filter_symmetric(s, r.signal, d->taps, d->reach, r.smoothed);
         else smooth_121(s, r.signal, r.smoothed);
-        for (int64_t i = 0; i < s; i++) highest = r.smoothed[i] > highest ? r.smoothed[i] : highest;
-        if (!(highest > least)) continue; /* one more pass only lowers it */
+        for (int64_t i = 0; i < s; i++) is_high |= r.smoothed[i] > least;
+        if (!is_high) continue; /* one more pass only lowers it */
         if (d->broad > 0) memcpy(r.even, r.smoothed, s * sizeof(float));
         else smooth_121(s, r.smoothed, r.even);
         for (int64_t i = 0; i < s && here < out->room; i++)

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.order import group_medians
+from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
@@ -83,18 +84,11 @@ def stack_pulse(
     used = (lag >= -before) & (lag <= after) & np.isfinite(signal)
     values = ((signal + _dither(time, signal.shape[1], std)) / amplitude[:, None])[used]
     bins = np.floor((lag[used] + before) / step).astype(np.int64)
-    order = np.argsort(bins, kind="stable")
-    bins, values = bins[order], values[order]
-    starts = np.flatnonzero(np.r_[True, np.diff(bins) > 0])
-    stack = []
-    for begin, end in zip(starts, np.r_[starts[1:], len(bins)], strict=True):
-        part = values[begin:end]
-        if len(part) >= LEAST_BIN:
-            middle = np.median(part)
-            spread = MAD_TO_STD * np.median(np.abs(part - middle))
-            centre = (bins[begin] + 0.5) * step - before
-            stack.append((centre, middle, MEDIAN_ERROR * max(spread, least) / np.sqrt(len(part))))
-    return Stack(*np.array(stack).reshape(-1, 3).T)
+    middle, spread = group_medians(values, bins)
+    number = np.bincount(bins)
+    kept = np.flatnonzero(number >= LEAST_BIN)
+    error = MEDIAN_ERROR * np.maximum(spread[kept], least) / np.sqrt(number[kept])
+    return Stack((kept + 0.5) * step - before, middle[kept].astype(np.float64), error)
 
 
 def _dither(time: np.ndarray, length: int, std: float) -> np.ndarray:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.core.order import find_order
+
 LONGEST_PULSE = 64
 """From this many points of equal GPS time on, the time is a constant and not that of one pulse."""
 
@@ -59,7 +61,9 @@ def find_nearest(
     # Most waveforms have one return: only the others need an order.
     echoes = np.flatnonzero(number[echo_waveform] > 1)
     if len(echoes):
-        returns = np.flatnonzero(number[return_waveform] > 1)
+        asked = np.zeros(len(number), bool)
+        asked[echo_waveform[echoes]] = True
+        returns = np.flatnonzero(asked[return_waveform])
         found = _find_nearest_of_many(
             echo_waveform[echoes], echo_time[echoes], return_waveform[returns], return_time[returns]
         )
@@ -112,15 +116,18 @@ def number_returns(
     """
     m = len(pulse)
     has_ray = np.any(direction != 0, axis=1)
-    grouped = np.lexsort((~has_ray, pulse))
+    grouped = np.argsort(pulse, kind="stable")
     is_first = np.append(True, pulse[grouped][1:] != pulse[grouped][:-1])[:m]
+    first = np.flatnonzero(is_first)
     group = np.empty(m, np.int64)
     group[grouped] = np.cumsum(is_first) - 1
-    head = grouped[is_first][group]
+    with_ray = np.minimum.reduceat(np.where(has_ray[grouped], np.arange(m), m), first) if m else first
+    head = grouped[np.where(with_ray < m, with_ray, first)][group]
     away = xyz - xyz[head]
     ray = direction[head]
     along = away[:, 0] * ray[:, 0] + away[:, 1] * ray[:, 1] + away[:, 2] * ray[:, 2]
-    order = np.lexsort((along, group))
+    order = find_order(group, along)
+    order = np.arange(m) if order is None else order
     number = np.empty(m, np.int64)
-    number[order] = np.arange(m) - np.flatnonzero(is_first)[group[order]] + 1
+    number[order] = np.arange(m) - first[group[order]] + 1
     return number, np.bincount(group)[group], has_ray[head]

@@ -37,10 +37,15 @@ def match_returns(
     matched = np.full(len(echo_waveform), -1, np.int64)
     if not len(echo_waveform) or not len(return_waveform):
         return matched
+    size = int(max(echo_waveform[-1], return_waveform[-1])) + 1
+    lone = (np.bincount(echo_waveform, minlength=size) == 1) & (np.bincount(return_waveform, minlength=size) == 1)
+    many_echoes, many_returns = np.flatnonzero(~lone[echo_waveform]), np.flatnonzero(~lone[return_waveform])
+    alone, one = np.flatnonzero(lone[echo_waveform]), np.flatnonzero(lone[return_waveform])
+    matched[alone] = np.where(np.abs(echo_time[alone] - return_time[one]) <= tolerance, one, -1)
     longest = max(np.abs(echo_time).max(), np.abs(return_time).max(initial=0.0))
     stride = 4.0 * (longest + tolerance) + 1.0
-    echoes = np.argsort(echo_waveform * stride + echo_time, kind="stable")
-    returns = np.argsort(return_waveform * stride + return_time, kind="stable")
+    echoes = _sort(many_echoes, echo_waveform * stride + echo_time)
+    returns = _sort(many_returns, return_waveform * stride + return_time)
     while len(echoes) and len(returns):
         echo_key = echo_waveform[echoes] * stride + echo_time[echoes]
         return_key = return_waveform[returns] * stride + return_time[returns]
@@ -54,6 +59,10 @@ def match_returns(
         taken[to_return[pair]] = True
         echoes, returns = echoes[~pair], returns[~taken]
     return matched
+
+
+def _sort(rows: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    return rows[np.argsort(keys[rows], kind="stable")]
 
 
 def _nearest(keys: np.ndarray, others: np.ndarray) -> np.ndarray:

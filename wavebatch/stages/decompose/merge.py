@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
@@ -96,21 +94,22 @@ def _merge(table: EchoTable, first: np.ndarray) -> EchoTable:
     variance = share * (a.sigma**2 + (a.time - time) ** 2) + (1 - share) * (b.sigma**2 + (b.time - time) ** 2)
     sigma = np.sqrt(variance)
     relative = np.minimum(a.amplitude_err / a.amplitude, b.amplitude_err / b.amplitude)
-    merged = replace(
-        a,
-        time=time,
-        amplitude=(total / sigma).astype(np.float32),
-        sigma=sigma.astype(np.float32),
-        time_err=np.minimum(a.time_err, b.time_err),
-        amplitude_err=(relative * total / sigma).astype(np.float32),
-        sigma_err=np.minimum(a.sigma_err, b.sigma_err),
-        relative_energy_err=np.minimum(a.relative_energy_err, b.relative_energy_err),
-        flags=(a.flags | b.flags | np.uint16(EchoFlag.MERGED)).astype(np.uint16),
-    )
+    merged = {
+        "time": time,
+        "amplitude": total / sigma,
+        "sigma": sigma,
+        "time_err": np.minimum(a.time_err, b.time_err),
+        "amplitude_err": relative * total / sigma,
+        "sigma_err": np.minimum(a.sigma_err, b.sigma_err),
+        "relative_energy_err": np.minimum(a.relative_energy_err, b.relative_energy_err),
+        "flags": a.flags | b.flags | np.uint16(EchoFlag.MERGED),
+    }
     keep = np.ones(len(table), bool)
-    keep[first] = keep[first + 1] = False
+    keep[first + 1] = False
     rest = table.take(np.flatnonzero(keep))
-    return join_tables(rest, merged)
+    for name, values in merged.items():  # between its neighbours: the order stays
+        getattr(rest, name)[first - np.arange(len(first))] = values
+    return rest
 
 
 def join_tables(*tables: EchoTable) -> EchoTable:

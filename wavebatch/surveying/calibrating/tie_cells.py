@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.order import group_medians
+from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.core.waveforms import angle_to_vertical
 from wavebatch.kernels.geometry.planes import fit_planes
 
@@ -120,11 +121,11 @@ def measure_ties(rows: np.ndarray, size: float, slope: float | None = None) -> T
     )
     if not len(rows):
         return measure_ties(rows, size)
-    _, at, number = np.unique(pair, return_index=True, return_counts=True)
-    middle, spread = _medians(value, pair)
+    _, at, group, number = np.unique(pair, return_index=True, return_inverse=True, return_counts=True)
+    middle, spread = group_medians(value, group)
     _, cells = np.unique(kept_cell[at], return_inverse=True)
     centre = (np.floor(rows["xyz"][at, :2] / size) + 0.5) * size
-    height, _ = _medians(off, pair)
+    height, _ = group_medians(off, group)
     error = MEDIAN_ERROR * np.maximum(spread, 1e-3) / np.sqrt(number)
     view = _describe_view(rows, facing, at + number // 2)
     return Ties(cells, rows["source"][at], middle, error, height, tilt[at], centre.astype(np.float64), size, view)
@@ -183,16 +184,3 @@ def _means(xyz: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Mean of the rows of each group, f8 (groups, 3)."""
     count = np.bincount(group)
     return np.stack([np.bincount(group, xyz[:, axis]) / count for axis in range(3)], axis=1)
-
-
-def _medians(value: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Median and robust standard deviation of the values of each pair; pairs are in order."""
-    _, group, count = np.unique(pair, return_inverse=True, return_counts=True)
-    start = np.cumsum(count) - count
-
-    def middle(values: np.ndarray) -> np.ndarray:
-        ordered = values[np.lexsort((values, group))]
-        return 0.5 * (ordered[start + (count - 1) // 2] + ordered[start + count // 2])
-
-    median = middle(value)
-    return median, MAD_TO_STD * middle(np.abs(value - median[group]))

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
@@ -366,8 +365,10 @@ def compare_pulses(a: SystemPulse, b: SystemPulse) -> float:
     reach = 30.0 * max(a.sigma_ref, b.sigma_ref)
     lag = np.arange(-reach, reach, step)
     first, second = draw_pulse(a, lag), draw_pulse(b, lag)
-    together = float(scipy.signal.correlate(first, second, mode="full", method="fft").max())
-    share = together**2 / float((first @ first) * (second @ second))
+    size = 2 * len(lag)  # zeros after the pulses, so that shifts do not wrap around
+    spectrum = np.fft.rfft(first, size) * np.conj(np.fft.rfft(second, size))
+    together = float(np.fft.irfft(spectrum, size).max())
+    share = together**2 / float(np.sum(first * first) * np.sum(second * second))
     return float(np.sqrt(max(1.0 - share, 0.0)))
 
 

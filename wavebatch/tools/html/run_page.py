@@ -126,8 +126,8 @@ def _summary(result: BatchResult, counts: dict[str, Any]) -> str:
     cards[-1:-1] = [("left out", f"{left:,}")] if left else []
     body = "".join(f'<div class="card"><b>{markup.text(value)}</b>{markup.text(name)}</div>' for name, value in cards)
     lines = [f"{states.count('skipped')} of the strips were up to date (--resume)."] if "skipped" in states else []
-    if result.advice:
-        lines.append(result.advice)
+    if advice := result.advice:
+        lines.append(advice)
     return markup.section("Summary", f'<div class="cards">{body}</div>', *map(markup.paragraph, lines))
 
 

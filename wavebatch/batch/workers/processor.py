@@ -18,7 +18,7 @@ import numpy as np
 
 from wavebatch.core.memory import ONE_THREAD
 
-_PROBE = "from wavebatch.core.processor import probe_arithmetic; print(probe_arithmetic())"
+_PROBE = "from wavebatch.batch.workers.processor import probe_arithmetic; print(probe_arithmetic())"
 
 _SIZES = ((3, 40), (13, 80), (19, 200), (64, 300))
 """Parameters and samples of the systems that are solved: from one echo in a window to the stack of a pulse."""

@@ -6,14 +6,14 @@ import sys
 
 import pytest
 
-from wavebatch.core.processor import describe_processor, probe_arithmetic
+from wavebatch.batch.workers.processor import describe_processor, probe_arithmetic
 from wavebatch.tools.simulate import simulate_strip
 
 KINDS = ("Haswell", "SkylakeX", "Prescott")
 
 
 def _probe(kind):
-    code = "from wavebatch.core.processor import probe_arithmetic; print(probe_arithmetic())"
+    code = "from wavebatch.batch.workers.processor import probe_arithmetic; print(probe_arithmetic())"
     env = {**os.environ, "OPENBLAS_CORETYPE": kind, "OPENBLAS_NUM_THREADS": "1"}
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env).stdout
 
@@ -25,7 +25,7 @@ def test_the_probe_is_the_same_each_time():
 
 
 def test_threads_are_no_other_kind():
-    code = "from wavebatch.core.processor import describe_processor; print(describe_processor()['probe'])"
+    code = "from wavebatch.batch.workers.processor import describe_processor; print(describe_processor()['probe'])"
     found = set()
     for threads in ("1", "2", "4"):
         env = {**os.environ, "OPENBLAS_NUM_THREADS": threads}
