@@ -58,6 +58,9 @@ class Sensor:
     """Relative standard deviation of the energy of shots."""
     store_energy: bool = False
     """Write the energy of each shot as the extra byte `pulse_energy`."""
+    vendor: str = ""
+    """Write reflectances of surfaces that face the sensor, with 5 % noise, as the extra byte Reflectance: dB, share or
+    percent."""
     bits: int = 16
     spacing: float = 1.0
     n_samples: int = 80
@@ -115,7 +118,8 @@ def write_strip(path: Path, facets: Sequence[Facet], sensor: Sensor, pulses: int
     clean = np.rint(20.0 + wave + sensor.noise * rng.standard_normal(wave.shape))
     samples = np.clip(clean, 0, (1 << sensor.bits) - 1).astype(np.uint16 if sensor.bits > 8 else np.uint8)
     hit = (strength * distance).sum(axis=1) / strength.sum(axis=1)
-    _write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy)
+    facing = (strength * distance**2 * 10.0 ** (2e-4 * AIR * distance)).sum(axis=1) / sensor.light
+    _write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy, facing)
     return path
 
 
@@ -169,13 +173,15 @@ def _render(time: np.ndarray, strength: np.ndarray, sensor: Sensor) -> np.ndarra
     return wave
 
 
-def _write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy) -> None:
+def _write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy, facing) -> None:
     indices = [1] if sensor.scanners else list(sensor.gains)
     digitizers = [
         Digitizer(index, sensor.bits, sensor.n_samples, sensor.spacing, sensor.descriptor_gain) for index in indices
     ]
     kind = {"version": "1.4", "point_format": 9} if sensor.scanners else {"version": "1.3", "point_format": 4}
     extra = [ExtraRecord.build("pulse_energy", "f4", "")] if sensor.store_energy else []
+    if sensor.vendor:
+        extra.append(ExtraRecord.build("Reflectance", "i2", "dB", no_data=-32768, scale=0.01))
     with FullwaveWriter(
         path, internal=True, digitizers=digitizers, offsets=(EAST, NORTH, 0.0), overwrite=True, extra_bytes=extra,
         **kind,
@@ -190,8 +196,13 @@ def _write(path, sensor, origin, ray, seconds, channel, samples, first, hit, ene
             points[name] = np.rint((origin + hit[:, None] * ray)[:, axis] / 0.001)
             points["xyz"[axis] + "_t"] = -ray[:, axis] * C_AIR / 1000.0
         points["gps_time"] = sensor.time + seconds
-        if extra:
+        if sensor.store_energy:
             points["pulse_energy"] = energy
+        if sensor.vendor:
+            facing = facing * (1 + 0.05 * np.random.default_rng(9).standard_normal(len(facing)))
+            value = {"dB": 10 * np.log10(facing), "share": facing, "percent": 100 * facing}[sensor.vendor]
+            points["Reflectance"] = np.rint(100 * value)
+            points["Reflectance"][::7] = -32768
         points["bit_fields"] = 1 | (1 << (4 if sensor.scanners else 3))
         heading = np.radians(sensor.heading)
         across = np.degrees(np.arctan2(ray @ [-np.cos(heading), np.sin(heading), 0.0], -ray[:, 2]))

@@ -24,8 +24,8 @@ INSIDE = {
         {"processor"}, {"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"},
     ],
     "surveying": [
-        {"measuring"}, {"flat_ground"}, {"survey", "sensor"},
-        {"system_file", "auto_chain", "predict_error"}, {"outgoing"},
+        {"measuring"}, {"flat_ground", "predict_error"}, {"hidden_neighbours"}, {"survey", "sensor"},
+        {"system_file", "auto_chain"}, {"outgoing"},
         {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"prepare"},
     ],
 }

@@ -256,7 +256,8 @@ def test_angles_of_simulated_slopes():
         made = simulate_pulses(scene, 2000, np.random.default_rng(part), first=2003 * part)
         block = with_sensor(made)
         # On slopes alone the system's width cannot be measured: level ground elsewhere, or SYSTEM.toml, must say it.
-        known = {"sigma_ref": scene.recording.pulse.sigma, "divergence": scene.divergence}
+        # So must the scatter of widths, which is measured below the system's width: slopes have moved that by 0.015 ns.
+        known = {"sigma_ref": scene.recording.pulse.sigma, "divergence": scene.divergence, "width_scatter": 0.0}
         system = system or replace(survey_block(block).system, **known)
         echoes = chain.run(block, system)
         true = np.degrees(made.rays.incidence)[echoes.waveform]
@@ -264,10 +265,10 @@ def test_angles_of_simulated_slopes():
         errors.append(echoes.attributes["incidence_angle_err"])
     off, errors = np.concatenate(off), np.concatenate(errors)
     known = np.isfinite(off)
-    assert 0.38 < known.mean() < 1.0
+    assert 0.45 < known.mean() < 1.0
     assert np.median(np.abs(off[known])) == pytest.approx(np.median(0.6745 * errors[known]), rel=0.2)
     # Intervals of echoes that just passed the limit are longer towards 0, but one number stands for both sides.
-    assert np.mean(np.abs(off[known]) < errors[known]) == pytest.approx(0.683, abs=0.11)
+    assert np.mean(np.abs(off[known]) < errors[known]) == pytest.approx(0.683, abs=0.08)
 
 
 def test_an_infrared_beam_has_no_angles():

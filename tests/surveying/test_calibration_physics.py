@@ -12,8 +12,8 @@ from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibrating.target_file import Target
-from wavebatch.surveying.calibrating.targets import CalibrationOptions
 
 RINGING = ((1.0, 0.0, 2.0), (0.06, 9.0, 2.2), (0.03, 16.0, 2.5))
 TAIL = ((1.0, 0.0, 2.0), (0.3, 3.0, 3.0))
@@ -295,7 +295,7 @@ def test_descriptors_that_differ_in_length_only_share_a_constant(tmp_path, chann
     ("change", "message", "least"),
     [
         ({"time": START + 5 * 86400.0}, "measured on 2021-03-17, this strip was flown on 2021-03-22", 0.035),
-        ({"time": START + 90 * 86400.0}, "grows by 5 %", 0.055),
+        ({"time": START + 90 * 86400.0}, "grows by 7 %, 5 % of it for the air", 0.07),
         ({"height": 1400.0, "light": 4.8e8}, "measured at 701 m, this strip is 14", 0.03),
         ({"pulse": ((1.0, 0.0, 2.2),)}, "the pulse of this strip is 5.", 0.09),
     ],
@@ -355,3 +355,32 @@ def test_a_trajectory_that_is_too_low_is_named_and_in_the_error(tmp_path):
     assert done.exit_code == 0 and "warning" not in done.stderr
     found = load_calibration(cal)
     assert found.constant == pytest.approx(constant_of(sensor), rel=0.002) and found.relative_error < 0.031
+
+
+@pytest.mark.quick_cases("dB")
+@pytest.mark.parametrize("vendor", ["dB", "share"])
+def test_a_vendors_column_of_reflectances_is_an_anchor(tmp_path, vendor):
+    sensor = Sensor(vendor=vendor, divergence=0.3e-3)
+    ground = [Facet(0.15, inside=box(0, -300, 60, 300)), Facet(0.5, slope=(0.3, 0.0), z0=-9.0, centre=(30.0, 0.0))]
+    strip = write_strip(tmp_path / "s.las", ground, sensor, 12_000)
+    done = call("calibrate", strip, "--from-column", "Reflectance", "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 0, done.output
+    row = load_calibration(tmp_path / "cal.toml").channels[0]
+    assert row.constant == pytest.approx(constant_of(sensor), rel=0.01)
+    assert 0.04 < row.spread < 0.07 and 0.03 < row.relative_error < 0.05
+    assert f"spread {100 * row.spread:.1f} %" in done.stderr and "incidence" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "message"),
+    [
+        ({"vendor": "percent"}, "Reflectance", "it holds neither dB nor shares of 1"),
+        ({"vendor": "dB"}, "reflectanse", "--from-column: no extra byte is called 'reflectanse'; did you mean"),
+    ],
+)
+def test_a_column_that_is_no_reflectance_is_refused(tmp_path, change, name, message):
+    strip = write_strip(tmp_path / "s.las", [Facet(0.3)], Sensor(**change), 1500)
+    done = call("calibrate", strip, "--from-column", name, "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 1 and message in done.stderr and not (tmp_path / "cal.toml").exists()
+    done = call("calibrate", strip, "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 2 and "give --targets FILE, or --from-column NAME" in done.stderr

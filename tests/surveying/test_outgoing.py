@@ -7,7 +7,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.pulse_energy import find_pulse_energy, read_blocks
+from wavebatch.files.pulse_energy import find_pulse_energy
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
@@ -126,7 +126,11 @@ def strip(tmp_path, rng):
 def _filled(path, request):
     with StripReader(path) as reader, reader.scan() as scan:
         energy = find_pulse_energy(reader, scan, request)
-        blocks = list(read_blocks(reader, scan, 128, energy))
+        blocks = [
+            block if energy is None else energy.fill(block, unit)
+            for unit in reader.read_units(scan)
+            for block, _ in reader.read_blocks(unit, 128, owned_only=True)
+        ]
     if energy is None:
         assert all(block.pulse_energy is None for block in blocks)
         return None

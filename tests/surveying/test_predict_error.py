@@ -83,7 +83,7 @@ def test_what_is_simulated_again_holds_the_echoes_noise_and_clipping():
     system = replace(system, noise_gain=0.05, saturation=200.0)
     waveform = np.arange(4000)
     echoes = EchoTable.build(waveform, np.full(4000, 30.0), np.where(waveform % 2, 100.0, 400.0), np.full(4000, 2.0))
-    again = simulate_again(block, system, echoes, np.random.default_rng(1))
+    again, _ = simulate_again(block, system, echoes, np.random.default_rng(1))
     assert again.samples.dtype == np.uint8 and again.samples.max() == 200
     quiet, peak = again.samples[:, :15].astype(float), again.samples[1::2, 30].astype(float)
     assert quiet.mean() == pytest.approx(system.baseline, abs=0.05)

@@ -44,6 +44,7 @@ SYSTEM = SystemPulse(
     recovery=42.0,
     tail_misfit=((-9.3, 0.0021), (5.574348636365153, 0.1 + 0.2)),
     misfit=0.1 / 3,
+    hidden=((0.035, 1 / 7, 0.0), (0.07, 0.1 + 0.2, 1e-9)),
 )
 SURVEY = Survey(
     SYSTEM,
@@ -101,7 +102,7 @@ def test_figures_that_are_no_numbers_are_left_out():
 
 def test_every_number_of_the_system_has_a_key():
     fields = {quantity.field for quantity in QUANTITIES.values()} | {"noise_by_kind", "components", "digitizers"}
-    fields |= {"correlation", "tail_misfit", "pattern"}
+    fields |= {"correlation", "tail_misfit", "pattern", "hidden"}
     # Of a calibration and of the sensor's position, which come with files of their own.
     elsewhere = {"calibration", "calibration_err", "channels", "attenuation", "sensor_error", "shot_error"}
     elsewhere |= {"attenuation_error", "swath"}
@@ -130,11 +131,11 @@ def test_without_saturation_nothing_clips():
 
 
 def test_files_of_earlier_versions_are_read():
-    """They have no correlation, no tail and no misfit."""
-    text = re.sub(r"^(correlation|tail_misfit|misfit) = .*\n", "", TEXT, flags=re.M)
-    assert text.count("\n") == TEXT.count("\n") - 3
+    """They have no correlation, no tail, no misfit and nothing of hidden neighbours."""
+    text = re.sub(r"^(correlation|tail_misfit|misfit|hidden) = .*\n", "", TEXT, flags=re.M)
+    assert text.count("\n") == TEXT.count("\n") - 4
     system = parse_survey(text, "x").survey.system
-    assert system == replace(SYSTEM, correlation=(), tail_misfit=(), misfit=0.0)
+    assert system == replace(SYSTEM, correlation=(), tail_misfit=(), misfit=0.0, hidden=())
 
 
 @pytest.mark.parametrize(

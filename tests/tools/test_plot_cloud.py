@@ -553,3 +553,25 @@ def test_small_groups_are_one_series(tmp_path):
     alone = np.repeat([1, 2], [4995, 5]).astype("u1")
     lone = write_cloud(tmp_path / "d.las", n=5000, group=(alone, None, None, "-"))
     assert count_values([lone], Selection("z"), by="group").names == ("group 1", "group 2"), "one has no company"
+
+
+def test_more_than_six_groups_have_axes_of_their_own(tmp_path):
+    matplotlib = pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    from wavebatch.tools.plots import draw_cloud
+
+    group = np.repeat(np.arange(8), 625).astype("u1")
+    path = write_cloud(tmp_path / "c.las", n=5000, group=(group, None, None, "-"))
+    found = count_values([path], Selection("z"), by="group")
+    parts = draw_cloud._split_series(found)
+    assert [part.names for part in parts] == [(f"group {number}",) for number in range(8)]
+    assert [part.total.values for part in parts] == [625] * 8 and found.total.values == 5000
+    assert all((part.counts == found.counts[row]).all() for row, part in enumerate(parts))
+    drawn = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda figure, *args, **more: drawn.extend(figure.axes) or args[0].write(b"x"))
+        draw_cloud.draw_histograms([found], tmp_path / "h.png")
+    assert len(drawn) == 8 and matplotlib
+    few = count_values([path], Selection("z"), by=None)
+    assert draw_cloud._split_series(few) == [few]

@@ -13,6 +13,7 @@ from plot_tools import PULSE, make_chain, simulate
 from strips import make_raw
 
 from wavebatch.cli import main
+from wavebatch.core.condition import parse_condition
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import WaveformBlock
@@ -31,7 +32,7 @@ from wavebatch.tools.plots.draw_sheet import draw_sheet
 from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels, draw_waveforms
 from wavebatch.tools.plots.echo_table import list_echoes
 from wavebatch.tools.plots.labels import place_labels
-from wavebatch.tools.plots.packets import MOST, Wanted, find_places
+from wavebatch.tools.plots.packets import MOST, Place, Wanted, find_places
 from wavebatch.tools.plots.waveform import add_ranges, build_views, read_views
 
 KAPPA = 0.15
@@ -194,6 +195,8 @@ def test_without_a_wish_a_few_are_spread_over_the_strip(tiny_strip):
         ("--gps-time 3", 2, "no pulse lies within"),
         ("--flags SATURATED --packet 3", 2, "--flags"),
         ("--flags SATURATD", 2, "did you mean 'SATURATED'"),
+        ("--where amplitude>1 --point 3", 2, "--where chooses the waveforms"),
+        ("--where amplitud>1", 2, "did you mean 'amplitude'"), ("--where amplitude>1e6", 1, "no echo meets"),
         ("--profile fastt", 2, "did you mean 'fast'"),
         ("--times 5", 2, "LOW:HIGH"),
         ("--chain none.toml", 2, "none.toml"),
@@ -332,6 +335,10 @@ def test_echoes_are_listed_and_written(tiny_strip, tmp_path):
     assert refused.exit_code == 1 and "--overwrite" in refused.stderr
     text = list_echoes(views, most=3)
     assert "more: -o FILE.csv" in text and "packet" in text.split("\n")[0]
+    errors = [view.echoes.amplitude * 1e-6 for view in views]
+    long = [replace(view, echoes=replace(view.echoes, amplitude_err=e)) for view, e in zip(views, errors, strict=True)]
+    lines = list_echoes([*long[:2], *views[2:]]).split("\n")
+    assert len({line.rindex("  ") for line in lines}) == 1, "flags start in one column"
 
 
 def test_real_waveforms(riegl, leica, tmp_path):
@@ -424,6 +431,21 @@ def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):
     draw_sheet(views, tmp_path / "s.svg", strip="a.las", chain="test")
     text = (tmp_path / "s.svg").read_text("utf-8")
     assert "SATURATED" in text and "no echo" in text and "3 waveforms" in text
+
+
+def test_waveforms_are_those_with_an_echo_that_meets_a_condition(tiny_strip):
+    chain = load_profile("balanced")
+    condition = parse_condition("number_of_returns >= 2 and not echo_width > 5 and not flag(WEAK)")
+    with StripReader(tiny_strip) as reader, reader.scan() as scan:
+        places = find_places(reader, scan, Wanted(where=condition, most=4), lambda block: chain.run(block, PULSE))
+        every = [Place(unit.number, row, -1) for unit in reader.read_units(scan)
+                 for row in np.flatnonzero(unit.packets.owned)[:400].tolist()]  # fmt: skip
+        meets = []
+        for place, view in zip(every, read_views(reader, scan, every, chain, PULSE), strict=True):
+            good = (view.echoes.attributes["echo_width"] <= 5) & ((view.echoes.flags & EchoFlag.WEAK) == 0)
+            if len(view.echoes) >= 2 and good.any():
+                meets.append((place.unit, place.row))
+    assert len(places) == 4 and [(place.unit, place.row) for place in places] == meets[:4]
 
 
 def test_a_listed_range_has_the_error_of_the_sensor_too(tiny_strip):

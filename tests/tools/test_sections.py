@@ -1,6 +1,7 @@
 """`plot section`, `plot profile`, `slice --cube` and `plot cube`: what is drawn equals a plain count."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -364,3 +365,19 @@ def test_level_segments_on_an_edge_lie_above_it(tmp_path):
     sums = dict(zip(found.edges[:-1].tolist(), found.values[0].tolist(), strict=True))
     assert [sums[edge] for edge in (100.0, 102.0, 104.0)] == pytest.approx([1, 2, 12])
     assert found.values.sum() == pytest.approx(15)
+
+
+def test_tails_of_voxels_are_not_drawn(voxels):
+    """Less than 2 % of the scale would look as solid as the ground."""
+    from types import SimpleNamespace
+
+    from wavebatch.tools.plots import draw_section
+
+    found = cut_section([voxels[0]], Selection("energy"), line=(10.0, 30.0, 30.0, 30.0), width=0.5)
+    value = np.where(np.arange(len(found.value)) % 2, 50.0, 0.5)
+    axes = SimpleNamespace(grid=lambda **_: None, imshow=lambda image, **_: image)
+    for name, faint in (("energy", False), ("count", True)):
+        facts = replace(found.facts, name=name)
+        image, _ = draw_section._draw_voxels(axes, replace(found, value=value, facts=facts, shown=(0.0, 60.0)))
+        assert bool((image == 0.5).any()) is faint and (image == 50.0).any()
+    assert any("below 2 %" in part for part in draw_section._parts(found, 1.0))

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import EAST, GROUND, NORTH, Flight
-from wavebatch.tools.slices import lines
+from wavebatch.tools.slices import lines, output
 from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
 from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
 
@@ -339,3 +340,24 @@ def test_lines_with_as_many_segments_as_allowed_are_counted_and_said(riegl, tmp_
     found = json.loads(few.stdout)
     assert found["full"] == found["segments"] > 0 and f"{found['full']} scan lines may have more" in few.stderr
     assert json.loads(many.stdout)["full"] == 0 and "may have more" not in many.stderr
+
+
+def test_fill_between_recordings_is_no_sample():
+    samples = np.full((5, 60), 12, np.uint8)
+    samples[:, 20] = 90
+    missing = np.zeros((5, 60), bool)
+    missing[:, 30:40] = True
+    block = replace(WaveformBlock.from_samples(samples, bits=8, spacing=2.0), missing=missing)
+    line = lines._build_line(0, lines._shape(block))
+    assert len(line.value) == 5 * 50 and sorted(set(line.time)) == [2.0 * k for k in range(60) if not 30 <= k < 40]
+
+
+def test_a_picture_of_a_slice_ends_near_the_signal(strip):
+    line = read_all(strip)[2]
+    piece = cut_slice(line, SliceOptions(geometry="time"))
+    image, extent = output._paint(piece)
+    loud = line.value > line.value.std()
+    low, high = piece.x[loud].min() * piece.pixel, piece.x[loud].max() * piece.pixel
+    every = np.ptp(piece.x) * piece.pixel
+    assert extent[0] < low and high < extent[1] and extent[1] - extent[0] < min(1.4 * (high - low), 0.95 * every)
+    assert np.isfinite(image).any(axis=1).all()

@@ -22,22 +22,26 @@ from wavebatch.files.inputs import find_files
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
     from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
-    from wavebatch.surveying.calibrating.targets import CalibrationOptions
+    from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
     from wavebatch.surveying.calibration import ChannelConstant, StripConstant, TargetResult
 
 
 @click.command()
 @click.argument("strips", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP...")
 @shared.declared("recursive")
-@shared.file_option("--targets", required=True,
+@shared.file_option("--targets",
                     text="Targets: GeoJSON polygons with the property reflectance, in WGS 84, in the CRS that the file "
                     "names, or in the coordinates of the strips; or CSV with reflectance and x, y, radius or vertices, "
                     "in the coordinates of the strips only.")
+@click.option("--from-column", "column", metavar="NAME",
+              help="In place of targets: an extra byte with the vendor's reflectances, in dB or as shares of 1.")
 @shared.output_option("Calibration file to write.", "CAL.toml")
 @click.option("--reflectance-error", type=click.FloatRange(0.0, 1.0), default=0.03, show_default=True, metavar="SHARE",
-              help="Relative standard deviation of the reflectances of the targets.")
-@click.option("--attenuation", type=click.FloatRange(0.0, 100.0), default=0.22, show_default=True, metavar="DB/KM",
-              help="Attenuation of the air, one way [dB/km].")
+              help="Relative standard deviation of the reflectances of the targets, or of the column.")
+@click.option("--attenuation", type=click.FloatRange(0.0, 100.0), metavar="DB/KM",
+              help="Attenuation of the air, one way [dB/km].  [default: 0.22 at 1064 nm]")
+@click.option("--wavelength", type=click.FloatRange(300.0, 2500.0), default=1064.0, show_default=True, metavar="NM",
+              help="Of the laser [nm]: clear air takes more of short waves where --attenuation is not given.")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]; cross sections need it.")
 @click.option("--scan-angle", is_flag=True,
@@ -52,7 +56,12 @@ if TYPE_CHECKING:
 @shared.html_option
 @shared.common_options("overwrite", "json")
 def calibrate(
-    strips: tuple[Path, ...], targets: Path, output: Path, html_file: Path | None, overwrite: bool, **options: Any
+    strips: tuple[Path, ...],
+    targets: Path | None,
+    output: Path,
+    html_file: Path | None,
+    overwrite: bool,
+    **options: Any,
 ) -> None:
     """Find the calibration constants of STRIPs over targets of known reflectance, for `wavebatch run --calibration`.
 
@@ -62,6 +71,8 @@ def calibrate(
     Used are echoes that are alone in their waveform, lie on the plane of a target, and have their whole footprint
     inside its outline. The incidence angle comes from that plane, unless the target file gives it; targets that do not
     say are refused by name. Pulse and chain are chosen as `wavebatch run` chooses them.
+
+    Without targets, --from-column takes the sensor vendor's own reflectances; the spread says how well they agree.
 
     Several strips of a flight are calibrated together: flat places where strips or channels overlap tie those without
     a target to those with one. Each strip gets its constant, its drift, and their errors.
@@ -74,6 +85,8 @@ def calibrate(
     from wavebatch.surveying.calibrating.calibration_file import format_calibration
     from wavebatch.surveying.calibrating.target_file import load_targets
 
+    if (targets is None) == (options["column"] is None):
+        raise click.UsageError("give --targets FILE, or --from-column NAME, and not both")
     paths = find_files(map(str, strips), recursive=options["recursive"])
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
         for target in filter(None, (output, options["report"], html_file)):
@@ -82,7 +95,7 @@ def calibrate(
     for target in filter(None, (output, options["report"])):
         refuse_existing(target, overwrite)
     shared.check_html(html_file)
-    flight = calibrate_flight(paths, load_targets(targets), _read_options(options))
+    flight = calibrate_flight(paths, load_targets(targets) if targets else [], _read_options(options))
     found = flight.calibration
     write_text(output, format_calibration(found), overwrite=overwrite)
     if options["report"] is not None:
@@ -111,13 +124,16 @@ def calibrate(
 
 def _read_options(options: dict[str, Any]) -> CalibrationOptions:
     """How to measure; pulse and chain are chosen as `wavebatch run` chooses them."""
-    from wavebatch.surveying.calibrating.targets import CalibrationOptions
+    from wavebatch.kernels.physics.radiometry import usual_attenuation
+    from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
     from wavebatch.tools.api.run import find_request, read_sensor
 
     asked = shared.from_options(RunOptions, options)
     chain, request = find_request(asked)
-    names = ("attenuation", "divergence", "reflectance_error", "direction", "energy", "scan_angle")
+    names = ("divergence", "reflectance_error", "direction", "energy", "scan_angle", "column")
     figures = {name: options[name] for name in names}
+    given = options["attenuation"]
+    figures["attenuation"] = usual_attenuation(options["wavelength"]) if given is None else given
     return CalibrationOptions(sensor=read_sensor(asked), chain=chain, request=request, **figures)
 
 
@@ -154,11 +170,13 @@ def _describe_pair(pair: PairOverlap) -> str:
 def _describe_target(target: TargetResult) -> str:
     if target.constant is None:
         return f"{target.name}: reflectance {target.reflectance:g}, refused: {target.refused}"
-    return (
-        f"{target.name}: reflectance {target.reflectance:g}, {count(target.echoes, 'echo')}, constant "
-        f"{target.constant:.4g}, spread {100 * target.spread:.1f} %, incidence {target.incidence_deg:.1f} +- "
-        f"{target.incidence_error_deg:.1f} deg"
+    line = (
+        f"{target.name}: reflectance {target.reflectance:.4g}, {count(target.echoes, 'echo')}, constant "
+        f"{target.constant:.4g}, spread {100 * target.spread:.1f} %"
     )
+    if target.incidence_deg is None:
+        return line
+    return f"{line}, incidence {target.incidence_deg:.1f} +- {target.incidence_error_deg:.1f} deg"
 
 
 def _describe_channel(channel: ChannelConstant) -> str:

@@ -280,6 +280,10 @@ class SystemPulse:
     """Standard deviation of `level_variance` [ns2]; None where it was not measured, infinite where surfaces of known
     slope were sought and not found, so that widths mean no angle.
     """
+    hidden: tuple[tuple[float, float, float], ...] = ()
+    """What neighbours that were not found do to times: variance of an echo over that of the pulse, less 1; and the
+    variance of its time over that excess, of lone echoes and of others (docs/algorithms.md 2.2). Empty for none.
+    """
     width_scatter: float = 0.0
     """Scatter of the echo widths of one surface beyond their fit errors [ns]: no pulse model is exact."""
     divergence: float | None = None

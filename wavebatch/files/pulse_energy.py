@@ -6,7 +6,7 @@ over the strip, so their unit does not matter.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -67,13 +67,18 @@ class PulseEnergy:
     fills: bool = False
     """A pulse of unknown energy counts as one of mean energy, as it would without energies; else it has no data."""
 
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """Return the values of the extra byte of point records (n,), f8, NaN where unknown."""
+        stored = points[self.field]
+        values = stored.astype(np.float64) * self.scaling[0] + self.scaling[1]
+        known = (np.abs(values) < LARGEST) & (True if self.empty is None else stored != self.empty)
+        return np.where(known, values, np.nan)
+
     def read(self, points: np.ndarray) -> np.ndarray:
         """Return the energies of the pulses of point records (n,), f8, NaN where unknown, in the unit of the source."""
         if self.field is not None:
-            stored = points[self.field]
-            values = stored.astype(np.float64) * self.scaling[0] + self.scaling[1]
-            known = (values < LARGEST) & (values > 0) & (True if self.empty is None else stored != self.empty)
-            return np.where(known, values, np.nan)
+            values = self.values(points)
+            return np.where(values > 0, values, np.nan)
         time = points["gps_time"].astype(np.float64)
         after = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
         place = after - (time - self.time[after - 1] < self.time[after] - time)
@@ -81,12 +86,7 @@ class PulseEnergy:
 
     def fill(self, block: WaveformBlock, unit: Unit) -> WaveformBlock:
         """Return a block of the unit with the energies of its pulses over their mean."""
-        place = block.point - unit.start
-        inside = (place >= 0) & (place < len(unit.points))
-        records = np.empty(len(block), unit.points.dtype)
-        records[inside] = unit.points[place[inside]]
-        if not inside.all():
-            records[~inside] = unit.context[np.searchsorted(unit.context_index, block.point[~inside])]
+        records = take_records(block, unit)
         energy, error = self.read(records) / self.mean, None
         if self.error_field is not None:
             error = records[self.error_field].astype(np.float64) / self.mean
@@ -107,13 +107,15 @@ class PulseEnergy:
         }
 
 
-def read_blocks(
-    reader: StripReader, scan: StripScan, size: int, energy: PulseEnergy | None
-) -> Iterator[WaveformBlock]:
-    """Yield every packet of a strip once, as `StripReader.all_blocks` does, with the energies of its pulses."""
-    for unit in reader.read_units(scan):
-        for block, _ in reader.read_blocks(unit, size, owned_only=True):
-            yield block if energy is None else energy.fill(block, unit)
+def take_records(block: WaveformBlock, unit: Unit) -> np.ndarray:
+    """Return the point record of each waveform (n,) of a block of the unit."""
+    place = block.point - unit.start
+    inside = (place >= 0) & (place < len(unit.points))
+    records = np.empty(len(block), unit.points.dtype)
+    records[inside] = unit.points[place[inside]]
+    if not inside.all():
+        records[~inside] = unit.context[np.searchsorted(unit.context_index, block.point[~inside])]
+    return records
 
 
 def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None) -> PulseEnergy | None:
@@ -139,7 +141,7 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
     path = reader.facts.path
     if request == NONE:
         return None
-    found = _find_column(reader, request or COLUMN)
+    found = find_column(reader, request or COLUMN)
     if found is None and request is None:
         return None
     found = found or _read_file(reader, request)
@@ -168,8 +170,8 @@ def _once(found: PulseEnergy, unit: Unit) -> np.ndarray:
     return found.read(points[new])
 
 
-def _find_column(reader: StripReader, request: str) -> PulseEnergy | None:
-    """The extra byte of this name; None where there is none."""
+def find_column(reader: StripReader, request: str) -> PulseEnergy | None:
+    """Find the extra byte of this name; None where there is none."""
     facts = reader.facts
     fields = facts.dtype.names[len(facts.dtype.names) - len(facts.records) :] if facts.records else ()
     known = {record.name: (field, record) for field, record in zip(fields, facts.records, strict=True)}
@@ -182,12 +184,16 @@ def _find_column(reader: StripReader, request: str) -> PulseEnergy | None:
     return PulseEnergy(request, field, record.scaling or (1.0, 0.0), empty, error_field=error if plain else None)
 
 
+def name_columns(reader: StripReader, request: str) -> str:
+    """Return the extra byte that is called nearly so, or what there is, for a message."""
+    names = [record.name for record in reader.facts.records]
+    return nearest(request, names) if names else "the strip has no extra bytes"
+
+
 def _read_file(reader: StripReader, request: str) -> PulseEnergy:
     if not Path(request).is_file():
-        names = [record.name for record in reader.facts.records]
-        hint = nearest(request, names) if names else "the strip has no extra bytes"
-        path = reader.facts.path
-        raise InputError(f"{path}: --energy: no extra byte and no file is called {request!r}; {hint}")
+        hint = name_columns(reader, request)
+        raise InputError(f"{reader.facts.path}: --energy: no extra byte and no file is called {request!r}; {hint}")
     time, energy = _parse(read_text(request, "file of pulse energies", 1 << 30).splitlines(), request)
     order = np.argsort(time, kind="stable")
     time, energy = time[order], energy[order]

@@ -92,9 +92,7 @@ def predict_errors(block: WaveformBlock, system: SystemPulse, chains: Mapping[st
     truth = adaptive(block, noise, system, maximum(block, noise, system))
     sure = truth.amplitude >= LEAST_SNR * noise.std[truth.waveform]
     truth = truth.take(np.flatnonzero(sure & ((truth.flags & int(_DOUBTFUL)) == 0)))
-    # Simulated waveforms have no defects.
-    system = replace(system, pattern=(), slope_spread=0.0, spikes=0.0, transient=0.0)
-    trial = simulate_again(block, system, truth, np.random.default_rng(SEED))
+    trial, system = simulate_again(block, system, truth, np.random.default_rng(SEED))
     bounds = bound_time(truth.amplitude, truth.sigma.astype(np.float64), system.noise_std, block.spacing) * HALF_C
     bound = _rms(bounds)
     predictions = []
@@ -130,7 +128,7 @@ def leave_out_false(predictions: Sequence[Prediction]) -> list[Prediction]:
 
 def simulate_again(
     block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rng: np.random.Generator
-) -> WaveformBlock:
+) -> tuple[WaveformBlock, SystemPulse]:
     """Simulate waveforms that hold given echoes, with the strip's pulse, new baselines and new noise.
 
     Parameters
@@ -144,7 +142,9 @@ def simulate_again(
 
     Returns
     -------
-    WaveformBlock
+    block : WaveformBlock
+    system : SystemPulse
+        Without the defects of the strip's waveforms, which these have not.
     """
     n, s = block.samples.shape
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
@@ -157,9 +157,10 @@ def simulate_again(
     signal += np.sqrt(variance).astype(np.float32) * rng.standard_normal((n, s), dtype=np.float32)
     signal += system.baseline + system.baseline_spread * rng.standard_normal((n, 1))
     top = block.digitizer.max_count if system.saturation is None else min(system.saturation, block.digitizer.max_count)
-    counts = np.clip(np.rint(signal), 0, top).astype(block.samples.dtype)
+    counts = np.clip(np.rint(signal), 0, top).astype(np.min_scalar_type(block.digitizer.max_count))
     trial = WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
-    return replace(trial, digitizer=block.digitizer)
+    plain = replace(system, pattern=(), slope_spread=0.0, spikes=0.0, transient=0.0)
+    return replace(trial, digitizer=block.digitizer), plain
 
 
 def _rms(values: np.ndarray) -> float:

@@ -16,6 +16,7 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.surveying.hidden_neighbours import measure_hidden
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
     find_isolated,
@@ -375,7 +376,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     else:
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
-    system = replace(system, width_scatter=_measure_scatter(part, system, echoes))
+    system = replace(measure_hidden(part, system, echoes), width_scatter=_measure_scatter(part, system, echoes))
     system = measure_skew(part, system, echoes) if learn else system
     figures.update(_describe(part, system, echoes))
     decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system))

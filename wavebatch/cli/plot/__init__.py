@@ -60,8 +60,9 @@ def plot() -> None:
               help="Draw the pulse nearest to this GPS time [s]; may be repeated.")
 @click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete_flags,
               help="Draw the first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
+@shared.where_option("Draw the first waveforms with echoes")
 @click.option("--most", type=click.IntRange(1, 100), metavar="N",
-              help="Most waveforms of --flags or of the default.  [default: 6; with --sheet: 100]")
+              help="Most waveforms of --flags, --where or of the default.  [default: 6; with --sheet: 100]")
 @click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
 @shared.seed_option("Seed of the random packets.")
 @click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
@@ -86,10 +87,12 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     from wavebatch.core.condition import read_flags
     from wavebatch.tools.plots.packets import Wanted
 
-    if options["flags"] and (options["packets"] or options["point_numbers"] or options["times"]):
-        raise ConfigError("--flags chooses the waveforms; leave out --packet, --point and --gps-time")
-    if options["random"] and any(options[name] for name in ("packets", "point_numbers", "times", "flags")):
-        raise ConfigError("--random chooses the waveforms; leave out --packet, --point, --gps-time and --flags")
+    named = any(options[name] for name in ("packets", "point_numbers", "times"))
+    for option in ("flags", "where"):
+        if options[option] and (named or options["random"]):
+            raise ConfigError(f"--{option} chooses the waveforms; leave out --packet, --point, --gps-time and --random")
+    if options["random"] and named:
+        raise ConfigError("--random chooses the waveforms; leave out --packet, --point and --gps-time")
     if options["sheet"] and (options["show"] or options["table"]):
         raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
     tabular = output.suffix.lower() == ".csv"

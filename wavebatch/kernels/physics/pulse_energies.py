@@ -13,8 +13,6 @@ LEAST_SLOPE = 0.5
 MOST_ERROR = 0.15
 """Slopes less certain than this say nothing: energies that hardly scatter, or plants."""
 
-SHIFTS = (0, 1, -1)
-
 
 def judge_energies(light: np.ndarray, energy: np.ndarray) -> str:
     """Find what contradicts the energies of pulses.
@@ -37,15 +35,12 @@ def judge_energies(light: np.ndarray, energy: np.ndarray) -> str:
     The slope of the one over the other is fitted with steps between surfaces clipped, also for energies of the next
     pulse and of the one before.
     """
-    slopes = [_fit_slope(light, np.roll(energy, shift)) for shift in SHIFTS]
-    slope, error = slopes[0]
+    slope, error = _fit_slope(light, energy)
     if not error <= MOST_ERROR or slope + 3.0 * error > LEAST_SLOPE:
         return ""
-    reason = f"light follows them with a slope of {slope:.2f} +- {error:.2f} where 1 is right"
-    best = int(np.argmax([one for one, _ in slopes]))
-    if slopes[best][0] <= LEAST_SLOPE:
-        return f"{reason}; they are of other pulses"
-    return f"{reason}; they come one pulse too {'late' if SHIFTS[best] < 0 else 'early'}"
+    early, late = (_fit_slope(light, np.roll(energy, shift))[0] > LEAST_SLOPE for shift in (1, -1))
+    cause = "come one pulse too early" if early else "come one pulse too late" if late else "are of other pulses"
+    return f"light follows them with a slope of {slope:.2f} +- {error:.2f} where 1 is right; they {cause}"
 
 
 def _fit_slope(light: np.ndarray, energy: np.ndarray) -> tuple[float, float]:

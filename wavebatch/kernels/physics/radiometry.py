@@ -10,6 +10,8 @@ import math
 
 import numpy as np
 
+from wavebatch.core.units import AIR_ATTENUATION
+
 ENERGY_CORRELATION = -1.0 / math.sqrt(3.0)
 """Correlation of the errors of amplitude and sigma of an isolated Gaussian echo (docs/algorithms.md 2.1)."""
 
@@ -57,6 +59,24 @@ def attenuation_of_visibility(visibility: float, wavelength: float) -> float:
     """
     exponent = 1.6 if visibility > 50.0 else 1.3 if visibility > 6.0 else 0.585 * visibility ** (1.0 / 3.0)
     return 10.0 / math.log(10.0) * 3.912 / visibility * (wavelength / 550.0) ** -exponent
+
+
+def usual_attenuation(wavelength: float) -> float:
+    """Attenuation of clear air that nothing is known of.
+
+    Parameters
+    ----------
+    wavelength : float, nm
+        Of the laser.
+
+    Returns
+    -------
+    float, dB/km
+        One way: AIR_ATTENUATION at 1064 nm, elsewhere as haze scatters (`attenuation_of_visibility`).
+    """
+    visibility = 23.0  # km; the ratio is the same from 6 to 50
+    ratio = attenuation_of_visibility(visibility, wavelength) / attenuation_of_visibility(visibility, 1064.0)
+    return AIR_ATTENUATION * ratio
 
 
 def backscatter(

@@ -1,10 +1,16 @@
-"""Merges fitted echoes that are too close to be resolved (docs/algorithms.md H1). Called after every fit."""
+"""Echoes too close to be resolved: fitted ones are merged (docs/algorithms.md H1), unseen ones are in the errors.
+
+Called after every fit.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.waveforms import SystemPulse
 
 UNRESOLVED = 0.25
 """Distance, in its errors, below which two echoes are one, as in kernels/c/decompose.h."""
@@ -68,6 +74,55 @@ def merge_unresolved(table: EchoTable) -> EchoTable:
         if not len(first):
             return table
         table = _merge(table, first)
+
+
+def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
+    """Add what neighbours that were not found do to the errors of times.
+
+    Parameters
+    ----------
+    table : EchoTable
+        Fitted echoes of n waveforms.
+    system : SystemPulse
+        With what the survey knows of such neighbours.
+    n : int
+
+    Returns
+    -------
+    EchoTable
+        The same echoes.
+
+    Notes
+    -----
+    An echo that hides another is wider than the pulse. Among echoes of one width the root mean square of their errors
+    is right; where no neighbour is hidden the error is too large (docs/algorithms.md 2.2).
+    """
+    if not system.hidden:
+        return table
+    excess, lone, others = np.array(system.hidden).T
+    wider = np.maximum(excess_variance(table, system), 0.0)
+    alone = table.count(n)[table.waveform] == 1
+    share = np.where(alone, np.interp(wider, excess, lone), np.interp(wider, excess, others))
+    error = np.sqrt(table.time_err**2 + share * wider * system.sigma_ref**2)
+    return replace(table, time_err=error.astype(np.float32))
+
+
+def excess_variance(table: EchoTable, system: SystemPulse) -> np.ndarray:
+    """Compute by how much the width of each echo exceeds the system's for sure.
+
+    Parameters
+    ----------
+    table : EchoTable
+        m fitted echoes.
+    system : SystemPulse
+
+    Returns
+    -------
+    float64 array, shape (m,)
+        Variance over that of the system pulse, less 1 and less its standard deviation.
+    """
+    sigma, error = table.sigma.astype(np.float64), np.nan_to_num(table.sigma_err.astype(np.float64))
+    return (sigma * sigma - 2.0 * sigma * error) / system.sigma_ref**2 - 1.0
 
 
 def _unresolved(table: EchoTable) -> np.ndarray:

@@ -20,7 +20,7 @@ from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
-from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
+from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
 from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
 from wavebatch.stages.pulse_tables import (
@@ -208,6 +208,8 @@ def describe_solution(
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components:
         table = drop_unproven(table, system, clip_level(block, system) - system.baseline)
+    if settings.grow:
+        table = cover_hidden(table, system, len(block))
     return flag_echoes(block, noise, system, clear_lone(table))
 
 

@@ -7,43 +7,28 @@ to a target has no constant, and a constant never goes from one channel to anoth
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.waveforms import angle_to_vertical, swath_columns
-from wavebatch.files.disk.fingerprint import take_fingerprint
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.core.waveforms import swath_columns
 from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
-from wavebatch.surveying.calibrating.strip_channels import SCANNERS, see_channels
-from wavebatch.surveying.calibrating.strip_echoes import ECHO, EchoSource
+from wavebatch.surveying.calibrating.flight_strips import FlightStrip, find_box, read_strip
+from wavebatch.surveying.calibrating.setting import SCANNERS
+from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibrating.target_file import Target
-from wavebatch.surveying.calibrating.targets import (
-    MOST_ECHOES,
-    CalibrationOptions,
-    build_calibration,
-    describe_channel,
-    measure_ranging,
-    open_strip_source,
-)
-from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, hash_squares, measure_ties
+from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, measure_ties
 from wavebatch.surveying.calibrating.trends import LEAST_SPREAD, Trend, find_trend, fit_swath
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult, check_attenuation
-
-MOST_TIES = 200_000
-"""Most waveforms of a strip that are decomposed for ties; they come from whole squares of 10 m, spread by chance."""
 
 _UNEXPLAINED = (
     "the strips' light from one place differs by more than their constants explain: check targets, trajectory and "
     "whether the overlaps are wet, rough or planted"
 )
-
-_Box = tuple[np.ndarray, np.ndarray]
-"""Lower and upper corner in x and y [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,26 +41,6 @@ class FlightCalibration:
     """Edge of the tie cells [m]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Strip:
-    """What is kept of one strip."""
-
-    path: Path
-    sha256: str
-    found: Calibration | None
-    """The calibration by targets on this strip."""
-    refused: str
-    channels: tuple[int, ...]
-    described: tuple[ChannelConstant, ...]
-    """How each of the channels records."""
-    ranging: float
-    """Relative error of a constant from the error of the sensor's position."""
-    ties: np.ndarray
-    """Array of TIE, with channels as sources."""
-    seen: Mapping[int, np.void]
-    """How the targets were seen by each channel, as VIEW."""
-
-
 def calibrate_flight(
     paths: Sequence[Path], targets: Sequence[Target], options: CalibrationOptions | None = None
 ) -> FlightCalibration:
@@ -86,7 +51,7 @@ def calibrate_flight(
     paths : sequence of Path
         Strips of one flight.
     targets : sequence of Target
-        Each may lie on any of the strips.
+        Each may lie on any of the strips; none where the options name a column.
     options : CalibrationOptions, optional
 
     Returns
@@ -105,9 +70,9 @@ def calibrate_flight(
     """
     options = options or CalibrationOptions()
     check_attenuation(options.attenuation)
-    boxes = [_find_box(path) for path in paths]
+    boxes = [find_box(path) for path in paths]
     origin = boxes[0][0]
-    strips = [_read_strip(path, i, boxes, targets, options) for i, path in enumerate(paths)]
+    strips = [read_strip(path, i, boxes, targets, options) for i, path in enumerate(paths)]
     good = [strip for strip in strips if strip.found is not None]
     if not good:
         raise InputError(strips[0].refused if len(strips) == 1 else "; ".join(strip.refused for strip in strips))
@@ -149,111 +114,7 @@ def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) 
     return replace(calibration, relative_error=whole, channels=channels, strips=strips), notes
 
 
-def _find_box(path: Path) -> _Box:
-    """Lower and upper corner of a strip in x and y by its header."""
-    with StripReader(path) as reader:
-        header = reader.facts.header
-        return np.array(header.mins[:2]), np.array(header.maxs[:2])
-
-
-def _read_strip(
-    path: Path,
-    number: int,
-    boxes: Sequence[_Box],
-    targets: Sequence[Target],
-    options: CalibrationOptions,
-) -> _Strip:
-    """Decompose what lies on targets or in the overlap with other strips, in one pass."""
-    with open_strip_source(path, options) as source:
-        header = source.reader.facts.header
-        targets = [target.place(path, header) for target in targets]
-        seen = see_channels(source.reader, source.scan)
-        known = source.reader.facts.digitizers  # points may name others: they have no waveform
-        channels = tuple(SCANNERS * digitizer + scanner for digitizer, scanner in seen if digitizer in known)
-        others = [box for i, box in enumerate(boxes) if i != number]
-        area = _TieArea(
-            boxes[number], boxes[0][0], [boxes[number]] if len(channels) > 1 else others, source.scan.packets
-        )
-        on_targets, ties = _collect(source, targets, area)
-        found, refused = None, ""
-        try:
-            found = build_calibration(source, targets, on_targets, options)
-        except InputError as error:
-            refused = str(error)
-        blank = [ChannelConstant(channel // SCANNERS, channel % SCANNERS, 1.0, 0.0) for channel in channels]
-        distance = np.array([source.sensor.distance or math.inf])
-        return _Strip(
-            path=path,
-            sha256=take_fingerprint(path, source.reader.facts.packets.file)["sha256_sampled"],
-            found=found,
-            refused=refused,
-            channels=channels,
-            described=tuple(describe_channel(row, source) for row in blank),
-            ranging=measure_ranging(source.sensor, distance, options.attenuation),
-            ties=ties,
-            seen=_see_targets(on_targets),
-        )
-
-
-def _see_targets(on_targets: Sequence[np.ndarray]) -> dict[int, np.void]:
-    """How each channel saw the targets in the middle, as VIEW; good targets are level."""
-    rows, seen = np.concatenate(on_targets), {}
-    for channel in np.unique(rows["channel"]).tolist():
-        mine, view = rows[rows["channel"] == channel], np.zeros(1, VIEW)[0]
-        view["angle"] = view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
-        view["distance"], view["time"] = np.median(mine["distance"]), np.median(mine["time"])
-        seen[channel] = view
-    return seen
-
-
-class _TieArea:
-    """Where a strip is decomposed for ties: squares in the boxes of those that it is tied to."""
-
-    def __init__(self, own: _Box, origin: np.ndarray, tied: Sequence[_Box], packets: int) -> None:
-        self.origin, self._tied = origin, tied
-        area = float(np.prod(np.maximum(own[1] - own[0], 1.0)))
-        common = [np.maximum(np.minimum(own[1], top) - np.maximum(own[0], low), 0.0) for low, top in tied]
-        shared = min(sum(float(np.prod(edge)) for edge in common), area)
-        self._share = MOST_TIES / max(packets * shared / area, MOST_TIES)
-        """Of the squares, so that about MOST_TIES waveforms are decomposed."""
-
-    def contains(self, xyz: np.ndarray) -> np.ndarray:
-        """Return which positions f8 (n, 3) count, bool (n,)."""
-        inside = np.zeros(len(xyz), bool)
-        for low, top in self._tied:
-            inside |= ((xyz[:, :2] >= low) & (xyz[:, :2] <= top)).all(axis=1)
-        return inside & (hash_squares(xyz) < self._share)
-
-
-def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> tuple[list[np.ndarray], np.ndarray]:
-    """Echoes on each target (ECHO), and those for ties (TIE, with channels as sources)."""
-    corners = np.concatenate([target.corners for target in targets])
-    low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
-    on_targets: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in targets]
-    parts = [np.empty(0, TIE)]
-
-    def wanted(xyz: np.ndarray) -> np.ndarray:
-        return ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1) | area.contains(xyz)
-
-    for rows in source.echoes(wanted):
-        x, y = rows["xyz"][:, 0], rows["xyz"][:, 1]
-        for target, some in zip(targets, on_targets, strict=True):
-            if sum(map(len, some)) < MOST_ECHOES:
-                some.append(rows[target.contains(x, y)])
-        parts.append(_shorten(rows[area.contains(rows["xyz"])], area.origin))
-    return [np.concatenate(some)[:MOST_ECHOES] for some in on_targets], np.concatenate(parts)
-
-
-def _shorten(rows: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    short = np.empty(len(rows), TIE)
-    short["xyz"] = rows["xyz"] - [*origin, 0.0]
-    short["source"] = rows["channel"]
-    for name in ("ray", "light", "distance", "time"):
-        short[name] = rows[name]
-    return short
-
-
-def _tie(strips: Sequence[_Strip], sources: Sequence[tuple[int, int]], origin: np.ndarray) -> Ties:
+def _tie(strips: Sequence[FlightStrip], sources: Sequence[tuple[int, int]], origin: np.ndarray) -> Ties:
     """The tie cells of all sources."""
     parts = [np.empty(0, TIE)]
     for number, (i, channel) in enumerate(sources):
@@ -265,7 +126,7 @@ def _tie(strips: Sequence[_Strip], sources: Sequence[tuple[int, int]], origin: n
 
 
 def _list_given(
-    strips: Sequence[_Strip], sources: Sequence[tuple[int, int]], options: CalibrationOptions
+    strips: Sequence[FlightStrip], sources: Sequence[tuple[int, int]], options: CalibrationOptions
 ) -> tuple[Anchors, np.ndarray]:
     """Constants by targets with their errors without that of the reflectance, which strips that see the same targets
     share; and how each source saw its targets, array of VIEW (n,), NaN without."""
@@ -283,12 +144,13 @@ def _list_given(
 
 def _reflectance_error(found: Sequence[Calibration], options: CalibrationOptions) -> float:
     """What the reflectance's error does to the constants: targets that several strips saw count once."""
-    names = {(row.name, row.reflectance) for one in found for row in one.targets if row.constant is not None}
+    names = {(row.name, not options.column and row.reflectance)
+             for one in found for row in one.targets if row.constant is not None}  # fmt: skip
     return options.reflectance_error / math.sqrt(len(names))
 
 
 def _assemble(
-    strips: Sequence[_Strip], sources: Sequence[tuple[int, int]], adjusted: Adjustment, options: CalibrationOptions
+    strips: Sequence[FlightStrip], sources: Sequence[tuple[int, int]], adjusted: Adjustment, options: CalibrationOptions
 ) -> Calibration:
     """The calibration of the flight: a constant per channel, and one per channel and strip."""
     good = [strip.found for strip in strips if strip.found is not None]
@@ -326,7 +188,7 @@ def _assemble(
 
 
 def _list_strips(
-    strips: Sequence[_Strip],
+    strips: Sequence[FlightStrip],
     sources: Sequence[tuple[int, int]],
     mine: Sequence[int],
     adjusted: Adjustment,
@@ -361,7 +223,7 @@ def _drift_scatter(sources: Sequence[tuple[int, int]], adjusted: Adjustment) -> 
     return math.sqrt(squares / freedom) if freedom else 0.0
 
 
-def _list_targets(strips: Sequence[_Strip]) -> Iterator[TargetResult]:
+def _list_targets(strips: Sequence[FlightStrip]) -> Iterator[TargetResult]:
     """What the targets gave on each strip; those without any echo on a strip of several are left out."""
     for strip in strips:
         for row in strip.found.targets if strip.found else ():
@@ -372,7 +234,11 @@ def _list_targets(strips: Sequence[_Strip]) -> Iterator[TargetResult]:
 
 
 def _describe_row(
-    strips: Sequence[_Strip], sources: Sequence[tuple[int, int]], mine: Sequence[int], constant: float, error: float
+    strips: Sequence[FlightStrip],
+    sources: Sequence[tuple[int, int]],
+    mine: Sequence[int],
+    constant: float,
+    error: float,
 ) -> ChannelConstant:
     """The row of a channel with how it records, and what targets say of its scatter; InputError for two recordings."""
     i, channel = sources[mine[0]]
@@ -402,7 +268,7 @@ def _describe_row(
     )
 
 
-def _name(strips: Sequence[_Strip], source: tuple[int, int]) -> str:
+def _name(strips: Sequence[FlightStrip], source: tuple[int, int]) -> str:
     i, channel = source
     if len(strips[i].channels) == 1:
         return strips[i].path.name

@@ -1,4 +1,4 @@
-"""What identifies a sensor's setting beyond its header: the rate of its pulses, the light of its strongest echoes.
+"""What a strip says of its sensor and its setting: day, name, channels, rate of pulses, light of the strongest echoes.
 
 `targets` measures it for CAL.toml and `strip_match` for each strip: another pulse rate or gain under the same header
 makes another sensor of it.
@@ -6,6 +6,7 @@ makes another sensor of it.
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,9 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.las.header import decode_text
 from wavebatch.files.pulse_energy import PulseEnergy
+from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.physics.pulse_energies import judge_energies
 from wavebatch.kernels.physics.radiometry import transmit
@@ -33,6 +36,17 @@ SLICES, SLICE_POINTS = 8, 2048
 
 LEAST_IN_ORDER = 0.8
 """Share of neighbouring points whose times must not fall: points in another order show no pulse rate."""
+
+SCANNERS = 4
+"""Scanner channels of LAS points (0 to 3). A channel number here is SCANNERS x digitizer + scanner channel."""
+
+_CHANNEL_SAMPLE = 4096
+"""Waveforms that show which scanner channels a strip has."""
+
+_GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
+_ADJUSTED = 1e9
+"""Seconds that LAS takes off standard GPS time."""
+_WEEK = 604_800.0
 
 
 class Setting(NamedTuple):
@@ -102,3 +116,34 @@ def _measure_rate(reader: StripReader) -> float | None:
         shortest = np.quantile(later, 0.1)
         rates.append(1.0 / float(np.mean(later[later < 1.3 * shortest + 1e-9])))
     return float(np.median(rates)) if rates else None
+
+
+def read_day(reader: StripReader) -> str:
+    """Return the day of the flight as 2026-11-22; empty where GPS times are not standard ones."""
+    header = reader.facts.header
+    if not header.point_count or not header.global_encoding & 1:
+        return ""
+    second = float(reader.read_points(0, 1)["gps_time"][0]) + _ADJUSTED
+    if not _WEEK < second < 4e9:
+        return ""
+    return (_GPS_EPOCH + timedelta(seconds=second)).date().isoformat()
+
+
+def read_sensor_name(facts: StripFacts) -> str:
+    """Return the system identifier of the header; empty where it names no sensor."""
+    name = decode_text(facts.header.system_identifier).strip()
+    return "" if name.upper() in ("OTHER", "MERGE", "MODIFICATION", "EXTRACTION", "TRANSFORMATION", "") else name
+
+
+def see_channels(reader: StripReader, scan: StripScan) -> dict[tuple[int, int], float]:
+    """Return the share of the waveforms of each digitizer and scanner channel, by a sample for the scanner channels."""
+    total = sum(scan.by_descriptor.values())
+    counts: dict[int, np.ndarray] = {}
+    for block in reader.sample_blocks(scan, _CHANNEL_SAMPLE):
+        scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
+        counts[block.digitizer.index] = counts.get(block.digitizer.index, 0) + np.bincount(scanner, minlength=SCANNERS)
+    shares = {}
+    for index, number in sorted(scan.by_descriptor.items()):
+        of = counts.get(index, np.eye(SCANNERS)[0])
+        shares |= {(index, scanner): number / total * of[scanner] / of.sum() for scanner in np.flatnonzero(of).tolist()}
+    return shares

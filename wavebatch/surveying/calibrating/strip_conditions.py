@@ -15,8 +15,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.attribute.light import AIR_DOUBT
-from wavebatch.surveying.calibrating.setting import measure_setting
-from wavebatch.surveying.calibrating.strip_channels import read_day, read_sensor_name
+from wavebatch.surveying.calibrating.setting import measure_setting, read_day, read_sensor_name
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.sensor import SensorSource
 
@@ -55,19 +54,27 @@ def doubt_calibration(calibration: Calibration) -> Iterator[str]:
         )
 
 
-def find_growth(calibration: Calibration, reader: StripReader, sensor: SensorSource) -> tuple[float, list[str]]:
-    """Error that day, distance and sensor add to the constant, relative, and the warnings."""
+def find_growth(
+    calibration: Calibration, reader: StripReader, sensor: SensorSource, attenuation: float | None
+) -> tuple[float, list[str]]:
+    """Error that day, air, distance and sensor add to the constant, relative, and the warnings.
+
+    attenuation: of the strip's air [dB/km], where it is given. Air that is not given is known to AIR_DOUBT: over the
+    whole way on another day than that of the calibration, over what the ways differ on the same.
+    """
     parts, lines = [], []
     day = read_day(reader)
+    slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
     if day and calibration.flight and day != calibration.flight:
         apart = abs((date.fromisoformat(day) - date.fromisoformat(calibration.flight)).days)
-        parts.append(OTHER_MONTH if apart > 30 else OTHER_DAY)
+        own = sensor.distance or 0.0 if attenuation is None else 0.0
+        air = slope * math.hypot(own, calibration.distance or 0.0)
+        parts.append(math.hypot(OTHER_MONTH if apart > 30 else OTHER_DAY, air))
         lines.append(
             f"calibration: measured on {calibration.flight}, this strip was flown on {day}: the error of the constant "
-            f"grows by {100 * parts[-1]:.0f} %"
+            f"grows by {100 * parts[-1]:.0f} %, {100 * air:.0f} % of it for the air"
         )
-    if calibration.distance and sensor.distance:
-        slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
+    elif calibration.distance and sensor.distance:
         parts.append(slope * abs(sensor.distance - calibration.distance))
         ratio = sensor.distance / calibration.distance
         if max(ratio, 1 / ratio) > FAR:

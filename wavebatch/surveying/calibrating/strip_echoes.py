@@ -8,35 +8,62 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy, read_blocks
+from wavebatch.files.pulse_energy import PulseEnergy, find_column, find_pulse_energy, name_columns, take_records
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
-from wavebatch.surveying.calibrating.setting import Setting, check_energies, measure_setting
-from wavebatch.surveying.calibrating.strip_channels import SCANNERS
+from wavebatch.surveying.calibrating.setting import SCANNERS, Setting, check_energies, measure_setting
 from wavebatch.surveying.choose_chain import Choice, Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 
 ECHO = np.dtype([
     ("xyz", "<f8", 3), ("ray", "<f8", 3), ("distance", "<f8"), ("light", "<f8"), ("light_err", "<f8"),
-    ("channel", "<i4"), ("time", "<f8"),
+    ("channel", "<i4"), ("time", "<f8"), ("given", "<f8"),
 ])  # fmt: skip
 """An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel, GPS
-time [s]."""
+time [s], value of the column that was asked for."""
 
 _BLOCK = 8192
 """Waveforms that are read at a time."""
 
 _LIGHT = "relative_backscatter"
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationOptions:
+    """How a calibration is measured."""
+
+    sensor: SensorRequest = field(default_factory=SensorRequest)
+    """Where the sensor's positions come from; by default from the strip's packets."""
+    chain: Chain | None = None
+    """The chain that decomposes; None: the widest that the request may choose."""
+    request: Request = field(default_factory=lambda: Request(auto=True))
+    """How pulse and chain are chosen: as for `wavebatch run`."""
+    attenuation: float = 0.22
+    """Of the air, one way [dB/km]."""
+    divergence: float | None = None
+    """Full angle of the beam between the 1/e^2 points [mrad]; None: that of a saved survey, if it has one."""
+    reflectance_error: float = 0.03
+    """Standard deviation of the targets' reflectances, relative."""
+    direction: str = "auto"
+    """Where packet vectors point: auto, toward or away."""
+    scan_angle: bool = False
+    """Fit how the light depends on the scan angle, where strips overlap."""
+    column: str | None = None
+    """Extra byte with the vendor's own reflectances, in place of targets."""
+    energy: str | None = None
+    """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EchoSource:
@@ -51,6 +78,8 @@ class EchoSource:
     sensor: SensorSource
     setting: Setting
     energy: PulseEnergy | None = None
+    column: PulseEnergy | None = None
+    """The extra byte whose values go with the echoes, if one was asked for."""
 
     @property
     def path(self) -> Path:
@@ -62,39 +91,24 @@ class EchoSource:
 
         wanted: which returns at positions f8 (k, 3) are of interest, bool (k,); only their waveforms are decomposed.
         """
-        for block in read_blocks(self.reader, self.scan, _BLOCK, self.energy):
-            near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
-            if len(near):
-                part = self.sensor.fill(block.rows(near))
-                yield take_clean(part, self.chain.run(part, self.system))
+        for unit in self.reader.read_units(self.scan):
+            for block, _ in self.reader.read_blocks(unit, _BLOCK, owned_only=True):
+                near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
+                if len(near):
+                    part = block.rows(near)
+                    given = None if self.column is None else self.column.values(take_records(part, unit))
+                    part = self.sensor.fill(part if self.energy is None else self.energy.fill(part, unit))
+                    yield take_clean(part, self.chain.run(part, self.system), given)
 
 
 @contextmanager
-def open_source(
-    path: Path,
-    *,
-    sensor: SensorRequest,
-    chain: Chain | None,
-    request: Request,
-    attenuation: float,
-    direction: str,
-    energy: str | None,
-) -> Iterator[EchoSource]:
+def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]:
     """Open a strip, choose pulse and chain as `wavebatch run` does, and find the sensor.
 
     Parameters
     ----------
     path : Path
-    sensor : SensorRequest
-    chain : Chain or None
-        None: the widest, for an automatic choice.
-    request : Request
-    attenuation : float
-        Of the air, one way [dB/km].
-    direction : str
-        Where packet vectors point: auto, toward or away.
-    energy : str or None
-        Of each emitted pulse; see `find_pulse_energy`.
+    options : CalibrationOptions
 
     Yields
     ------
@@ -105,15 +119,22 @@ def open_source(
     InputError
         Where the strip cannot be read or the sensor's position is unknown.
     """
-    with StripReader(path, direction=direction) as reader, reader.scan() as scan:
-        setup = prepare(reader, scan, chain or widest_chain(), request, sensor=sensor, positions=Positions.REQUIRED)
+    with StripReader(path, direction=options.direction) as reader, reader.scan() as scan:
+        chain = options.chain or widest_chain()
+        setup = prepare(reader, scan, chain, options.request, sensor=options.sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
-        system = replace(setup.system, attenuation=attenuation, sensor_error=0.0)
-        setting = measure_setting(reader, scan, setup.sensor, attenuation)
-        sent = find_pulse_energy(reader, scan, energy)
-        if energy is not None and sent is not None:
+        system = replace(setup.system, attenuation=options.attenuation, sensor_error=0.0)
+        setting = measure_setting(reader, scan, setup.sensor, options.attenuation)
+        sent = find_pulse_energy(reader, scan, options.energy)
+        if options.energy is not None and sent is not None:
             check_energies(reader, scan, sent)
-        yield EchoSource(reader, scan, setup.choice, with_energy(setup.chain), system, setup.sensor, setting, sent)
+        column = options.column
+        given = find_column(reader, column) if column else None
+        if column and given is None:
+            hint = name_columns(reader, column)
+            raise InputError(f"{path}: --from-column: no extra byte is called {column!r}; {hint}")
+        chain = with_energy(setup.chain)
+        yield EchoSource(reader, scan, setup.choice, chain, system, setup.sensor, setting, sent, given)
 
 
 def with_energy(chain: Chain) -> Chain:
@@ -125,8 +146,11 @@ def with_energy(chain: Chain) -> Chain:
     return replace(chain, steps=tuple(steps))
 
 
-def take_clean(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
-    """Take the echoes of a block that are alone in their waveform and whose place and energy are sure, as ECHO."""
+def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None = None) -> np.ndarray:
+    """Take the echoes of a block that are alone in their waveform and whose place and energy are sure, as ECHO.
+
+    given: values of a column for each waveform, f8 (n,).
+    """
     alone = echoes.count(len(block))[echoes.waveform] == 1
     echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.UNANCHORED)) == 0)))
     rows = np.zeros(len(echoes), ECHO)
@@ -139,6 +163,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     rows["light_err"] = echoes.attributes[f"{_LIGHT}_err"]
     scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(np.int32)
     rows["time"] = block.gps_time[echoes.waveform]
+    rows["given"] = np.nan if given is None else given[echoes.waveform]
     rows["channel"] = SCANNERS * block.digitizer.index + scanner
     known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & np.isfinite(rows["light_err"])
     return rows[known]

@@ -21,7 +21,7 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import sample_reference
-from wavebatch.surveying.calibrating.strip_channels import see_channels
+from wavebatch.surveying.calibrating.setting import see_channels
 from wavebatch.surveying.calibrating.strip_conditions import (
     compare_air,
     compare_divergence,
@@ -96,7 +96,7 @@ def match_strip(
     warnings = list(doubt_calibration(calibration))
     if not any(row.is_described for row in calibration.channels):
         return StripMatch(calibration, tuple(warnings))
-    growth, reasons = find_growth(calibration, reader, sensor)
+    growth, reasons = find_growth(calibration, reader, sensor, attenuation)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
     if all(row.sha256 != own_strip for row in calibration.strips):
         more, lines = compare_setting(calibration, reader, scan, system, sensor)

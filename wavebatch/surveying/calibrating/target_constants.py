@@ -13,8 +13,8 @@ import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.geometry.facets import fit_facet
-from wavebatch.surveying.calibrating.strip_channels import SCANNERS
-from wavebatch.surveying.calibrating.target_file import Target
+from wavebatch.surveying.calibrating.setting import SCANNERS
+from wavebatch.surveying.calibrating.target_file import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibration import ChannelConstant, TargetResult
 
 LEAST_ECHOES = 10
@@ -40,6 +40,13 @@ STRANGE_SIGMA, MOST_STRANGE = 6.0, 0.1
 
 EDGE_SIGMA, LEAST_EDGE = 4.0, 0.01
 """Echoes of the outer half differ from the others where their medians do by so many errors and by this share."""
+
+
+LEAST_NEGATIVE, MOST_REFLECTANCE = 0.01, 2.0
+"""Share of negative values from which a column of reflectances is in dB, and the most that its median may be."""
+
+CLASSES = 5
+"""Classes of reflectance whose constants are compared."""
 
 
 def measure_target(
@@ -120,6 +127,48 @@ def measure_target(
     hot_err = 0.5 * target.hot_spot / (1.0 + target.hot_spot)
     error = float(np.sqrt(reflectance_error**2 + hot_err**2 + facing_err**2 + inner**2 + edge_err**2))
     return replace(result, relative_error=error), rows[used], constant
+
+
+def measure_column(
+    name: str, rows: np.ndarray, reflectance_error: float
+) -> tuple[TargetResult, np.ndarray, np.ndarray]:
+    """Measure the constant by a column of reflectances that the sensor's vendor computed.
+
+    Parameters
+    ----------
+    name : str
+        Of the column.
+    rows : array of ECHO (n,)
+        Clean single echoes; `given` is the reflectance of a matt surface that faces the sensor and returns as much, in
+        dB or as a share.
+    reflectance_error : float
+        Standard deviation of the vendor's constant, relative.
+
+    Returns
+    -------
+    result : TargetResult
+        Its error holds by how much dark and bright echoes differ.
+    used : array of ECHO (k,)
+    constant : float64 (k,)
+        As `measure_target`.
+    """
+    rows = rows[np.isfinite(rows["given"])]
+    facing = 10.0 ** (0.1 * rows["given"]) if np.mean(rows["given"] < 0) > LEAST_NEGATIVE else rows["given"]
+    rows, facing = rows[facing > LEAST_REFLECTANCE], facing[facing > LEAST_REFLECTANCE]
+    blank = TargetResult(f"column {name}", float(np.median(facing)) if len(facing) else 0.0, len(rows))
+    if len(rows) < LEAST_ECHOES or not blank.reflectance < MOST_REFLECTANCE:
+        reason = f"{len(rows)} clean single echoes have a reflectance, {LEAST_ECHOES} are needed"
+        if len(rows) >= LEAST_ECHOES:
+            reason = f"its median is {blank.reflectance:.3g}: it holds neither dB nor shares of 1"
+        return replace(blank, refused=reason), rows[:0], np.empty(0)
+    constant = 4.0 * facing / rows["light"]
+    result = summarise(blank, constant)
+    # By both: classes of one alone differ where that one is noisy.
+    order = np.argsort(facing * rows["light"], kind="stable")
+    classes = np.array_split(constant[order], min(CLASSES, len(rows) // LEAST_ECHOES))
+    apart = float(np.std([np.median(some) for some in classes])) / result.constant
+    inner = MEDIAN_ERROR * result.spread / np.sqrt(len(rows) - 1)
+    return replace(result, relative_error=float(np.hypot(np.hypot(reflectance_error, apart), inner))), rows, constant
 
 
 def summarise(blank: TargetResult, constant: np.ndarray) -> TargetResult:

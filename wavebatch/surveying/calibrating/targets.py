@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,60 +18,22 @@ from wavebatch.files.area_crs import describe_miss
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.las.header import decode_text
 from wavebatch.kernels.physics.radiometry import backscatter_error
-from wavebatch.stages.chain import Chain
-from wavebatch.surveying.calibrating.strip_channels import read_day, read_sensor_name
-from wavebatch.surveying.calibrating.strip_echoes import EchoSource, open_source
+from wavebatch.surveying.calibrating.setting import read_day, read_sensor_name
+from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
 from wavebatch.surveying.calibrating.target_constants import (
     LEAST_ECHOES,
     MOST_STRANGE,
     combine_targets,
+    measure_column,
     measure_target,
     summarise,
 )
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
-from wavebatch.surveying.choose_chain import Request
-from wavebatch.surveying.sensor import SensorRequest, SensorSource
+from wavebatch.surveying.sensor import SensorSource
 
 MOST_ECHOES = 200_000
 """Most echoes that a target uses: the error of its reflectance is far larger than that of so many."""
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationOptions:
-    """How a calibration is measured."""
-
-    sensor: SensorRequest = field(default_factory=SensorRequest)
-    """Where the sensor's positions come from; by default from the strip's packets."""
-    chain: Chain | None = None
-    """The chain that decomposes; None: the widest that the request may choose."""
-    request: Request = field(default_factory=lambda: Request(auto=True))
-    """How pulse and chain are chosen: as for `wavebatch run`."""
-    attenuation: float = 0.22
-    """Of the air, one way [dB/km]."""
-    divergence: float | None = None
-    """Full angle of the beam between the 1/e^2 points [mrad]; None: that of a saved survey, if it has one."""
-    reflectance_error: float = 0.03
-    """Standard deviation of the targets' reflectances, relative."""
-    direction: str = "auto"
-    """Where packet vectors point: auto, toward or away."""
-    scan_angle: bool = False
-    """Fit how the light depends on the scan angle, where strips overlap."""
-    energy: str | None = None
-    """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
-
-
-def open_strip_source(path: Path, options: CalibrationOptions):
-    """Open a strip for a calibration; see `strip_echoes.open_source`."""
-    return open_source(
-        path,
-        sensor=options.sensor,
-        chain=options.chain,
-        request=options.request,
-        attenuation=options.attenuation,
-        direction=options.direction,
-        energy=options.energy,
-    )
 
 
 def build_calibration(
@@ -89,7 +50,7 @@ def build_calibration(
         The strip.
     targets : sequence of Target
     found : sequence of arrays of ECHO
-        Clean single echoes inside the outline of each target.
+        Clean single echoes inside the outline of each target; all echoes where the options name a column.
     options : CalibrationOptions
 
     Returns
@@ -108,12 +69,14 @@ def build_calibration(
     divergence = options.divergence or source.system.divergence
     measured = [
         measure_target(target, rows, divergence, options.reflectance_error)
-        for target, rows in zip(targets, found, strict=True)
+        for target, rows in zip(targets, found, strict=not options.column)
     ]
+    if options.column:
+        measured = [measure_column(options.column, found[0], options.reflectance_error)]
     results = [result for result, _, _ in measured]
     whole = combine_targets(results, _fit_errors([used for _, used, _ in measured]))
     if whole is None:
-        miss = describe_miss([target.corners for target in targets], source.reader.facts.header)
+        miss = describe_miss([target.corners for target in targets], source.reader.facts.header) if targets else ""
         reasons = miss or "; ".join(f"{result.name}: {result.refused}" for result in results)
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,10 +27,14 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.angle_limits import REFERENCE_ERROR
+from wavebatch.tools.plots.draw_cloud import SERIES
 from wavebatch.tools.plots.labels import fit_parts
 
 ANGLES = np.arange(0.0, 81.0)
 """Angles of the table [deg]."""
+
+DRAWN = (1.0, 0.25, 4.0)
+"""Amplitudes over that of the table for which a picture has errors."""
 
 _DRAWS = 2000
 """Measured widths, evenly drawn from their law, from which the error of an angle is computed."""
@@ -126,11 +131,11 @@ def write_angles(
         raise InputError(f"--angles {target}: the distance of the sensor is not known, so no width means an angle")
     if math.isinf(system.level_error or 0.0):
         raise InputError(f"--angles {target}: the strip does not show which width a surface has that faces the sensor")
-    found = tabulate_angles(system, spacing, distance, system.divergence, amplitude)
+    tables = [tabulate_angles(system, spacing, distance, system.divergence, part * amplitude) for part in DRAWN]
     if target.suffix.lower() == ".csv":
-        write_text(target, format_angles(found), overwrite=overwrite)
+        write_text(target, format_angles(tables[0]), overwrite=overwrite)
     else:
-        draw_angles(found, target, strip=strip, overwrite=overwrite)
+        draw_angles(tables, target, strip=strip, overwrite=overwrite)
 
 
 def format_angles(found: AngleTable) -> str:
@@ -145,19 +150,24 @@ def format_angles(found: AngleTable) -> str:
     return text.getvalue()
 
 
-def draw_angles(found: AngleTable, target: Path, *, strip: str = "", overwrite: bool = False) -> None:
-    """Writes a picture of the table; raises as figure_file.open_picture does."""
-    with open_picture(target, (7.0, 4.6), overwrite=overwrite) as figure:
-        axes = figure.subplots()
-        low, high = np.clip(found.angle - found.error, 0, 90), np.clip(found.angle + found.error, 0, 90)
-        axes.fill_between(found.width, low, high, color="#0072b2", alpha=0.2, linewidth=0,
-                          label="root mean square error")  # fmt: skip
-        axes.plot(found.width, found.angle, color="#0072b2", linewidth=1.5, label="angle")
+def draw_angles(tables: Sequence[AngleTable], target: Path, *, strip: str = "", overwrite: bool = False) -> None:
+    """Writes a picture of the angles, and of their errors for echoes of each table's amplitude.
+
+    Raises as figure_file.open_picture does.
+    """
+    found = tables[0]
+    with open_picture(target, (7.0, 6.0), overwrite=overwrite) as figure:
+        axes, errors = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+        axes.plot(found.width, found.angle, color=SERIES[0], linewidth=1.5)
         axes.set_ylim(0, 90)
-        axes.set_xlabel("echo_width [ns]")
         axes.set_ylabel("incidence angle [deg]")
-        beam = f"{found.distance:.0f} m, {found.divergence:g} mrad"
-        parts = [plain_text(strip), beam, f"errors of echoes of {found.amplitude:.0f} DN"]
+        for one, color in zip(tables, SERIES, strict=False):
+            errors.plot(one.width, one.error, color=color, linewidth=1.2, label=f"echoes of {one.amplitude:.0f} DN")
+        errors.set_yscale("log")
+        errors.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        errors.set_ylabel("rms error [deg]")
+        errors.set_xlabel("echo_width [ns]")
+        parts = [plain_text(strip), f"{found.distance:.0f} m, {found.divergence:g} mrad"]
         figure.suptitle(fit_parts(figure, [part for part in parts if part], 6.8, size=10.5), x=0.01, ha="left",
                         fontsize=10.5)  # fmt: skip
-        axes.legend(loc="lower right")
+        errors.legend(loc="upper right")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a8a8a")
 """Colours of Okabe and Ito, which colour-blind readers can distinguish; more than eight series repeat them."""
 
+MOST_TOGETHER = 6
+"""Most series in one axes: more lines cannot be followed."""
+
 _NARROW = 4.0
 """Maps so many times as high as wide have a place of its own for the scale of colours: it would shrink with them."""
 
@@ -38,14 +42,32 @@ def draw_histograms(
 ) -> None:
     """Writes a picture of histograms, one below the other, each with an axis of its own unit.
 
-    Several series in one histogram are drawn as shares of their values, so that small and large ones can be compared.
+    Several series in one histogram are drawn as shares of their values, so that small and large ones can be compared;
+    more than MOST_TOGETHER side by side, each in its own axes.
     counts: as numbers of values all the same. log: logarithmic axis of counts. Raises as figure_file.open_picture does.
     """
-    lines = sum(len(found.names) + (len(found.names) == 1) for found in every)
-    with open_picture(target, (8.0, 3.9 * len(every) + 0.3 + 0.2 * lines), overwrite=overwrite) as figure:
-        panels = figure.subplots(len(every), 1, squeeze=False)[:, 0]
-        for axes, found in zip(panels, every, strict=True):
+    every = [part for found in every for part in _split_series(found)]
+    columns = 1 if len(every) <= MOST_TOGETHER else 2
+    rows, lines = -(-len(every) // columns), sum(len(found.names) + (len(found.names) == 1) for found in every)
+    size = 8.0 * columns, 3.9 * rows + 0.3 + 0.2 * lines / columns
+    with open_picture(target, size, overwrite=overwrite) as figure:
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes, found in zip(panels, every, strict=False):
             _draw_histogram(axes, found, log=log, counts=counts or len(found.names) == 1)
+        for axes in panels[len(every) :]:
+            axes.set_axis_off()
+
+
+def _split_series(found: Histogram) -> list[Histogram]:
+    """The histogram, or one for each of its series where these are too many for one picture."""
+    if len(found.names) <= MOST_TOGETHER:
+        return [found]
+    own = ("counts", "below", "above", "values", "percentiles", "means")
+    parts = []
+    for row, name in enumerate(found.names):
+        rows = {key: getattr(found, key)[row : row + 1] for key in own}
+        parts.append(replace(found, names=(name,), clouds=(name,), total=Tally(values=int(rows["values"][0])), **rows))
+    return parts
 
 
 def _draw_histogram(axes: Axes, found: Histogram, *, log: bool, counts: bool) -> None:

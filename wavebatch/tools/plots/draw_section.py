@@ -16,6 +16,10 @@ from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
 from wavebatch.tools.plots.labels import fit_parts, fit_text, space_ticks
 from wavebatch.tools.plots.section_data import Profile, Section
 
+LIGHT, FAINT = ("energy", "cross_section"), 0.02
+"""Columns of voxels of which less than this share of the scale is not drawn: deconvolution leaves tails of a few per
+mille below the ground, which would look as solid as the ground does."""
+
 _NARROW = 3.0
 """Sections less wide have the scale of colours beside them [inches]: below, its numbers would not fit."""
 
@@ -69,6 +73,7 @@ def _parts(found: Section, aspect: float) -> list[str]:
     parts += [f"{found.total.no_data:,} without data"] if found.total.no_data else []
     parts += [f"{found.total.left_out:,} left out"] if found.total.left_out else []
     parts += [f"{found.outside:,} outside"] if found.outside else []
+    parts += [f"below {100 * FAINT:g} % of the scale: empty"] * (found.voxel > 0 and found.facts.name in LIGHT)
     parts.append("equal scales" if aspect == 1.0 else f"heights {aspect:g} times exaggerated")
     return [*parts, f"CRS: {plain_text(found.crs.name, 90) or 'not given'}"]
 
@@ -95,6 +100,8 @@ def _draw_voxels(axes, found: Section):
     number = np.bincount(cell, minlength=shape[0] * shape[1])
     with np.errstate(invalid="ignore"):
         image = (np.bincount(cell, found.value, shape[0] * shape[1]) / number).reshape(shape)
+        if found.facts.name in LIGHT:
+            image[image < FAINT * found.shown[1]] = np.nan
     extent = (0.0, shape[1] * edge, base, base + shape[0] * edge)
     axes.grid(visible=False)
     shown = axes.imshow(image, extent=extent, origin="lower", cmap="viridis", interpolation="nearest", aspect="auto")

@@ -31,23 +31,24 @@ def name_flags(flags: int) -> str:
 
 def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
     """A table of the echoes, for a monospaced font: time, amplitude, width, range if it is known, and flags."""
-    ranged = any(np.isfinite(_column(view, "range")).any() for view in views)
-    several = len(views) > 1
-    head = f"{'packet':>8}  " * several + f"{'echo':>4}  "
-    head += "".join(f"{name:>15}  " for name in ("time [ns]", "amplitude [DN]", "width [ns]"))
-    lines = [head + f"{'range [m]':>20}  " * ranged + "flags"]
+    several, ranged = len(views) > 1, any(np.isfinite(_column(view, "range")).any() for view in views)
+    head = [*["packet"] * several, "echo", "time [ns]", "amplitude [DN]", "width [ns]", *["range [m]"] * ranged]
     every = [(view, row) for view in views for row in range(len(view.echoes))]
+    if not every:
+        return "no echo"
+    rows = [[head, ["flags"]]]
     for view, row in every[:most]:
-        front = f"{view.packet if view.packet >= 0 else '-':>8}  " * several + f"{row + 1:>4}  "
-        front += "  ".join(f"{text:>15}" for text in _measures(view, row)) + "  "
-        if ranged:
-            found, error = (_column(view, name)[row] for name in ("range", "range_error"))
-            front += f"{_measure(found, error):>20}  "
-        flags = textwrap.wrap(name_flags(int(view.echoes.flags[row])) or "-", _FLAGS_WIDE)
-        lines += [(front if number == 0 else " " * len(front)) + text for number, text in enumerate(flags)]
+        front = [str(view.packet) if view.packet >= 0 else "-"] * several + [str(row + 1), *_measures(view, row)]
+        front += [_measure(*(_column(view, name)[row] for name in ("range", "range_error")))] * ranged
+        rows.append([front, textwrap.wrap(name_flags(int(view.echoes.flags[row])) or "-", _FLAGS_WIDE)])
+    widths = [max(len(front[place]) for front, _ in rows) for place in range(len(head))]
+    lines = []
+    for front, flags in rows:
+        text = "  ".join(f"{word:>{width}}" for word, width in zip(front, widths, strict=True))
+        lines += [f"{text if number == 0 else ' ' * len(text)}  {more}" for number, more in enumerate(flags)]
     if len(every) > most:
         lines.append(f"and {len(every) - most} more: -o FILE.csv writes all")
-    return "\n".join(lines) if every else "no echo"
+    return "\n".join(lines)
 
 
 def _measures(view: WaveformView, row: int) -> Iterator[str]:

@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 
@@ -45,8 +47,10 @@ class Wanted:
     """GPS times [s]; the nearest pulse of each."""
     flags: int = 0
     """EchoFlag bits: the first waveforms with an echo that has one of them."""
+    where: Condition | None = None
+    """The first waveforms with an echo that meets this."""
     most: int | None = None
-    """Most waveforms with flags, or spread evenly; None: FEW of them, or a full sheet."""
+    """Most waveforms with flags, that meet `where`, or spread evenly; None: FEW of them, or a full sheet."""
     random: int = 0
     """Number of packets to draw at random; 0: none."""
     seed: int = 0
@@ -89,7 +93,7 @@ def find_places(
         raise InputError(f"{path}: holds no waveform to draw; `wavebatch check` shows what it holds")
     if wanted.number > wanted.limit:
         raise _too_many(path, wanted)
-    if wanted.flags:
+    if wanted.flags or wanted.where is not None:
         return _find_flagged(reader, scan, wanted, run)
     numbers = _list_numbers(scan, wanted, str(path))
     if len(numbers) + len(wanted.points) + len(wanted.times) > wanted.limit:
@@ -182,7 +186,7 @@ def _find_nearest(unit: Unit, time: float) -> tuple[int, float]:
 def _find_flagged(
     reader: StripReader, scan: StripScan, wanted: Wanted, run: Callable[[WaveformBlock], EchoTable]
 ) -> list[Place]:
-    """The first waveforms in the file with an echo that has one of the flags."""
+    """The first waveforms in the file with an echo that has one of the flags and meets the condition."""
     found: list[Place] = []
     for unit, base in _read_units(reader, scan):
         rows = np.flatnonzero(unit.packets.owned)
@@ -190,10 +194,24 @@ def _find_flagged(
             hits = []
             for block, index in reader.read_rows(unit, rows[begin : begin + _BLOCK], _BLOCK):
                 table = run(block)
-                hits += index[np.unique(table.waveform[(table.flags & np.uint16(wanted.flags)) != 0])].tolist()
+                hits += index[np.unique(table.waveform[_is_wanted(table, len(block), wanted)])].tolist()
             found += [_place(unit, base, row) for row in sorted(hits)]
             if len(found) >= wanted.number:
                 return found[: wanted.number]
     if not found:
-        raise InputError(f"{reader.facts.path}: no echo has one of these flags: nothing to draw")
+        text = "has one of these flags" if wanted.where is None else f"meets {wanted.where.text!r}"
+        raise InputError(f"{reader.facts.path}: no echo {text}: nothing to draw")
     return found
+
+
+def _is_wanted(table: EchoTable, n: int, wanted: Wanted) -> np.ndarray:
+    """Whether each echo of n waveforms has one of the flags, if any are wanted, and meets the condition."""
+    meets = (table.flags & np.uint16(wanted.flags)) != 0 if wanted.flags else np.ones(len(table), bool)
+    if wanted.where is None:
+        return meets
+    own = {"echo_time": table.time, "echo_flags": table.flags, "number_of_returns": table.count(n)[table.waveform]}
+    have = {**table.attributes, **own}
+    for name in wanted.where.columns:
+        if name not in have:
+            raise wanted.where.complain(name, f"echoes have no column {name!r}; {nearest(name, have)}")
+    return meets & wanted.where.choose({name: have[name] for name in wanted.where.columns})

@@ -123,7 +123,7 @@ def _shape(block: WaveformBlock) -> _Pulses:
     at = int(_FLOOR * (s - 1))
     values -= np.partition(values, at, axis=1)[:, at : at + 1]
     if block.missing is not None:
-        values[block.missing] = 0
+        values[block.missing] = np.nan
     place = (block.point, block.gps_time, block.origin, block.direction)
     return _Pulses(*place, np.full(n, block.spacing), np.full(n, s), values.reshape(-1))
 
@@ -154,5 +154,5 @@ def _cut_long(edges: np.ndarray) -> np.ndarray:
 def _build_line(number: int, pulses: _Pulses) -> ScanLine:
     row = np.repeat(np.arange(len(pulses)), pulses.count)
     time = (np.arange(len(row)) - pulses.first[row]) * pulses.spacing[row]
-    place = (pulses.point, pulses.gps_time, pulses.origin, pulses.direction)
-    return ScanLine(number, *place, float(pulses.spacing[0]), row, time, pulses.values)
+    place, there = (pulses.point, pulses.gps_time, pulses.origin, pulses.direction), ~np.isnan(pulses.values)
+    return ScanLine(number, *place, float(pulses.spacing[0]), row[there], time[there], pulses.values[there])

@@ -25,6 +25,9 @@ _HEAD = ("line", "segment", "x1", "y1", "z1", "x2", "y2", "z2", *_FIGURES)
 NO_SAMPLE = "#d9e6f2"
 """Colour of what was not recorded: a light blue, because samples without signal are white."""
 
+_ROOM = 0.15
+"""What is drawn above and below the signal, as a share of its depth: the rest of the samples is empty."""
+
 _TALLEST = 8.0
 """Largest height of the axes of a slice [inches]."""
 _MOST_PIXELS = 40_000_000
@@ -126,14 +129,20 @@ def draw_slice(
 
 
 def _paint(piece: Slice) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Largest value per pixel, and the extent of the picture in its units."""
-    x, y = np.rint(piece.x).astype(np.int64), np.rint(piece.y).astype(np.int64)
+    """Largest value per pixel, and the extent of the picture in its units; samples far from all signal are left out."""
+    x, y, value = np.rint(piece.x).astype(np.int64), np.rint(piece.y).astype(np.int64), piece.line.value
+    depth = y if piece.geometry == "plane" else x
+    loud = depth[value > value.std(dtype=np.float64)]
+    if len(loud):
+        room = _ROOM * (np.ptp(loud) + 1)
+        near = (depth >= loud.min() - room) & (depth <= loud.max() + room)
+        x, y, value = x[near], y[near], value[near]
     low_x, low_y = int(x.min()), int(y.min())
     width, height = int(x.max()) - low_x + 1, int(y.max()) - low_y + 1
     if width * height > _MOST_PIXELS:
         raise ConfigError(f"scan line {piece.line.number}: a slice of {width} x {height} pixels is too large to draw")
     image = np.full(height * width, np.nan, np.float32)
-    np.fmax.at(image, (y - low_y) * width + x - low_x, piece.line.value)
+    np.fmax.at(image, (y - low_y) * width + x - low_x, value)
     step_x = piece.pixel
     step_y, base = (piece.pixel, piece.base[2]) if piece.geometry == "plane" else (1.0, 0.0)
     edges_x = ((low_x - 0.5) * step_x, (low_x + width - 0.5) * step_x)

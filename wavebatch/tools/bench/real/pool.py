@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +38,10 @@ class Solver:
 
     @property
     def system(self) -> SystemPulse:
-        """Of the strip's main digitizer."""
-        return self.survey.system
+        """Of the strip's main digitizer. Injected echoes hide no neighbours: their errors are those of the fit."""
+        whole = self.survey.system
+        others = {index: replace(one, hidden=()) for index, one in whole.digitizers.items()}
+        return replace(whole, hidden=(), digitizers=others)
 
     @property
     def fwhm(self) -> float:

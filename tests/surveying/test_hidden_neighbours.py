@@ -1,0 +1,72 @@
+"""Errors of times hold neighbours that are too close to be found, as far as the strip's pairs tell."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wavebatch.core.echoes import UNCLEAN, EchoTable
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.decompose.merge import cover_hidden
+from wavebatch.stages.score import match_echoes
+from wavebatch.surveying import survey_block
+from wavebatch.tools.simulate import find_scene, simulate_block
+
+ACCURATE = load_profile("accurate")
+
+
+def scaled_errors(scene, system, block, truth):
+    """Errors of clear echoes over the reported ones: without a flag, and with one."""
+    found = ACCURATE.run(block, system)
+    match = match_echoes(found, truth)
+    clear = truth.amplitude[match.truth] > 10 * find_scene(scene).recording.recorded_noise
+    found, at = found.take(match.found[clear]), match.truth[clear]
+    scaled = (found.time - truth.time[at]) / found.time_err
+    flagged = (found.flags & np.uint16(UNCLEAN)) != 0
+    return scaled[~flagged], scaled[flagged]
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.quick_cases("forest")
+@pytest.mark.parametrize("scene", ["forest", "mixed", "urban"])
+def test_errors_of_times_cover_hidden_neighbours(scene):
+    """Over three strips, since each survey knows its strip's pairs to a fifth only."""
+    bare, covered = [], []
+    for seed in (5, 6, 7):
+        block, truth = simulate_block(scene, 5000, np.random.default_rng(seed))
+        system = survey_block(block).system
+        bare.append(scaled_errors(scene, replace(system, hidden=()), block, truth))
+        covered.append(scaled_errors(scene, system, block, truth))
+    assert min(rms(np.concatenate(kind)) for kind in zip(*bare, strict=True)) > 2
+    plain, flagged = (rms(np.concatenate(kind)) for kind in zip(*covered, strict=True))
+    assert 0.7 < plain < 1.1
+    assert 0.8 < flagged < 1.3
+
+
+def test_a_strip_of_lone_echoes_has_the_errors_of_the_fit():
+    block, _ = simulate_block("slope", 3000, np.random.default_rng(5))
+    assert survey_block(block).system.hidden == ()
+
+
+def test_the_cover_is_that_of_a_loop(rng):
+    system = SystemPulse(1.5, hidden=((0.1, 0.2, 0.05), (0.4, 0.3, 0.1), (1.6, 0.1, 0.02)))
+    waveform = np.sort(rng.integers(0, 40, 60)).astype(np.int32)
+    sigma = rng.uniform(1.2, 3.5, 60)
+    errors = {"time_err": rng.uniform(0, 0.1, 60), "sigma_err": rng.uniform(0, 0.2, 60)}
+    table = EchoTable.build(waveform, rng.uniform(0, 50, 60), np.full(60, 40.0), sigma, **errors)
+    covered = cover_hidden(table, system, 40)
+    lone, others = 0, 0
+    for i in range(60):
+        variance, its_error = float(table.sigma[i]) ** 2, 2 * float(table.sigma[i]) * float(table.sigma_err[i])
+        excess = max((variance - its_error) / 1.5**2 - 1, 0)
+        alone = np.count_nonzero(waveform == waveform[i]) == 1
+        lone, others = lone + alone, others + (not alone)
+        share = np.interp(excess, [0.1, 0.4, 1.6], [0.2, 0.3, 0.1] if alone else [0.05, 0.1, 0.02])
+        expected = np.sqrt(float(table.time_err[i]) ** 2 + share * excess * 1.5**2)
+        assert covered.time_err[i] == pytest.approx(expected, rel=1e-5)
+    assert lone and others
+    assert cover_hidden(table, replace(system, hidden=()), 40) is table
