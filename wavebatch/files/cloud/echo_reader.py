@@ -20,7 +20,7 @@ from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
-from wavebatch.files.las.crs import metres_per_unit, read_crs
+from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.point_formats import read_angles, read_classes, split_numbers
 from wavebatch.files.las.read_points import open_points
@@ -88,7 +88,7 @@ class CloudReader(Closing):
         units = read_crs(self.path, checked.header)[1]
         self.metres = metres_per_unit(units)
         """Metres of a step of 1 in x, y and z; NaN in degrees."""
-        self.unit = next((one.describe() for one in units if not one.is_metric), "metres")
+        self.unit = name_units(units)
         self.bounds = checked.header.mins, checked.header.maxs
         self._format = describe_format(checked)
         self.point_format: int = self._format.id

@@ -61,7 +61,7 @@ def map_columns(path: Path, facts: Sequence[ColumnFacts], sample: EvenSample) ->
     places = seen["place"]
     box = (*places.min(axis=0).tolist(), *places.max(axis=0).tolist())
     grid = choose_grid(str(path), sample, box, None, fixed=False, most=MOST_CELLS)
-    crs, unit = describe_crs(path)
+    crs = describe_crs(path)
     row, column, inside = grid.place(*places.T)
     cell = (row * grid.columns + column)[inside]
     every = np.full(len(places), float(sample.step))
@@ -73,5 +73,5 @@ def map_columns(path: Path, facts: Sequence[ColumnFacts], sample: EvenSample) ->
         found = compute_cells(statistic, cell, values[inside], size, grid.size**2 / sample.step)
         if np.isfinite(found).any():
             found = found.reshape(grid.rows, grid.columns)
-            maps.append(Raster(one, statistic, grid, found, Tally(), 0, find_shown(found), crs, unit))
+            maps.append(Raster(one, statistic, grid, found, Tally(), 0, find_shown(found), crs))
     return maps

@@ -62,6 +62,9 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     crs, unit = _find_crs(paths, options.crs)
     facts = _find_facts(paths, options.columns)
     box, points, largest = _find_extent(paths, options)
+    if unit == "degree" and options.size > max(box[2] - box[0], box[3] - box[1]):
+        raise ConfigError(f"{paths[0]}: coordinates are degrees, and cells of {options.size:g} degrees are larger than "
+                          "the clouds; --size 1e-05 gives cells of about 1 m")  # fmt: skip
     grid = _lay_out(str(paths[0]), box, options)
     west, _, _, north = grid.extent
     layout = RasterLayout(
