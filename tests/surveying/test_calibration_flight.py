@@ -49,7 +49,7 @@ def flight(tmp_path_factory):
     (folder / "t.csv").write_text(f"name,reflectance,vertices\nfield,0.3,{corners}\n")
     strips = [folder / f"{name}.las" for name in sensors]
     options = ("--targets", folder / "t.csv", "-o", folder / "cal.toml", "--divergence", 0.5)
-    outputs = ("--report", folder / "cal.json", "--plot", folder / "cal.png")
+    outputs = ("--report", folder / "cal.json", "--html", folder / "cal.html")
     done = call("calibrate", *strips, *options, *outputs)
     assert done.exit_code == 0, done.output
     return folder, done.stderr
@@ -92,7 +92,7 @@ def test_drifts_and_overlaps_are_told_reported_and_drawn(flight):
     pair = next(row for row in report["pairs"] if (row["a"], row["b"]) == ("b.las", "a.las"))
     assert pair["ratio"] == pytest.approx(1.08, abs=0.003) and pair["after"] == pytest.approx(1.0, abs=0.002)
     assert abs(pair["height"]) < 0.003
-    assert (folder / "cal.png").stat().st_size > 10_000
+    assert "Calibrated light of the first over the second" in (folder / "cal.html").read_text("utf-8")
 
 
 @pytest.mark.slow

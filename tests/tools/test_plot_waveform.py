@@ -29,7 +29,7 @@ from wavebatch.tools.compare.chains import ChainRun
 from wavebatch.tools.compare.goodness import measure_fit
 from wavebatch.tools.html.strip_views import measure_residuals
 from wavebatch.tools.plots.draw_sheet import draw_sheet
-from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels
+from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels, draw_waveforms
 from wavebatch.tools.plots.echo_table import list_echoes
 from wavebatch.tools.plots.labels import place_labels
 from wavebatch.tools.plots.packets import MOST, Place, Wanted, find_places
@@ -396,6 +396,9 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
         assert len(find_places(reader, scan, Wanted(packets=((0, 60),), sheet=True), None)) == 60
         with pytest.raises(ConfigError, match=f"{MOST} fit"):
             find_places(reader, scan, Wanted(random=40), None)
+        assert len(find_places(reader, scan, Wanted(sheet=True), None)) == 100  # as many as a sheet holds
+        with pytest.raises(ConfigError, match="100 with --sheet"):
+            find_places(reader, scan, Wanted(most=30), None)
     pytest.importorskip("matplotlib")
     target = tmp_path / "sheet.svg"
     words = (tiny_strip, "-o", target, "--random", 9, "--seed", 1, "--sheet", "--profile", "fast", "--overwrite")
@@ -406,6 +409,17 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
     assert run(*words).exit_code == 0 and target.read_bytes() == first
     clash = run(tiny_strip, "-o", tmp_path / "p.png", "--random", 3, "--packet", 2)
     assert clash.exit_code == 2 and "--random chooses the waveforms" in clash.stderr
+
+
+def test_titles_name_every_flag_of_many_echoes(tmp_path):
+    pytest.importorskip("matplotlib")
+    peaks = [(100.0, 20.3 + 8 * k, 2.0) for k in range(3)]
+    (view,) = build_views(simulate(PulseShape(), peaks, n=1), make_chain("decompose.gaussian"), PULSE, [0])
+    view.echoes.flags[:] = int(EchoFlag.SATURATED | EchoFlag.OVERLAPPED | EchoFlag.AMPLITUDE_UNRELIABLE)
+    draw_waveforms([view] * 3, tmp_path / "w.svg", strip="s", chain="c")
+    text = (tmp_path / "w.svg").read_text("utf-8")
+    for name in ("SATURATED", "OVERLAPPED", "AMPLITUDE_UNRELIABLE"):
+        assert text.count(f"{name} 1,2") == 3
 
 
 def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):

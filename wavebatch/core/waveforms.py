@@ -182,6 +182,10 @@ class WaveformBlock:
         first = int(self.point[index[0]]) if len(index) else self.first
         return replace(self, samples=samples, first=first, returns=returns, **parts)
 
+    def without_samples(self) -> WaveformBlock:
+        """The block with waveforms of no samples: their place, time and sensor are left."""
+        return replace(self, samples=np.empty((len(self), 0), self.samples.dtype), missing=None)
+
 
 def _join_returns(blocks: Sequence[WaveformBlock]) -> ReturnTable | None:
     if any(block.returns is None for block in blocks):

@@ -169,7 +169,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     missing = None if block.missing is None else block.missing.T
     std, width = sample_noise(system), system.sigma_ref / block.spacing
     reach = int(np.ceil(3 * width))
-    spread = _slope_spread(signal, system, std, reach, missing)
+    spread = _slope_spread(signal, std, reach, missing)
     if spread:
         # Everything else is measured about level baselines.
         system = replace(system, slope_spread=spread / block.spacing)
@@ -194,24 +194,22 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     return replace(system, transient=find_transient(above, std) * block.spacing)
 
 
-ONE_SIDED = 0.1
-"""Median of slopes, over the width of their middle two thirds, above which they may be tails: these all fall."""
+RARER = 0.1
+"""Share of the steep slopes that must be of the rarer sign: tails, and weak echoes after the last clear one, slope one
+way."""
 
 
-def _slope_spread(signal: np.ndarray, system: SystemPulse, std: float, reach: int, missing: np.ndarray | None) -> float:
-    """Standard deviation of the slopes of baselines [count per sample]; 0 where chance and tails explain them.
-
-    A tail looks like a slope that falls: where tails were found (`recovery`), slopes must be of both signs.
-    """
+def _slope_spread(signal: np.ndarray, std: float, reach: int, missing: np.ndarray | None) -> float:
+    """Standard deviation of the slopes of baselines [count per sample]; 0 where chance or signal explains them."""
     slope, error = fit_slopes(signal, std, reach, missing=missing)
     known = np.isfinite(error)
     if np.count_nonzero(known) < LEAST_WAVEFORMS:
         return 0.0
     slope, error = slope[known], error[known]
     share = np.mean(np.abs(slope) > STEEP * error)
-    low, middle, high = np.quantile(slope, [0.1587, 0.5, 0.8413])
-    if system.recovery > 0 and abs(middle) > ONE_SIDED * (high - low):
+    if min(np.mean(slope > STEEP * error), np.mean(slope < -STEEP * error)) < RARER * share:
         return 0.0
+    low, middle, high = np.quantile(slope, [0.1587, 0.5, 0.8413])
     excess = max(0.25 * (high - low) ** 2 + middle**2 - np.median(error) ** 2, 0.0)
     few = np.mean(slope**2) if share < 0.3 else 0.0
     spread = float(np.sqrt(max(excess, few - np.median(error) ** 2)))

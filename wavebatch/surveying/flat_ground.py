@@ -307,7 +307,9 @@ def _fit_divergence(
         return None, 0.0
     groups = np.array_split(np.argsort(lever, kind="stable"), GROUPS)
     middle = np.array([(np.median(lever[rows]), np.median(variance[rows])) for rows in groups])
-    square, level = np.polyfit(*middle.T, 1)
+    off = middle - middle.mean(axis=0)
+    square = float((off[:, 0] * off[:, 1]).sum() / max((off[:, 0] ** 2).sum(), 1e-300))
+    level = float(middle[:, 1].mean() - square * middle[:, 0].mean())
     for _ in range(ROUNDS):
         total = np.hypot(error, max(square, 0.0) * lever_err)
         left = variance - level - square * lever

@@ -12,6 +12,7 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
@@ -275,7 +276,7 @@ def compare_levels(own: Level, rest: list[Level], noise: float, most: float = ST
     std = float(np.sqrt(np.average([level.std**2 for level in rest], weights=weights)))
     ratio = own.std / std
     # Quiet samples of one waveform are correlated: a tenth of them count.
-    if abs(np.log(ratio)) > max(np.log(most), STRANGE / np.sqrt(0.2 * own.samples)):
+    if abs(log(ratio)) > max(log(most), STRANGE / np.sqrt(0.2 * own.samples)):
         return f"its noise is {own.std:.2f} DN, that of the others {std:.2f}"
     clips = {level.clip for level in rest if level.clip is not None}
     if own.clip is not None and clips and own.clip < min(clips):

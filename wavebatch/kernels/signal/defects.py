@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet
 
 SPIKE, HEIGHT, HOLE = 4.5, 5.5, 6.5
@@ -51,7 +52,7 @@ def find_spikes(above: np.ndarray, std: float, width: float) -> np.ndarray:
     bool (s, n)
         Never the first or the last sample.
     """
-    drop = np.float32(CURVATURE * (1 - np.exp(-0.5 / width**2)))
+    drop = np.float32(CURVATURE * (1 - exp(-0.5 / width**2)))
     spikes = np.zeros(above.shape, bool)
     if len(above) < 5:
         return spikes
@@ -71,7 +72,7 @@ def _least_between(above: np.ndarray, width: np.float32) -> np.ndarray:
     at least the square of its neighbour over the next one, less that: between two strong echoes, whose sum falls to the
     valley, next to nothing. The neighbour itself is the most that it says.
     """
-    bend = np.exp(np.float32(-CURVATURE) / (width * width))
+    bend = exp(np.float32(-CURVATURE) / (width * width))
     sides = []
     for near, far in ((above[1:-3], above[:-4]), (above[3:-1], above[4:])):
         falls = np.maximum(near, np.float32(0)) / np.maximum(np.maximum(near, far), np.float32(1e-6))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -34,9 +34,44 @@ from wavebatch.stages.pulse_tables import (
     shape_limits,
 )
 
-LeastWidth = Annotated[float, Range(0.05, 1.0)]
-MostWidth = Annotated[float, Range(1.0, BROADEST)]
-"""Limits of fitted widths, the box of Wang et al. eq. 4 [widths of the system pulse]."""
+
+@dataclass(frozen=True)
+class EchoLimits:
+    """What decomposers accept as an echo: options that they share.
+
+    Parameters
+    ----------
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+    least_width : float
+        Smallest width of an echo, of the box of Wang et al. eq. 4 [widths of the system pulse].
+    most_width : float
+        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4.
+    """
+
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0
+    least_width: Annotated[float, Range(0.05, 1.0)] = LEAST_WIDTH
+    most_width: Annotated[float, Range(1.0, BROADEST)] = MOST_WIDTH
+
+
+@dataclass(frozen=True)
+class FitOptions(EchoLimits):
+    """Options that decomposers with an iterative fit share.
+
+    Parameters
+    ----------
+    max_iterations : int
+        An echo that has not converged after so many is flagged.
+    tolerance : float
+        A fit ends with the step that promises a smaller fall of chi2; with 0.5 it is then within a few hundredths of a
+        standard deviation of the minimum.
+    """
+
+    max_iterations: Annotated[int, Range(1, 1000)] = 40
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5
+
+
+FIT = FitOptions()
 
 
 def fit_gaussian(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
@@ -65,8 +100,7 @@ def make_settings(
     block: WaveformBlock,
     system: SystemPulse,
     shape: PulseShape,
-    *,
-    widths: tuple[float, float] = (LEAST_WIDTH, MOST_WIDTH),
+    fit: FitOptions,
     **options: Any,
 ) -> Settings:
     """Collect what a decomposition with this pulse may do: the strip's widths, digitizer and noise.
@@ -77,8 +111,7 @@ def make_settings(
         As for a stage.
     shape : PulseShape
         The pulse to fit.
-    widths : tuple of float
-        Smallest and largest width of an echo [widths of the system pulse].
+    fit : FitOptions
     **options
         Further fields of Settings.
 
@@ -87,8 +120,12 @@ def make_settings(
     Settings
         For `fit_candidates`.
     """
-    limits = shape_limits(system if shape.components else replace(system, components=()), block.spacing, *widths)
-    return Settings(*limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, **options)
+    pulse = system if shape.components else replace(system, components=())
+    limits = shape_limits(pulse, block.spacing, fit.least_width, fit.most_width)
+    return Settings(
+        *limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, tolerance=fit.tolerance,
+        max_iterations=fit.max_iterations, **options,
+    )  # fmt: skip
 
 
 def fit_candidates(
