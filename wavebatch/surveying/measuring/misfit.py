@@ -60,6 +60,7 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
     ----------
     block : WaveformBlock
     system : SystemPulse
+        Its misfit is the least: 0, or that of a known sensor.
     strong : EchoTable
         The strongest single echoes that no target has widened, one per waveform.
 
@@ -93,7 +94,8 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
         if np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) < CLIPPED:
             share = min(share, np.quantile(_common_promise(part, noise, system, fitted) / energy, COMMON_QUANTILE))
         misfit = SCATTERED * float(np.sqrt(max(share, 0.0)))
-    return replace(system, misfit=misfit, tail_misfit=_measure_tail(part, system, fitted))
+    # A known sensor's pulse changes from shot to shot: of that echoes of a strip have nothing in common.
+    return replace(system, misfit=max(misfit, system.misfit), tail_misfit=_measure_tail(part, system, fitted))
 
 
 def _promise(part: WaveformBlock, samples: Samples, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
