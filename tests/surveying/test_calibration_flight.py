@@ -78,12 +78,14 @@ def test_a_channel_has_the_mean_constant_and_an_error_that_holds_the_drift(fligh
     assert second.relative_error == pytest.approx(first.relative_error, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_strip_that_nothing_ties_is_named_and_has_no_constant(flight):
     folder, said = flight
     assert "warning: d.las: has no constant: no target lies on it" in said
     assert all(row.strip != "d.las" for row in load_calibration(folder / "cal.toml").strips)
 
 
+@pytest.mark.slow
 def test_drifts_and_overlaps_are_told_reported_and_drawn(flight):
     folder, said = flight
     assert "b.las: its constant is -6." in said
@@ -132,6 +134,7 @@ def test_the_adjustment_is_not_pulled_by_wet_or_moved_cells(rng):
     assert np.abs(found.value - constants).max() < 0.01
 
 
+@pytest.mark.slow
 def test_the_errors_of_the_adjustment_hold_its_errors(rng):
     constants = np.array([0.0, 0.3, -0.2])
     ratios = []
@@ -215,6 +218,7 @@ def test_a_step_in_height_between_strips_is_found(clouds, tmp_path):
     assert float(line.split()[6]) == pytest.approx(-0.12, abs=0.003)
 
 
+@pytest.mark.slow
 def test_clouds_that_do_not_overlap_are_one_line(flight):
     folder, _ = flight
     done = call("compare", folder / "a.las", folder / "d.las", "--overlap")
@@ -223,6 +227,7 @@ def test_clouds_that_do_not_overlap_are_one_line(flight):
     assert done.exit_code == 2 and "--overlap needs two clouds" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_strip_in_a_folder_is_never_replaced(flight, tmp_path):
     folder, _ = flight
     strip = tmp_path / "a.las"

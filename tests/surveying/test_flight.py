@@ -109,6 +109,7 @@ def test_a_survey_of_one_strip_is_none_of_a_flight(strips):
             hold_strip(reader, scan, survey)
 
 
+@pytest.mark.slow
 def test_surveys_that_agree(strips):
     surveys = {}
     for name in ("flat", "urban", "wide", "level"):

@@ -201,6 +201,7 @@ def test_after_pulses_of_every_echo_belong_to_the_pulse_however_high(share, seed
     assert whole > 0.985
 
 
+@pytest.mark.slow
 def test_what_is_left_of_few_echoes_is_learned_too():
     """A tail of 1.5 % of the amplitude, from about a hundred clear echoes."""
 

@@ -103,6 +103,7 @@ def optech(x):
     return front / 1.04 + tail + 0.01 * sum(share * bell((x - lag) / 0.6) for lag, share in ripples)
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases("4")
 @pytest.mark.parametrize("seed", [3, 4])
 def test_clipped_echoes_stay_one(seed):

@@ -58,6 +58,7 @@ def test_the_page_of_a_run_has_every_part_and_its_counts_are_those_of_the_report
     assert "<b>&" not in shown.source
 
 
+@pytest.mark.slow
 def test_a_page_is_the_same_for_the_same_result(flight, tmp_path):
     again = tmp_path / "again.html"
     _run("run", flight / "in", "-o", flight / "out", "--resume", "--html", again, code=3)
@@ -124,6 +125,7 @@ def test_counts_that_do_not_add_up_are_marked(flight):
     assert draw_sums({**counts, "echoes": counts["echoes"] + 1}, "echoes").count("does not add up") == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", ["echoes", "returns"])
 def test_the_sums_of_a_page_hold_with_points_left_out(points, tiny_strip, tmp_path):
     for name in ("a.las", "b.las"):
