@@ -81,8 +81,8 @@ LIBRARIES = {
 BY_LOOP = {
     "choose", "tail_at", "build_table", "find_ends", "quiet_edges", "accumulate", "quiet_mean",
     "filter_autocorrelation", "window_signal", "list_samples", "highest_samples", "slide_taps", "slide_energy",
-    "pad_samples", "smooth_b3", "gap_distance", "split_rays", "pack_index", "unpack_index", "fits_keys", "differences_along",
-    "fill_spikes",
+    "pad_samples", "smooth_b3", "gap_distance", "split_rays", "pack_index", "unpack_index", "fits_keys",
+    "differences_along", "fill_spikes",
 }  # fmt: skip
 """Kernels whose loop is short and stands in their test."""
 
