@@ -79,7 +79,7 @@ def decompose(y, std, start, s, clip=np.inf, **shape):
     x = np.arange(float(len(y)))
     clipped = y >= clip
     low = np.array([0.0, -3.0, s.width_low])[:, None]
-    high = np.array([1e9, len(y) + 2.0, s.width_high])[:, None]
+    high = np.array([1e12, len(y) + 2.0, s.width_high])[:, None]
     best, target = None, np.inf
     for _ in range(20):
         prior = (s.width_ref, s.prior_spread) if s.prior_spread and start.shape[1] > 1 else None

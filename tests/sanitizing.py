@@ -132,7 +132,7 @@ def draw_shape(rng: np.random.Generator) -> PulseShape:
         rows = int(rng.choice([2, 3, 65, 4000]))
         z = np.linspace(-8, 8, rows)
         value = np.exp(-0.5 * z**2).astype(np.float32)
-        return PulseShape(table=PulseTable(-8.0, 16 / (rows - 1), value, (-z * value).astype(np.float32)))
+        return PulseShape(table=PulseTable(-8.0, 16 / (rows - 1), value, (-z * value).astype(np.float32), 0.0))
     return PulseShape(origin=("", "", "segment", "waveform")[kind - 3])
 
 

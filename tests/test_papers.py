@@ -259,6 +259,7 @@ WRONG = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIGHT)
 def test_what_is_right_is_accepted(name, load):
     table = RIGHT[name](load(name))

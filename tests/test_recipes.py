@@ -1,19 +1,24 @@
 """docs/recipes.md: every block runs where its programs are installed; all of wavebatch's commands run everywhere."""
 
+import json
 import os
 import re
 import shutil
 import stat
 import subprocess
 import sys
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+
+from wavebatch.core.echoes import COLUMNS
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "recipes.md").read_text("utf-8")
 BLOCKS = dict(re.findall(r'(?ms)^```\w+ title="([^"]+)"\n(.*?)^```$', PAGE))
 RECIPES = {title: text for title, text in BLOCKS.items() if "." not in title}
 PROGRAMS = {"wavebatch", "python"}
+GIS = Path(__file__).resolve().parent.parent / "examples" / "gis"
 
 
 def _programs(text: str) -> list[str]:
@@ -29,6 +34,7 @@ def folder(tiny_strip, tmp_path_factory):
     for title, text in BLOCKS.items():
         if "." in title:
             (folder / title).write_text(text)
+    shutil.copytree(GIS, folder / "examples" / "gis")
     (folder / "bin").mkdir()
     programs = {"wavebatch": f"{sys.executable} -m wavebatch", "python": sys.executable}
     if shutil.which("qgis_process.bin"):  # Debian 12: its `qgis_process` adds an option that the program does not have
@@ -62,6 +68,27 @@ def test_the_page_has_the_programs_of_the_field():
     assert {"gdalinfo", "pdal", "untwine", "Rscript", "CloudCompare", "qgis_process"} <= named
 
 
+def test_every_pipeline_reads_a_cloud_and_is_in_a_recipe():
+    pipelines = {path.name: json.loads(path.read_text()) for path in GIS.glob("*.json")}
+    for name, stages in pipelines.items():
+        assert stages[0] == {"type": "readers.las", "filename": "clouds/strip.laz", "use_eb_vlr": True}
+        assert stages[-1]["type"].startswith("writers.") and f"pdal pipeline examples/gis/{name}" in PAGE
+        for stage in stages:
+            if stage["type"] == "filters.range":
+                assert stage["limits"].split("[")[0] in COLUMNS
+            assert stage.get("dimension", "amplitude") in COLUMNS
+    assert len(pipelines) == 4
+
+
+def test_every_style_draws_a_column_and_hides_no_data():
+    for path in GIS.glob("*.qml"):
+        renderer = ElementTree.parse(path).getroot().find("renderer")
+        assert renderer.get("attribute") == path.stem and path.stem in COLUMNS and f"`{path.stem}`" in PAGE
+        ramp = renderer.find("colorrampshader")
+        values = [float(item.get("value")) for item in ramp.findall("item")]
+        assert ramp.get("clip") == "1" and values == sorted(values) and values[0] > -9999
+
+
 @pytest.mark.parametrize("title", list(RECIPES))
 def test_recipe(folder, title):
     text = RECIPES[title]
@@ -75,6 +102,8 @@ def test_recipe(folder, title):
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     if "CloudCompare" in text and not _opens_las(folder):
         pytest.skip("the CloudCompare here has no LAS plugin")
+    if "copc" in title and "pdal" in text and "writers.copc" not in _run(folder, "pdal --drivers"):
+        pytest.skip("the PDAL here writes no COPC")
     shown = _run(folder, text)
     if title == "gdal-raster":
         assert "Description = median of echo_width" in shown and "NoData Value=-9999" in shown

@@ -94,3 +94,17 @@ def test_a_pulse_that_is_a_guess_warns_in_cron_too(tiny_strip, tmp_path):
     assert "the system pulse is a guess" in line and "--system" in line
     assert CliRunner().invoke(main, ["survey", str(tiny_strip), "-o", str(tmp_path / "long.toml")]).exit_code == 0
     assert warn_quietly(short, tmp_path / "again", "--system", str(tmp_path / "long.toml")) == []
+
+
+def test_a_residual_threshold_below_the_noise_is_said(tiny_strip, tmp_path):
+    stages = ("noise.pooled", "detect.maximum", "decompose.residual_loop")
+    text = "\n".join(f'[[chain]]\nstage = "{name}"' for name in stages)
+    rest = '[[chain]]\nstage = "attribute.position"\n'
+    for t_diff, raised in ((0.1, True), (50.0, False)):
+        chain = tmp_path / f"{t_diff}.toml"
+        chain.write_text(f'{text}\nt_diff = {t_diff}\nt_unit = "count"\n{rest}')
+        folder = tmp_path / f"out-{t_diff}"
+        done = CliRunner().invoke(main, ["run", str(tiny_strip), "-o", str(folder), "-c", str(chain)])
+        assert done.exit_code == 0, done.stderr
+        told = json.loads((folder / f"{tiny_strip.stem}.report.json").read_text())["remarks"]
+        assert any("lies below the noise of" in line and "raised" in line for line in told) == raised

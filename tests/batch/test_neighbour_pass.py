@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -12,18 +13,20 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from strips import descriptor, make_raw, vlr
-from writer_tools import plan_output
 
 from wavebatch.batch import neighbour_pass
 from wavebatch.batch.job import StripJob, choose_columns
-from wavebatch.batch.neighbour_pass import SecondPass, process_tile
+from wavebatch.batch.neighbour_pass import ENTRY, SecondPass, process_tile
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
+from wavebatch.batch.selection import build_selection
 from wavebatch.cli import main
-from wavebatch.core.echoes import RAY
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.disk import spool
-from wavebatch.stages.chain import STAGES, Step
+from wavebatch.kernels.geometry.normals import Gap
+from wavebatch.stages.chain import STAGES, Stage, Step
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import START_TIME, Flight, trace_rays
@@ -44,9 +47,10 @@ def strips(tmp_path_factory):
     return folder
 
 
-def run_strip(path, folder, *, columns=None, text=CHAIN, batch=None, **options):
-    chain = parse_chain(text, "test")
+def run_strip(path, folder, *, columns=None, chain=None, batch=None, selection=None, **options):
+    chain = chain or parse_chain(CHAIN, "test")
     job = StripJob(Path(path), chain, RunOptions(**options), choose_columns(chain, columns))
+    job = job if selection is None else replace(job, selection=selection)
     outcome = run_batch([job], RunOptions(Path(folder), **(batch or {}))).outcomes[0]
     assert outcome.error is None, outcome.error
     return outcome.report
@@ -120,6 +124,31 @@ def test_returns_and_other_names(strips, clouds, tmp_path):
     np.testing.assert_array_equal(cloud.X, vendor.X)
 
 
+def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """Twice the angle."""
+    assert block.samples.shape == (len(block), 0) or np.isnan(echoes.attributes[COLUMNS[0]]).all()
+    return echoes.with_attributes(energy=2 * echoes.attributes[COLUMNS[0]])
+
+
+@pytest.mark.parametrize("points", ["echoes", "returns"])
+def test_stages_after_it_see_its_columns_whatever_the_units(strips, clouds, tmp_path, monkeypatch, points):
+    """They are ordinary stages, and their columns decide what is written."""
+    after = Stage("attribute.energy", "attribute", energy, {}, ("energy",), (COLUMNS[0],))
+    chain = parse_chain(CHAIN, "test")
+    chain = replace(chain, steps=(*chain.steps, Step(after)))
+    monkeypatch.setattr("wavebatch.files.strip.reader.UNIT_POINTS", 3000)
+    selection = build_selection(RunOptions(where="energy < 40 and z > 0"))
+    report = run_strip(strips / "slope.las", tmp_path, chain=chain, selection=selection, points=points)
+    cloud = laspy.read(tmp_path / "slope.laz")
+    angle = np.asarray(cloud[COLUMNS[0]])
+    assert len(cloud) > 2000 and (angle < 20).all()
+    np.testing.assert_array_equal(cloud["energy"], 2 * angle)
+    if points == "echoes":
+        assert report.no_data[COLUMNS[0]]["KNOWN"] == clouds[1]["slope"].no_data[COLUMNS[0]]["KNOWN"]
+        whole = np.asarray(laspy.read(clouds[0] / "slope.laz")[COLUMNS[0]])
+        np.testing.assert_array_equal(angle, whole[(whole != -9999) & (whole < 20)])
+
+
 def test_without_its_columns_there_is_no_second_pass(strips, tmp_path, monkeypatch):
     monkeypatch.setattr("wavebatch.batch.strip_task.SecondPass", None)
     report = run_strip(strips / "slope.las", tmp_path, columns="echo_flags")
@@ -165,7 +194,7 @@ main(sys.argv[1:])
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
-@pytest.mark.parametrize("method", ["take", pytest.param("rows", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["take", pytest.param("next_call", marks=pytest.mark.slow)])
 def test_killed_in_the_second_pass_resume_gives_what_an_undisturbed_run_gives(strips, clouds, tmp_path, method):
     arguments = ["run", str(strips / "slope.las"), "-o", str(tmp_path), "-c", str(strips / "chain.toml"), "-q"]
     done = subprocess.run([sys.executable, "-c", _DIE.format(method=method), *arguments], capture_output=True)
@@ -189,68 +218,71 @@ def test_a_failure_in_the_second_pass_leaves_nothing(strips, tmp_path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
-@pytest.fixture
-def layout(tiny_strip):
-    return plan_output(tiny_strip, COLUMNS)
+SCALES = (0.001, 0.001, 0.001)
 
 
-def make_rows(layout, xyz, ray=(0, 0.1, -1)):
-    rows = np.zeros(len(xyz), layout.extended(RAY).dtype)
-    for axis, name in enumerate("XYZ"):
-        rows[name] = np.rint(np.asarray(xyz, float).reshape(-1, 3)[:, axis] / layout.source.header.scales[axis])
-    for value, name in zip(ray, RAY, strict=True):
-        rows[name] = value
-    return rows
+def make_rows(xyz, ray=(0, 0.1, -1)):
+    entries = np.zeros(len(xyz), ENTRY)
+    entries["xyz"] = np.rint(np.asarray(xyz, float).reshape(-1, 3) / SCALES)
+    entries["ray"] = ray
+    return entries
 
 
-def fill(layout, parts, folder, step=None, **options):
-    """The rows of a cloud after a second pass, and the account."""
-    step = step or Step(STAGES[STAGE])
-    second = SecondPass(step, layout, folder / "cloud.laz", **options)
+def fill(parts, folder, **options):
+    """Values and gaps of all rows after a second pass."""
+    second = SecondPass(Step(STAGES[STAGE]), SCALES, folder / "cloud.laz", **options)
     try:
         for rows in parts:
-            second.add(rows)
-        second.cut()
-        while second.has_more:
-            second.take(process_tile(*second.next_tile()))
-        assert second.is_complete
-        rows = list(second.rows())
-        return np.concatenate([np.empty(0, layout.dtype), *rows]), second.count_reasons(sum(map(len, parts)))
+            second.add(rows, np.zeros(3, np.uint8))
+        return take_all(second, sum(map(len, parts)))
     finally:
         second.close()
         assert not list(folder.iterdir())
 
 
-def test_no_rows_one_row_and_rows_without_a_ray(layout, tmp_path):
+def take_all(second, number):
+    """The values of `number` rows, in the order of the units."""
+    second.cut()
+    found, units = [], 0
+    while second.has_more:
+        function, arguments = second.next_call(b"", None)
+        if function is process_tile:
+            assert second.take(function(*arguments))[0] is None
+        else:
+            found.append(arguments[2])
+            second.take((None, None))
+            units += 1
+    assert second.is_complete and sum(map(len, found)) == number
+    return np.concatenate(found)
+
+
+def test_no_rows_one_row_and_rows_without_a_ray(tmp_path):
     for count in (0, 1):
-        rows, counts = fill(layout, [make_rows(layout, np.zeros((count, 3)))], tmp_path)
-        assert len(rows) == count
-        assert counts == {COLUMNS[0]: {"FEW_NEIGHBOURS": 1} if count else {}}
-        assert (rows[COLUMNS[0]] == -9999).all()
+        found = fill([make_rows(np.zeros((count, 3)))], tmp_path)
+        assert (found["gap"] == Gap.FEW_NEIGHBOURS).all() and len(found) == count
     flat = np.random.default_rng(1).uniform(0, 8, (500, 3)) * [1, 1, 0]
     for ray in ((0, 0, 0), (np.nan, 0, 0)):
-        rows, counts = fill(layout, [make_rows(layout, flat, ray)], tmp_path)
-        assert counts == {COLUMNS[0]: {"NO_RAY": 500}} and (rows[COLUMNS[0]] == -9999).all()
+        assert (fill([make_rows(flat, ray)], tmp_path)["gap"] == Gap.NO_RAY).all()
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_any_tiles_give_the_same_bits_on_any_points(layout, tmp_path, monkeypatch, seed):
+def test_any_tiles_give_the_same_bits_on_any_points(tmp_path, monkeypatch, seed):
     rng = np.random.default_rng(seed)
     spread = rng.uniform(0, 60, (2500, 3)) * [1, 1, 0.001]
     dense = rng.uniform(20, 22, (2500, 3)) * [1, 1, 0.001]
     grid = np.stack(np.meshgrid(np.arange(0, 20, 0.5), np.arange(0, 20, 0.5), [0.0]), -1).reshape(-1, 3) + [80, 0, 0]
     xyz = np.concatenate([spread, dense, grid, np.tile([[5, 5, 0]], (600, 1)), [[2e6, -2e6, 0], [0, 0, 1000]]])
-    rows = make_rows(layout, rng.permutation(xyz))
-    whole, counts = fill(layout, [rows], tmp_path, tile_points=10**9)
-    assert counts[COLUMNS[0]]["KNOWN"] > 4000
+    rows = make_rows(rng.permutation(xyz))
+    whole = fill([rows], tmp_path, tile_points=10**9)
+    assert np.count_nonzero(whole["gap"] == Gap.KNOWN) > 4000
     monkeypatch.setattr(neighbour_pass, "PART_POINTS", 300)
     monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)
-    again, counts_again = fill(layout, np.array_split(rows, 7), tmp_path, tile_points=200)
-    assert counts_again == counts and again.tobytes() == whole.tobytes()
+    again = fill(np.array_split(rows, 7), tmp_path, tile_points=200)
+    assert again.tobytes() == whole.tobytes()
 
 
 @pytest.mark.slow
-def test_very_many_points_in_one_place_take_no_more_memory(layout, tmp_path, monkeypatch):
+def test_very_many_points_in_one_place_take_no_more_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(neighbour_pass, "PART_POINTS", 2000)
     monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)
     monkeypatch.setattr(spool, "MEMORY", 1 << 16)
@@ -258,39 +290,32 @@ def test_very_many_points_in_one_place_take_no_more_memory(layout, tmp_path, mon
     monkeypatch.setattr("wavebatch.files.disk.row_file.RowStore.pieces.__defaults__", (2000,))
     rng, peaks = np.random.default_rng(3), []
     for n in (8000, 40_000):
-        parts = [make_rows(layout, rng.normal(0, 0.05, (2000, 3))) for _ in range(n // 2000)]
-        second = SecondPass(Step(STAGES[STAGE]), layout, tmp_path / "cloud.laz", tile_points=1000)
+        parts = [make_rows(rng.normal(0, 0.05, (2000, 3))) for _ in range(n // 2000)]
+        second = SecondPass(Step(STAGES[STAGE]), SCALES, tmp_path / "cloud.laz", tile_points=1000)
         for rows in parts:
-            second.add(rows)
+            second.add(rows, np.zeros(3, np.uint8))
         del parts
         tracemalloc.start()
-        second.cut()
-        while second.has_more:
-            second.take(process_tile(*second.next_tile()))
-        number = sum(len(rows) for rows in second.rows())
+        take_all(second, n)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         second.close()
-        assert number == n
     assert peaks[1] < 1.3 * peaks[0]
 
 
 @pytest.mark.slow
-def test_memory_does_not_grow_with_the_strip(layout, tmp_path, monkeypatch):
+def test_memory_does_not_grow_with_the_strip(tmp_path, monkeypatch):
     monkeypatch.setattr(neighbour_pass, "SAMPLE", 4000)
     monkeypatch.setattr(spool, "MEMORY", 1 << 20)
     peaks = []
     for n in (60_000, 240_000):
         rng = np.random.default_rng(3)
-        second = SecondPass(Step(STAGES[STAGE]), layout, tmp_path / "cloud.laz", tile_points=10_000)
+        second = SecondPass(Step(STAGES[STAGE]), SCALES, tmp_path / "cloud.laz", tile_points=10_000)
         for start in range(0, n, 20_000):
             xyz = rng.uniform(0, 100, (20_000, 3)) * [1, 1, 0.001] + [start / 200, 0, 0]
-            second.add(make_rows(layout, xyz))
+            second.add(make_rows(xyz), np.zeros(3, np.uint8))
         tracemalloc.start()
-        second.cut()
-        while second.has_more:
-            second.take(process_tile(*second.next_tile()))
-        sum(len(rows) for rows in second.rows())
+        take_all(second, n)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         second.close()

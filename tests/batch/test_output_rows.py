@@ -185,7 +185,7 @@ def test_integer_columns_are_written_too(spoilt, monkeypatch, points, no_data, e
         )
     number = (np.arange(len(echoes.table)) % 200 + 1).astype(np.uint8)
     echoes = dataclasses.replace(echoes, table=echoes.table.with_attributes(amplitude=number))
-    rows, _ = (assemble_echoes if points == "echoes" else assemble_returns)(unit, echoes, prepared.layout)
+    rows = (assemble_echoes if points == "echoes" else assemble_returns)(unit, echoes, prepared.layout).rows
     is_echo = (rows["echo_flags"] & PASSED_THROUGH) == 0
     kept = number if points == "echoes" else number[echoes.table.attributes["point"] >= 0]
     assert rows["amplitude"].dtype == np.uint8

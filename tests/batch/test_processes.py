@@ -154,6 +154,7 @@ def test_a_script_needs_no_main_guard(tiny_strip, tmp_path):
     assert done.stdout.splitlines() == ["script runs", "BatchResult(1 strip written, 0 skipped, 0 failed)"]
 
 
+@pytest.mark.slow
 def test_a_script_with_a_stage_needs_one_and_says_so(tiny_strip, tmp_path):
     done = _run_script(tmp_path, tiny_strip, _STAGE_SCRIPT, call='if __name__ == "__main__":\n    work()')
     assert done.returncode == 0 and done.stdout == "0\n", done.stderr

@@ -249,13 +249,17 @@ def test_the_summary_says_what_is_left_out(riegl, tmp_path):
     assert "no point is written" in CliRunner().invoke(main, [*words, "--overwrite", "--quiet"]).output
 
 
-def test_conditions_of_a_cloud_read_as_those_of_its_run(full, riegl, tmp_path):
-    """One grammar: what `stats --where` takes of a cloud is what `run --where` would have written."""
-    some, _ = _run(riegl, tmp_path / "some", where="echo_width < 4.5")
-    _run(riegl, tmp_path / "all")
+@pytest.mark.parametrize(
+    ("names", "where"),
+    [("wavebatch", "echo_width < 4.5"), ("riegl", "'Echo Width' < 4.65"), ("pdal", "AMPLITUDE > 30 and z > 0")],
+)
+def test_conditions_of_a_cloud_read_as_those_of_its_run(full, riegl, tmp_path, names, where):
+    """One grammar and one resolution of names: `stats --where` takes what `run --where` would have written."""
+    some, _ = _run(riegl, tmp_path / "some", where=where, names=names)
+    _run(riegl, tmp_path / "all", names=names)
     path = next((tmp_path / "all").glob("*.laz"))
-    keep = find_keep(path, parse_condition("echo_width < 4.5"))
-    assert np.count_nonzero(keep(laspy.read(path).points.array)) == len(some.points)
+    keep = find_keep(path, parse_condition(where))
+    assert 0 < len(some.points) == np.count_nonzero(keep(laspy.read(path).points.array))
 
 
 def test_api_refuses_a_wrong_condition(riegl, tmp_path):

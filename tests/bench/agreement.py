@@ -1,8 +1,9 @@
-"""Whether surveys of parts of a strip agree: halves, tiles, and the same waveforms in another order.
+"""Whether surveys of a strip agree: of halves, tiles, the same waveforms in another order, and with other pulse models.
 
     PYTHONPATH=tests python -m bench.agreement STRIP...
 
-Each part is surveyed, then the same packets are decomposed with either survey. `!` marks surveys that disagree.
+Each part is surveyed, then the same packets are decomposed with either survey. The whole strip is also surveyed with at
+most 2, 3, 4, ... Gaussians: tiles may choose different numbers of them. `!` marks surveys that disagree.
 """
 
 from __future__ import annotations
@@ -11,11 +12,14 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
 from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, Stack, fit_gaussians
 from wavebatch.stages.score import match_echoes
+from wavebatch.surveying.measuring import learn_pulse
 from wavebatch.tools.bench.real.measure import Pulse
 from wavebatch.tools.bench.real.pool import Pool, Solver, read_pool
 from wavebatch.tools.bench.report import align
@@ -62,7 +66,23 @@ def compare_parts(pool: Pool, whole: Solver, rng: np.random.Generator) -> list[A
             one, other = (Solver.of_blocks(part) for part in parts)
             rows.append(compare_solvers(name, one, other, packets))
     shuffled = Solver.of_blocks(_shuffle(pool, rng))
-    return [*rows, compare_solvers("in order/shuffled", whole, shuffled, packets)]
+    rows.append(compare_solvers("in order/shuffled", whole, shuffled, packets))
+    return [*rows, *_compare_models(pool, whole, packets)]
+
+
+def _compare_models(pool: Pool, whole: Solver, packets: Sequence[WaveformBlock]) -> Iterator[Agreement]:
+    """Surveys of the whole strip whose pulses have at most 2, 3, 4, ... Gaussians; each number that is chosen once."""
+    seen = {Pulse.of(whole).model}
+    for most in range(2, MOST_COMPONENTS + 2):
+
+        def fit(stack: Stack, width: float, first: int, goal: float, most: int = most):
+            return fit_gaussians(stack, width, min(first, most) if first < MOST_COMPONENTS else most, goal)
+
+        with mock.patch.object(learn_pulse, "fit_gaussians", fit):
+            other = Solver.of_blocks(pool.surveyed)
+        if Pulse.of(other).model not in seen:
+            seen.add(Pulse.of(other).model)
+            yield compare_solvers(f"as it is/at most {most} Gaussians", whole, other, packets)
 
 
 def _per_block(pool: Pool, values: np.ndarray) -> tuple[np.ndarray, ...]:

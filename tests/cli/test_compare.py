@@ -65,7 +65,7 @@ def test_thresholds_set_the_exit_code(strips, option, value, code):
 
 
 def test_a_figure_that_does_not_exist_meets_no_threshold(strips):
-    result = run(strips / "a.las", "--truth", strips / "b.npz", "--tolerance", 1e-6, "--max-rmse", 5)
+    result = run(strips / "a.las", "--truth", strips / "b.npz", "--within", 1e-6, "--max-rmse", 5)
     assert result.exit_code == 1
     assert "has nan" in result.stderr
 
@@ -78,7 +78,7 @@ def test_a_figure_that_does_not_exist_meets_no_threshold(strips):
         (["a.las", "a.npz"], "--truth"),
         (["a.las", "--truth", "b.las"], "no truth file"),
         (["a.las", "none.las"], "none.las"),
-        (["a.las", "b.las", "--tolerance", "-1"], "tolerance"),
+        (["a.las", "b.las", "--within", "-1"], "tolerance"),
     ],
 )
 def test_wrong_usage_has_exit_code_2(strips, arguments, words):

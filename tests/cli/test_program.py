@@ -16,7 +16,7 @@ from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOpt
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.program import log_file
 from wavebatch.cli.program.about import roff
-from wavebatch.cli.program.command import ProgramCommand
+from wavebatch.cli.program.command import ProgramCommand, group_options
 from wavebatch.cli.program.examples import EXAMPLES, GROUPS
 from wavebatch.cli.program.settings import NEVER, OLD_NAMES
 
@@ -57,7 +57,9 @@ def test_examples_are_right_usage(title, line):
 
 def test_groups_name_options_that_exist_and_each_once():
     known = {option.name for _, command in _commands() for option in command.params} | {"help"}
-    named = [name for names in GROUPS.values() for name in names]
+    titled = {(title, option.name) for title, command in _commands() for option in command.params}
+    named = [name for names in GROUPS.values() for name in names if " " not in name]
+    assert {tuple(name.rsplit(" ", 1)) for names in GROUPS.values() for name in names if " " in name} <= titled
     assert len(named) == len(set(named)) and not set(named) & set(OPTIONS)
     rivals = {name for group in (*EXCLUSIVE, *NEEDS.values(), NEEDS) for name in group}
     assert [name for name in {*rivals, *NEVER, *ELSEWHERE} if name not in known] == []
@@ -125,9 +127,39 @@ def test_options_of_several_commands_mean_the_same():
     mixed = {name: kinds for name, kinds in seen.items() if len(kinds) > 1}
     # Files that are written in one command are read by others; other names stand for numbers of different things.
     read_or_written = {"--chain", "--truth", "--angles"}
-    numbers = {"--tolerance", "--point-format", "--no-data", "--pulses", "--width", "--most"}
+    numbers = {"--point-format", "--no-data", "--pulses", "--width", "--most"}
     assert mixed.keys() <= read_or_written | numbers
-    assert not seen.keys() & OLD_NAMES.keys() and set(OLD_NAMES.values()) <= seen.keys()
+    assert set(OLD_NAMES.values()) <= seen.keys()
+    for title, command in _commands():
+        names = {name for option in command.params for name in option.opts}
+        assert not any({old, new} <= names for old, new in OLD_NAMES.items()), title
+
+
+def test_options_that_share_a_name_stand_where_they_belong():
+    places = (("grid", "--crs", "Reading"), ("grid", "--column", "Options"), ("slice", "--most", "Options"))
+    for title, name, heading in places:
+        command = dict(_commands())[title]
+        groups = dict(group_options(command, click.Context(command, info_name=title)))
+        assert any(record[0].startswith(name) for record in groups[heading]), (title, name)
+
+
+def test_every_command_has_quiet_and_debug():
+    for title, command in _commands():
+        names = {name for option in command.params for name in option.opts}
+        assert not names or {"-q", "--quiet", "--debug", "--log-file"} <= names, title
+
+
+def test_quiet_hides_what_is_written_but_no_warning(tiny_strip, tmp_path):
+    loud, still = (invoke("survey", tiny_strip, "-o", tmp_path / f"{name}.toml", *words)
+                   for name, words in (("a", ()), ("b", ("-q",))))  # fmt: skip
+    assert loud.exit_code == still.exit_code == 0 and loud.stdout == still.stdout
+    assert "a.toml: written" in loud.stderr and still.stderr == ""
+
+
+def test_the_tolerance_of_compare_has_another_name(tiny_strip):
+    found = invoke("compare", tiny_strip, tiny_strip, "--tolerance", "0.5")
+    assert found.exit_code == 0, found.stderr
+    assert "--tolerance is now --within" in found.stderr and "within 0.5 ns" in found.stdout
 
 
 def test_old_names_of_options_work_with_a_remark(tiny_strip, tmp_path):
@@ -224,6 +256,13 @@ def test_wrong_settings_are_one_line(folder, text, words):
     (folder / "wavebatch.toml").write_text(text)
     result = _dry(folder)
     assert result.exit_code == 2 and words in result.stderr and result.stderr.count("\n") == 1, result.stderr
+
+
+def test_a_file_beside_the_archives_resumes_no_import(tmp_path):
+    (tmp_path / "wavebatch.toml").write_text("[import]\nresume = true\n")
+    (tmp_path / "a.pls").write_bytes(b"")
+    result = invoke("import", tmp_path / "a.pls", "-o", tmp_path / "a.las")
+    assert result.exit_code == 2 and "resume can be given on the command line or in a variable only" in result.stderr
 
 
 def test_strips_of_folders_with_different_settings_are_not_mixed(folder, tmp_path):

@@ -106,6 +106,6 @@ def test_every_option_that_writes_is_known_as_such():
         "voxelize --profiles", "slice --overview", "slice --cube", "survey --angles", "compare --output",
         "section --output", "profile --output", "cube --output",
         "waveform --output", "histogram --output", "map --output", "calibrate --output", "calibrate --report",
-        "calibrate --plot", "bench --output", "import --output", "export --output",
+        "bench --output", "import --output", "export --output",
         "grid --output", *(f"{command} --html" for command in ("run", "survey", "bench", "calibrate", "compare")),
     }  # fmt: skip

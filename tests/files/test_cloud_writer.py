@@ -232,8 +232,8 @@ def test_columns_are_found_by_the_account_of_the_run(tmp_path):
         with CloudReader(tmp_path / f"{style}.las") as reader:
             np.testing.assert_allclose(next(reader.read_pieces())["echo_width"], values["echo_width"], atol=0.051)
         with ColumnReader(tmp_path / f"{style}.las", "reflectance") as reader:
-            found = next(reader.read_pieces())["value"]
-            in_db = reader.facts.unit == "dB"
+            found = next(reader.read_pieces())["values"][:, 0]
+            in_db = reader.facts[0].unit == "dB"
         expected = 10 * np.log10(values["reflectance"]) if in_db else values["reflectance"]
         np.testing.assert_allclose(found, expected, atol=0.0051)
         assert in_db == (style in ("riegl", "pdal"))
@@ -250,7 +250,7 @@ def test_a_vendors_column_of_our_name_does_not_hide_ours(tmp_path):
     np.testing.assert_array_equal(cloud["amplitude"], np.arange(200))
     np.testing.assert_array_equal(cloud["input_amplitude"], points["amplitude"])
     with ColumnReader(tmp_path / "b.las", "amplitude") as reader:
-        assert reader.facts.name == "wb_amplitude"
+        assert reader.facts[0].name == "wb_amplitude"
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xff", b"[1]", b'{"columns": 3}', b'{"columns": {"amplitude": ["x"]}}'])

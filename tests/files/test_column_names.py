@@ -5,7 +5,7 @@ import pytest
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.column_names import STYLES, describe, describe_roundings, name_columns, normalise
+from wavebatch.files.cloud.column_names import STYLES, describe, describe_roundings, name_columns, normalise, resolve
 
 ALL = tuple(COLUMNS)
 WRITTEN = tuple(name for name, column in COLUMNS.items() if column.extra_bytes)
@@ -129,3 +129,13 @@ def test_flags_keep_their_bits():
     (flags,) = name_columns(["echo_flags"], "wavebatch", ())
     assert flags.record.no_data is None
     assert list(flags.encode(np.array([0, 1, 65535], np.uint16))) == [0, 1, 65535]
+
+
+def test_exact_names_come_before_those_that_are_alike_and_kinds_count_in_order():
+    ours, file = {"echo_width": "Pulse width", "amplitude": "wb_amplitude"}, {"Amplitude": "Amplitude", "z": "z"}
+    assert resolve("Amplitude", ours, file) == "Amplitude"
+    assert resolve("amplitude", ours, file) == "wb_amplitude"
+    assert resolve("AMPLITUDE", ours, file) == "wb_amplitude"
+    assert resolve("Echo Width", ours, file) == "Pulse width"
+    assert resolve("Z", ours, file) == "z"
+    assert resolve("width", ours, file) is None

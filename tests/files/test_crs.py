@@ -294,3 +294,15 @@ def test_geocentric_strips_without_a_crs_get_no_ranges(tmp_path, records):
     done = CliRunner().invoke(main, [*arguments, "--flight-height", "500"])
     assert done.exit_code == 4 and "coordinates are geocentric" in done.stderr
     assert CliRunner().invoke(main, arguments).exit_code == 0
+
+
+def test_degrees_with_metric_vectors_get_no_new_echoes(tmp_path):
+    strip = make_raw(200).write(tmp_path / "s.las")
+    content = bytearray(strip.read_bytes())
+    struct.pack_into("<3d", content, 131, 1e-7, 1e-7, 0.001)
+    struct.pack_into("<6d", content, 179, 15.7, 15.6, 48.7, 48.6, 400.0, 300.0)
+    strip.write_bytes(content)
+    arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 4 and "coordinates are degrees, packet vectors metres" in done.stderr
+    assert CliRunner().invoke(main, [*arguments, "--points", "returns"]).exit_code == 0

@@ -150,6 +150,7 @@ def read_block(path):
         return block, survey_blocks(read_sample(reader, scan)).system
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases("255")
 @pytest.mark.parametrize("fill", [0, 255])
 def test_readers_mark_fill_and_put_quiet_counts_there(whole, tmp_path, fill):
@@ -212,6 +213,7 @@ def test_detectors_find_nothing_in_gaps_and_at_their_edges(whole, tmp_path, name
     assert abs(len(first) - len(second)) <= 0.03 * len(first)
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases("7-decompose.adaptive", "7-decompose.gaussian", "0-decompose.[!alg]*", "0-decompose.asdf_only")
 @pytest.mark.parametrize("name", DECOMPOSERS)
 @pytest.mark.parametrize("shift", [0, 7])

@@ -10,8 +10,9 @@ from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, vlr
 from writer_tools import data_file, read_raw
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import spool, temp_folders
+from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.las import laz_decode
 from wavebatch.files.strip import reader as reader_module
 from wavebatch.files.strip import scanner, shared_packets
@@ -430,3 +431,20 @@ def test_scanner_channels_come_with_their_waveforms(tmp_path):
     with StripReader(make_raw(3).write(tmp_path / "old.las")) as reader, reader.scan() as scan:
         block, _ = next(iter(reader.read_blocks(reader.read_unit(0, scan), 5, owned_only=True)))
     assert block.scanner is None
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
+def test_a_link_to_a_strip_finds_the_packets_beside_its_target(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "links").mkdir()
+    strip = make_raw(60, internal=False).write(tmp_path / "real" / "a strip.las")
+    link = tmp_path / "links" / "b.las"
+    link.symlink_to(strip)
+    with StripReader(link) as reader:
+        assert reader.facts.packets.file == strip.with_suffix(".wdp").resolve()
+    other = link.with_suffix(".wdp")
+    other.write_bytes(strip.with_suffix(".wdp").read_bytes())
+    with StripReader(link) as reader:  # those beside the link count first
+        assert reader.facts.packets.file == other
+    with protecting([link]), pytest.raises(ConfigError, match="replace this input"):
+        refuse_input(strip.with_suffix(".wdp"))

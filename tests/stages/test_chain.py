@@ -1,5 +1,6 @@
 """Stages and chains: what the decorator refuses, the order of kinds, needs and makes, and a stage that fails."""
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -208,6 +209,45 @@ def test_a_stage_that_needs_a_column_comes_after_the_one_that_makes_it(dependent
     for wrong in ((second,), (second, first)):
         with pytest.raises(ConfigError, match="attribute.second needs energy; put the stage that makes it before"):
             Chain((*steps(*BASE), *wrong))
+
+
+def test_stages_share_parameters_with_defaults_and_meanings():
+    @dataclass(frozen=True)
+    class Wide:
+        """Shared.
+
+        Parameters
+        ----------
+        width : float
+            Of something [ns].
+        """
+
+        width: Annotated[float, Range(0.0, 9.0)] = 1.0
+
+    @dataclass(frozen=True)
+    class Long(Wide):
+        """Shared too.
+
+        Parameters
+        ----------
+        length : int
+            Of something else.
+        """
+
+        length: int = 2
+
+    @stage("attribute", makes=("energy",), shares=Long(length=5))
+    def sharing(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: float
+                ) -> EchoTable:  # fmt: skip
+        """A column."""
+        return echoes.with_attributes(energy=np.full(len(echoes), options.get("width", 7.0)))
+
+    made = chain_module.STAGES["attribute.sharing"]
+    assert {name: (one.default, one.meaning) for name, one in made.parameters.items()} == {
+        "width": (1.0, "Of something [ns]."), "length": (5, "Of something else.")}  # fmt: skip
+    assert made.parameters["width"].range == Range(0.0, 9.0)
+    table = Chain((*steps(*BASE), Step(made, {"width": 3.0}))).run(block(), SYSTEM)
+    assert (table.attributes["energy"] == 3.0).all()
 
 
 @pytest.mark.parametrize("first", ["attribute.incidence_angle_normals", "attribute.of_neighbours"])

@@ -17,7 +17,7 @@ from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.kernels.physics.radar import receive_power
 from wavebatch.stages.attribute.light import echo_light
-from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.stages.pulse_tables import describe_echoes, pulse_shape, shape_limits
 from wavebatch.surveying import survey_block
@@ -117,18 +117,25 @@ def test_reflectance_by_the_width_of_the_echo():
 
 def test_reflectance_by_normals_waits_for_the_second_pass():
     block, echoes, _ = make(np.full(50, 30.0), snr=3000.0)
-    done = run(block, echoes, SYSTEM, "backscatter_coefficient", "reflectance")
+    done = run(block, echoes, SYSTEM, "backscatter_coefficient", "incidence_angle_normals", "reflectance")
     assert np.isnan(done.attributes["reflectance"]).all()
     assert reasons(done)["reflectance"] == {"NO_ANGLE": 50}
-    carried = {name: done.attributes[name] for name in ("facing_reflectance", "facing_reflectance_err")}
-    assert carried["facing_reflectance"] == pytest.approx(done.attributes["backscatter_coefficient"] / 4)
-    angle, error = np.full(50, 60.0), np.full(50, 1.0)
+    gamma = done.attributes["backscatter_coefficient"]
+    assert done.attributes["facing_reflectance"] == pytest.approx(gamma / 4)
+    angle, error = np.full(50, 60.0, np.float32), np.full(50, 1.0, np.float32)
     angle[0] = np.nan
-    complete = STAGES["attribute.reflectance"].complete
-    full = complete({**carried, "incidence_angle_normals": angle, "incidence_angle_normals_err": error})
+    names = ("backscatter_coefficient", "incidence_angle_normals", "reflectance")
+    chain = Chain((*load_profile("fast").steps, *(Step(STAGES[f"attribute.{name}"]) for name in names)))
+    noise = Noise(np.full(len(block), 12, np.float32), np.ones(len(block), np.float32))
+    kept = chain.keep_needed(Solved(block, noise, SYSTEM, done))
+    assert not kept.block.samples.size and set(kept.echoes.attributes) == {"x", "y", "z", "range_err"}
+    full = chain.solve_again(kept._replace(echoes=kept.echoes.with_attributes(
+        incidence_angle_normals=angle, incidence_angle_normals_err=error)))  # fmt: skip
+    assert reasons(full)["reflectance"] == {"NO_ANGLE": 1, "KNOWN": 49}
+    full = full.attributes
     assert np.isnan(full["reflectance"][0])
-    assert full["reflectance"][1:] == pytest.approx(done.attributes["backscatter_coefficient"][1:] / 2, rel=1e-6)
-    relative = carried["facing_reflectance_err"] / carried["facing_reflectance"]
+    assert full["reflectance"][1:] == pytest.approx(gamma[1:] / 2, rel=1e-6)
+    relative = done.attributes["backscatter_coefficient_err"] / gamma
     expected = np.hypot(relative, np.tan(np.pi / 3) * np.radians(1.0))[1:]
     assert full["reflectance_err"][1:] / full["reflectance"][1:] == pytest.approx(expected, rel=1e-5)
 

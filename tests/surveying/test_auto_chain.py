@@ -65,6 +65,8 @@ def test_an_open_scene_gets_one_fit_per_maximum_and_reads_why():
         (_survey(overlapped_share=0.003, empty_share=0.0), False),
         (_survey(overlapped_share=0.003, empty_share=0.8), True),  # of the echoes there, many overlap
         (_survey(overlapped_share=0.0, waveforms=300), True),  # too few to be sure
+        (_survey(overlapped_share=0.0, waveforms=1000), True),  # as one pair among them
+        (_survey(overlapped_share=0.001, waveforms=1000), True),
         (_survey(overlapped_share=0.0, empty_share=1.0), True),
         (_survey(decisions=()), True),
         (replace(_survey(), figures={}), True),

@@ -49,7 +49,7 @@ def flight(tmp_path_factory):
     (folder / "t.csv").write_text(f"name,reflectance,vertices\nfield,0.3,{corners}\n")
     strips = [folder / f"{name}.las" for name in sensors]
     options = ("--targets", folder / "t.csv", "-o", folder / "cal.toml", "--divergence", 0.5)
-    outputs = ("--report", folder / "cal.json", "--plot", folder / "cal.png")
+    outputs = ("--report", folder / "cal.json", "--html", folder / "cal.html")
     done = call("calibrate", *strips, *options, *outputs)
     assert done.exit_code == 0, done.output
     return folder, done.stderr
@@ -78,12 +78,14 @@ def test_a_channel_has_the_mean_constant_and_an_error_that_holds_the_drift(fligh
     assert second.relative_error == pytest.approx(first.relative_error, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_strip_that_nothing_ties_is_named_and_has_no_constant(flight):
     folder, said = flight
     assert "warning: d.las: has no constant: no target lies on it" in said
     assert all(row.strip != "d.las" for row in load_calibration(folder / "cal.toml").strips)
 
 
+@pytest.mark.slow
 def test_drifts_and_overlaps_are_told_reported_and_drawn(flight):
     folder, said = flight
     assert "b.las: its constant is -6." in said
@@ -92,7 +94,7 @@ def test_drifts_and_overlaps_are_told_reported_and_drawn(flight):
     pair = next(row for row in report["pairs"] if (row["a"], row["b"]) == ("b.las", "a.las"))
     assert pair["ratio"] == pytest.approx(1.08, abs=0.003) and pair["after"] == pytest.approx(1.0, abs=0.002)
     assert abs(pair["height"]) < 0.003
-    assert (folder / "cal.png").stat().st_size > 10_000
+    assert "Calibrated light of the first over the second" in (folder / "cal.html").read_text("utf-8")
 
 
 @pytest.mark.slow
@@ -132,6 +134,7 @@ def test_the_adjustment_is_not_pulled_by_wet_or_moved_cells(rng):
     assert np.abs(found.value - constants).max() < 0.01
 
 
+@pytest.mark.slow
 def test_the_errors_of_the_adjustment_hold_its_errors(rng):
     constants = np.array([0.0, 0.3, -0.2])
     ratios = []
@@ -215,6 +218,7 @@ def test_a_step_in_height_between_strips_is_found(clouds, tmp_path):
     assert float(line.split()[6]) == pytest.approx(-0.12, abs=0.003)
 
 
+@pytest.mark.slow
 def test_clouds_that_do_not_overlap_are_one_line(flight):
     folder, _ = flight
     done = call("compare", folder / "a.las", folder / "d.las", "--overlap")
@@ -223,6 +227,7 @@ def test_clouds_that_do_not_overlap_are_one_line(flight):
     assert done.exit_code == 2 and "--overlap needs two clouds" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_strip_in_a_folder_is_never_replaced(flight, tmp_path):
     folder, _ = flight
     strip = tmp_path / "a.las"

@@ -95,6 +95,7 @@ def test_brightness_that_falls_across_the_swath_is_named_and_in_the_errors(tmp_p
     assert 0.5 < np.mean(np.abs(off) < stated) < 0.9
 
 
+@pytest.mark.slow
 def test_the_term_over_the_scan_angle_is_fitted_kept_drawn_and_applied(tmp_path, dim_edges):
     page = tmp_path / "page.html"
     found, said = calibrate(dim_edges, "--scan-angle", "--html", page)
@@ -174,6 +175,7 @@ def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_pat
     assert np.nanmedian(stated) == pytest.approx(growth, abs=0.1)
 
 
+@pytest.mark.slow
 def test_reflectances_above_one_are_one_line_whatever_the_reason(tmp_path, calibrated):
     wrong = write_targets(tmp_path / "t.csv")
     wrong.write_text(wrong.read_text().replace("field,0.3", "field,0.9"))

@@ -208,6 +208,7 @@ def flickering(tmp_path_factory):
     return folder, flight, truth
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases("shots.csv")
 @pytest.mark.parametrize("source", ["shot_energy", "shots.csv"])
 def test_the_energy_of_each_shot_is_divided_out(tmp_path, flickering, source):

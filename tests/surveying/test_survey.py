@@ -78,6 +78,7 @@ def test_waveforms_of_several_lengths_are_surveyed_together():
     assert join_digitizers([]) == [] and survey_blocks([]).waveforms == 0
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases("0.2")
 @pytest.mark.parametrize("gain", [0.0, 0.03, 0.2])
 def test_the_growth_of_noise_is_not_what_the_fit_leaves_of_it(gain):

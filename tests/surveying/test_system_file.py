@@ -102,7 +102,7 @@ def test_figures_that_are_no_numbers_are_left_out():
 
 def test_every_number_of_the_system_has_a_key():
     fields = {quantity.field for quantity in QUANTITIES.values()} | {"noise_by_kind", "components", "digitizers"}
-    fields |= {"correlation", "tail_misfit", "pattern", "hidden"}
+    fields |= {"correlation", "tail_misfit", "pattern", "seams", "hidden"}
     # Of a calibration and of the sensor's position, which come with files of their own.
     elsewhere = {"calibration", "calibration_err", "channels", "attenuation", "sensor_error", "shot_error"}
     elsewhere |= {"attenuation_error", "swath"}

@@ -1,5 +1,7 @@
 """What receivers do to waveforms besides noise: tails, spikes, transients, patterns, slopes, clipped tops."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
+from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
 
 BASE = 12.0
 
@@ -100,6 +103,7 @@ def optech(x):
     return front / 1.04 + tail + 0.01 * sum(share * bell((x - lag) / 0.6) for lag, share in ripples)
 
 
+@pytest.mark.slow
 @pytest.mark.quick_cases("4")
 @pytest.mark.parametrize("seed", [3, 4])
 def test_clipped_echoes_stay_one(seed):
@@ -177,11 +181,39 @@ def test_sloping_baselines_hide_no_echo():
     assert found > 0.99 and true > 0.99
 
 
+def two_recordings(seed, n=600):
+    """Packets of two recordings that meet at sample 60, which is interpolated: .3 to .7 samples are lost there."""
+    rng = np.random.default_rng(seed)
+    time = rng.uniform(50, 72, n)
+    at = np.arange(120.0) - (np.arange(120) > 60) * rng.uniform(0.3, 0.7, (n, 1))
+    exact = BASE + rng.uniform(60, 200, (n, 1)) * bell((at - time[:, None]) / 1.7) + rng.normal(0, 0.7, (n, 120))
+    counts = np.rint(exact)
+    counts[:, 60] = np.rint(0.5 * (counts[:, 59] + counts[:, 61]))
+    return WaveformBlock.from_samples(counts.astype(np.uint8)), time
+
+
+def test_an_interpolated_seam_between_two_recordings_is_no_signal():
+    """An echo across it was fitted as two, or at a bound (GeoLas: 21 % of the echoes near the seam)."""
+    block, time = two_recordings(14)
+    survey = survey_blocks([block])
+    assert survey.system.seams == {120: 60}
+    assert any("two recordings" in decision.reason for decision in survey.decisions)
+    across = np.abs(time - 60) < 3
+    numbers = []
+    for system in (survey.system, replace(survey.system, seams={})):
+        echoes = load_profile("accurate").run(block, system)
+        numbers.append(echoes.count(len(block))[across].mean())
+    assert numbers[0] < 1.05 < numbers[1]
+    kept = parse_survey(format_survey(SavedSurvey(survey, "x", {})), "x")
+    assert kept.survey.system.seams == {120: 60}
+
+
 def test_strips_without_defects_keep_their_counts():
     for pulse, seed in ((bell, 9), (tailed(0.012, 30.0), 10)):
         block = digitize(render(pulse, seed, second=0.3)[0], seed)
         system = survey_block(block).system
         assert not system.has_defects and clean_block(block, system) is block
+        assert not survey_blocks([block]).system.seams
 
 
 @pytest.mark.quick_cases("0.0-0.1")

@@ -286,14 +286,14 @@ def test_an_empty_cloud_has_no_area(tmp_path):
 @pytest.mark.parametrize("bad", [np.nan, 1e300, -np.inf])
 def test_pulses_without_a_place_are_counted_outside(tmp_path, monkeypatch, bad):
     pulse, _, number = make_cloud(tmp_path / "c.las", n=300)
-    pieces = returns.ReturnReader.read_pieces
+    pieces = returns.CloudReader.read_pieces
 
     def damage(self):
         for rows in pieces(self):
             rows["xyz"][(rows["gps_time"] < 1e5 + 40) & (rows["number"] == 1), 0] = bad
             yield rows
 
-    monkeypatch.setattr(returns.ReturnReader, "read_pieces", damage)
+    monkeypatch.setattr(returns.CloudReader, "read_pieces", damage)
     (one,), _ = count_returns([tmp_path / "c.las"], divisions=[Grid(10), PolygonSet([square(299_000, -500, 2000)])])
     for kinds in (("cell",), ("polygon",)):
         inside = [area for area in one.areas if area.kind in kinds]

@@ -73,6 +73,7 @@ def test_document_has_a_row_per_chain_and_peer(document):
     assert document["scenes"][0]["cheapest"] in names
 
 
+@pytest.mark.slow
 def test_isolated_echoes_are_at_the_bound(document):
     figures = find_row(document, "accurate")["figures"]
     for name in ("time", "amplitude", "sigma"):

@@ -124,6 +124,16 @@ def test_tables_of_wang_et_al(kappa, noise_share, gaussian, log_normal):
         assert floor[alone].mean() == pytest.approx(60 * noise_share**2 / (np.sqrt(np.pi) * sigma), rel=0.03)
 
 
+def test_the_floor_is_that_of_single_samples_where_noise_is_coloured():
+    """Thresholds use what noise does to a pulse: E0 was .116 on a strip whose fits leave .024."""
+    block, noise = record(100 * naive.pulse(np.arange(60.0), 30.0, 2.0)[None], std=1.0)
+    echo = EchoTable.build(np.zeros(1), np.array([30.0]), np.array([100 * FINE]), np.array([2.0]))
+    step = Step(STAGES["decompose.gaussian"])
+    plain = measure_fit(block, noise, SystemPulse(2.0, noise_std=1.6), step, echo)[1]
+    coloured = measure_fit(block, noise, SystemPulse(2.0, noise_std=1.6, noise_by_kind={"quiet": 0.8}), step, echo)[1]
+    assert coloured == pytest.approx(plain / 4, rel=1e-5)
+
+
 def test_floor_of_the_specification():
     """0.00159 for 60 samples, amplitude over noise 100, sigma 2.123."""
     block, noise = record(100 * naive.pulse(np.arange(60.0), 30.0, 2.123)[None], std=1.0)

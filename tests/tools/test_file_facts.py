@@ -4,6 +4,7 @@ import json
 import shlex
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import laspy
 import numpy as np
@@ -14,7 +15,7 @@ from writer_tools import data_file, write_source
 import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.files.las.header import Vlr
-from wavebatch.tools.inspect.file_facts import describe_file
+from wavebatch.tools.inspect.file_facts import _describe_time, describe_file
 
 
 @pytest.mark.parametrize("point_format", [0, 1, 3, 6, 8])
@@ -101,7 +102,7 @@ def _make(words, folder):
 
 def test_headers_that_are_wrong_show():
     shown = CliRunner().invoke(main, ["info", str(data_file("no-packets/simple1_3.las"))]).stdout
-    assert "the header says -235434519.000 to -234935841.000" in shown
+    assert "the header says -235434519 to -234935841" in shown
 
 
 @pytest.mark.parametrize("account", [b"[]", b"{", b'{"options": 3, "request": [], "columns": 7, "chain": {}}'])
@@ -109,3 +110,9 @@ def test_accounts_of_any_form_are_shown_as_far_as_they_go(tmp_path, account):
     write_source(tmp_path / "a.las", 6, (1, 4), vlrs=[Vlr(b"wavebatch", 1, account)])
     result = CliRunner().invoke(main, ["info", str(tmp_path / "a.las")])
     assert result.exit_code == 0, result.output
+
+
+def test_times_that_are_no_seconds_of_the_week_are_not_called_so():
+    header = SimpleNamespace(global_encoding=0)
+    assert _describe_time(header, (1e9, 1.1e9))["kind"].startswith("unknown (the header says seconds of the week")
+    assert _describe_time(header, (5.0, 604_000.0))["kind"] == "seconds of the week"

@@ -1,5 +1,7 @@
 """`wavebatch grid`: every cell equals a plain count, in bounded memory; GDAL reads place, CRS, units and no-data."""
 
+import struct
+
 import laspy
 import numpy as np
 import pytest
@@ -228,3 +230,15 @@ def test_the_raster_of_a_real_strip_has_its_crs(rasterio, riegl, tmp_path):
     _run(tmp_path / f"{riegl.stem}.laz", "--column", "echo_width", "--size", 2, "-o", tmp_path / "x.tif")
     with rasterio.open(tmp_path / "x.tif") as found:
         assert found.crs.to_epsg() == 32633
+
+
+def test_cells_in_metres_are_refused_on_degrees(rasterio, rng, tmp_path):
+    degrees = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257]],UNIT["degree",0.0174532925]]'
+    _cloud(tmp_path / "d.las", rng, wkt=degrees)
+    content = bytearray((tmp_path / "d.las").read_bytes())
+    struct.pack_into("<6d", content, 131, 1e-8, 1e-8, 0.001, 15.0, 48.0, 0.0)
+    struct.pack_into("<6d", content, 179, 15.1, 15.0, 48.1, 48.0, 1.0, 0.0)
+    (tmp_path / "d.las").write_bytes(content)
+    words = (tmp_path / "d.las", "--column", "height", "-o", tmp_path / "d.tif")
+    assert "coordinates are degrees, and cells of 1 degrees are larger" in _run(*words, code=2).stderr
+    _run(*words, "--size", "1e-05")

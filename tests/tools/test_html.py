@@ -58,6 +58,7 @@ def test_the_page_of_a_run_has_every_part_and_its_counts_are_those_of_the_report
     assert "<b>&" not in shown.source
 
 
+@pytest.mark.slow
 def test_a_page_is_the_same_for_the_same_result(flight, tmp_path):
     again = tmp_path / "again.html"
     _run("run", flight / "in", "-o", flight / "out", "--resume", "--html", again, code=3)
@@ -109,12 +110,13 @@ def test_the_page_of_a_benchmark(timed_here, tmp_path):
 def test_the_page_of_a_calibration(tmp_path):
     targets = (TargetResult("roof <i>", 0.3, 50, 2e-9, 0.1, 12.0), TargetResult("lake", 0.02, 1, refused="too few"))
     strips = tuple(StripConstant(f"{n}.las", "", 1, 0, 2e-9, 0.05, 0.01 * n, 0.02, 9) for n in range(3))
-    found = Calibration(2e-9, 0.05, strip="s.las", targets=targets, strips=strips, notes=("constants differ",))
+    found = Calibration(2e-9, 0.05, strip="s.las", date="2026-01-02", targets=targets, strips=strips,
+                        notes=("constants differ",))  # fmt: skip
     pairs = (PairOverlap("0.las", "1.las", 40, 1.1, 1.01, 0.02, 0.003, 0.01),)
     write_calibrate_page(tmp_path / "c.html", FlightCalibration(found, pairs))
     shown = Page(tmp_path / "c.html").check()
-    assert shown.row("roof <i>")[2] == "50" and shown.row("lake")[-1] == "too few"
-    assert "constants differ" in shown.text
+    assert "0.las / 1.las" in shown.text and shown.row("roof <i>")[2] == "50" and shown.row("lake")[-1] == "too few"
+    assert "constants differ" in shown.text and shown.row("day of the flight")[1] == "not in the strip"
 
 
 def test_counts_that_do_not_add_up_are_marked(flight):
@@ -123,6 +125,7 @@ def test_counts_that_do_not_add_up_are_marked(flight):
     assert draw_sums({**counts, "echoes": counts["echoes"] + 1}, "echoes").count("does not add up") == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", ["echoes", "returns"])
 def test_the_sums_of_a_page_hold_with_points_left_out(points, tiny_strip, tmp_path):
     for name in ("a.las", "b.las"):

@@ -122,6 +122,7 @@ def test_slices_and_cubes(texts, tmp_path, riegl):
     assert any(riegl.name in text for name, text, *_ in texts if name == "a.png"), "the strip is named"
 
 
+@pytest.mark.slow
 def test_axes_in_metres_have_equal_scales(tmp_path, riegl, monkeypatch):
     kept = []
     save = figure_file._save

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from plot_tools import PULSE, make_chain, simulate
+from scipy.optimize import curve_fit
 from strips import make_raw
 
 from wavebatch.cli import main
@@ -29,7 +30,7 @@ from wavebatch.tools.compare.chains import ChainRun
 from wavebatch.tools.compare.goodness import measure_fit
 from wavebatch.tools.html.strip_views import measure_residuals
 from wavebatch.tools.plots.draw_sheet import draw_sheet
-from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels
+from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels, draw_waveforms
 from wavebatch.tools.plots.echo_table import list_echoes
 from wavebatch.tools.plots.labels import place_labels
 from wavebatch.tools.plots.packets import MOST, Place, Wanted, find_places
@@ -64,6 +65,10 @@ def test_residuals_are_those_of_the_cleaned_samples():
     assert np.nanmedian(misfit / floor) == pytest.approx(1.0, abs=0.2)
 
 
+def gaussian(time, amplitude, centre, width):
+    return amplitude * np.exp(-0.5 * ((time - centre) / width) ** 2)
+
+
 @pytest.mark.parametrize("name", [name for name, shape in MODELS.items() if shape is not None])
 def test_curves_are_the_fit_of_every_decomposer(name):
     shape, system, parameters = PulseShape(), PULSE, {}
@@ -82,7 +87,9 @@ def test_curves_are_the_fit_of_every_decomposer(name):
         assert np.sqrt(np.mean(view.residual[near] ** 2)) < worst + 0.6
         top = view.curves[0].max()
         assert top == pytest.approx(float(view.echoes.amplitude[0]), rel=0.01)
-        assert view.fine[np.argmax(view.curves[0])] == pytest.approx(float(view.echoes.time[0]), abs=0.1)
+        # The datum of a pulse is the centre of the Gaussian that fits it best.
+        (_, centre, _), _ = curve_fit(gaussian, view.fine, view.curves[0], (top, 30, 2))
+        assert centre == pytest.approx(float(view.echoes.time[0]), abs=0.1)
     rms = np.sqrt(np.mean([np.mean(view.residual[np.abs(view.time - 30) <= 5] ** 2) for view in views]))
     assert rms < worst
 
@@ -396,6 +403,9 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
         assert len(find_places(reader, scan, Wanted(packets=((0, 60),), sheet=True), None)) == 60
         with pytest.raises(ConfigError, match=f"{MOST} fit"):
             find_places(reader, scan, Wanted(random=40), None)
+        assert len(find_places(reader, scan, Wanted(sheet=True), None)) == 100  # as many as a sheet holds
+        with pytest.raises(ConfigError, match="100 with --sheet"):
+            find_places(reader, scan, Wanted(most=30), None)
     pytest.importorskip("matplotlib")
     target = tmp_path / "sheet.svg"
     words = (tiny_strip, "-o", target, "--random", 9, "--seed", 1, "--sheet", "--profile", "fast", "--overwrite")
@@ -406,6 +416,17 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
     assert run(*words).exit_code == 0 and target.read_bytes() == first
     clash = run(tiny_strip, "-o", tmp_path / "p.png", "--random", 3, "--packet", 2)
     assert clash.exit_code == 2 and "--random chooses the waveforms" in clash.stderr
+
+
+def test_titles_name_every_flag_of_many_echoes(tmp_path):
+    pytest.importorskip("matplotlib")
+    peaks = [(100.0, 20.3 + 8 * k, 2.0) for k in range(3)]
+    (view,) = build_views(simulate(PulseShape(), peaks, n=1), make_chain("decompose.gaussian"), PULSE, [0])
+    view.echoes.flags[:] = int(EchoFlag.SATURATED | EchoFlag.OVERLAPPED | EchoFlag.AMPLITUDE_UNRELIABLE)
+    draw_waveforms([view] * 3, tmp_path / "w.svg", strip="s", chain="c")
+    text = (tmp_path / "w.svg").read_text("utf-8")
+    for name in ("SATURATED", "OVERLAPPED", "AMPLITUDE_UNRELIABLE"):
+        assert text.count(f"{name} 1,2") == 3
 
 
 def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):

@@ -74,8 +74,8 @@ def test_order_of_points_does_not_matter(tmp_path, rng):
 def test_without_times_rising_numbers_make_a_pulse(tmp_path, monkeypatch):
     path = write_cloud(tmp_path / "c.las", **SMALL, point_format=0)
     check_small(count_returns([path])[1], "return_number")
-    pieces = returns.ReturnReader.read_pieces
-    monkeypatch.setattr(returns.ReturnReader, "read_pieces", lambda self, size=2: pieces(self, 2))
+    pieces = returns.CloudReader.read_pieces
+    monkeypatch.setattr(returns.CloudReader, "read_pieces", lambda self, size=2: pieces(self, 2))
     check_small(count_returns([path])[1], "return_number")
 
 

@@ -6,18 +6,24 @@ import re
 import shutil
 import struct
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from strips import add_record
 
 from wavebatch.cli import main
+from wavebatch.core.errors import ConfigError
 from wavebatch.files.las.crs import metres_per_unit, parse_wkt
 from wavebatch.files.las.geotiff_wkt import build_utm
 from wavebatch.files.las.header import build_wkt
+from wavebatch.files.strip.packet_vectors import DirectionTally, decide
 from wavebatch.tools.html.cloud_pictures import picture_cloud
+from wavebatch.tools.plots.section_data import cut_section, measure_profile
+from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.simulate import simulate_strip
 
 FOOT = 1200 / 3937
+GEOCENTRIC = 'GEOCCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257]],UNIT["metre",1]]'
 FEET = build_utm(32614).replace('UNIT["metre",1,AUTHORITY["EPSG","9001"]]', f'UNIT["US survey foot",{FOOT!r}]')
 DEGREES = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257]],UNIT["degree",0.0174532925]]'
 
@@ -126,3 +132,27 @@ def test_no_waveforms_are_modelled_with_distances_in_another_unit(clouds, tmp_pa
     said = _print("synthesize", clouds[unit], "-o", tmp_path / "a.las", code=1).stderr
     assert said.count("\n") == 1 and "project it to metres first" in said and not list(tmp_path.iterdir())
     _print("synthesize", clouds["m"], "-o", tmp_path / "a.las", "-q")
+
+
+def test_pictures_name_the_unit_of_heights(clouds):
+    made = {name: measure_profile([path], Selection("z"), "count") for name, path in clouds.items()}
+    units = {name: (found.facts.unit, found.label.split(" of ")[0].split()[-1]) for name, found in made.items()}
+    assert units == {"m": ("m", "m"), "ft": ("us-ft", "us-ft"), "deg": ("m", "m")}
+    assert "of height" in made["m"].label
+    with pytest.raises(ConfigError, match="coordinates are degrees, heights are not"):
+        cut_section([clouds["deg"]], Selection("z"))
+
+
+def test_geocentric_coordinates_have_no_height(clouds, tmp_path):
+    cloud = tmp_path / "g.las"
+    cloud.write_bytes(clouds["m"].read_bytes())
+    add_record(cloud, build_wkt(GEOCENTRIC))
+    found = measure_profile([cloud], Selection("z"), "count")
+    assert found.upright == "z" and found.label.endswith(" m of z")
+    assert "coordinates    geocentric (ECEF)" in _print("info", cloud).stdout
+
+
+def test_vectors_in_the_unit_of_the_coordinates_are_no_oddity():
+    tally = DirectionTally("stored", [10, 0], [10, 0], [np.full(10, 1 / FOOT)])
+    assert decide(tally, "auto", FOOT).warnings == ()
+    assert "3.281 times c/2 long" in decide(tally, "auto").warnings[0]

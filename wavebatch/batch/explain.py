@@ -19,6 +19,7 @@ from wavebatch.stages.decompose.rebuild import loop_model
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.sensor import SensorSource
+from wavebatch.surveying.systems.known_systems import COMPARED, find_source
 
 _ANGLE = "incidence_angle"
 
@@ -89,7 +90,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _find_gaps(prepared.sensor, report.no_data)
     lines += _doubt_units(prepared)
     lines += _name_height(prepared)
-    lines += _name_model(prepared)
+    lines += [*_name_model(prepared), *_name_raised(prepared)]
     lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
@@ -142,6 +143,20 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     return tuple(lines)
 
 
+def _name_raised(prepared: Prepared) -> Iterator[str]:
+    """A threshold of the residual loop that lies below the noise, which the stage takes in its place."""
+    step, survey = prepared.choice.chain.steps[2], prepared.choice.survey
+    if step.stage.name != "decompose.residual_loop":
+        return
+    given, noise = step.effective(), survey.system.noise_std
+    unit = {"count": 1.0, "amplitude": survey.figures.get("amplitude_50", 0.0)}.get(given["t_unit"], 0.0)
+    if 0 < unit * given["t_diff"] < noise:
+        yield (
+            f"decompose.residual_loop: t_diff = {given['t_diff']:g} (unit {given['t_unit']}) lies below the noise of "
+            f"{noise:.2f} DN and was raised to it"
+        )
+
+
 def _doubt_fits(prepared: Prepared, report: RunReport) -> Iterator[str]:
     """A line for each flag of failed fits that far more echoes have than usual."""
     written = report.count("points_out") - sum(report.passed_through.values())
@@ -181,14 +196,19 @@ def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
 
 
 def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """A system pulse that is a guess, because the survey had too few echoes to measure it."""
-    figures, system = prepared.choice.survey.figures, prepared.system
-    alone = figures.get("isolated_echoes")
-    if report.count("echoes") and alone is not None and alone < FEW and "pulse_cost" not in figures:
+    """A system pulse that is a guess: the survey had too few echoes to measure it, or to tell it from plants."""
+    found, system = prepared.choice.survey, prepared.system
+    alone, drawn = found.figures.get("isolated_echoes"), "pulse_cost" in found.figures
+    if not report.count("echoes") or alone is None or (drawn and find_source(system) is not None):
+        return
+    reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed" if alone < FEW else ""
+    if drawn and not reason and found.waveforms < COMPARED:
+        reason = f"only {found.waveforms} waveforms, with close echoes in most of them"
+    if reason:
         yield (
-            f"the survey found too few isolated echoes, {int(alone)} where {FEW} are needed: the system pulse is a "
-            f"guess, a Gaussian of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns, and widths, errors and the number of "
-            "echoes depend on it; give --system, a survey of a longer strip of this sensor"
+            f"the survey found {reason}: the system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns, "
+            "and widths, errors and the number of echoes depend on it; give --system, a survey of a longer strip of "
+            "this sensor"
         )
 
 

@@ -1,9 +1,10 @@
-"""Columns that need the points around an echo: a second pass over a strip's rows before the cloud is written.
+"""Columns that need the points around an echo: a second pass over a strip's points before its rows are made.
 
-1. `strip_task` adds the rows of all units; they wait in a temporary file next to the cloud.
-2. `cut` sorts their positions into tiles of about equal numbers of points, each with a buffer around it.
+1. Workers run the chain on all units (`begin_unit`). Their rows wait in temporary files next to the cloud, with the
+   echoes, but not the samples, where stages need the columns.
+2. `cut` sorts the places into tiles of about equal numbers of points, each with a buffer around it.
 3. Workers process tiles in any order with `process_tile`; results are kept by row.
-4. The results are filled into the rows while the cloud is written.
+4. Workers finish the units (`end_unit`): stages that need the columns run again, and the rows are filled and chosen.
 
 Before you change it: a value must depend on the points within the stage's radius alone, whatever the tiles are.
 """
@@ -14,23 +15,25 @@ import functools
 import itertools
 import pickle
 import time
-from collections import defaultdict, deque
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.unit import list_carried, unpack
-from wavebatch.core.echoes import COLUMNS, RAY
-from wavebatch.core.no_data import NoData
-from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.batch.output_rows import Assembled, UnitEchoes, spread
+from wavebatch.batch.unit import Prepared, SolvedBlocks, solve_unit, unpack
+from wavebatch.core.echoes import COLUMNS, EchoTable
+from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.files.disk.row_file import RowStore
+from wavebatch.files.disk.shared_rows import Rows, discard_rows, read_rows, share_rows
 from wavebatch.files.disk.spool import Spool
 from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, thin_out
 from wavebatch.kernels.geometry.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
-from wavebatch.stages.chain import Step
+from wavebatch.stages.chain import Chain, Step
 
 TILE_POINTS = 150_000
 """Points of a tile without its buffer, roughly."""
@@ -41,7 +44,13 @@ SAMPLE = 1 << 18
 PART_POINTS = 1 << 18
 """Most points of a tile that are processed at a time, to bound memory where very many lie in one place."""
 
-_ENTRY = np.dtype([("row", "<i8"), ("xyz", "<i4", 3), ("ray", "<f4", 3)])
+ENTRY = np.dtype([("row", "<i8"), ("xyz", "<i4", 3), ("ray", "<f4", 3)])
+"""One row: its number, its position as it is stored, and the unit vector of its ray (NaN: none)."""
+
+_REASONS = np.array([NoData[gap.name] for gap in Gap], np.uint8)
+"""Why an echo has no value, by its gap."""
+
+PROTOCOL = pickle.HIGHEST_PROTOCOL
 
 Found = tuple[np.ndarray, np.ndarray, RunReport]
 """Rows i8 (m,), ascending; the values found for them, as `_found_dtype` has them; and the timing."""
@@ -63,55 +72,53 @@ class TileTask:
 
 
 class SecondPass:
-    """The second pass of one strip: `add` all rows, `cut` them, `take` the result of each `next_tile`, read `rows`.
+    """The second pass of one strip: `add` all units, `cut` them, `take` the result of each `next_call`.
 
     Parameters
     ----------
     step : Step
         Of the chain, with a second pass.
-    layout : OutputLayout
-        Of the cloud; rows that are added have `layout.extended(RAY)`.
+    scales : tuple of float
+        Of the stored positions.
     target : Path
         The cloud; temporary files lie next to it.
-    late : tuple of Step
-        Steps whose columns are completed from those of the second pass; rows that are added carry what they need.
     tile_points : int, optional
         TILE_POINTS by default; the result does not depend on it.
     """
 
     def __init__(
-        self,
-        step: Step,
-        layout: OutputLayout,
-        target: Path,
-        *,
-        late: tuple[Step, ...] = (),
-        tile_points: int | None = None,
+        self, step: Step, scales: tuple[float, float, float], target: Path, *, tile_points: int | None = None
     ) -> None:
-        self._step, self._layout, self._late = step, layout, late
+        self._step, self._scales = step, scales
         self._tile_points = tile_points or TILE_POINTS
-        self._carrying = layout.extended(list_carried(late))
-        self._completed = dict.fromkeys((step.stage.makes[0] for step in late), 0)
-        self._rows = RowStore(target, self._carrying.dtype)
+        self._rows, self._states = RowStore(target, ENTRY), RowStore(target, np.dtype("u1"))
         self._found = RowStore(target, _found_dtype(step))
         self._entries: Spool | None = None
         self._blob = b""
         self._parts: deque[tuple[int, int]] = deque()
-        self._waiting = 0
-        self._gaps = np.zeros(len(Gap), np.int64)
+        self._units: deque[tuple[slice, slice]] = deque()
+        self._tiles_left = self._units_left = 0
         self._sample, self._every = [np.empty((0, 3))], 1
 
-    def add(self, rows: np.ndarray) -> None:
-        """Keep rows (m,), in the order in which they will be written."""
+    def add(self, entries: Rows, state: Rows) -> None:
+        """Keep what `begin_unit` gave, in the order of the units."""
+        rows, kept = read_rows(entries), read_rows(state)
         first = -self._rows.count % self._every
-        self._sample.append(self._place(rows[first :: self._every]))
+        self._sample.append(rows["xyz"][first :: self._every] * np.array(self._scales))
+        self._units.append(tuple(slice(store.count, store.count + len(new))
+                                 for store, new in ((self._rows, rows), (self._states, kept))))  # fmt: skip
         self._rows.add(rows)
+        self._states.add(kept)
+        discard_rows(entries)
+        discard_rows(state)
         while sum(map(len, self._sample)) > SAMPLE:
             self._sample = [np.concatenate(self._sample)[::2].copy()]
             self._every *= 2
 
     def cut(self) -> RunReport:
-        """Sort all rows into tiles; returns the timing."""
+        """Sort all rows into tiles, once all units are there; returns the timing. May be called again."""
+        if self._entries is not None:
+            return RunReport()
         start = time.perf_counter()
         reach = _reach(self._step)
         sample = np.concatenate(self._sample)
@@ -120,90 +127,155 @@ class SecondPass:
         # Tiles much smaller than their buffers would list each point many times.
         tiles = cut_tiles(sample, max(self._tile_points // self._every, 1), 8 * reach)
         self._found.extend(self._rows.count)
-        self._entries = Spool(len(tiles), _ENTRY)
+        self._entries = Spool(len(tiles), ENTRY)
         counts, at = np.zeros(len(tiles), np.int64), 0
         for rows in self._rows.pieces():
-            place = self._place(rows)
+            rows["row"] = np.arange(at, at + len(rows))
+            place = rows["xyz"] * np.array(self._scales)
             able = np.flatnonzero(np.isfinite(place).all(axis=1))
             index, tile = sort_into_tiles(tiles, place[able], reach)
             counts += np.bincount(tile, minlength=len(tiles))
-            self._entries.append(tile, _list_entries(rows, at)[able[index]])
+            self._entries.append(tile, rows[able[index]])
             at += len(rows)
-        task = TileTask(self._step, tiles, self._entries.seal(), self._layout.source.header.scales)
-        self._blob = pickle.dumps(task, pickle.HIGHEST_PROTOCOL)
+        self._blob = pickle.dumps(TileTask(self._step, tiles, self._entries.seal(), self._scales), PROTOCOL)
         for tile, count in enumerate(counts.tolist()):
             self._parts.extend((tile, part) for part in range(-(-count // PART_POINTS)))
+        self._tiles_left, self._units_left = len(self._parts), len(self._units)
         return RunReport(timing={"tiles": time.perf_counter() - start})
 
     @property
     def has_more(self) -> bool:
-        """Whether there is a `next_tile`."""
-        return bool(self._parts)
+        """Whether there is a `next_call`: of tiles, and once all of them are done of units."""
+        return bool(self._parts or self._units_left and not self._tiles_left and self._units)
 
     @property
     def is_complete(self) -> bool:
-        """Whether all tiles are done."""
-        return not self._parts and not self._waiting
+        """Whether all units are finished."""
+        return self._entries is not None and not self._tiles_left + self._units_left
 
-    def next_tile(self) -> tuple[bytes, int, int]:
-        """Return the arguments of `process_tile` for the next tile."""
-        self._waiting += 1
-        return (self._blob, *self._parts.popleft())
+    def next_call(self, blob: bytes, folder: Path | None) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """Return the next function to call and its arguments; those given are as for `begin_unit`."""
+        if self._parts:
+            return process_tile, (self._blob, *self._parts.popleft())
+        rows, state = self._units.popleft()
+        kept = share_rows(self._states.read(state.start, state.stop), folder)
+        return end_unit, (blob, kept, self._found.read(rows.start, rows.stop), folder)
 
-    def take(self, result: Found) -> RunReport:
-        """Keep the result of a tile; returns its timing."""
-        index, found, report = result
-        self._found.put(index, found)
-        self._waiting -= 1
-        return report
-
-    def rows(self) -> Iterator[np.ndarray]:
-        """Yield all rows in the cloud's layout, with the results filled in."""
-        final = self._layout.dtype
-        fields = zip(self._layout.extra_fields[len(self._layout.carried) :], self._layout.written, strict=True)
-        filled = [(field, column) for field, column in fields if column.column in self._found.dtype.names]
-        for rows, found in zip(self._rows.pieces(), self._found.pieces(), strict=True):
-            self._gaps += np.bincount(found["gap"], minlength=len(Gap))
-            known = found["gap"] == Gap.KNOWN
-            values = {name: np.where(known, found[name], np.float32(np.nan)) for name in found.dtype.names[:-1]}
-            for field, column in filled:
-                rows[field] = column.encode(values[column.column])
-            self._complete(rows, values)
-            plain = rows.view(np.uint8).reshape(len(rows), -1)[:, : final.itemsize]
-            yield np.ascontiguousarray(plain).view(final)[:, 0]
-
-    def count_reasons(self, echoes: int) -> dict[str, dict[str, int]]:
-        """Count the echoes by reason for RunReport.no_data, once all rows were read."""
-        counts = {NoData[gap.name].name: int(self._gaps[gap]) for gap in Gap if gap != Gap.NO_RAY}
-        counts[NoData.NO_RAY.name] = echoes - sum(counts.values())
-        counts = {name: number for name, number in counts.items() if number}
-        # The units counted these as echoes without an angle; counts of a strip are sums.
-        late = {name: {NoData.KNOWN.name: k, NoData.NO_ANGLE.name: -k} for name, k in self._completed.items() if k}
-        return {self._found.dtype.names[0]: counts, **late}
+    def take(self, result: Found | tuple[Rows, RunReport]) -> tuple[Rows | None, RunReport]:
+        """Take the result of the oldest call: rows of the cloud, None for a tile; and its report."""
+        if not self._tiles_left:
+            self._units_left -= 1
+            return result
+        self._found.put(*result[:2])
+        self._tiles_left -= 1
+        return None, result[2]
 
     def close(self) -> None:
         """Remove all temporary files; harmless twice."""
-        self._rows.close()
-        self._found.close()
-        if self._entries is not None:
-            self._entries.close()
+        for store in (self._rows, self._states, self._found, self._entries):
+            if store is not None:
+                store.close()
 
-    def _complete(self, rows: np.ndarray, values: dict[str, np.ndarray]) -> None:
-        """Fill the columns of late steps into the rows; values: the columns of the second pass."""
-        layout, fields = self._carrying, defaultdict(list)
-        for field, column in zip(layout.extra_fields[len(layout.carried) :], layout.written, strict=True):
-            fields[column.column].append((field, column))  # twice where a selection needs it too
-        for step in self._late:
-            needed = {name: fields[name][0][0] for name in step.stage.makes if not COLUMNS[name].extra_bytes}
-            carried = {name: _decode(name, rows[field]) for name, field in needed.items()}
-            for name, found in step.stage.complete({**values, **carried}).items():
-                if name in self._completed:
-                    self._completed[name] += int(np.count_nonzero(np.isfinite(found)))
-                for field, column in fields.get(name, ()):
-                    rows[field] = column.encode(found)
 
-    def _place(self, rows: np.ndarray) -> np.ndarray:
-        return np.stack([rows[name] for name in "XYZ"], axis=1) * np.array(self._layout.source.header.scales)
+def begin_unit(
+    blob: bytes, number: int, block_size: int | None, folder: Path | None
+) -> tuple[tuple[Rows, Rows], RunReport]:
+    """Run the chain on one unit.
+
+    Parameters
+    ----------
+    blob, number, block_size
+        As for `process_unit`.
+    folder : Path or None
+        Of shared memory.
+
+    Returns
+    -------
+    entries, state : Rows
+        ENTRY (m,), without numbers; and what `end_unit` needs, u1 (k,).
+    report : RunReport
+        The timing.
+    """
+    prepared: Prepared = unpack(blob)
+    timing: dict[str, float] = {}
+    solved, echoes, made = solve_unit(prepared, number, block_size, timing)
+    needed = {name: made.columns[name] for name in ("echo_flags", *prepared.selector.needed)}
+    chain = prepared.job.chain
+    kept = [(index, chain.keep_needed(block)) for index, block in solved] if chain.after_second else []
+    state = np.frombuffer(pickle.dumps((made._replace(columns=needed), kept), PROTOCOL), np.uint8)
+    shared = share_rows(_list_entries(echoes, made), folder), share_rows(state, folder)
+    return shared, RunReport(timing=timing)
+
+
+def end_unit(blob: bytes, state: Rows, found: np.ndarray, folder: Path | None) -> tuple[Rows, RunReport]:
+    """Make the rows of a unit that are written, once the second pass has been over its points.
+
+    Parameters
+    ----------
+    blob, folder
+        As for `begin_unit`.
+    state : Rows
+        From `begin_unit`.
+    found : structured array (m,)
+        Of the unit's rows.
+
+    Returns
+    -------
+    rows : Rows
+    report : RunReport
+    """
+    _gather.cache_clear()  # tiles are done: their memory is needed for the unit
+    prepared: Prepared = unpack(blob)
+    timing: dict[str, float] = {}
+    made, solved = pickle.loads(read_rows(state))
+    discard_rows(state)
+    has_echo = made.echo >= 0
+    by_echo = np.zeros(len(made.counted), found.dtype)
+    by_echo[made.echo[has_echo]] = found[has_echo]
+    first, *_ = names = found.dtype.names[:-1]
+    known = by_echo["gap"] == Gap.KNOWN
+    values = {name: np.where(known, by_echo[name], np.float32(np.nan)) for name in names}
+    values[f"{first}{SUFFIX}"] = _REASONS[by_echo["gap"]]
+    values |= _solve_again(prepared.job.chain, solved, values, timing)
+    columns = {name: spread(name, column, made.echo) for name, column in values.items() if name in COLUMNS}
+    prepared.layout.fill(made.rows, columns)
+    rows, left = prepared.selector.select(made.rows, {**made.columns, **columns})
+    reasons = count_reasons({name: codes[made.counted] for name, codes in values.items()})
+    report = replace(made.report, no_data={**made.report.no_data, **reasons}, timing=timing)
+    return share_rows(rows, folder), report + left
+
+
+def _solve_again(
+    chain: Chain, solved: SolvedBlocks, values: Mapping[str, np.ndarray], timing: dict[str, float]
+) -> dict[str, np.ndarray]:
+    """The columns of stages that need those of the second pass; values (k,) are by packet, as `gather_echoes` sorts."""
+    if not solved:
+        return {}
+    order = np.argsort(np.concatenate([index[block.echoes.waveform] for index, block in solved]), kind="stable")
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    tables, at = [], 0
+    for _, block in solved:
+        rows = place[at : at + len(block.echoes)]
+        echoes = block.echoes.with_attributes(**{name: column[rows] for name, column in values.items()})
+        tables.append((chain.solve_again(block._replace(echoes=echoes), timing), 0))
+        at += len(rows)
+    found = EchoTable.concatenate(tables).take(order).attributes
+    made = [name for step in chain.after_second for name in step.stage.makes]
+    return {name: found[name] for one in made for name in (one, f"{one}{SUFFIX}") if name in found}
+
+
+def _list_entries(echoes: UnitEchoes, made: Assembled) -> np.ndarray:
+    """Entries (m,) of the rows of a unit, without numbers."""
+    entries = np.zeros(len(made.rows), ENTRY)
+    for axis, name in enumerate("XYZ"):
+        entries["xyz"][:, axis] = made.rows[name]
+    x, y, z = echoes.direction.T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        length = np.sqrt(x * x + y * y + z * z)
+        ray = (echoes.direction / length[:, None]).astype(np.float32)[echoes.table.waveform]
+    entries["ray"] = np.append(ray, np.full((1, 3), np.nan, np.float32), axis=0)[made.echo]
+    return entries
 
 
 def process_tile(blob: bytes, number: int, part: int) -> Found:
@@ -242,7 +314,7 @@ def _gather(blob: bytes, number: int) -> Surroundings:
     """The points of a tile and its buffer that count as neighbours."""
     task: TileTask = unpack(blob)
     radius = task.step.effective()["radius"]
-    kept = np.empty(0, _ENTRY)
+    kept = np.empty(0, ENTRY)
     held: list[np.ndarray] = []
     for piece in itertools.chain(task.entries.pieces(number), [None]):
         if piece is not None:
@@ -257,7 +329,7 @@ def _gather(blob: bytes, number: int) -> Surroundings:
 def _read_part(entries: Spool, number: int, part: int) -> np.ndarray:
     """Entries of a tile that are its PART_POINTS of that number, in the order of their rows."""
     low, high, at = part * PART_POINTS, (part + 1) * PART_POINTS, 0
-    found = [np.empty(0, _ENTRY)]
+    found = [np.empty(0, ENTRY)]
     for piece in entries.pieces(number):
         found.append(piece[max(low - at, 0) : max(high - at, 0)])
         at += len(piece)
@@ -266,25 +338,9 @@ def _read_part(entries: Spool, number: int, part: int) -> np.ndarray:
     return np.concatenate(found)
 
 
-def _list_entries(rows: np.ndarray, first: int) -> np.ndarray:
-    """Entries (n,) of rows that start at the strip's row `first`."""
-    entries = np.empty(len(rows), _ENTRY)
-    entries["row"] = np.arange(first, first + len(rows))
-    for axis, name in enumerate("XYZ"):
-        entries["xyz"][:, axis] = rows[name]
-    for axis, name in enumerate(rows.dtype.names[-len(RAY) :]):
-        entries["ray"][:, axis] = rows[name]
-    return entries
-
-
 def _reach(step: Step) -> float:
     """Width of a tile's buffer [m]: cells that the radius touches must be complete."""
     return step.effective()["radius"] * (1.0 + 2.0 / FINENESS)
-
-
-def _decode(name: str, values: np.ndarray) -> np.ndarray:
-    """Values of a temporary column, NaN where they are no-data."""
-    return np.where(values == np.float32(COLUMNS[name].no_data), np.float32(np.nan), values)
 
 
 def _found_dtype(step: Step) -> np.dtype:

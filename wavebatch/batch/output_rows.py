@@ -7,9 +7,9 @@ before you change anything here, make sure that each packet and each point still
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from wavebatch.files.cloud.layout import OutputLayout
     from wavebatch.files.strip.reader import Unit
 
-_REFLECTING = ("level_reflectance", "reflectance", "facing_reflectance")
+_REFLECTING = ("level_reflectance", "facing_reflectance")
 """Columns that no matt surface has above 1."""
 
 NEEDED = ("x", "y", "z", "point")
@@ -91,6 +91,21 @@ class _Rows:
     """Why it is passed through, EchoFlag, u2 (m,)."""
 
 
+class Assembled(NamedTuple):
+    """The rows of a unit."""
+
+    rows: np.ndarray
+    """Structured array (m,) in the cloud's layout."""
+    echo: np.ndarray
+    """Row of the unit's echo table, -1 for points that are passed through, i8 (m,)."""
+    columns: Mapping[str, np.ndarray]
+    """The columns that were asked for as they were computed, arrays (m,), and echo_flags."""
+    counted: np.ndarray
+    """Echoes of the table that count in this unit, bool (k,)."""
+    report: RunReport
+    """Without the counts of what is written, which the selection adds."""
+
+
 def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray, EchoTable]]) -> UnitEchoes:
     """Collect the echoes of a unit's blocks in packet order.
 
@@ -138,8 +153,8 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
 
 
 def assemble_echoes(
-    unit: Unit, echoes: UnitEchoes, layout: OutputLayout, dropped: int = 0
-) -> tuple[np.ndarray, RunReport]:
+    unit: Unit, echoes: UnitEchoes, layout: OutputLayout, needed: Collection[str] = (), dropped: int = 0
+) -> Assembled:
     """Make a row per echo, and a row per point that no echo matches.
 
     Parameters
@@ -148,14 +163,15 @@ def assemble_echoes(
     echoes : UnitEchoes
         Of the packets that the unit owns, and of no others.
     layout : OutputLayout
+    needed : collection of str, optional
+        Columns to give beside those of the layout.
     dropped : int, optional
         EchoFlag bits of rows that will not be written: return numbers are counted without them.
 
     Returns
     -------
-    rows : structured array (m,)
+    Assembled
         Ordered by the packet's first point, then time; points without a packet keep their place.
-    report : RunReport
 
     Raises
     ------
@@ -186,19 +202,24 @@ def assemble_echoes(
     number, total = _number_rows(pulse, places, direction, records, (flags & np.uint16(dropped)) == 0)
     flags |= np.where(number > layout.max_return, np.uint16(EchoFlag.RETURN_LIMIT), np.uint16(0))
 
+    columns = {**_columns(table, rows.echo, layout, needed), "echo_flags": flags}
     output = layout.rows(
         records,
         xyz=xyz,
         return_number=number,
         number_of_returns=total,
-        columns={**_columns(table, rows.echo, layout), "echo_flags": flags},
+        columns=columns,
         matched=(rows.echo < 0) | np.append(point >= 0, False)[rows.echo],
         time=np.append(table.time, np.nan)[rows.echo],
     )
-    return output, _count(unit, table, members.packet, found, owned[members.packet], rows.reason, flags)
+    counted = np.ones(len(table), bool)
+    report = _count(unit, table, counted, members.packet, found, owned[members.packet], rows.reason)
+    return Assembled(output, rows.echo, columns, counted, report)
 
 
-def assemble_returns(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tuple[np.ndarray, RunReport]:
+def assemble_returns(
+    unit: Unit, echoes: UnitEchoes, layout: OutputLayout, needed: Collection[str] = ()
+) -> Assembled:
     """Make a row per point of the unit, with the columns of the echo that matches it.
 
     Parameters
@@ -207,12 +228,13 @@ def assemble_returns(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tu
     echoes : UnitEchoes
         Of all packets of the unit's points.
     layout : OutputLayout
+    needed : collection of str, optional
+        Columns to give beside those of the layout.
 
     Returns
     -------
-    rows : structured array (n,)
+    Assembled
         In the order of the points; standard fields are unchanged.
-    report : RunReport
 
     Raises
     ------
@@ -231,10 +253,15 @@ def assemble_returns(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tu
         raise _bug(unit, "echoes and returns are not matched one to one")
     reason = np.where(unit.point_flags > 0, unit.point_flags, np.uint16(EchoFlag.NO_ECHO)).astype(np.uint16)
     flags = np.where(found, np.append(table.flags, np.uint16(0))[echo], reason).astype(np.uint16)
-    output = layout.rows(np.asarray(unit.points), columns={**_columns(table, echo, layout), "echo_flags": flags})
+    columns = {**_columns(table, echo, layout, needed), "echo_flags": flags}
+    output = layout.rows(np.asarray(unit.points), columns=columns)
 
     packet = unit.packet_of_point
-    return output, _count(unit, table, packet, found, packet >= 0, np.where(found, np.uint16(0), reason), flags)
+    # An echo counts in the unit of its point, where the second pass has seen it; without one in that of its packet.
+    counted = unit.packets.owned[table.waveform] & (table.attributes["point"] < 0)
+    counted[mine] = True
+    report = _count(unit, table, counted, packet, found, packet >= 0, np.where(found, np.uint16(0), reason))
+    return Assembled(output, echo, columns, counted, report)
 
 
 def _bug(unit: Unit, what: str) -> StageError:
@@ -292,38 +319,41 @@ def _locations(records: np.ndarray) -> np.ndarray:
     return np.nan_to_num(widen(records["return_point_wave_location"]) / PS_PER_NS, nan=-np.inf)
 
 
-def _columns(table: EchoTable, echo: np.ndarray, layout: OutputLayout) -> dict[str, np.ndarray]:
-    """The layout's columns of the echoes at `echo`; no-data where that is -1."""
+def _columns(
+    table: EchoTable, echo: np.ndarray, layout: OutputLayout, needed: Collection[str]
+) -> dict[str, np.ndarray]:
+    """The layout's columns and those needed of the echoes at `echo`; no-data where that is -1."""
     values = {**table.attributes, "echo_time": table.time}
-    columns = {}
-    for name in (written.column for written in layout.written):
-        if name in values:
-            known = values[name]
-            # NaN becomes no-data when it is written. Integers have no NaN: they need the declared value itself.
-            empty = np.nan if known.dtype.kind == "f" else COLUMNS[name].no_data or 0
-            columns[name] = np.append(known, known.dtype.type(empty))[echo]
-    return columns
+    names = dict.fromkeys([*(written.column for written in layout.written), *needed])
+    return {name: spread(name, values[name], echo) for name in names if name in values}
+
+
+def spread(name: str, values: np.ndarray, echo: np.ndarray) -> np.ndarray:
+    """Return a column (m,) of rows from its values (k,) by echo; no-data where `echo` is -1."""
+    # NaN becomes no-data when it is written. Integers have no NaN: they need the declared value itself.
+    empty = np.nan if values.dtype.kind == "f" else COLUMNS[name].no_data or 0
+    return np.append(values, values.dtype.type(empty))[echo]
 
 
 def _count(
     unit: Unit,
     table: EchoTable,
+    counted: np.ndarray,
     packet: np.ndarray,
     found: np.ndarray,
     inside: np.ndarray,
     reason: np.ndarray,
-    flags: np.ndarray,
 ) -> RunReport:
-    """The report of a unit.
+    """The report of a unit, without what is written of it.
 
+    counted: echoes of the table (k,) that count in this unit.
     packet, found, inside: of the points (k,) that are counted as returns: row of unit.packets, whether an echo matches,
-    whether it is counted. reason, flags: of the output rows (m,).
+    whether it is counted. reason: of the output rows (m,).
     """
     owned = unit.packets.owned
     per_packet = np.append(table.count(len(owned)), 0)
     has_echoes = per_packet[packet] > 0
-    mine = owned[table.waveform]
-    table = table if mine.all() else table.take(mine)
+    table = table if counted.all() else table.take(counted)
     counts = {
         "points_in": len(unit.points),
         "points_with_waveform": unit.packet_of_point >= 0,
@@ -335,13 +365,11 @@ def _count(
         "matched_returns": inside & found,
         "no_echo_returns": inside & ~has_echoes,
         "unmatched_returns": inside & has_echoes & ~found,
-        "points_out": len(flags),
     }
     above = np.any([table.attributes[name] > 1 for name in _REFLECTING if name in table.attributes], axis=0)
     report = RunReport(
         counts={name: n if isinstance(n, int) else int(np.count_nonzero(n)) for name, n in counts.items()},
         passed_through=count_flags(reason),
-        flags=count_flags(flags),
         no_data=count_reasons(table.attributes),
         above_one=int(np.count_nonzero(above)),
     )

@@ -150,7 +150,7 @@ def plan_strip(job: StripJob, options: RunOptions) -> dict[str, Any]:
     done = task.start() is not None
     facts = task.facts
     layout, is_laz = plan_layout(job, facts), job.options.format == "laz"
-    RowSelector(job.selection, job.chain, layout).check()
+    RowSelector.plan(job.selection.place(layout.source), job.chain, layout)
     return {
         "action": "skip" if done else "write",
         "strip": str(job.path),

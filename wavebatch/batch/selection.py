@@ -1,7 +1,7 @@
 """Which rows of a strip are written: --drop-flags, --classes, --bbox, --polygon and --where of `wavebatch run`.
 
-`cli.run` and the public API build a `Selection`; `unit.process_unit` applies it to the rows of a unit, or `strip_task`
-does once a second pass has filled them. Every row that is left out is counted by the first reason, in the order above.
+`cli.run` and the public API build a `Selection`; workers apply it to the rows of each unit. Every row that is left
+out is counted by the first reason, in the order above.
 Before you change it: a row's values and its neighbours must not depend on what is written, only its return numbers do.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,18 +23,16 @@ from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.area_crs import describe_miss
-from wavebatch.files.cloud.column_names import normalise
-from wavebatch.files.cloud.echo_reader import describe_dimension, list_fields, read_dimension, read_field
+from wavebatch.files.cloud.column_names import resolve
+from wavebatch.files.cloud.echo_reader import describe_dimension, name_standard, read_dimension, read_field
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.files.las.checked_header import CheckedHeader
-from wavebatch.files.las.point_formats import read_angles
+from wavebatch.files.las.point_formats import read_classes
 from wavebatch.stages.chain import STAGES, Chain
 
 WITHOUT_STAGE = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
-
-_FLAGS = "echo_flags"
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,142 +95,106 @@ class Selection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowSelector:
-    """A selection on the rows of one strip.
-
-    Parameters
-    ----------
-    selection : Selection
-    chain : Chain
-        That makes the rows.
-    layout : OutputLayout
-        Of the cloud. Rows have `carrying`: this layout and the columns that the selection needs, at its end.
-    """
+    """A selection on the rows of one strip, from `plan`."""
 
     selection: Selection
-    chain: Chain
     layout: OutputLayout
+    """Of the cloud."""
+    sources: Mapping[str, tuple[str, str]]
+    """What each name of --where stands for: `computed`, `standard` or `carried`, and the column or field."""
+
+    @classmethod
+    def plan(cls, selection: Selection, chain: Chain, layout: OutputLayout) -> RowSelector:
+        """Return the selector of a strip.
+
+        Parameters
+        ----------
+        selection : Selection
+        chain : Chain
+            That makes the rows.
+        layout : OutputLayout
+
+        Returns
+        -------
+        RowSelector
+
+        Raises
+        ------
+        ConfigError
+            Where --where names a column that the rows do not have.
+        """
+        where = selection.where
+        made = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
+        fields = zip(layout.carried, layout.extra_fields, strict=False)
+        names = {
+            "computed": {name: name for name in [*made, *WITHOUT_STAGE]},
+            "standard": name_standard(layout.point_format),
+            "carried": {one.record.name: field for one, field in fields if not layout.dtype[field].shape},
+        }
+        kinds = [{name: (kind, meant) for name, meant in known.items()} for kind, known in names.items()]
+        sources = {name: resolve(name, *kinds) for name in (() if where is None else where.columns)}
+        for name in [name for name, source in sources.items() if source is None]:
+            makers = [stage.name for stage in STAGES.values() if name in stage.makes and name in COLUMNS]
+            remedy = nearest(name, [one for known in kinds for one in known])
+            if makers:
+                remedy = f"chain {chain.name} does not compute it; add stage {' or '.join(makers)} to it"
+            raise where.complain(name, f"{layout.source.path}: there is no column {name!r}; {remedy}")
+        return cls(selection, layout, sources)
 
     @property
     def needed(self) -> tuple[str, ...]:
-        """The columns that rows carry for the selection, as they were computed, whatever the cloud's names and units.
+        """The computed columns that decide what is written."""
+        return tuple(found for kind, found in self.sources.values() if kind == "computed")
 
-        echo_flags is always one of them: the flags of rows that are left out are not counted as written.
-        """
-        if not self.selection:
-            return ()
-        named = () if self.selection.where is None else self.selection.where.columns
-        found = [self._find(name) for name in named]
-        return tuple(dict.fromkeys([_FLAGS, *(name for kind, name in found if kind == "computed")]))
-
-    @property
-    def carrying(self) -> OutputLayout:
-        """The layout of the rows that are given to `select`."""
-        return self.layout.extended(self.needed) if self.needed else self.layout
-
-    def check(self) -> None:
-        """Raise ConfigError where --where names a column that the rows do not have, and as `Selection.place`."""
-        self.selection.place(self.layout.source)
-        where = self.selection.where
-        for name in () if where is None else where.columns:
-            if not self._find(name)[0]:
-                makers = [stage.name for stage in STAGES.values() if name in stage.makes and name in COLUMNS]
-                remedy = nearest(name, [known for names in self._names().values() for known in names])
-                if makers:
-                    remedy = f"chain {self.chain.name} does not compute it; add stage {' or '.join(makers)} to it"
-                raise where.complain(name, f"{self.layout.source.path}: there is no column {name!r}; {remedy}")
-
-    def select(self, rows: np.ndarray) -> tuple[np.ndarray, RunReport]:
+    def select(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, RunReport]:
         """Choose the rows that are written.
 
         Parameters
         ----------
         rows : structured array (m,)
-            In the layout `carrying`.
+            In the cloud's layout.
+        columns : mapping of str to array (m,)
+            Those `needed` and echo_flags as they were computed, whatever the cloud's names and units.
 
         Returns
         -------
         rows : structured array (k,)
-            In the cloud's layout.
+            Those that are written.
         report : RunReport
-            What changes in the counts: rows left out by reason, fewer points and flags that are written.
+            Points and flags that are written, and points left out by reason.
         """
-        if not self.selection:
-            return rows, RunReport()
         left = np.zeros(len(rows), np.int64)
-        for number, reason in enumerate(LEFT_OUT, 1):
-            meets = self._test(reason, rows)
-            if meets is not None:
-                left = np.where((left == 0) & ~meets, number, left)
-        out = left > 0
+        for number, meets in enumerate(self._test(rows, columns) if self.selection else (), 1):
+            left = np.where((left == 0) & ~np.asarray(meets), number, left)
+        kept = left == 0
         numbers = np.bincount(left, minlength=len(LEFT_OUT) + 1)[1:].tolist()
         report = RunReport(
-            counts={"points_out": -int(np.count_nonzero(out))},
+            counts={"points_out": int(np.count_nonzero(kept))},
             left_out={name: number for name, number in zip(LEFT_OUT, numbers, strict=True) if number},
-            flags={name: -number for name, number in count_flags(self._read(_FLAGS, rows[out])).items()},
+            flags=count_flags(columns["echo_flags"][kept]),
         )
-        final = self.layout.dtype
-        plain = rows[~out].view(np.uint8).reshape(-1, rows.dtype.itemsize)[:, : final.itemsize]
-        return np.ascontiguousarray(plain).view(final).reshape(-1), report
+        return rows if kept.all() else rows[kept], report
 
-    def _test(self, reason: str, rows: np.ndarray) -> np.ndarray | None:
-        """Whether rows (m,) are written as far as one option is concerned, bool (m,); None where it is not given."""
-        chosen = self.selection
-        if reason == "drop_flags":
-            return (self._read(_FLAGS, rows) & np.uint16(chosen.drop_flags)) == 0 if chosen.drop_flags else None
-        if reason == "classes":
-            return np.isin(self._read("classification", rows), chosen.classes) if chosen.classes else None
-        if reason == "where":
-            where = chosen.where
-            return None if where is None else where.choose({name: self._read(name, rows) for name in where.columns})
-        x, y = self._read("x", rows), self._read("y", rows)
-        if reason == "bbox":
-            if chosen.bbox is None:
-                return None
-            west, south, east, north = chosen.bbox
-            return (x >= west) & (x <= east) & (y >= south) & (y <= north)
-        if not chosen.areas:
-            return None
-        return np.logical_or.reduce([find_inside(polygon.rings, x, y) for polygon in chosen.areas])
+    def _test(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> Iterator[np.ndarray | bool]:
+        """Whether rows (m,) are written as far as each reason of LEFT_OUT is concerned, bool (m,) or for all."""
+        chosen, header = self.selection, self.layout.source.header
+        yield (columns["echo_flags"] & np.uint16(chosen.drop_flags)) == 0
+        yield not chosen.classes or np.isin(read_classes(rows), chosen.classes)
+        x, y = (rows[name] * header.scales[axis] + header.offsets[axis] for axis, name in enumerate("XY"))
+        west, south, east, north = chosen.bbox or (-math.inf, -math.inf, math.inf, math.inf)
+        yield chosen.bbox is None or (x >= west) & (x <= east) & (y >= south) & (y <= north)
+        yield not chosen.areas or np.logical_or.reduce([find_inside(one.rings, x, y) for one in chosen.areas])
+        values = {name: self._read(*source, rows, columns) for name, source in self.sources.items()}
+        yield chosen.where is None or chosen.where.choose(values)
 
-    def _names(self) -> dict[str, dict[str, str]]:
-        """Names that --where may use, by kind, each with what it stands for; the first kind that has a name counts."""
-        made = [name for name in self.chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
-        computed = {name: name for name in [*made, *WITHOUT_STAGE]}
-        standard = {name: name for name in list_fields(self.layout.point_format)}
-        standard |= {"scan_angle": "scan_angle", "scan_angle_rank": "scan_angle"}
-        fields = zip(self.layout.carried, self.layout.extra_fields, strict=False)
-        carried = {one.record.name: field for one, field in fields if not self.layout.dtype[field].shape}
-        return {"computed": computed, "standard": standard, "carried": carried}
-
-    def _find(self, name: str) -> tuple[str, str]:
-        """Kind of a column and what its name stands for; two empty texts where there is none.
-
-        Exact names come first: `Amplitude` is the vendor's, `amplitude` is ours.
-        """
-        names = self._names()
-        for kind, known in names.items():
-            if name in known:
-                return kind, known[name]
-        for kind, known in names.items():
-            alike = [meant for one, meant in known.items() if normalise(one) == normalise(name)]
-            if alike:
-                return kind, alike[0]
-        return "", ""
-
-    def _read(self, name: str, rows: np.ndarray) -> np.ndarray:
-        """Values (m,) of a column of rows in the layout `carrying`, NaN for no data."""
-        kind, found = self._find(name)
+    def _read(self, kind: str, found: str, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Values (m,) of a column, NaN for no data."""
         if kind == "computed":
-            return rows[self.carrying.extra_fields[self.needed.index(found) - len(self.needed)]]
+            return columns[found].astype(COLUMNS[found].dtype, copy=False)
         if kind == "carried":
             at = self.layout.extra_fields.index(found)
             return read_dimension(rows, describe_dimension(found, self.layout.carried[at].record))
-        if found in ("x", "y", "z"):
-            header, axis = self.layout.source.header, "xyz".index(found)
-            return rows[found.upper()] * header.scales[axis] + header.offsets[axis]
-        if found == "scan_angle":
-            return read_angles(rows)
-        return read_field(rows, self.layout.point_format, found)
+        return read_field(rows, self.layout.point_format, found, self.layout.source.header)
 
 
 def build_selection(options: RunOptions) -> Selection:

@@ -19,7 +19,7 @@ from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.job import StripJob
-from wavebatch.batch.neighbour_pass import SecondPass, process_tile
+from wavebatch.batch.neighbour_pass import SecondPass, begin_unit
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.row_transfer import RowStream, process_unit_shared
 from wavebatch.batch.unit import Prepared, prepare_strip
@@ -29,7 +29,6 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target
-from wavebatch.files.disk.shared_rows import Rows, discard_rows, read_rows
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.text_file import draft_text
 
@@ -133,21 +132,22 @@ class StripTask:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all units and all tiles of a second pass are done, and all rows are in the cloud that can be."""
+        """Whether all units are done, also by a second pass, and all rows are in the cloud that can be."""
         if self.prepared is None or self.written < self.prepared.units or self._rows.pending:
             return False
         return self._second is None or self._second.is_complete
 
     def submit(self, workers: Workers | Cluster) -> None:
-        """Submit the next call: the preparation, then unit by unit, then the tiles of a second pass."""
+        """Submit the next call: the preparation, then unit by unit, then those of a second pass."""
         if self.prepared is None:
             self.pending.append(workers.submit(prepare_strip, self.job.absolute() if workers.is_remote else self.job))
             return
         if self._submitted == self.prepared.units:
-            self.pending.append(workers.submit(process_tile, *self._second.next_tile()))
+            function, arguments = self._second.next_call(self._blob, self._rows.folder)
+            self.pending.append(workers.submit(function, *arguments))
             return
         arguments = self._blob, self._submitted, self._options.block_size, self._rows.folder
-        self.pending.append(workers.submit(process_unit_shared, *arguments))
+        self.pending.append(workers.submit(process_unit_shared if self._second is None else begin_unit, *arguments))
         self._submitted += 1
 
     def take(self, future: Future, workers: Workers | Cluster) -> None:
@@ -164,25 +164,23 @@ class StripTask:
             self._report += result.report
             self._open(workers)
         elif self.written == self.prepared.units:
-            self._report += self._second.take(result)
-            return
+            rows, report = self._second.take(result)
+            if rows is not None:
+                self._rows.add(rows)
+            self._report += report
         else:
             rows, report = result
-            self._add(rows)
+            if self._second is None:
+                self._rows.add(rows)
+            else:
+                self._second.add(*rows)
             self.written += 1
             self._report += report + RunReport(timing={"write": time.perf_counter() - start})
         if self.written == self.prepared.units:
-            if self._second is None:
-                self._rows.end()
-            else:
+            if self._second is not None:
                 self._report += self._second.cut()
-
-    def _add(self, rows: Rows) -> None:
-        if self._second is None:
-            self._rows.add(rows)
-        else:
-            self._second.add(read_rows(rows))
-            discard_rows(rows)
+            if self._second is None or self._second.is_complete:
+                self._rows.end()
 
     def _open(self, workers: Workers | Cluster) -> None:
         options, prepared = self._options, self.prepared
@@ -194,20 +192,7 @@ class StripTask:
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
         self._rows = RowStream(self._writer, workers.submit if workers.compresses else None, workers.memory)
         if prepared.second_step is not None:
-            layout = prepared.selector.carrying
-            self._second = SecondPass(prepared.second_step, layout, cloud, late=prepared.late_steps)
-
-    def _fill(self) -> None:
-        """Write the rows that waited for the second pass."""
-        start = time.perf_counter()
-        selector = self.prepared.selector
-        for rows in self._second.rows():
-            chosen, left = selector.select(rows)
-            self._report += left
-            self._writer.write(chosen)
-        self._second.close()
-        no_data = self._second.count_reasons(self._report.count("echoes"))
-        self._report += RunReport(no_data=no_data, timing={"write": time.perf_counter() - start})
+            self._second = SecondPass(prepared.second_step, prepared.layout.source.header.scales, cloud)
 
     def finish(self) -> RunReport:
         """Publish the cloud, then its report, which means that the cloud is complete; both or none.
@@ -225,8 +210,6 @@ class StripTask:
             Where counts do not add up.
         """
         options, job = self._options, self.job
-        if self._second is not None:
-            self._fill()
         start = time.perf_counter()
         self._report.check(job.options.points, str(job.path))
         self._report += RunReport(remarks=(*_name_stranger(self.prepared), *find_remarks(self.prepared, self._report)))
@@ -250,8 +233,7 @@ class StripTask:
         finally:
             draft.discard()
         self.warnings = document["warnings"]
-        self._rows.close()
-        self.prepared.scan.close()
+        self._close()
         return self._report
 
     def drop(self) -> None:
@@ -260,15 +242,16 @@ class StripTask:
             if not future.cancel() and self.prepared is None:
                 future.add_done_callback(_close_scan)
         self.pending.clear()
-        if self._rows is not None:
-            self._rows.close()
         if self._writer is not None:
             self._writer.abort()
-        if self._second is not None:
-            self._second.close()
-        if self.prepared is not None:
-            self.prepared.scan.close()
+        self._close()
         self.release()
+
+    def _close(self) -> None:
+        """Remove what waited in memory and in temporary files."""
+        for one in (self._rows, self._second, self.prepared and self.prepared.scan):
+            if one is not None:
+                one.close()
 
     def _stat(self) -> list[tuple[int, int]]:
         """Size and time of the input files, to see whether they change during the run."""

@@ -17,15 +17,14 @@ import numpy as np
 
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob, plan_layout
-from wavebatch.batch.output_rows import assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.selection import RowSelector
-from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
-from wavebatch.stages.chain import Chain, Step
+from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
 from wavebatch.surveying.calibrating.setting import check_energies
@@ -34,6 +33,9 @@ from wavebatch.surveying.choose_chain import Choice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius, measure_slope
 from wavebatch.surveying.prepare import prepare
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, judge_scale, refuse_units
+
+SolvedBlocks = list[tuple[np.ndarray, Solved]]
+"""Per block of a unit: row of unit.packets of each waveform, i8 (n,), and what the chain found, without the samples."""
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block by default: a unit of 50,000 waveforms of 80. Smaller blocks are slower: NumPy's cost per call."""
@@ -77,37 +79,15 @@ class Prepared:
 
     @property
     def second_step(self) -> Step | None:
-        """The step whose columns need a second pass over the strip's points; None where none of them is written."""
-        step, wanted = self.job.chain.second_step, self._wanted
-        return step if step is not None and (self.late_steps or set(step.stage.makes) & wanted) else None
-
-    @property
-    def late_steps(self) -> tuple[Step, ...]:
-        """Steps that complete written columns from those of the second pass."""
-        wanted = self._wanted
-        return tuple(step for step in self.job.chain.late_steps if set(step.stage.makes) & wanted)
-
-    @property
-    def row_layout(self) -> OutputLayout:
-        """The layout of a unit's rows: that of the cloud, then the columns of the selection and of a second pass."""
-        layout = self.selector.carrying
-        return layout if self.second_step is None else layout.extended(list_carried(self.late_steps))
+        """The step whose columns need a second pass over the strip's points; None where nothing wanted needs them."""
+        chain, step = self.job.chain, self.job.chain.second_step
+        made = {name for one in (step, *chain.after_second) if one is not None for name in one.stage.makes}
+        return None if made.isdisjoint([*self.job.columns, *self.selector.needed]) else step
 
     @property
     def selector(self) -> RowSelector:
         """Chooses the rows that are written."""
-        return RowSelector(self.job.selection, self.job.chain, self.layout)
-
-    @property
-    def _wanted(self) -> set[str]:
-        """Columns that are written, or that decide what is written."""
-        return {*self.job.columns, *self.selector.needed}
-
-
-def list_carried(late: Iterable[Step]) -> tuple[str, ...]:
-    """Columns that rows carry for a second pass, and the cloud does not get: those of late steps, then the rays."""
-    hidden = (name for step in late for name in step.stage.makes if not COLUMNS[name].extra_bytes)
-    return (*hidden, *RAY)
+        return RowSelector.plan(self.job.selection, self.job.chain, self.layout)
 
 
 def prepare_strip(job: StripJob) -> Prepared:
@@ -132,8 +112,8 @@ def prepare_strip(job: StripJob) -> Prepared:
     start = time.perf_counter()
     with job.open() as reader:
         facts = reader.facts
-        RowSelector(job.selection, job.chain, plan_layout(job, facts)).check()
         job = replace(job, selection=job.selection.place(facts))
+        RowSelector.plan(job.selection, job.chain, plan_layout(job, facts))
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
@@ -157,7 +137,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.energy is not None and energy is not None:
                 check_energies(reader, scan, energy)
             layout = plan_layout(job, facts)
-            RowSelector(job.selection, job.chain, layout).check()
+            RowSelector.plan(job.selection, job.chain, layout)
             units = reader.unit_count()
         except BaseException:
             scan.close()
@@ -235,29 +215,55 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
     Returns
     -------
     rows : structured array (m,)
-        In the strip's `row_layout`; without a second pass those that are written, in the cloud's `layout`.
+        Those that are written, in the cloud's layout.
     report : RunReport
     """
     prepared: Prepared = unpack(blob)
     timing: dict[str, float] = {}
-    echoes_mode = prepared.job.options.points == "echoes"
+    _, _, made = solve_unit(prepared, number, block_size, timing)
     start = time.perf_counter()
+    rows, left = prepared.selector.select(made.rows, made.columns)
+    timing["assemble"] += time.perf_counter() - start
+    return rows, replace(made.report + left, timing=timing)
+
+
+def solve_unit(
+    prepared: Prepared, number: int, block_size: int | None, timing: dict[str, float]
+) -> tuple[SolvedBlocks, UnitEchoes, Assembled]:
+    """Run the chain on the packets of a unit and make all of its rows.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    number, block_size
+        As for `process_unit`.
+    timing : dict
+        Gets the seconds of every step.
+
+    Returns
+    -------
+    solved : SolvedBlocks
+    echoes : UnitEchoes
+        The same echoes, by packet.
+    made : Assembled
+        With the columns that the selection needs.
+    """
+    start = time.perf_counter()
+    echoes_mode = prepared.job.options.points == "echoes"
     with StripReader(prepared.facts) as reader:
         unit = reader.read_unit(number, prepared.scan)
         timing["read points"] = time.perf_counter() - start
         blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)
-        echoes = gather_echoes(unit, _run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
+        solved = list(_run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
     start = time.perf_counter()
-    layout = prepared.row_layout
+    echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
+    layout, needed = prepared.layout, prepared.selector.needed
     if echoes_mode:
-        rows, report = assemble_echoes(unit, echoes, layout, prepared.job.selection.drop_flags)
+        made = assemble_echoes(unit, echoes, layout, needed, prepared.job.selection.drop_flags)
     else:
-        rows, report = assemble_returns(unit, echoes, layout)
-    if prepared.second_step is None:
-        rows, left = prepared.selector.select(rows)
-        report += left
+        made = assemble_returns(unit, echoes, layout, needed)
     timing["assemble"] = time.perf_counter() - start
-    return rows, replace(report, timing=timing)
+    return solved, echoes, made
 
 
 @functools.lru_cache(maxsize=4)
@@ -275,13 +281,13 @@ def _block_size(unit: Unit, wanted: int | None) -> int:
 
 def _run_blocks(
     prepared: Prepared, unit: Unit, blocks: Iterable[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
-) -> Iterator[tuple[WaveformBlock, np.ndarray, EchoTable]]:
+) -> Iterator[tuple[np.ndarray, Solved]]:
     system = prepared.system
     for block, index in blocks:
         placed = prepared.sensor.fill(block)
         if prepared.pulse_energy is not None:
             placed = prepared.pulse_energy.fill(placed, unit)
-        yield block, index, prepared.job.chain.run(placed, system, timing)
+        yield index, prepared.job.chain.solve(placed, system, timing).without_samples()
 
 
 def _timed(items: Iterator, timing: dict[str, float], name: str) -> Iterator:

@@ -14,14 +14,14 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wavebatch.cli.messages import one_line, print_json, print_result, talk
+from wavebatch.cli.messages import answer, one_line, print_result, talk
 from wavebatch.cli.options import (
     check_html,
     common_options,
+    declared,
     from_options,
     html_option,
     output_option,
-    parse_length,
     seed_option,
 )
 from wavebatch.cli.program.completion import complete_scenes
@@ -42,17 +42,16 @@ _REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "lo
 @click.option("--repeat", "repeats", type=click.IntRange(1), default=3, show_default=True, metavar="N",
               help="Repetitions of the timing.")
 @seed_option("Seed of the simulated waveforms.")
-@click.option("--tolerance", metavar="LENGTH",
-              help="Name the cheapest chain whose range error of isolated echoes is at most this, e.g. 0.02m.")
+@declared("tolerance", "Name the cheapest chain whose range error of isolated echoes is at most this, e.g. 0.02m.")
 @click.option("--all-methods", is_flag=True, help="Also measure every detector and every decomposer.")
 @click.option("--real", is_flag=True,
               help="Inject echoes into the waveforms of each STRIP and count those found, and count false echoes.")
 @output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR", required=False,
                folder=True)
 @html_option
-@common_options("json", "quiet")
+@common_options("json")
 def bench(
-    files: tuple[Path, ...], output: Path | None, tolerance: str | None, html_file: Path | None, **options: Any
+    files: tuple[Path, ...], output: Path | None, tolerance: float | None, html_file: Path | None, **options: Any
 ) -> None:
     """Measure error and run time of all shipped chains and of CHAIN files (.toml).
 
@@ -86,7 +85,7 @@ def bench(
         strip=strips[0] if strips else None,
         scenes=options["scenes"] or (() if strips else ("mixed",)),
         chains=tuple(path for path in files if path.suffix.lower() == ".toml"),
-        tolerance_cm=parse_length(tolerance) if tolerance else None,
+        tolerance_cm=100.0 * tolerance if tolerance else None,
     )
     document = run_bench(settings, say)
     text = format_document(document)
@@ -133,7 +132,6 @@ def _bench_real(
 
         write_real_page(html_file, [(report.strip, format_report(report)) for report in reports])
         talk(f"{html_file}: written")
-    if options["as_json"]:
-        print_json({"strips": [asdict(report) for report in reports]}, "real")
+    answer({"strips": [asdict(report) for report in reports]}, "real")
     if failed:
         sys.exit(1)

@@ -14,10 +14,9 @@ import click
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, format_json, print_json, talk
+from wavebatch.cli.messages import answer, count, format_json, talk
 from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
-from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
 
 if TYPE_CHECKING:
@@ -49,15 +48,13 @@ if TYPE_CHECKING:
               help="Fit how the light falls with the scan angle, where strips overlap; `run` takes it off.")
 @shared.output_option("Also write constants, drifts and overlaps of the strips as JSON.", "FILE", "--report",
                       required=False)
-@shared.output_option("Also draw drifts and overlaps of the strips (PNG, SVG or PDF).", "FILE", "--plot",
-                      required=False)
 @shared.chain_options
 @shared.system_option
 @shared.declared("energy")
 @shared.sensor_options
 @shared.declared("direction")
 @shared.html_option
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def calibrate(
     strips: tuple[Path, ...],
     targets: Path | None,
@@ -92,13 +89,11 @@ def calibrate(
         raise click.UsageError("give --targets FILE, or --from-column NAME, and not both")
     paths = find_files(map(str, strips), recursive=options["recursive"])
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
-        for target in filter(None, (output, options["report"], options["plot"], html_file)):
+        for target in filter(None, (output, options["report"], html_file)):
             refuse_input(target)
     shared.check_toml(output)
     for target in filter(None, (output, options["report"])):
         refuse_existing(target, overwrite)
-    if options["plot"] is not None:
-        check_picture(options["plot"], overwrite=overwrite)
     shared.check_html(html_file)
     flight = calibrate_flight(paths, load_targets(targets) if targets else [], _read_options(options))
     found = flight.calibration
@@ -109,12 +104,7 @@ def calibrate(
         from wavebatch.tools.html.calibrate_page import write_calibrate_page
 
         write_calibrate_page(html_file, flight)
-    if options["plot"] is not None:
-        from wavebatch.tools.plots.draw_flight import draw_flight
-
-        draw_flight(flight, options["plot"], overwrite=overwrite)
-    if options["as_json"]:
-        print_json(_list_report(flight))
+    answer(_list_report(flight))
     for note in found.notes:
         talk(f"warning: {note}")
     if options["quiet"]:

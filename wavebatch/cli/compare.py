@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.compare_tables import list_angles, list_lines, list_match, list_overlap
-from wavebatch.cli.messages import print_result, talk
+from wavebatch.cli.messages import print_result, talk, tell
 from wavebatch.cli.options import (
     check_html,
     common_options,
@@ -53,7 +53,7 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 @click.option("--overlap", is_flag=True,
               help="Compare brightness and height of the clouds of two strips, A and B, where they overlap.")
 @where_option("Compare at the points of both clouds, or at those of A with --truth (all true echoes count)")
-@click.option("--tolerance", type=float, metavar="NS",
+@click.option("--within", type=float, metavar="NS",
               help="Largest time difference of the same echo [ns].  [default: 1; with --truth: 1.5]")
 @click.option("--min-completeness", **_SHARE, help="Least share of B's echoes that A has.")
 @click.option("--min-correctness", **_SHARE, help="Least share of A's echoes that B has.")
@@ -79,8 +79,8 @@ def compare(
 ) -> None:
     """Compare the echoes of cloud A with those of B: another cloud, or the strip with the vendor's returns.
 
-    Two echoes of a pulse are the same if their distance along the ray is within the tolerance. Points that were passed
-    through without an echo are ignored.
+    Two echoes of a pulse are the same if their times differ by at most --within. Points that were passed through
+    without an echo are ignored.
 
     With --strip, A and B are chains. They run on the strip and are compared waveform by waveform: with each other, with
     the vendor's returns, and by their goodness of fit. One of them may be a cloud. Without B, A is compared with the
@@ -133,11 +133,11 @@ def _write_page(target: Path | None, result: Any, broken: list[str]) -> None:
         from wavebatch.tools.html.compare_page import write_compare_page
 
         write_compare_page(target, result, broken)
-        talk(f"{target}: written")
+        tell(f"{target}: written")
 
 
 def _tolerance(options: dict) -> dict[str, float]:
-    return {} if options["tolerance"] is None else {"tolerance_ns": options["tolerance"]}
+    return {} if options["within"] is None else {"tolerance_ns": options["within"]}
 
 
 def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
@@ -208,14 +208,14 @@ def _measure_angles(a: Path, b: Path | None, options: dict) -> AngleAgreement:
     """The agreement of the angles of one or two clouds; UsageError for options that have no meaning here."""
     from wavebatch.tools.compare.angles import compare_angles
 
-    _refuse_others(options, "--angles", "tolerance")
+    _refuse_others(options, "--angles", "within")
     return compare_angles(a, b, **_tolerance(options))
 
 
 def _refuse_others(options: dict, mode: str, *allowed: str) -> None:
     """UsageError for options that have no meaning in this mode."""
     for name, value in options.items():
-        if value not in (None, False) and name not in (*allowed, "debug"):
+        if value not in (None, False) and name not in (*allowed, "debug", "quiet"):
             raise click.UsageError(f"--{name.removesuffix('_file').replace('_', '-')} has no meaning with {mode}")
 
 

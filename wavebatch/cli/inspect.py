@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json, print_text, printable, talk
+from wavebatch.cli.messages import answer, count, print_text, printable, talk
 from wavebatch.cli.options import common_options, declared, for_each, strip_options, strips_argument
 from wavebatch.cli.program.completion import complete_files
 from wavebatch.files.inputs import find_files
@@ -33,7 +33,9 @@ EXIT_PROBLEMS, EXIT_UNREADABLE = 1, 1
 @click.option("-v", "--verbose", is_flag=True,
               help="Also survey the strip: its pulse, and the known sensor that it looks like.")
 @common_options("json")
-def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool, debug: bool, **reading: Any) -> None:
+def info(
+    strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool, quiet: bool, debug: bool, **reading: Any
+) -> None:
     """Show header, points, wave packets, descriptors and sample values of strips, and how clouds were made.
 
     STRIP is a LAS or LAZ file of any version, with or without waveforms, a glob, a folder, or @list.txt with one of
@@ -58,8 +60,7 @@ def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool,
         return facts
 
     results, failed = for_each(paths, show, debug=debug)
-    if as_json:
-        print_json(results[0] if len(paths) == 1 else results)
+    answer(results[0] if len(paths) == 1 else results)
     sys.exit(EXIT_UNREADABLE if failed or lost else 0)
 
 
@@ -89,7 +90,8 @@ def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, A
 @click.option("--strict", is_flag=True, help="Count notes as problems.")
 @common_options("json")
 def check(
-    files: tuple[Path, ...], direction: str, headerless: bool, strict: bool, as_json: bool, debug: bool, recursive: bool
+    files: tuple[Path, ...], direction: str, headerless: bool, strict: bool, as_json: bool, quiet: bool,
+    debug: bool, recursive: bool,
 ) -> None:
     """Check strips and chain files (.toml); print one line per problem, with its place and what to do.
 
@@ -111,8 +113,7 @@ def check(
             print_text(printable(f"{found.file}: note: {line}"))
         if found.is_clean:
             print_text(printable(f"{found.file}: ok ({found.summary})"))
-    if as_json:
-        print_json(results)
+    answer(results)
     sys.exit(0 if clean else EXIT_PROBLEMS)
 
 
@@ -125,6 +126,7 @@ def _list_lines(facts: dict[str, Any]) -> Iterator[str]:
     for run in facts["provenance"]:
         yield from _provenance_lines(run)
     yield f"CRS            {_shorten(facts['crs'] or 'none')}"
+    yield f"coordinates    {facts['coordinates']}"
     yield f"points         {facts['points']}"
     if "counts" in facts:
         counts = facts["counts"]
@@ -163,8 +165,8 @@ def _point_lines(facts: dict[str, Any]) -> Iterator[str]:
             low, high = bounds["least"][axis], bounds["largest"][axis]
             ends = [math.nan if end is None else end for end in (given["least"][axis], given["largest"][axis])]
             right = max(abs(ends[0] - low), abs(ends[1] - high)) <= 1.5 * abs(step)  # False for NaN
-            said = "" if right else f"; the header says {ends[0]:.3f} to {ends[1]:.3f}"
-            yield f"{name}              {low:.3f} to {high:.3f}, steps of {step:g}{said}"
+            said = "" if right else f"; the header says {ends[0]:.12g} to {ends[1]:.12g}"
+            yield f"{name}              {low:.12g} to {high:.12g}, steps of {step:g}{said}"
     if time:
         dates = f", {' to '.join(time['dates_gps'])} GPS" if "dates_gps" in time else ""
         yield f"GPS time       {time['least']:.16g} to {time['largest']:.16g} s, {time['kind']}{dates}"

@@ -13,7 +13,7 @@ import math
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, is_dataclass
 from typing import IO, Any
 
@@ -125,6 +125,12 @@ def talk(message: str) -> None:
     log_file.log(printable(message))
 
 
+def tell(message: str) -> None:
+    """`talk`, unless --quiet was given."""
+    if not click.get_current_context().params["quiet"]:
+        talk(message)
+
+
 def write_message(line: str) -> None:
     """One line on stderr; where it cannot be written, later ones are dropped, and the work goes on."""
     try:
@@ -158,6 +164,12 @@ def print_json(value: Any, mode: str = "") -> None:
     schema = {"schema": f"wavebatch.{'-'.join(path)}/1"}
     named = [{**schema, **one} for one in value] if isinstance(value, list) else {**schema, **value}
     print_text(format_json(named))
+
+
+def answer(document: Any, mode: str = "") -> None:
+    """`print_json`, if --json was given."""
+    if click.get_current_context().params["as_json"]:
+        print_json(document, mode)
 
 
 def print_text(text: str) -> None:
@@ -203,13 +215,11 @@ def print_result(as_json: bool, document: Any, lines: Iterable[str], mode: str =
         print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
 
 
-def print_summary(options: Mapping[str, Any], summary: Any, lines: Iterable[str]) -> None:
+def print_summary(summary: Any, lines: Iterable[str]) -> None:
     """The summary (a dataclass or dictionary) as JSON if --json is given, and the lines on stderr unless --quiet."""
-    if options["as_json"]:
-        print_json(summary)
-    if not options["quiet"]:
-        for line in lines:
-            talk(line)
+    answer(summary)
+    for line in lines:
+        tell(line)
 
 
 def count(number: int, name: str) -> str:

@@ -260,13 +260,13 @@ _COMMON = {
 
 
 def common_options(*names: str, failure: int = 1) -> Callable:
-    """The last options of a command, by their names in _COMMON and always `--debug`, and its errors as one line.
+    """The last options of a command, by their names in _COMMON and those that all have, and its errors as one line.
 
     failure: exit code as in `report_errors`.
     """
 
     def decorate(command: Callable) -> Callable:
-        shared = (*names, "log_file", "log_level", "debug")
+        shared = (*names, "quiet", "log_file", "log_level", "debug")
         return together(*(_COMMON[name] for name in shared))(report_errors(failure)(_protected(command)))
 
     return decorate

@@ -27,6 +27,7 @@ from wavebatch.cli.messages import (
     print_text,
     printable,
     talk,
+    tell,
 )
 from wavebatch.cli.options import (
     OutputPath,
@@ -57,7 +58,7 @@ EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
 @click.option("--progress", type=click.Choice(["auto", "bar", "json", "none"]), default="auto", show_default=True,
               help="auto: a bar if stderr is a terminal; json: one line per event on stdout.")
 @click.option("-v", "--verbose", is_flag=True, help="Print more about each strip.")
-@common_options("json", "quiet", failure=EXIT_NOTHING)
+@common_options("json", failure=EXIT_NOTHING)
 def run(**options: Any) -> None:
     """Decompose strips into enriched point clouds.
 
@@ -181,8 +182,7 @@ def _write_page(result: Any, folder: Path, options: dict[str, Any]) -> bool:
             traceback.print_exc()
         talk(f"error: --html: {one_line(error)}")
         return False
-    if not options["quiet"]:
-        talk(f"{target}: written")
+    tell(f"{target}: written")
     return True
 
 

@@ -99,7 +99,7 @@ _internal = click.option("--internal/--external", default=True,
 @click.option("--threshold", type=click.FloatRange(0.0, 1e10), metavar="DN",
               help="Discrete: amplitude that triggers a return [DN].  [default: 12]")
 @click.option("--most-returns", "most", type=int, help="Discrete: most returns per pulse.  [default: 4]")
-@common_options("overwrite", "json", "quiet")
+@common_options("overwrite", "json")
 def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | None, **options: Any) -> None:
     """Simulate a full-waveform strip of a SCENE with known echoes.
 
@@ -128,7 +128,7 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
             summary = simulate_strip(shaped, output, truth=truth, **common)
             rest = f"{count(summary.packets, 'packet')} with {count(summary.echoes, 'echo')}"
     points = f"{count(summary.points, 'point')} of {count(summary.pulses, 'pulse')}"
-    print_summary(options, summary, [f"{output}: {points}, {rest}"])
+    print_summary(summary, [f"{output}: {points}, {rest}"])
 
 
 def _build_receiver(truth: Path | None, options: dict[str, Any]) -> DiscreteReceiver | None:
@@ -190,7 +190,7 @@ def _shape_scene(scene: Scene, options: dict[str, Any]) -> Scene:
               help="Reflectance: efficiency of the optics.  [default: 0.5]")
 @click.option("--attenuation", type=click.FloatRange(*RADAR_LIMITS["attenuation"]), metavar="DB_KM",
               help="Reflectance: attenuation of the air [dB/km].  [default: 0.22]")
-@common_options("overwrite", "json", "quiet")
+@common_options("overwrite", "json")
 def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     """Model waveforms from the discrete returns of CLOUD: one Gaussian per return, from its range and intensity.
 
@@ -204,7 +204,7 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
     lines = _list_lines(output, summary, settings)
-    print_summary(options, summary.to_json() if options["as_json"] else summary, lines)
+    print_summary(summary.to_json() if options["as_json"] else summary, lines)
 
 
 def _build_radar(options: dict[str, Any]) -> Radar | None:

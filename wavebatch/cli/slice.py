@@ -16,7 +16,7 @@ import click
 
 from wavebatch import __version__
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, print_json, talk
+from wavebatch.cli.messages import answer, count, talk
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.figure_file import check_picture
@@ -83,7 +83,7 @@ class Extras:
               "CRS, which GDAL and QGIS read.")
 @click.option("--most", default=20, show_default=True, metavar="N", help="Most segments per slice.")
 @shared.declared("direction")
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def slice_(
     strips: tuple[str, ...],
     output: Path | None,
@@ -129,8 +129,7 @@ def slice_(
     found, failed = shared.for_each(
         paths, lambda strip: _slice(strip, targets.get(strip), lines, extras, options), debug=options["debug"]
     )
-    if options["as_json"]:
-        print_json(found[0] if len(paths) == 1 else found)
+    answer(found[0] if len(paths) == 1 else found)
     sys.exit(EXIT_SOME_FAILED if failed else 0)
 
 

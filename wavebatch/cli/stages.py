@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("name", required=False, shell_complete=complete_stages)
 @common_options("json")
-def stages(name: str | None, as_json: bool, debug: bool) -> None:
+def stages(name: str | None, as_json: bool, quiet: bool, debug: bool) -> None:
     """List the algorithms that a chain can use, those of one kind, or explain the one called NAME.
 
     Kinds are noise, detect, decompose and attribute.

@@ -58,7 +58,7 @@ _ZONE = ("dead_zone_m", "dead_zone_err_m")
 @common_options("overwrite", "json")
 def stats(
     clouds: tuple[Path, ...], size: float | None, polygon: Path | None, output: Path | None, overwrite: bool,
-    as_json: bool, debug: bool, recursive: bool, where: Condition | None,
+    as_json: bool, quiet: bool, debug: bool, recursive: bool, where: Condition | None,
 ) -> None:
     """Count how many returns the pulses of CLOUDs have, how far apart they are, and which flags they have.
 

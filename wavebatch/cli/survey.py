@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.messages import count, one_line, print_result, talk
+from wavebatch.cli.messages import count, one_line, print_result, talk, tell
 from wavebatch.cli.options import (
     check_html,
     check_toml,
@@ -102,7 +102,7 @@ def survey(
         write_survey_page(html_file, saved.survey, document, used, **reading)
     for target in (output, chain_file, angles, html_file):
         if target is not None:
-            talk(f"{target}: written")
+            tell(f"{target}: written")
     if facts.get("misfits") or facts.get("failed"):
         sys.exit(EXIT_PROBLEMS)
 
@@ -235,7 +235,8 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     yield from _pulse_lines(saved)
     if "divergence_seen_mrad" in figures:
         seen = format_measure(figures["divergence_seen_mrad"], figures["divergence_seen_error_mrad"])
-        yield _line("beam", f"{seen} mrad by the widths of echoes over the slopes of their surfaces")
+        words = "mrad by the widths of echoes over the slopes of their surfaces, if these are plane"
+        yield _line("beam", f"{seen} {words}")
     yield from _digitizer_lines(saved)
     yield from _scene_lines(saved)
     yield "decisions"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, counting, print_json, talk
+from wavebatch.cli.messages import answer, count, counting, talk
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import format_measure
 from wavebatch.files.disk.protect import refuse_input
@@ -60,7 +60,7 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @shared.declared("energy")
 @shared.sensor_options
 @shared.strip_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     """Deconvolve the waveforms of each STRIP and sum them in the voxels of a 3D grid.
 
@@ -130,8 +130,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
         return summary
 
     summaries, failed = shared.for_each(paths, work, debug=options["debug"])
-    if options["as_json"]:
-        print_json(summaries[0] if len(paths) == 1 else [asdict(one) for one in summaries])
+    answer(summaries[0] if len(paths) == 1 else [asdict(one) for one in summaries])
     sys.exit(EXIT_SOME_FAILED if failed else 0)
 
 

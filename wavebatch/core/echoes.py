@@ -118,20 +118,10 @@ _COLUMNS = (
     Column("y", "f8", "m", "northing of the echo", extra_bytes=False),
     Column("z", "f8", "m", "height of the echo", extra_bytes=False),
     Column("facing_reflectance", "f4", "-", "reflectance if the surface faces the sensor", extra_bytes=False),
-    Column("facing_reflectance_err", "f4", "-", "its standard deviation", extra_bytes=False),
-    Column("facing_relative_reflectance", "f4", "DN ns m2", "the same in units of the strip", extra_bytes=False),
-    Column("facing_relative_reflectance_err", "f4", "DN ns m2", "its standard deviation", extra_bytes=False),
-    Column("ray_x", "f4", "-", "east component of the unit vector away from the sensor", extra_bytes=False),
-    Column("ray_y", "f4", "-", "north component of the unit vector away from the sensor", extra_bytes=False),
-    Column("ray_z", "f4", "-", "upward component of the unit vector away from the sensor", extra_bytes=False),
 )
 
 COLUMNS: dict[str, Column] = {column.name: column for column in _COLUMNS}
 """Every column by its name."""
-
-RAY = ("ray_x", "ray_y", "ray_z")
-"""Columns that a stage with a second pass needs: the direction in which each echo was seen."""
-
 
 _FIELDS: dict[str, type] = {
     "waveform": np.int32,

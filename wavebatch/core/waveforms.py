@@ -182,6 +182,10 @@ class WaveformBlock:
         first = int(self.point[index[0]]) if len(index) else self.first
         return replace(self, samples=samples, first=first, returns=returns, **parts)
 
+    def without_samples(self) -> WaveformBlock:
+        """The block with waveforms of no samples: their place, time and sensor are left."""
+        return replace(self, samples=np.empty((len(self), 0), self.samples.dtype), missing=None)
+
 
 def _join_returns(blocks: Sequence[WaveformBlock]) -> ReturnTable | None:
     if any(block.returns is None for block in blocks):
@@ -260,6 +264,8 @@ class SystemPulse:
     """Spikes of one sample per waveform; 0 where they are not taken off."""
     transient: float = 0.0
     """Time at the start of every waveform in which its receiver is not at rest [ns]."""
+    seams: Mapping[int, int] = field(default_factory=dict)
+    """Sample between two recordings of a packet that was interpolated, by the number of samples of such packets."""
     ringing: float = 0.0
     """Largest after-pulse as a share of the amplitude."""
     saturation: float | None = None

@@ -7,6 +7,7 @@ picture is drawn, because it takes longer to import than many commands take to r
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
 import io
 import logging
@@ -117,10 +118,20 @@ def _style(target: str, more: Mapping[str, Any] | None = None) -> Iterator[None]
         import matplotlib.backends.backend_agg  # also where a half of an installation is missing
     except ImportError as error:
         raise ConfigError(f"{target}: matplotlib cannot be imported; install it again: {error}") from error
-    kept = {name: value for name, value in matplotlib.rcParamsDefault.items() if name not in _UNTOUCHED}
-    with matplotlib.rc_context({**kept, **_STYLE, **(more or {})}), warnings.catch_warnings():
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        dict.update(matplotlib.rcParams, _read_style())  # checked once: a page has many pictures
+        matplotlib.rcParams.update(more or {})
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         yield
+
+
+@functools.cache
+def _read_style() -> Mapping[str, Any]:
+    """All settings that change the look of a figure."""
+    import matplotlib
+
+    kept = {name: value for name, value in matplotlib.rcParamsDefault.items() if name not in _UNTOUCHED}
+    return matplotlib.RcParams({**kept, **_STYLE})
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.disk.protect import protect
+from wavebatch.files.disk.protect import protect, real_name
 from wavebatch.files.text_file import MOST_LIST, read_text
 
 SUFFIXES = (".las", ".laz")
@@ -35,7 +35,7 @@ def find_files(
     files: dict[str, Path] = {}
     for argument in arguments:
         for path in _expand(argument, Path(), recursive, kinds):
-            files.setdefault(_real_name(path), path)
+            files.setdefault(real_name(path), path)
     if not files:
         raise ConfigError("no file given; name files, folders, patterns or @list.txt")
     protect(files.values())
@@ -92,13 +92,6 @@ def _walk(folder: Path) -> list[str]:
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         found += [os.path.relpath(os.path.join(place, name), folder) for name in files]
     return found
-
-
-def _real_name(path: Path) -> str:
-    try:
-        return os.path.realpath(path)
-    except (OSError, ValueError):  # no file can have this name
-        return os.path.abspath(path)
 
 
 def _expand_home(name: str) -> str:

@@ -6,6 +6,7 @@ file: every keyword argument is a key, its annotation gives type and range, its 
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import re
 import time
@@ -18,6 +19,7 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
+from wavebatch.core.no_data import SUFFIX
 from wavebatch.core.schema import Range, read_hint
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.clean import clean_block
@@ -29,6 +31,8 @@ KINDS: dict[str, tuple[tuple[str, ...], type]] = {
     "attribute": (("block", "noise", "system", "echoes"), EchoTable),
 }
 """Per kind of stage: its data arguments, in order, and what it returns. Chains hold the kinds in this order."""
+
+Needs = tuple[str, ...] | Callable[[Mapping[str, Any]], tuple[str, ...]]
 
 _SECTION = re.compile(r"^(\w[\w ]*)\n-{3,}$", re.MULTILINE)
 _ENTRY = re.compile(r"^(\w+)(?: :.*)?$", re.MULTILINE)
@@ -58,11 +62,12 @@ class Stage:
     parameters: Mapping[str, Parameter]
     makes: tuple[str, ...] = ()
     """Names of the attribute columns that the stage adds."""
-    needs: tuple[str, ...] = ()
-    """Names of the attribute columns that earlier stages must have added."""
+    needs: Needs = ()
+    """Names of the attribute columns that earlier stages must have added, or a function of the stage's parameters that
+    returns them."""
     second_pass: Callable[..., Any] | None = None
     """Kernel that computes the stage's columns from all points of the strip. The stage sees one block only, so it fills
-    its columns with no-data and adds `ray_x`, `ray_y`, `ray_z`.
+    its columns with no-data; stages that need them run again once they are known.
 
     The kernel gets points (n, 3) [m], rays (n, 3), kernels.geometry.normals.Surroundings and the stage's parameters,
     of which `radius` [m] is the largest distance at which a point matters. It returns the columns' values and a
@@ -72,12 +77,6 @@ class Stage:
     it, so that widths and areas are read as what they are. None: the survey's pulse."""
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None
     """What is wrong with this stage in a chain and for a strip (None before the strip is known); empty if nothing."""
-    needs_if: Mapping[str, Mapping[Any, tuple[str, ...]]] = field(default_factory=dict)
-    """More columns that earlier stages must have added, by parameter and its value."""
-    complete: Callable[[Mapping[str, np.ndarray]], dict[str, np.ndarray]] | None = None
-    """Computes columns that need those of the second pass. In the block, the stage fills them with no-data for the
-    reason NO_ANGLE, and its other columns hold what is needed. The function gets these and those of the second pass
-    (float (n,), NaN where unknown), and returns the completed ones."""
 
     @property
     def summary(self) -> str:
@@ -100,12 +99,11 @@ def stage(
     kind: str,
     *,
     makes: tuple[str | Column, ...] = (),
-    needs: tuple[str, ...] = (),
+    needs: Needs = (),
     second_pass: Callable[..., Any] | None = None,
     fits: Callable[[SystemPulse, Mapping[str, Any]], SystemPulse] | None = None,
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None,
-    needs_if: Mapping[str, Mapping[Any, tuple[str, ...]]] | None = None,
-    complete: Callable[[Mapping[str, np.ndarray]], dict[str, np.ndarray]] | None = None,
+    shares: Any = None,
 ) -> Callable[[Callable], Callable]:
     """Register the decorated function as stage `kind.<function name>`.
 
@@ -115,10 +113,13 @@ def stage(
         Decides the data arguments and the result: see KINDS.
     makes : tuple of str or Column
         Attribute columns that the stage adds. A Column declares a new one, so that `run` can write it.
-    needs : tuple of str
+    needs : tuple of str, or function of the parameters
         Attribute columns that earlier stages must have added.
-    second_pass, fits, check, needs_if, complete : optional
+    second_pass, fits, check : optional
         See `Stage`.
+    shares : dataclass instance, optional
+        Parameters that stages share: its fields with their annotations, its values as defaults, its docstring for their
+        meaning. The function takes them as `**options`.
 
     Returns
     -------
@@ -137,7 +138,7 @@ def stage(
         name = f"{kind}.{function.__name__}"
         if name in STAGES:
             raise StageError(f"stage {name} is registered twice")
-        parameters = _read_parameters(name, kind, function)
+        parameters = _read_parameters(name, kind, function, shares)
         if second_pass is not None and "radius" not in parameters:
             raise StageError(f"stage {name} has a second pass, but no parameter radius")
         new = {column.name: column for column in makes if isinstance(column, Column)}
@@ -145,36 +146,43 @@ def stage(
             raise StageError(f"stage {name} declares column {min(taken)}, which there is already")
         COLUMNS.update(new)
         names = tuple(column.name if isinstance(column, Column) else column for column in makes)
-        STAGES[name] = Stage(
-            name, kind, function, parameters, names, needs, second_pass, fits, check, needs_if or {}, complete
-        )  # fmt: skip
+        STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass, fits, check)
         return function
 
     return register
 
 
-def _read_parameters(name: str, kind: str, function: Callable) -> dict[str, Parameter]:
-    signature = inspect.signature(function)
-    hints = typing.get_type_hints(function, include_extras=True)
-    data = tuple(p.name for p in signature.parameters.values() if p.kind is not p.KEYWORD_ONLY)
+def _read_parameters(name: str, kind: str, function: Callable, shares: Any) -> dict[str, Parameter]:
+    given = inspect.signature(function).parameters.values()
+    data = tuple(p.name for p in given if p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD))
     if data != KINDS[kind][0]:
         raise StageError(f"stage {name} takes {data}, a {kind} stage takes {KINDS[kind][0]}")
-    if hints.get("return") is not KINDS[kind][1]:
+    if typing.get_type_hints(function).get("return") is not KINDS[kind][1]:
         raise StageError(f"stage {name} must be annotated to return {KINDS[kind][1].__name__}")
-    _, *entries = _ENTRY.split(_split_docstring(function)[1].get("Parameters", ""))
-    meanings = {head: " ".join(text.split()) for head, text in zip(entries[::2], entries[1::2], strict=True)}
-    parameters = {}
-    for key, parameter in signature.parameters.items():
-        if parameter.kind is not parameter.KEYWORD_ONLY:
-            continue
-        if parameter.default is parameter.empty or not meanings.get(key):
-            raise StageError(f"stage {name}: parameter {key} needs a default and an entry under Parameters")
-        kinds, choices, limits = read_hint(hints[key])
-        parameters[key] = Parameter(key, kinds, parameter.default, meanings[key], choices, limits)
+    defaults = {p.name: p.default for p in given if p.kind is p.KEYWORD_ONLY}
+    parameters = _declare(name, function, defaults)
+    if shares is not None:
+        values = dataclasses.asdict(shares)
+        for one in type(shares).__mro__[:-1]:
+            parameters |= _declare(name, one, {key: values[key] for key in one.__annotations__})
     return parameters
 
 
-def _split_docstring(function: Callable) -> tuple[str, dict[str, str]]:
+def _declare(name: str, source: Callable | type, defaults: Mapping[str, Any]) -> dict[str, Parameter]:
+    """Parameters from the annotations and the docstring of a function or dataclass."""
+    hints = typing.get_type_hints(source, include_extras=True)
+    _, *entries = _ENTRY.split(_split_docstring(source)[1].get("Parameters", ""))
+    meanings = {head: " ".join(text.split()) for head, text in zip(entries[::2], entries[1::2], strict=True)}
+    parameters = {}
+    for key, default in defaults.items():
+        if default is inspect.Parameter.empty or not meanings.get(key):
+            raise StageError(f"stage {name}: parameter {key} needs a default and an entry under Parameters")
+        kinds, choices, limits = read_hint(hints[key])
+        parameters[key] = Parameter(key, kinds, default, meanings[key], choices, limits)
+    return parameters
+
+
+def _split_docstring(function: Callable | type) -> tuple[str, dict[str, str]]:
     """Text before the first section of a numpydoc docstring, and the text of each section."""
     prose, *rest = _SECTION.split(inspect.getdoc(function) or "")
     return prose.strip(), {title: body.strip("\n") for title, body in zip(rest[::2], rest[1::2], strict=True)}
@@ -194,8 +202,7 @@ class Step:
     @property
     def needs(self) -> tuple[str, ...]:
         """Attribute columns that earlier stages must have added."""
-        more = [by_value.get(self.effective()[name], ()) for name, by_value in self.stage.needs_if.items()]
-        return (*self.stage.needs, *(column for columns in more for column in columns))
+        return self.stage.needs(self.effective()) if callable(self.stage.needs) else self.stage.needs
 
 
 class Solved(NamedTuple):
@@ -208,6 +215,10 @@ class Solved(NamedTuple):
     system: SystemPulse
     """Of the block's digitizer."""
     echoes: EchoTable
+
+    def without_samples(self) -> Solved:
+        """Leave the samples out."""
+        return self._replace(block=self.block.without_samples(), noise=replace(self.noise, of_sample=None))
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,11 +281,15 @@ class Chain:
         return next((step for step in self.steps if step.stage.second_pass is not None), None)
 
     @property
-    def late_steps(self) -> tuple[Step, ...]:
-        """The steps that complete their columns from those of the second pass."""
-        second = self.second_step
-        made = set() if second is None else set(second.stage.makes)
-        return tuple(step for step in self.steps if step.stage.complete is not None and made & set(step.needs))
+    def after_second(self) -> tuple[Step, ...]:
+        """The steps that need the columns of the second pass, or of another such step, in order."""
+        made = set() if self.second_step is None else set(self.second_step.stage.makes)
+        found = []
+        for step in self.steps:
+            if not made.isdisjoint(step.needs):
+                found.append(step)
+                made.update(step.stage.makes)
+        return tuple(found)
 
     def run(self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None) -> EchoTable:
         """Find and describe the echoes of a block.
@@ -315,15 +330,46 @@ class Chain:
         Solved
         """
         cleaned, noise, system = self.estimate_noise(block, system, timing)
-        used, echoes = system, None
+        found = Solved(cleaned, noise, system, None)
         for step in self.steps[1:]:
-            data = {"block": cleaned, "noise": noise, "system": used, "echoes": echoes}
-            echoes = self._call(step, data, timing)
-            if step.stage.fits is not None:
-                fitted = step.stage.fits(system, step.effective())
-                other = (fitted.components, fitted.kappa) != (system.components, system.kappa)
-                used = replace(fitted, other_pulse=other)
-        return Solved(cleaned, noise, system, echoes)
+            found = found._replace(echoes=self._call(step, self._data(found, step), timing))
+        return found
+
+    def keep_needed(self, solved: Solved) -> Solved:
+        """Leave all out that stages after the second pass do not see: samples, returns, columns they do not need."""
+        needed = {name for step in self.after_second for name in step.needs} - set(self.second_step.stage.makes)
+        others = {name for step in self.steps[3:] for name in step.stage.makes} - needed
+        kept = {name: values for name, values in solved.echoes.attributes.items()
+                if name.removesuffix(SUFFIX) not in others}  # fmt: skip
+        small = solved.without_samples()
+        return small._replace(block=replace(small.block, returns=None), echoes=replace(small.echoes, attributes=kept))
+
+    def solve_again(self, solved: Solved, timing: dict[str, float] | None = None) -> EchoTable:
+        """Run the stages again that need the columns of the second pass, once the echoes have them.
+
+        Parameters
+        ----------
+        solved : Solved
+            From `keep_needed`, its echoes with the columns of the second pass.
+        timing
+            As for `run`.
+
+        Returns
+        -------
+        EchoTable
+        """
+        for step in self.after_second:
+            solved = solved._replace(echoes=self._call(step, self._data(solved, step), timing))
+        return solved.echoes
+
+    def _data(self, solved: Solved, step: Step) -> dict[str, Any]:
+        """The data of a step; attribute stages get the system with the pulse that the decomposer fitted."""
+        system, decomposer = solved.system, self.steps[2]
+        if step.stage.kind == "attribute" and decomposer.stage.fits is not None:
+            fitted = decomposer.stage.fits(system, decomposer.effective())
+            other = (fitted.components, fitted.kappa) != (system.components, system.kappa)
+            system = replace(fitted, other_pulse=other)
+        return {**solved._asdict(), "system": system}
 
     def estimate_noise(
         self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None

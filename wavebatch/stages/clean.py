@@ -1,4 +1,4 @@
-"""Spikes, patterns of the converter, transients and sloping baselines: which a strip has, and how they are taken off.
+"""Spikes, patterns of the converter, transients, slopes and seams: which a strip has, and how they are taken off.
 
 The survey measures them after its first look at noise and width; `Chain.run` and the survey clean every block before
 anything else. Each defect must stand clear of chance: waveforms of other strips pass through untouched. Cleaned samples
@@ -7,14 +7,22 @@ are float32, so that a block that was cleaned is known by its samples.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
+from wavebatch.kernels.signal.defects import (
+    fill_spikes,
+    find_pattern,
+    find_seam,
+    find_spikes,
+    find_transient,
+    fit_slopes,
+)
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
-from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, transpose_samples
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_fill, transpose_samples
 from wavebatch.stages.pulse_tables import clip_level
 
 GUARD = 3.0
@@ -36,6 +44,9 @@ SLOPES, STEEP = 0.02, 5.0
 LEAST_RISE = 0.5
 """... and standard deviation of the baseline's rise over half of a waveform [noise of a sample]."""
 
+FLANK = 4
+"""Samples beside a seam that hold the flank of an echo of the other recording."""
+
 LEAST_WAVEFORMS, MOST_WAVEFORMS = 50, 2048
 """Waveforms from which defects are looked for, and how many are looked at."""
 
@@ -44,7 +55,7 @@ SHORTEST = 24
 
 
 def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
-    """Return the block without the strip's pattern, slopes, spikes and transients.
+    """Return the block without the strip's pattern, slopes, spikes, transients and seams.
 
     Parameters
     ----------
@@ -56,13 +67,17 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
     Returns
     -------
     WaveformBlock
-        With float32 samples; clipped ones keep their count. Transients are marked as missing.
+        With float32 samples; clipped ones keep their count. Transients and seams are marked as missing; a block with a
+        seam and no other defect keeps its counts.
 
     References
     ----------
     docs/algorithms.md H17.
     """
-    if not system.has_defects or block.samples.dtype.kind == "f":
+    if block.samples.dtype.kind == "f":
+        return block
+    block = mark_seam(block, system.seams)
+    if not system.has_defects:
         return block
     raw = transpose_samples(block.samples)
     signal = raw.copy()
@@ -85,6 +100,37 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
         gone[:, :lost] = True
         return replace(block, samples=samples, missing=gone)
     return replace(block, samples=samples)
+
+
+def mark_seam(block: WaveformBlock, seams: Mapping[int, int]) -> WaveformBlock:
+    """Mark the samples of a block's seam as missing.
+
+    These are the interpolated one, its neighbours, and of the recording with less signal there FLANK more: the time
+    between both recordings is not known to a sample, so that no pulse fits an echo across the seam.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        Raw counts.
+    seams : mapping
+        Sample of the seam by the number of samples of a packet.
+    """
+    at = seams.get(block.digitizer.n_samples, 0)
+    if not 0 < at < block.samples.shape[1] - 1:
+        return block
+    missing = np.zeros(block.samples.shape, bool) if block.missing is None else block.missing.copy()
+    missing[:, at - 1 : at + 2] = True
+    before, after = block.samples[:, max(at - 1 - FLANK, 0) : at - 1], block.samples[:, at + 2 : at + 2 + FLANK]
+    later = after.max(axis=1, initial=0) > before.max(axis=1, initial=0)
+    missing[:, max(at - 1 - FLANK, 0) : at - 1] |= later[:, None]
+    missing[:, at + 2 : at + 2 + FLANK] |= ~later[:, None]
+    return replace(block, samples=quiet_fill(block.samples, missing), missing=missing)
+
+
+def find_seams(blocks: Iterable[WaveformBlock]) -> dict[int, int]:
+    """Return the seams of packets by their number of samples (`find_seam`)."""
+    found = {block.digitizer.n_samples: find_seam(block.samples) for block in blocks}
+    return {length: at for length, at in found.items() if at}
 
 
 def sample_noise(system: SystemPulse) -> float:
@@ -123,7 +169,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     missing = None if block.missing is None else block.missing.T
     std, width = sample_noise(system), system.sigma_ref / block.spacing
     reach = int(np.ceil(3 * width))
-    spread = _slope_spread(signal, system, std, reach, missing)
+    spread = _slope_spread(signal, std, reach, missing)
     if spread:
         # Everything else is measured about level baselines.
         system = replace(system, slope_spread=spread / block.spacing)
@@ -148,24 +194,22 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     return replace(system, transient=find_transient(above, std) * block.spacing)
 
 
-ONE_SIDED = 0.1
-"""Median of slopes, over the width of their middle two thirds, above which they may be tails: these all fall."""
+RARER = 0.1
+"""Share of the steep slopes that must be of the rarer sign: tails, and weak echoes after the last clear one, slope one
+way."""
 
 
-def _slope_spread(signal: np.ndarray, system: SystemPulse, std: float, reach: int, missing: np.ndarray | None) -> float:
-    """Standard deviation of the slopes of baselines [count per sample]; 0 where chance and tails explain them.
-
-    A tail looks like a slope that falls: where tails were found (`recovery`), slopes must be of both signs.
-    """
+def _slope_spread(signal: np.ndarray, std: float, reach: int, missing: np.ndarray | None) -> float:
+    """Standard deviation of the slopes of baselines [count per sample]; 0 where chance or signal explains them."""
     slope, error = fit_slopes(signal, std, reach, missing=missing)
     known = np.isfinite(error)
     if np.count_nonzero(known) < LEAST_WAVEFORMS:
         return 0.0
     slope, error = slope[known], error[known]
     share = np.mean(np.abs(slope) > STEEP * error)
-    low, middle, high = np.quantile(slope, [0.1587, 0.5, 0.8413])
-    if system.recovery > 0 and abs(middle) > ONE_SIDED * (high - low):
+    if min(np.mean(slope > STEEP * error), np.mean(slope < -STEEP * error)) < RARER * share:
         return 0.0
+    low, middle, high = np.quantile(slope, [0.1587, 0.5, 0.8413])
     excess = max(0.25 * (high - low) ** 2 + middle**2 - np.median(error) ** 2, 0.0)
     few = np.mean(slope**2) if share < 0.3 else 0.0
     spread = float(np.sqrt(max(excess, few - np.median(error) ** 2)))

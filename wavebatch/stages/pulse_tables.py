@@ -1,6 +1,7 @@
 """The strip's pulse in samples, as kernels need it, with tables that turn fitted widths into echo widths.
 
-A learned pulse is a sum of Gaussians: kernels fit its main component, echo tables describe the whole pulse.
+A learned pulse is a sum of Gaussians: kernels fit its main component, echo tables describe the whole pulse. Kernels
+place a skewed pulse by its peak; echo tables place every pulse by its datum.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     PulseMeasures,
     PulseShape,
     evaluate_pulse,
+    find_datum,
     measure_pulse,
 )
 from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, correlation_matrix
@@ -116,7 +118,7 @@ def shape_limits(
 
 @lru_cache(maxsize=16)
 def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
-    """Tabulate peak, delay and full width at half maximum by fitted width; cached, since each block needs it.
+    """Tabulate peak and full width at half maximum by fitted width; cached, since each block needs it.
 
     Parameters
     ----------
@@ -131,6 +133,44 @@ def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
         The table.
     """
     return measure_pulse(shape, limits.low, limits.high)
+
+
+@lru_cache(maxsize=16)
+def matched_gaussian(shape: PulseShape, width: float) -> tuple[float, float]:
+    """Return the Gaussian that fits a pulse best: cached, since each block needs it.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        A pulse.
+    width : float
+        Its width [samples].
+
+    Returns
+    -------
+    centre, sigma : float
+        Centre after that of the pulse's main part, and standard deviation [samples].
+    """
+    return find_datum(shape, width)
+
+
+def _find_delay(shape: PulseShape, ref: float, width: np.ndarray) -> tuple[np.ndarray | float, np.ndarray | float]:
+    """Datum after the fitted time, and its slope by the width, of echoes of these widths (m,) [samples].
+
+    The datum is the centre of the Gaussian that fits the echo of a flat target best. A target that widens a sum of
+    Gaussians leaves it where it is. A pulse that is stretched lies otherwise around it: by how much follows from the
+    third moment, which a target leaves alone (docs/algorithms.md 0).
+    """
+    if shape.components:
+        return matched_gaussian(shape, ref)[0], 0.0
+    datum = shape.table.datum if shape.table is not None else matched_gaussian(PulseShape(shape.kappa), 1.0)[0]
+    ratio = np.maximum(width / ref, LEAST_WIDTH)
+    return datum * ref * (ratio + ratio**-2 - 1), datum * (1 - 2 * ratio**-3)
+
+
+def _is_symmetric(shape: PulseShape) -> bool:
+    """Whether a pulse needs no description: its parameters are those of its echoes."""
+    return not shape.components and shape.table is None and abs(shape.kappa) < NO_SKEW
 
 
 def _near_table(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
@@ -226,26 +266,25 @@ def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlatio
     main = np.concatenate([main, main[:1] + main[2:]])
     whole = main.copy()
     if shape.components:
-        peak, by_peak, by_delay = _change_with_width(pulse_measures(shape, limits), np.float64(width))
+        peak, by_peak = _change_with_width(pulse_measures(shape, limits), np.float64(width))
         whole[0] += by_peak / peak * width * main[2]
-        whole[1] += by_delay * main[2]
     variance = np.einsum("is,st,it->i", whole, correlation_matrix(correlation, joint.shape[1]), whole)
     return np.sqrt(np.maximum(variance / np.sum(whole * whole, axis=1), LEAST_FACTOR))
 
 
 def _change_with_width(table: PulseMeasures, width: np.ndarray) -> list[np.ndarray]:
-    """Peak of a pulse of amplitude 1, and the slopes of peak and delay by the width, each of the shape of width."""
-    slopes = (np.gradient(values, table.width) for values in (table.peak, table.delay))
-    return [np.interp(width, table.width, values) for values in (table.peak, *slopes)]
+    """Peak of a pulse of amplitude 1, and its slope by the width, each of the shape of width."""
+    return [np.interp(width, table.width, values) for values in (table.peak, np.gradient(table.peak, table.width))]
 
 
 def describe_echoes(
     shape: PulseShape, limits: ShapeLimits, parameters: np.ndarray, errors: np.ndarray, shared: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Turn fitted parameters of a learned pulse's main component into amplitude, time and sigma of the whole pulse.
+    """Turn fitted parameters into amplitude, time and sigma of the whole pulse.
 
-    The amplitude is the height of the pulse's peak, the time that of the peak, sigma the full width at half maximum of
-    the main lobe over 2.354820, so that they mean the same for every model. Other pulses need no change.
+    The amplitude of a learned pulse is the height of its peak, sigma the full width at half maximum of the main lobe
+    over 2.354820. The time of every pulse is that of its datum (`matched_gaussian` of a flat target's echo), so that it
+    means the same for every model.
 
     Parameters
     ----------
@@ -256,43 +295,46 @@ def describe_echoes(
     parameters, errors : float64 array, shape (m, 3)
         Amplitude [count], time [samples] and width [samples], and their standard deviations.
     shared : float64 array, shape (m, 2)
-        Covariance of amplitude and width, and of time and width: peak and delay of the pulse change with its width.
+        Covariance of amplitude and width, and of time and width: peak and datum of the pulse change with its width.
 
     Returns
     -------
     parameters, errors : float64 array, shape (m, 3)
         The same of the whole pulse.
     """
-    if not shape.components:
+    if _is_symmetric(shape):
         return parameters, errors
-    near = _near_table(shape, limits)
-    whole = _describe(near, parameters, errors, shared)
-    beyond = parameters[:, 2] > near.width[-1]
-    if beyond.any():
-        wide = _describe(_wide_table(shape, limits), parameters[beyond], errors[beyond], shared[beyond])
-        for values, others in zip(whole, wide, strict=True):
-            values[beyond] = others
-    return whole
+    whole, whole_errors = parameters.copy(), errors.copy()
+    delay, by_width = _find_delay(shape, limits.ref, parameters[:, 2])
+    whole[:, 1] += delay
+    variance = errors[:, 1] ** 2 + (by_width * errors[:, 2]) ** 2 + 2 * by_width * shared[:, 1]
+    whole_errors[:, 1] = np.sqrt(np.maximum(variance, 0))
+    if shape.components:
+        near = _near_table(shape, limits)
+        beyond = parameters[:, 2] > near.width[-1]
+        tables = ((near, ~beyond), *(((_wide_table(shape, limits), beyond),) if beyond.any() else ()))
+        for table, rows in tables:
+            described = _describe(table, parameters[rows], errors[rows], shared[rows, 0])
+            whole[rows, ::2], whole_errors[rows, ::2] = described
+    return whole, whole_errors
 
 
 def _describe(
     table: PulseMeasures, parameters: np.ndarray, errors: np.ndarray, shared: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As describe_echoes, with one table."""
-    amplitude, time, width = parameters.T
-    peak, by_peak, by_delay = _change_with_width(table, width)
+    """Amplitude and sigma of a learned pulse, and their errors, each (m, 2); shared: their covariance (m,)."""
+    amplitude, _, width = parameters.T
+    peak, by_peak = _change_with_width(table, width)
     sigma = table.half_width / FWHM_PER_SIGMA
     steep = np.interp(width, table.width, np.gradient(sigma, table.width))
-    whole = [amplitude * peak, time + np.interp(width, table.width, table.delay), np.interp(width, table.width, sigma)]
-    by_self = np.stack([peak, np.ones_like(peak)])
-    by_width = np.stack([amplitude * by_peak, by_delay])
-    variance = (by_self * errors[:, :2].T) ** 2 + (by_width * errors[:, 2]) ** 2 + 2 * by_self * by_width * shared.T
-    whole_errors = np.stack([*np.sqrt(np.maximum(variance, 0)), errors[:, 2] * np.abs(steep)], axis=1)
-    return np.stack(whole, axis=1), whole_errors
+    by_width = amplitude * by_peak
+    variance = (peak * errors[:, 0]) ** 2 + (by_width * errors[:, 2]) ** 2 + 2 * peak * by_width * shared
+    whole_errors = np.stack([np.sqrt(np.maximum(variance, 0)), errors[:, 2] * np.abs(steep)], axis=1)
+    return np.stack([amplitude * peak, np.interp(width, table.width, sigma)], axis=1), whole_errors
 
 
 def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray) -> np.ndarray:
-    """Invert `describe_echoes`: amplitude, time and width of the main component.
+    """Invert `describe_echoes`: amplitude, time and width of the fitted pulse, of a learned one its main component.
 
     Parameters
     ----------
@@ -308,13 +350,16 @@ def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray)
     float64 array, shape (m, 3)
         Parameters for the kernels.
     """
-    if not shape.components:
+    if _is_symmetric(shape):
         return echoes
-    near = _near_table(shape, limits)
-    inner = _invert(near, echoes)
-    beyond = echoes[:, 2] * FWHM_PER_SIGMA > near.half_width[-1] * (1 + 1e-5)
-    if limits.high > near.width[-1] and beyond.any():
-        inner[beyond] = _invert(_wide_table(shape, limits), echoes[beyond])
+    inner = echoes.copy()
+    if shape.components:
+        near = _near_table(shape, limits)
+        inner = _invert(near, echoes)
+        beyond = echoes[:, 2] * FWHM_PER_SIGMA > near.half_width[-1] * (1 + 1e-5)
+        if limits.high > near.width[-1] and beyond.any():
+            inner[beyond] = _invert(_wide_table(shape, limits), echoes[beyond])
+    inner[:, 1] -= _find_delay(shape, limits.ref, inner[:, 2])[0]
     return inner
 
 
@@ -322,5 +367,4 @@ def _invert(table: PulseMeasures, echoes: np.ndarray) -> np.ndarray:
     """As model_parameters, with one table."""
     amplitude, time, sigma = echoes.T
     width = np.interp(sigma, table.half_width / FWHM_PER_SIGMA, table.width)
-    delay = np.interp(width, table.width, table.delay)
-    return np.stack([amplitude / np.interp(width, table.width, table.peak), time - delay, width], axis=1)
+    return np.stack([amplitude / np.interp(width, table.width, table.peak), time, width], axis=1)

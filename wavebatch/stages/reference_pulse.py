@@ -12,7 +12,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.signal.filters import refine_peaks
-from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import describe_echoes, pulse_shape, shape_limits
 
 ReferenceKind = Literal["gaussian", "system", "given"]
 
@@ -23,7 +23,7 @@ class Reference(NamedTuple):
     taps: np.ndarray
     """float64 (k,), k odd; peak about 1."""
     peak: float
-    """Place of the peak among the samples; times of echoes refer to it."""
+    """Place of the peak, of the survey's pulse that of its datum, among the samples; times of echoes refer to it."""
 
     @property
     def middle(self) -> int:
@@ -66,12 +66,9 @@ def reference_pulse(
     if kind == "gaussian":
         return Reference(exp(-0.5 * (x * spacing / system.sigma_ref) ** 2), float(half))
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
-    delay, peak = 0.0, 1.0
-    if shape.components:
-        table = pulse_measures(shape, limits)
-        delay = float(np.interp(limits.ref, table.width, table.delay))
-        peak = float(np.interp(limits.ref, table.width, table.peak))
-    taps = evaluate_pulse(shape, x[:, None], np.full(1, -delay), np.full(1, limits.ref))[0][:, 0]
+    flat = np.array([[1.0, 0.0, limits.ref]])
+    (peak, datum, _), *_ = describe_echoes(shape, limits, flat, np.ones((1, 3)), np.zeros((1, 2)))[0]
+    taps = evaluate_pulse(shape, x[:, None], np.full(1, -datum), np.full(1, limits.ref))[0][:, 0]
     return Reference(taps / peak, float(half))
 
 

@@ -55,9 +55,9 @@ def _decide_growth(survey: Survey) -> Decision:
     if not filled or all(decision.part != Part.GROWTH for decision in survey.decisions):
         return Decision(Part.GROWTH, True, "the survey does not say how many echoes overlap")
     number = share * filled
-    # Upper limit of the share: two standard deviations of the count above it, and at least four waveforms more,
-    # because a small sample without overlaps proves little.
-    most = min((number + 2 + 2 * math.sqrt(number + 1)) / filled, 1.0)
+    # Upper limit of the share: two standard deviations of the count above it, and at least six waveforms more, because
+    # a small sample without overlaps proves little: with four, tiles of 1,000 waveforms grew or not by one pair.
+    most = min((number + 4 + 2 * math.sqrt(number + 1)) / filled, 1.0)
     found = f"of the {filled:.0f} waveforms with echoes {100 * share:.2f} % hold overlapping ones"
     limit = f"at most {100 * most:.2f} % by this sample, the limit is {100 * LOST:g} %"
     return Decision(Part.GROWTH, most >= LOST, f"{found}; {limit}")

@@ -54,7 +54,8 @@ GROUPS = 12
 """Groups of echoes by angle, through whose median widths the first line for the divergence goes."""
 
 LEAST_DIVERGENCE_ERROR = 0.03
-"""Relative error of a divergence from widths at best: rough ground widens echoes too, by a little."""
+"""Relative error of a divergence from widths at best: rough ground widens echoes too, by a little. It holds where
+surfaces are plane over a footprint and several points: on two real strips (.5 mrad) the widths gave .563 and .375."""
 
 LARGEST_DIVERGENCE_ERROR = 0.25
 """A divergence that is known less well than this is not given."""
@@ -306,7 +307,9 @@ def _fit_divergence(
         return None, 0.0
     groups = np.array_split(np.argsort(lever, kind="stable"), GROUPS)
     middle = np.array([(np.median(lever[rows]), np.median(variance[rows])) for rows in groups])
-    square, level = np.polyfit(*middle.T, 1)
+    off = middle - middle.mean(axis=0)
+    square = float((off[:, 0] * off[:, 1]).sum() / max((off[:, 0] ** 2).sum(), 1e-300))
+    level = float(middle[:, 1].mean() - square * middle[:, 0].mean())
     for _ in range(ROUNDS):
         total = np.hypot(error, max(square, 0.0) * lever_err)
         left = variance - level - square * lever

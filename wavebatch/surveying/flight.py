@@ -59,6 +59,10 @@ WIDER, STEADY = 0.10, 0.5
 """How much wider they may be, where more than this share of them have nearly one width. Slopes and forest widen echoes
 by any amount, but never most of them by the same."""
 
+OTHER_NOISE = 1.5
+"""Ratio of the noise of two strips from which they are of two sensors: that of one sensor grows with the light of the
+scene, on strips of one RIEGL from .62 to .89 DN."""
+
 SAME_WIDTH = 0.06
 """How far from the edge a width may be to count as the same, as a share of it."""
 
@@ -282,12 +286,11 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: Survey) -> str:
 
 def _hold(sample: StripSample, system: SystemPulse, whole: Look, kinds: Mapping[int, Kind]) -> Held:
     """A strip held against what the flight records."""
-    about = (sample.path, sample.fingerprint, sample.waveforms)
-    reason = _compare_kinds(sample.blocks, kinds)
-    if reason:
-        return Held(*about, None, reason, sample.facts)
-    look = look_at(sample.blocks, system)
-    return Held(*about, look, "" if look is None else compare_looks(look, whole, system), sample.facts)
+    kind, look = _compare_kinds(sample.blocks, kinds), look_at(sample.blocks, system)
+    # Counts of other bits or another gain say nothing; times do.
+    pulse = "" if look is None else (_compare_pulses if kind else compare_looks)(look, whole, system)
+    reason = "; ".join(filter(None, (pulse, kind)))
+    return Held(sample.path, sample.fingerprint, sample.waveforms, None if kind else look, reason, sample.facts)
 
 
 def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None:
@@ -344,13 +347,17 @@ def _find_width(block: WaveformBlock, expected: float) -> tuple[SystemPulse, Ech
 
 
 def compare_looks(own: Look, whole: Look, system: SystemPulse, wider: float = WIDER) -> str:
-    """Return why a strip does not belong to the flight; empty where it does.
+    """Return why a strip does not belong to the flight, the pulse first; empty where it does.
 
     wider: how much wider than the flight's most echoes may be, as a share of the width.
     """
-    reason = compare_levels(own.level, [whole.level], system.noise_std)
-    if reason:
-        return reason.strip().replace("the others", "the flight")
+    level = compare_levels(own.level, [whole.level], system.noise_std, OTHER_NOISE)
+    level = level.strip().replace("the others", "the flight")
+    return "; ".join(filter(None, (_compare_pulses(own, whole, system, wider), level)))
+
+
+def _compare_pulses(own: Look, whole: Look, system: SystemPulse, wider: float = WIDER) -> str:
+    """Why the echoes of a strip are not of the flight's sensor; empty where they may be."""
     if own.width and whole.width:
         ratio = own.width / whole.width
         if ratio < 1 - NARROWER or (ratio > 1 + wider and own.steady > STEADY):

@@ -198,7 +198,8 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
     remedy = "project the strip to metres, or leave out the stages that measure in metres"
     for unit in units:
         if not unit.is_metric:
-            raise InputError(f"{path}: coordinates are {unit.describe()}, so ranges would not be in metres: {remedy}")
+            why = "which have no height" if unit.kind == "geocentric" else "so ranges would not be in metres"
+            raise InputError(f"{path}: coordinates are {unit.describe()}, {why}: {remedy}")
     if abs(ratio * FOOT - 1.0) < 0.05:
         raise InputError(
             f"{path}: packet vectors are {ratio:.3f} times c/2 long, as in feet, but the CRS of the strip does not say "
@@ -237,6 +238,11 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
     is_feet = along is not None and abs(along / FOOT - 1.0) < 0.001
     if along is not None and not is_feet and abs(ratio * FOOT - 1.0) >= 0.05:
         return ()  # metres, and vectors of metres
+    if _look_like_degrees(reader) and ratio > 0.01:  # vectors in degrees are shorter than 1e-5
+        raise InputError(
+            f"{path}: coordinates are degrees, packet vectors metres, so new echoes would be misplaced: project the "
+            "strip with its vectors to metres, or write only its own points with --points returns"
+        )
     scale = measure_scale(reader, scan)
     if scale is None:
         doubt = "coordinates are in feet by the CRS, packet vectors as long as metres: added echoes may be far off"

@@ -12,9 +12,10 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
-from wavebatch.stages.clean import clean_block, measure_defects
+from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.hidden_neighbours import measure_hidden
 from wavebatch.surveying.measuring.learn_pulse import (
@@ -118,9 +119,19 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
     A descriptor is not a digitizer: descriptors that differ in the number of samples only are surveyed together,
     unless their level, noise or clipping differ by more than chance (`find_strangers`).
     """
-    groups = _group_descriptors(join_digitizers(blocks))
-    if not groups:
+    joined = join_digitizers(blocks)
+    if not joined:
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
+    seams = find_seams(joined)
+    found = _survey_joined([mark_seam(block, seams) for block in joined], learn=learn)
+    others = {index: replace(own, seams=seams) for index, own in found.system.digitizers.items()}
+    decisions = (*found.decisions, *_decide_seams(seams))
+    return replace(found, system=replace(found.system, seams=seams, digitizers=others), decisions=decisions)
+
+
+def _survey_joined(joined: list[WaveformBlock], *, learn: bool) -> Survey:
+    """As `survey_blocks`, from one block per descriptor whose seams are marked."""
+    groups = _group_descriptors(joined)
     (main, members), *others = groups
     plain = measure_gaussian(main)
     strangers = find_strangers(members, plain) if len(members) > 1 else {}
@@ -251,8 +262,8 @@ def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
     return Level(int(used.sum()), mean, spread, max(std, QUANTISATION_STD), freedom, clip)
 
 
-def compare_levels(own: Level, rest: list[Level], noise: float) -> str:
-    """Why a descriptor is a stranger among the rest; empty where it is none."""
+def compare_levels(own: Level, rest: list[Level], noise: float, most: float = STRANGE_NOISE) -> str:
+    """Why a descriptor is a stranger among the rest, or empty; most: ratio of two noises of one sensor."""
     rest = [level for level in rest if level.waveforms]
     if own.waveforms < LEAST_LEVELS or not rest:
         return ""
@@ -265,7 +276,7 @@ def compare_levels(own: Level, rest: list[Level], noise: float) -> str:
     std = float(np.sqrt(np.average([level.std**2 for level in rest], weights=weights)))
     ratio = own.std / std
     # Quiet samples of one waveform are correlated: a tenth of them count.
-    if abs(np.log(ratio)) > max(np.log(STRANGE_NOISE), STRANGE / np.sqrt(0.2 * own.samples)):
+    if abs(log(ratio)) > max(log(most), STRANGE / np.sqrt(0.2 * own.samples)):
         return f"its noise is {own.std:.2f} DN, that of the others {std:.2f}"
     clips = {level.clip for level in rest if level.clip is not None}
     if own.clip is not None and clips and own.clip < min(clips):
@@ -483,6 +494,13 @@ def _decide_defects(system: SystemPulse) -> Iterator[Decision]:
         yield Decision("spikes taken off", True, f"{system.spikes:.3g} spikes of one sample per waveform")
     if system.transient:
         yield Decision("start left out", True, f"the first {system.transient:g} ns of the waveforms jump")
+
+
+def _decide_seams(seams: Mapping[int, int]) -> Iterator[Decision]:
+    """Where packets hold two recordings with an interpolated sample between them."""
+    for length, at in sorted(seams.items()):
+        reason = f"packets of {length} samples are interpolated at sample {at}: two recordings meet there"
+        yield Decision("seam left out", True, reason)
 
 
 def _explain_pulse(system: SystemPulse, figures: Mapping[str, float]) -> str:

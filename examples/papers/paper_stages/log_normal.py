@@ -4,30 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from wavebatch import EchoTable, Noise, SystemPulse, WaveformBlock, stage
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
-from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.rebuild import MODELS
 from wavebatch.stages.decompose.skew import fit_each
-from wavebatch.stages.decompose.solve import LeastWidth, MostWidth, make_settings
-from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH
+from wavebatch.stages.decompose.solve import FitOptions, make_settings
+
+_FIT = FitOptions(max_iterations=60)
 
 
 def _fit_log_normal(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
     return replace(system, components=(), kappa=0.0)
 
 
-@stage("decompose", makes=("skew", "skew_err"), fits=_fit_log_normal)
+@stage("decompose", makes=("skew", "skew_err"), fits=_fit_log_normal, shares=_FIT)
 def log_normal(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     origin: Literal["segment", "waveform"] = "segment",
-    max_iterations: Annotated[int, Range(1, 1000)] = 60,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
+    **options: float,
 ) -> EchoTable:  # fmt: skip
     """Sum of log-normals as the paper prints them, a exp(-(ln x - mu)^2 / (2 sigma^2)): three parameters per echo.
 
@@ -40,26 +36,14 @@ def log_normal(
     ----------
     origin : {"segment", "waveform"}
         Sample with x = 1: the first one of the samples that are fitted together, or of the waveform.
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse].
 
     References
     ----------
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 1.2.
     """
-    settings = make_settings(
-        block, system, PulseShape(origin=origin), widths=(least_width, most_width), tolerance=tolerance,
-        max_iterations=max_iterations, grow=False,
-    )  # fmt: skip
-    return fit_each(block, noise, system, echoes, settings, significance)
+    fit = replace(_FIT, **options)
+    settings = make_settings(block, system, PulseShape(origin=origin), fit, grow=False)
+    return fit_each(block, noise, system, echoes, settings, fit.significance)
 
 
 # Echoes carry their skews, with which they are drawn.

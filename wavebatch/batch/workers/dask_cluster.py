@@ -29,6 +29,7 @@ from wavebatch.batch.workers.worker_check import (
 )
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
+from wavebatch.files.disk.protect import list_packet_files
 from wavebatch.files.disk.publish import Draft, reporting
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
@@ -269,5 +270,4 @@ def _work(scratch: Path | None, function: Callable, arguments: tuple) -> Any:
 
 def _with_packets(path: Path) -> list[Path]:
     """The strip, and the packet file beside it."""
-    beside = (path.with_suffix(suffix) for suffix in (".wdp", ".WDP", ".wdz", ".WDZ"))
-    return [path, *(file for file in beside if file.exists())]
+    return [path, *filter(Path.exists, list_packet_files(path))]

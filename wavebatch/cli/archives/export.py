@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, counting, print_json, printable, talk
+from wavebatch.cli.messages import answer, count, counting, printable, talk
 from wavebatch.cli.options import (
     common_options,
     for_each,
@@ -30,7 +30,7 @@ from wavebatch.tools.archives.export_strip import SUFFIXES, ExportSummary, expor
 @output_option("File to write: .las or .laz with a .wdp beside it, or .npz; or a folder, which gets STEM.las for each "
                "strip.", "FILE|DIR", folder=None)
 @strip_options
-@common_options("overwrite", "json", "quiet")
+@common_options("overwrite", "json")
 def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: Any) -> None:
     """Write STRIPs as other programs need them: LAS with repaired packets, or waveforms as arrays.
 
@@ -58,8 +58,7 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
         return summary
 
     summaries, failed = for_each(paths, work, debug=options["debug"])
-    if options["as_json"]:
-        print_json([asdict(one) for one in summaries])
+    answer([asdict(one) for one in summaries])
     sys.exit(1 if failed else 0)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, counting, print_json, printable, talk
+from wavebatch.cli.messages import answer, count, counting, printable, talk
 from wavebatch.cli.options import (
     common_options,
     declared,
@@ -39,7 +39,7 @@ EXIT_SOME, EXIT_NONE = 3, 4
 @click.option("--internal/--external", default=False,
               help="Store packets in the strip or in a .wdp file beside it.  [default: external]")
 @click.option("--resume", is_flag=True, help="Skip files whose strip is there and up to date.")
-@common_options("overwrite", "json", "quiet")
+@common_options("overwrite", "json")
 def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **options: Any) -> None:
     """Import PulseWaves FILEs (.pls with the .wvs beside it) as LAS 1.4 strips of point format 9.
 
@@ -56,8 +56,7 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
     results, failed = for_each(
         paths, lambda path: _import(path, targets[path], chosen, options), debug=options["debug"], alone=True
     )
-    if options["as_json"]:
-        print_json({"files": [describe(one) for one in results], "failed": failed})
+    answer({"files": [describe(one) for one in results], "failed": failed})
     sys.exit(0 if not failed else EXIT_SOME if results else EXIT_NONE)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, print_json, talk
+from wavebatch.cli.messages import answer, count, talk, tell
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.files.inputs import find_files
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 @click.option("--crs", metavar="CRS", help="CRS of the clouds, e.g. EPSG:32632.  [default: that of their headers]")
 @click.option("--no-data", type=float, default=-9999.0, show_default=True, metavar="VALUE",
               help="Value of cells without data; nan is possible.")
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
     """Write columns of CLOUDs as a GeoTIFF, of clouds of any size.
 
@@ -60,11 +60,9 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     layout = found.layout
     if layout.crs is None:
         talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")
-    if not options["quiet"]:
-        talk(f"{output}: {_summarise(found, columns)}")
-    if options["as_json"]:
-        print_json({"output": str(output), "clouds": [str(path) for path in paths], "statistic": options["statistic"],
-                    **_describe(found, columns)})  # fmt: skip
+    tell(f"{output}: {_summarise(found, columns)}")
+    answer({"output": str(output), "clouds": [str(path) for path in paths], "statistic": options["statistic"],
+            **_describe(found, columns)})  # fmt: skip
 
 
 def _summarise(found: GridResult, columns: Sequence[str]) -> str:

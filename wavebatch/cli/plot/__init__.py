@@ -14,8 +14,8 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import NearestGroup, count, print_json, talk
-from wavebatch.cli.plot.sections import cube, describe_picture, list_tally, profile, section, select
+from wavebatch.cli.messages import NearestGroup, answer, count, print_json, tell
+from wavebatch.cli.plot.sections import cube, describe_picture, describe_tally, list_tally, profile, section, select
 from wavebatch.cli.program.completion import complete_columns, complete_flags
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import check_target
@@ -61,8 +61,8 @@ def plot() -> None:
 @click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete_flags,
               help="Draw the first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
 @shared.where_option("Draw the first waveforms with echoes")
-@click.option("--most", type=click.IntRange(1, 24), default=6, show_default=True, metavar="N",
-              help="Most waveforms of --flags, --where or of the default.")
+@click.option("--most", type=click.IntRange(1, 100), metavar="N",
+              help="Most waveforms of --flags, --where or of the default.  [default: 6; with --sheet: 100]")
 @click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
 @shared.seed_option("Seed of the random packets.")
 @click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
@@ -75,7 +75,7 @@ def plot() -> None:
 @shared.chain_options
 @shared.system_option
 @shared.strip_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def waveform(strip: Path, output: Path, **options: Any) -> None:
     """Draw waveforms of STRIP with their fit, residual and echoes; or write the echoes as a table.
 
@@ -99,7 +99,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
         if options[name]:
             raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
-    check_target(output, overwrite=options["overwrite"]) if tabular else _check(output, options)
+    (check_target if tabular else check_picture)(output, overwrite=options["overwrite"])
     flags = read_flags(options["flags"])
     wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
@@ -110,14 +110,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     else:
         _draw_waveforms(views, output, strip.name, chain, options)
     echoes = sum(len(view.echoes) for view in views)
-    if not options["quiet"]:
-        talk(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
-    if options["as_json"]:
-        print_json({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
-
-
-def _check(output: Path, options: dict[str, Any]) -> None:
-    check_picture(output, overwrite=options["overwrite"])
+    tell(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
+    answer({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
 
 
 def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, options: dict[str, Any]) -> None:
@@ -173,12 +167,13 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
               help="Draw one line per value of this column, e.g. number_of_returns or classification.")
 @click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
 @click.option("--range", "limits", callback=_read_range, metavar="LOW:HIGH",
-              help="Values to show.  [default: from 0.1 to 99.9 % of each line; what lies outside is counted]")
+              help="Values to show.  [default: 5 to 95 % of each line, and 1.5 times that range on both sides; what "
+              "lies outside is counted]")
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
 @click.option("--counts", is_flag=True, help="Draw numbers also for several lines, not shares of each line's values.")
 @shared.selection_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
     """Draw histograms of columns of CLOUDs of any size.
 
@@ -192,14 +187,13 @@ def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **
     from wavebatch.tools.plots.histogram import is_flags
 
     clouds = find_files(map(str, clouds), recursive=options["recursive"])
-    _check(output, options)
+    check_picture(output, overwrite=options["overwrite"])
     columns = tuple(dict.fromkeys(columns))
     if any(is_flags(clouds[0], column) for column in columns):
         text, tallies = _draw_flags(clouds, columns, output, options)
     else:
         text, tallies = _draw_histograms(clouds, columns, output, options)
-    if not options["quiet"]:
-        talk(f"{output}: {text}")
+    tell(f"{output}: {text}")
     if options["as_json"]:
         drawn = [{"columns": list(names), **list_tally(tally)} for names, tally in tallies.items()]
         print_json({**describe_picture(output, clouds), "drawn": drawn})
@@ -243,11 +237,7 @@ def _draw_histograms(
 
     how = {name: options[name] for name in ("log", "counts", "overwrite")}
     draw_histograms(every, output, **how)
-    texts = []
-    for found in every:
-        total, outside = found.total, int(found.below.sum() + found.above.sum())
-        parts = f"{total.no_data} without data, {total.left_out} left out, {outside} outside the picture"
-        texts.append(f"{count(total.values, 'value')}, {parts}")
+    texts = [describe_tally(found.total, int(found.below.sum() + found.above.sum())) for found in every]
     names = [tuple(one.column for one in selections) for selections in panels.values()]
     return "; ".join(texts), {columns: found.total for columns, found in zip(names, every, strict=True)}
 
@@ -268,10 +258,11 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
               help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
               show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
-@click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
+@click.option("--size", type=float, metavar="M",
+              help="Side of a cell, in the unit of the coordinates.  [default: gives a few points per cell]")
 @shared.bbox_option("Show")
 @shared.selection_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
     """Draw a map of a column of CLOUDs of any size, over x and y.
 
@@ -292,15 +283,12 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     from wavebatch.tools.plots.draw_cloud import draw_map
 
     draw_map(found, output, names=tuple(path.name for path in clouds), overwrite=options["overwrite"])
-    if not options["quiet"]:
-        grid, total = found.grid, found.total
-        points = f"{count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside"
-        points += f", {total.left_out} left out" * bool(total.left_out)
-        talk(f"{output}: {points}; {grid.columns} x {grid.rows} cells of {grid.size:g} {found.unit}")
+    grid = found.grid
+    cells = f"{grid.columns} x {grid.rows} cells of {grid.size:g} {found.crs.unit}"
+    tell(f"{output}: {describe_tally(found.total, found.outside)}; {cells}")
     if options["as_json"]:
-        cells = {"columns": found.grid.columns, "rows": found.grid.rows, "size": found.grid.size,
-                 "unit": found.unit}
-        more = {"statistic": statistic, "outside": found.outside, **cells}
+        more = {"statistic": statistic, "outside": found.outside, "columns": grid.columns, "rows": grid.rows,
+                "size": grid.size, "unit": found.crs.unit}  # fmt: skip
         print_json({**describe_picture(output, clouds), "column": column, **list_tally(found.total), **more})
 
 

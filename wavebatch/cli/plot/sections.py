@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, print_json, talk
+from wavebatch.cli.messages import count, print_json, tell
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.figure_file import check_picture
@@ -39,8 +39,10 @@ def list_tally(tally: Any) -> dict[str, int]:
     return {name: getattr(tally, name) for name in ("points", "left_out", "no_data", "values")}
 
 
-def _left_out(tally: Any) -> str:
-    return f", {tally.left_out} left out" * bool(tally.left_out)
+def describe_tally(tally: Any, outside: int, kind: str = "value") -> str:
+    """How many points were drawn, and how many were not, for people."""
+    left_out = f", {tally.left_out} left out" * bool(tally.left_out)
+    return f"{count(tally.values, kind)}, {tally.no_data} without data{left_out}, {outside} outside the picture"
 
 
 def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> tuple[list[Path], bool]:
@@ -79,7 +81,7 @@ def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool 
 @click.option("--aspect", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, metavar="F",
               help="Exaggerate heights F times.")
 @shared.selection_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def section(clouds: Sequence[Path], output: Path, column: str | None, **options: Any) -> None:
     """Draw a side view of CLOUDs or voxels along a line.
 
@@ -98,13 +100,10 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
     from wavebatch.tools.plots.draw_section import draw_section
 
     draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
-    if not options["quiet"]:
-        kind = count(found.inside, "voxel" if found.voxel else "point")
-        far = f", {found.outside} outside" if found.outside else ""
-        text = f"{kind} of {found.total.values}, {found.total.no_data} without data{far}"
-        talk(f"{output}: {text}{_left_out(found.total)}")
+    kind = "voxel" if found.voxel else "point"
+    tell(f"{output}: {found.inside} of {describe_tally(found.total, found.outside, kind)}")
     if options["as_json"]:
-        place = {"line": list(found.line), "width": found.width, "unit": found.unit, "crs": found.crs or None}
+        place = {"line": list(found.line), "width": found.width, "unit": found.crs.unit, "crs": found.crs.name or None}
         place |= {"outside": found.outside}
         more = {"inside": found.inside, "drawn": len(found.value), "voxel": found.voxel or None, **place}
         print_json({**describe_picture(output, paths), "column": column, **list_tally(found.total), **more})
@@ -121,7 +120,7 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one of all.")
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of values.")
 @shared.selection_options
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def profile(clouds: Sequence[Path], output: Path, column: str | None, **options: Any) -> None:
     """Draw how many points, or how much of a column, of CLOUDs, voxels or segments lie at each height.
 
@@ -146,11 +145,7 @@ def profile(clouds: Sequence[Path], output: Path, column: str | None, **options:
     from wavebatch.tools.plots.draw_section import draw_profile
 
     draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
-    if not options["quiet"]:
-        total = found.total
-        kind = "segment" if segments else "value"
-        text = f"{count(total.values, kind)}, {total.no_data} without data, {found.outside} outside"
-        talk(f"{output}: {text}{_left_out(total)}")
+    tell(f"{output}: {describe_tally(found.total, found.outside, 'segment' if segments else 'value')}")
     if options["as_json"]:
         series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]
         more = {"statistic": statistic, "outside": found.outside, "edges": found.edges.tolist(), "series": series}
@@ -164,7 +159,7 @@ def profile(clouds: Sequence[Path], output: Path, column: str | None, **options:
 @click.option("--x", type=click.IntRange(0), metavar="N", help="Slice across the lines at pulse N of each.")
 @click.option("--y", type=click.IntRange(0), metavar="N", help="Slice along scan line N.")
 @click.option("--t", type=float, metavar="NS", help="Slice of all pulses at one time [ns].")
-@shared.common_options("overwrite", "json", "quiet")
+@shared.common_options("overwrite", "json")
 def cube(cube_file: Path, output: Path, **options: Any) -> None:
     """Draw slices of a data cube of `wavebatch slice --cube`: x (pulse), y (scan line) and t (time).
 
@@ -179,8 +174,7 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
     from wavebatch.tools.slices.draw import draw_cube
 
     draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
-    if not options["quiet"]:
-        talk(f"{output}: {', '.join(one.title for one in slices)}")
+    tell(f"{output}: {', '.join(one.title for one in slices)}")
     if options["as_json"]:
         drawn = [{"title": one.title, "rows": one.image.shape[0], "columns": one.image.shape[1],
                   "extent": list(one.extent), "across": one.across, "up": one.up} for one in slices]  # fmt: skip

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from wavebatch.batch.options import AIR, CHAIN, OUTPUT, RUNNING, WHICH
+from wavebatch.batch.options import AIR, CHAIN, OUTPUT, READING, RUNNING, WHICH
 
 EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "run": (
@@ -99,13 +99,17 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
 """Per command: a line to type, and what it is for."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
+    "Options": ("grid columns", "slice most"),
+    READING: ("grid crs",),
     CHAIN: ("waveforms", "divergence"),
     AIR: ("reflectance_error", "scan_angle"),
     WHICH: ("flags", "packets", "point_numbers", "times", "most", "random", "limit"),
-    OUTPUT: ("column", "html_file", "report", "as_json", "plot"),
+    OUTPUT: ("html_file", "report", "as_json"),
     RUNNING: ("dry_run", "progress", "verbose", "quiet", "log_path", "log_level", "debug", "help"),
 }
-"""Names of options under a heading of --help, besides those of RunOptions. Others come first, under Options."""
+"""Names of options under a heading of --help, besides those of RunOptions. Others come first, under Options.
+
+With the command in front where the name means something else in others."""
 
 FEWEST = 8
 """Pages with fewer options than this have no groups."""

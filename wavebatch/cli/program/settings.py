@@ -35,7 +35,7 @@ _ORDER = (ParameterSource.COMMANDLINE, ParameterSource.ENVIRONMENT, ParameterSou
 NEVER = ("overwrite", "force", "help", "debug")
 """Options that are given on the command line only: they may destroy files, or hide that a result is wrong."""
 
-IN_NO_FILE = {"run": ("report", "resume", "scheduler")}
+IN_NO_FILE = {"run": ("report", "resume", "scheduler"), "import": ("resume",)}
 """Options by command that replace files without --overwrite, or trust other machines: wavebatch.toml may have come with
 the data."""
 
@@ -43,7 +43,7 @@ SIMILAR = 0.74
 """Least similarity of a variable that no command reads to one that is read, for a warning: JBOS to JOBS is 0.75."""
 
 OLD_NAMES = {"--bounds": "--bbox", "--polygons": "--polygon", "--flags-with": "--flags",
-             "--flags-without": "--drop-flags", "--pulse-energy": "--energy"}  # fmt: skip
+             "--flags-without": "--drop-flags", "--pulse-energy": "--energy", "--tolerance": "--within"}  # fmt: skip
 """Names of earlier versions, and what they are now."""
 
 _INPUTS = ("strips", "strip", "clouds", "files", "cloud", "a")

@@ -7,8 +7,9 @@ only if the column has the meaning and unit that the other program gives to this
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -88,10 +89,6 @@ _SHORT = {
     "amplitude_normalized_db_err": "1 sigma, normalized",
     "level_reflectance": "reflectance if level",
     "level_reflectance_err": "1 sigma, slope unknown",
-    "facing_reflectance": "reflectance if facing",
-    "facing_reflectance_err": "1 sigma, facing",
-    "facing_relative_reflectance": "relative, facing",
-    "facing_relative_reflectance_err": "1 sigma, facing",
     **{f"relative_{name}": "relative to strip only" for name in _RELATIVE},
     **{f"relative_{name}_err": "1 sigma, relative" for name in _RELATIVE},
 }
@@ -143,6 +140,19 @@ def normalise(name: str) -> str:
     PDAL makes `_` of every sign, and takes names that differ in case only as one.
     """
     return re.sub(r"[\W_]", "", name.casefold())
+
+
+def resolve(name: str, *kinds: Mapping[str, Any]) -> Any:
+    """Return what the name of a column stands for: the one way of --where, --column and all readers of clouds.
+
+    kinds: names with what they stand for, the more important first. Exact names of any kind come before names that are
+    alike by `normalise`: `Amplitude` is the vendor's, `amplitude` is ours. None where no name fits.
+    """
+    for known in kinds:
+        if name in known:
+            return known[name]
+    alike = (known[one] for known in kinds for one in known if normalise(one) == normalise(name))
+    return next(alike, None)
 
 
 def describe(column: Column, unit: str | None = None) -> str:

@@ -1,4 +1,4 @@
-"""One column of any point cloud, read in pieces: a wavebatch column, an extra dimension of the vendor, or a LAS field.
+"""Columns of any point cloud, read in pieces: a wavebatch column, an extra dimension of the vendor, or a LAS field.
 
 `wavebatch plot` reads clouds with it. Units and meanings come from the file; wavebatch's declarations are used only
 for its own columns.
@@ -7,11 +7,10 @@ for its own columns.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import laspy
 import numpy as np
 from laspy.point.dims import DimensionInfo
 
@@ -19,13 +18,11 @@ from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
-from wavebatch.files.cloud.column_names import normalise
-from wavebatch.files.cloud.echo_reader import CloudReader
-from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.cloud.column_names import resolve
+from wavebatch.files.cloud.echo_reader import CloudReader, name_standard, read_dimension, read_field
 from wavebatch.files.las.point_formats import ANGLE_UNIT
 
-VALUE_DTYPE = np.dtype([("x", "<f8"), ("y", "<f8"), ("value", "<f8"), ("flags", "<u2")])
-"""One point: position [m], the column's value (NaN: no data), EchoFlag bits (0 where the cloud has no flags)."""
+_PLACE = np.dtype([("x", "<f8"), ("y", "<f8")])
 
 _UNITS = {
     "x": "m", "y": "m", "z": "m", "gps_time": "s", "scan_angle": "deg", "scan_angle_rank": "deg",
@@ -33,10 +30,6 @@ _UNITS = {
     "x_t": "m/ps", "y_t": "m/ps", "z_t": "m/ps",
 }  # fmt: skip
 """Units of the standard fields that have one."""
-
-
-_ANGLES = {"scanangle": "scan_angle_rank", "scananglerank": "scan_angle"}
-"""The scan angle [deg] of the point formats 0 to 5 and of 6 to 10, each by the name that the other formats have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,28 +57,30 @@ class ColumnFacts:
 
 
 class ColumnReader(CloudReader):
-    """A CloudReader of VALUE_DTYPE for every point of the file; `facts` describes the column.
+    """A CloudReader of columns for every point: rows have x, y [m] and `values`, f8 (k,) (NaN: no data).
 
-    column: name of an extra dimension or a standard field, or a wavebatch column in the names of any style. If no name
-    fits exactly, case, spaces and underscores are ignored. None: the value is 1 for every point. others: further
-    columns; rows then have a field `others`, f8 (n, number of them), NaN for no data.
+    columns: names of extra dimensions or standard fields, or wavebatch columns in the names of any style. If no name
+    fits exactly, case, spaces and underscores are ignored. None: the value is 1 for every point.
+    missing_ok: columns that the file does not have are left out.
+    `facts` describes the columns.
     Raises InputError if the file cannot be read, ConfigError if it has no such column.
     """
 
-    def __init__(self, path: Path, column: str | None, others: Sequence[str] = ()) -> None:
-        super().__init__(path)
-        self._dtype = VALUE_DTYPE
-        if others:
-            self._dtype = np.dtype([*VALUE_DTYPE.descr, ("others", "<f8", (len(others),))])
-        self.has_flags = "echo_flags" in self._sources
+    def __init__(self, path: Path, *columns: str | None, missing_ok: bool = False) -> None:
+        super().__init__(path, _PLACE)
+        found = []
         try:
-            self.facts, self._read = self._find(column)
-            found = [self._find(other) for other in others]
+            for name in columns:
+                try:
+                    found.append(self._find(name))
+                except ConfigError:
+                    if not missing_ok:
+                        raise
         except BaseException:
-            self._points.close()
+            self.close()
             raise
-        self.other_facts = tuple(facts for facts, _ in found)
-        self._others = tuple(read for _, read in found)
+        self.facts: tuple[ColumnFacts, ...] = tuple(facts for facts, _ in found)
+        self._values = [read for _, read in found]
 
     def list_columns(self) -> list[str]:
         """Return the names of all columns of the file."""
@@ -109,29 +104,25 @@ class ColumnReader(CloudReader):
             return ColumnFacts("points", "-", "", 1.0), lambda raw: np.ones(len(raw))
         known = self.list_columns()
         extra = {one.name: one for one in self._format.extra_dimensions if one.num_elements == 1}
-        ours = self._find_ours(list(extra.values()), COLUMNS, decibel=True)
-        alike = [name for name in known if normalise(name) == normalise(column)]
-        if column in ours and column in self.written and not stored:
-            column = ours[column].name
-        elif column not in known:
-            if column in ours:
-                column = ours[column].name
-            else:
-                column = next(iter(alike), _ANGLES.get(normalise(column), column))
+        ours = {} if stored else self._find_ours(list(extra.values()), COLUMNS, decibel=True)
+        ours = {name: one.name for name, one in ours.items()}
+        written = {name: found for name, found in ours.items() if name in self.written}
+        standard = name_standard(self._format.id)
+        wanted, column = column, resolve(column, written, {name: name for name in extra} | standard, ours)
         if column in extra:
             dimension = extra[column]
-            return self._describe_extra(dimension), lambda raw: self._read_column(raw, dimension)
+            return self._describe_extra(dimension), lambda raw: read_dimension(raw, dimension)
         if column in known:
-            return self._describe_standard(column), lambda raw: self._read_standard(raw, column)
-        ours_not_here = [name for name in COLUMNS if normalise(name) == normalise(column)]
-        if ours_not_here:
+            return self._describe_standard(column), lambda raw: read_field(raw, self.point_format, column, self)
+        missing = resolve(wanted, {name: name for name in COLUMNS})
+        if missing:
             raise ConfigError(
-                f"{self.path}: has no column {column!r}; `wavebatch run` writes {ours_not_here[0]} into clouds"
-                + (f": add --columns +{ours_not_here[0]}" if self.written else ", and this is none of them")
+                f"{self.path}: has no column {wanted!r}; `wavebatch run` writes {missing} into clouds"
+                + (f": add --columns +{missing}" if self.written else ", and this is none of them")
             )
-        hint = nearest(column, known)
+        hint = nearest(wanted, known)
         has = "" if hint.startswith("known") else f" Columns of the file: {', '.join(known)}"
-        raise ConfigError(f"{self.path}: has no column {column!r}; {hint}{has}")
+        raise ConfigError(f"{self.path}: has no column {wanted!r}; {hint}{has}")
 
     def _describe_extra(self, dimension: DimensionInfo) -> ColumnFacts:
         """Facts from the description in the file; for a wavebatch column from its declaration."""
@@ -156,21 +147,11 @@ class ColumnReader(CloudReader):
             step = ANGLE_UNIT
         return ColumnFacts(name, _UNITS.get(name, "-"), "", step, is_standard=True)
 
-    def _read_standard(self, raw: np.ndarray, name: str) -> np.ndarray:
-        if name in "xyz":
-            return self._locate(raw, "xyz".index(name))
-        values = widen(np.asarray(laspy.PackedPointRecord(raw, self._format)[name]))
-        values[~np.isfinite(values)] = np.nan
-        return values * ANGLE_UNIT if name == "scan_angle" else values
-
     def _convert(self, raw: np.ndarray) -> np.ndarray:
-        rows = np.zeros(len(raw), self._dtype)
-        rows["x"], rows["y"] = self._locate(raw, 0), self._locate(raw, 1)
-        rows["value"] = self._read(raw)
-        for place, read in enumerate(self._others):
-            rows["others"][:, place] = read(raw)
-        if self.has_flags:
-            rows["flags"] = raw[self._sources["echo_flags"].name].astype(np.uint16)
+        rows = np.zeros(len(raw), [*_PLACE.descr, ("values", "<f8", (len(self._values),))])
+        rows["x"], rows["y"] = (read_field(raw, self.point_format, axis, self) for axis in "xy")
+        for place, read in enumerate(self._values):
+            rows["values"][:, place] = read(raw)
         return rows
 
 
@@ -180,7 +161,7 @@ def find_keep(path: Path, condition: Condition) -> Callable[[np.ndarray], np.nda
     Raises ConfigError, with the place in the text, if the file has no such column.
     """
     values: dict[str, Callable[[np.ndarray], np.ndarray]] = {}
-    with ColumnReader(path, None) as reader:
+    with ColumnReader(path) as reader:
         for column in condition.columns:
             try:
                 values[column] = reader.find_value(column)
@@ -189,10 +170,23 @@ def find_keep(path: Path, condition: Condition) -> Callable[[np.ndarray], np.nda
     return lambda raw: condition.choose({column: read(raw) for column, read in values.items()})
 
 
-def select_points(reader: CloudReader, condition: Condition | None) -> None:
-    """Let a reader give only the points that meet a condition (None: all); raises ConfigError as `find_keep` does."""
-    if condition is not None:
-        reader.keep = find_keep(reader.path, condition)
+def select_points(
+    reader: CloudReader, condition: Condition | None, flags_with: int = 0, flags_without: int = 0
+) -> None:
+    """Let a reader give only the points that meet a condition (None: all) and have the right flags.
+
+    flags_with: EchoFlag bits of which points must have one; 0: any point. flags_without: those they must not have.
+    Raises ConfigError as `find_keep` does, and for a cloud without flags.
+    """
+    tests = [] if condition is None else [find_keep(reader.path, condition)]
+    if flags_with or flags_without:
+        if not reader.has_flags:
+            raise ConfigError(f"{reader.path}: has no column echo_flags to select points by")
+        tests.append(lambda raw: (reader.read_flags(raw) & np.uint16(flags_without)) == 0)
+    if flags_with:
+        tests.append(lambda raw: (reader.read_flags(raw) & np.uint16(flags_with)) != 0)
+    if tests:
+        reader.keep = lambda raw: np.logical_and.reduce([test(raw) for test in tests])
 
 
 def check_alike(readers: Iterable[tuple[Path, ColumnFacts]]) -> ColumnFacts:

@@ -1,7 +1,7 @@
 """Point clouds read in pieces: positions, GPS times and wavebatch's columns under the names of any style.
 
-The comparisons read with `CloudReader`; the readers of returns, angles and single columns are built on it. Files may
-come from any program: laspy only describes the fields, the bytes are read and checked by wavebatch.
+All commands that read clouds use `CloudReader` with the fields that they need, or a ColumnReader, which is built on it.
+Files may come from any program: laspy only describes the fields, the bytes are read and checked by wavebatch.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -20,9 +20,9 @@ from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
-from wavebatch.files.las.crs import metres_per_unit, read_crs
+from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.point_formats import read_classes, split_numbers
+from wavebatch.files.las.point_formats import read_angles, read_classes, split_numbers
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.point_dtypes import list_dimensions
 
@@ -46,8 +46,15 @@ CLOUD_DTYPE = np.dtype(
         *((name, "<f4") for name in CLOUD_COLUMNS),
     ]  # fmt: skip
 )
-"""One echo of a cloud: time [s], position [m], the stored packet vector (0: none; it may point either way), EchoFlag
-bits, return number and number of returns, class, intensity, and columns (NaN: no data)."""
+"""One echo of a cloud, as the comparisons read it."""
+
+RETURN_DTYPE = np.dtype(
+    [
+        ("gps_time", "<f8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("intensity", "<u2"),
+        ("scan_angle", "<f4"), ("echo_width", "<f4"), ("flags", "<u2"), ("source", "<u2"),
+    ]  # fmt: skip
+)
+"""One return of a cloud. Keep it small: statistics hold many of them in memory."""
 
 _PIECE = 250_000
 _PIECE_BYTES = 1 << 26
@@ -55,23 +62,36 @@ _LARGEST = 1e30
 """Larger values are damage and become no data: their squares would overflow in single precision."""
 
 
-class CloudReader(Closing):
-    """Reads a LAS or LAZ file in pieces of CLOUD_DTYPE; subclasses read other records. A context manager.
+class Placing(Protocol):
+    """A header or a reader: what stored positions mean."""
 
+    scales: tuple[float, float, float]
+    offsets: tuple[float, float, float]
+
+
+class CloudReader(Closing):
+    """Reads a LAS or LAZ file in pieces. A context manager.
+
+    dtype: the fields to read. They are gps_time [s], xyz [m], ray (the stored packet vector, which may point either
+    way; 0: none), flags (EchoFlag bits), number and total (of returns), classification, intensity, scan_angle [deg],
+    source (point source id), and names of wavebatch columns (NaN: no data). With `ray`, points without a packet are
+    left out if the cloud has packets.
     Raises InputError if the file is damaged, or compressed in a way that no installed library can read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, dtype: np.dtype = CLOUD_DTYPE) -> None:
         self.path = Path(path)
+        self.dtype = dtype
         checked = read_checked_header(self.path, waveforms=False)
         self.point_count: int = checked.header.point_count
         self.scales, self.offsets = checked.header.scales, checked.header.offsets
         units = read_crs(self.path, checked.header)[1]
         self.metres = metres_per_unit(units)
         """Metres of a step of 1 in x, y and z; NaN in degrees."""
-        self.unit = next((one.describe() for one in units if not one.is_metric), "metres")
+        self.unit = name_units(units)
         self.bounds = checked.header.mins, checked.header.maxs
         self._format = describe_format(checked)
+        self.point_format: int = self._format.id
         names = set(self._format.dimension_names)
         self.has_gps_time = "gps_time" in names
         self.has_packets = "wavepacket_index" in names
@@ -81,8 +101,12 @@ class CloudReader(Closing):
         self.written = {column: name for column, name in written.items() if _may_hold(kinds[name], column)}
         """The file's name of each wavebatch column, by its provenance; empty without one. Columns that another
         program has stored as several numbers, or flags as signed ones, are none."""
-        self._sources = self._find_ours(extra, (*CLOUD_COLUMNS, "echo_flags"))
-        self.columns = tuple(name for name in CLOUD_COLUMNS if name in self._sources)
+        self._sources = self._find_ours(extra, (*dtype.names, "echo_flags"))
+        self.columns = tuple(name for name in dtype.names if name in self._sources)
+        """The wavebatch columns among the fields that the cloud has."""
+        self.has_flags = "echo_flags" in self._sources
+        self.records = np.empty(0)
+        """The raw records of the last piece."""
         self.keep: Callable[[np.ndarray], np.ndarray] | None = None
         """Which raw records (n,) are read, bool (n,); None: all. `column_reader.select_points` sets it."""
         self.left_out = 0
@@ -101,10 +125,7 @@ class CloudReader(Closing):
         self._points.close()
 
     def read_pieces(self, size: int = _PIECE) -> Iterator[np.ndarray]:
-        """Yield the points of the file in order, at most `size` at a time.
-
-        CLOUD_DTYPE leaves out points whose packet index is 0, if the cloud still has packets.
-        """
+        """Yield the points of the file in order, at most `size` at a time."""
         size = max(min(size, _PIECE_BYTES // self._format.size), 1)
         for start in range(0, self.point_count, size):
             raw = self._points.read(start, min(start + size, self.point_count))
@@ -112,7 +133,14 @@ class CloudReader(Closing):
                 chosen = np.asarray(raw)[self.keep(raw)]
                 self.left_out += len(raw) - len(chosen)
                 raw = chosen
+            self.records = raw
             yield self._convert(raw)
+
+    def read_flags(self, raw: np.ndarray) -> np.ndarray:
+        """Return the EchoFlag bits of raw records, u2 (n,); 0 where the cloud has no flags."""
+        if not self.has_flags:
+            return np.zeros(len(raw), np.uint16)
+        return raw[self._sources["echo_flags"].name].astype(np.uint16)
 
     def _find_ours(
         self, extra: list[DimensionInfo], columns: Iterable[str], *, decibel: bool = False
@@ -125,36 +153,36 @@ class CloudReader(Closing):
         return {name: one for name, one in found.items() if decibel or not (one.description or "").endswith("[dB]")}
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
-        rows = self._place(raw, CLOUD_DTYPE)
-        for name in CLOUD_COLUMNS:
-            rows[name] = self._read_column(raw, self._sources.get(name))
-        rows["number"], rows["total"] = split_numbers(raw)
-        rows["classification"] = read_classes(raw)
-        rows["intensity"] = raw["intensity"]
-        if "echo_flags" in self._sources:
-            rows["flags"] = raw[self._sources["echo_flags"].name].astype(np.uint16)
-        if not self.has_packets:
-            return rows
-        for axis, name in enumerate(("x_t", "y_t", "z_t")):
-            rows["ray"][:, axis] = widen(raw[name])
-        rows["ray"][~np.isfinite(rows["ray"]).all(axis=1)] = 0.0  # damaged: as if there were none
-        return rows[raw["wavepacket_index"] != 0]
-
-    def _place(self, raw: np.ndarray, dtype: np.dtype) -> np.ndarray:
-        """New rows of `dtype` with positions and GPS times of raw records, zero otherwise."""
-        rows = np.zeros(len(raw), dtype)
-        for axis in range(3):
-            rows["xyz"][:, axis] = self._locate(raw, axis)
-        if self.has_gps_time:
-            rows["gps_time"] = widen(raw["gps_time"])
+        if "ray" in self.dtype.names and self.has_packets:
+            raw = raw[raw["wavepacket_index"] != 0]
+        rows = np.zeros(len(raw), self.dtype)
+        for name in self.dtype.names:
+            values = self._read_named(raw, name)
+            if values is not None:
+                rows[name] = values
         return rows
 
-    def _locate(self, raw: np.ndarray, axis: int) -> np.ndarray:
-        return raw["XYZ"[axis]] * self.scales[axis] + self.offsets[axis]
-
-    def _read_column(self, raw: np.ndarray, dimension: DimensionInfo | None) -> np.ndarray | float:
-        """Physical values with NaN for no data; NaN if the cloud has no such dimension."""
-        return np.nan if dimension is None else read_dimension(raw, dimension)
+    def _read_named(self, raw: np.ndarray, name: str) -> np.ndarray | float | None:
+        """Values of a field of `dtype`; None where the file has none and they are 0."""
+        if name in COLUMNS:
+            return read_dimension(raw, self._sources[name]) if name in self._sources else np.nan
+        if name == "ray" and self.has_packets:
+            ray = np.stack([widen(raw[axis]) for axis in ("x_t", "y_t", "z_t")], axis=1)
+            ray[~np.isfinite(ray).all(axis=1)] = 0.0  # damaged: as if there were none
+            return ray
+        if name == "gps_time" and self.has_gps_time:
+            return widen(raw["gps_time"])
+        readers = {
+            "xyz": lambda: np.stack([read_field(raw, self.point_format, axis, self) for axis in "xyz"], axis=1),
+            "flags": lambda: self.read_flags(raw),
+            "number": lambda: split_numbers(raw)[0],
+            "total": lambda: split_numbers(raw)[1],
+            "classification": lambda: read_classes(raw),
+            "intensity": lambda: raw["intensity"],
+            "scan_angle": lambda: read_angles(raw),
+            "source": lambda: raw["point_source_id"],
+        }
+        return readers[name]() if name in readers else None
 
 
 def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
@@ -187,16 +215,31 @@ def read_dimension(raw: np.ndarray, dimension: DimensionInfo) -> np.ndarray:
         return np.where(np.abs(values) <= _LARGEST, values, np.nan)
 
 
-def list_fields(point_format: int) -> tuple[str, ...]:
-    """Return the names of the fields of a point format, with x, y and z in place of their integers."""
-    return ("x", "y", "z", *(name for name in list_dimensions(point_format) if name not in ("X", "Y", "Z")))
+def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) -> np.ndarray:
+    """Return the values (n,) of a field of raw records, NaN for those that are not finite.
 
-
-def read_field(raw: np.ndarray, point_format: int, name: str) -> np.ndarray:
-    """Return the stored values (n,) of a field of raw records, other than x, y and z."""
+    placing: scales and offsets of the positions.
+    """
+    if name in ("x", "y", "z"):
+        axis = "xyz".index(name)
+        return raw[name.upper()] * placing.scales[axis] + placing.offsets[axis]
+    if name.startswith("scan_angle"):
+        return read_angles(raw)
     import laspy
 
-    return widen(np.asarray(laspy.PackedPointRecord(raw, laspy.PointFormat(point_format))[name]))
+    values = widen(np.asarray(laspy.PackedPointRecord(raw, laspy.PointFormat(point_format))[name]))
+    values[~np.isfinite(values)] = np.nan
+    return values
+
+
+def name_standard(point_format: int) -> dict[str, str]:
+    """Return the names of the fields of a point format, x, y and z for its integers, each with the field that it means.
+
+    The scan angle also has the name that other point formats give it.
+    """
+    names = ("x", "y", "z", *(name for name in list_dimensions(point_format) if name not in ("X", "Y", "Z")))
+    angle = next(name for name in names if name in ("scan_angle", "scan_angle_rank"))
+    return {**{name: name for name in names}, "scan_angle": angle, "scan_angle_rank": angle}
 
 
 def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:

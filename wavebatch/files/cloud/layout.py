@@ -7,14 +7,13 @@ A row depends only on its input point and echo, never on the block or unit that 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.carried_bytes import Carried, plan_carried
-from wavebatch.files.cloud.column_names import Naming, WrittenColumn, describe, name_columns
+from wavebatch.files.cloud.column_names import WrittenColumn, name_columns
 from wavebatch.files.cloud.las_version import choose_version
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
@@ -65,13 +64,6 @@ class OutputLayout:
         """Names of the fields of `dtype` with extra dimensions, in order."""
         return self.dtype.names[len(self.dtype.names) - len(self.carried) - len(self.written) :]
 
-    def extended(self, columns: Sequence[str]) -> OutputLayout:
-        """Return the layout with temporary columns at the end, which a second pass needs and the cloud does not get."""
-        records = [ExtraRecord.build(name, COLUMNS[name].dtype, describe(COLUMNS[name])) for name in columns]
-        more = [WrittenColumn(name, record, Naming(name)) for name, record in zip(columns, records, strict=True)]
-        dtype = build_dtype(self.point_format, [*self.extra_records, *records])
-        return replace(self, dtype=dtype, written=(*self.written, *more))
-
     def rows(
         self,
         source: np.ndarray,
@@ -118,14 +110,21 @@ class OutputLayout:
         self._carry(rows, source, matched)
         if self.packets is not None:
             self._point_at_packets(rows, None if xyz is None else xyz[:, 0], time)
-        for field, column in zip(self.extra_fields[len(self.carried) :], self.written, strict=True):
-            values = columns.get(column.column)
-            if values is None:
-                empty = column.record.no_data
-                rows[field] = 0 if empty is None else empty[0]
-            else:
-                rows[field] = column.encode(values)
+        self.fill(rows, columns)
+        for field, column in self._columns:
+            if column.column not in columns:
+                rows[field] = 0 if column.record.no_data is None else column.record.no_data[0]
         return rows
+
+    def fill(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
+        """Write columns into rows; arguments as for `rows`."""
+        for field, column in self._columns:
+            if column.column in columns:
+                rows[field] = column.encode(columns[column.column])
+
+    @property
+    def _columns(self) -> list[tuple[str, WrittenColumn]]:
+        return list(zip(self.extra_fields[len(self.carried) :], self.written, strict=True))
 
     def _set_coordinates(self, rows: np.ndarray, xyz: np.ndarray) -> None:
         new = ~np.isnan(xyz).all(axis=1)

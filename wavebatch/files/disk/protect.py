@@ -27,11 +27,11 @@ class _Inputs:
 
     def add(self, path: Path) -> None:
         for one in (path, *_packet_files(path)):
-            self.names.add(_real_name(one))
+            self.names.add(real_name(one))
             self.numbers |= _number(one)
 
     def has(self, target: Path) -> bool:
-        return _real_name(target) in self.names or bool(_number(target) & self.numbers)
+        return real_name(target) in self.names or bool(_number(target) & self.numbers)
 
 
 _inputs: ContextVar[_Inputs | None] = ContextVar("wavebatch_inputs", default=None)
@@ -65,10 +65,11 @@ def refuse_input(target: Path) -> None:
         raise ConfigError(f"{target}: the output would replace this input; choose another output")
 
 
-def _real_name(path: Path) -> str:
+def real_name(path: Path) -> str:
+    """The file that a name leads to, links resolved."""
     try:
         return os.path.realpath(path)
-    except (OSError, ValueError):
+    except (OSError, ValueError):  # no file can have this name
         return os.path.abspath(path)
 
 
@@ -95,4 +96,10 @@ def _packet_files(path: Path) -> list[Path]:
         return []
     if head[_ENCODING_BYTE] & _WAVES_INTERNAL:
         return []
-    return [path.with_suffix(suffix) for suffix in (".wdp", ".WDP", ".wdz", ".WDZ")]
+    return list_packet_files(path)
+
+
+def list_packet_files(path: Path, suffixes: Iterable[str] = (".wdp", ".WDP", ".wdz", ".WDZ")) -> list[Path]:
+    """Where the packets of a strip may be: beside it, then beside the file to which it is a link."""
+    places = dict.fromkeys((path, Path(real_name(path))))
+    return [place.with_suffix(suffix) for place in places for suffix in suffixes]

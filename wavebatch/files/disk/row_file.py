@@ -55,15 +55,19 @@ class RowStore:
                 self._draft.file.seek(place * size)
                 self._draft.file.write(content[start * size : end * size])
 
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Return rows [start, stop)."""
+        rows = np.empty(stop - start, self.dtype)
+        with reporting(self._draft.target):
+            self._draft.file.seek(start * self.dtype.itemsize)
+            if self._draft.file.readinto(rows.view(np.uint8)) != rows.nbytes:
+                raise InputError(f"{self._draft.target}: its temporary file was cut by another program; run again")
+        return rows
+
     def pieces(self, size: int = PIECE) -> Iterator[np.ndarray]:
         """Yield all rows, at most `size` at a time; the arrays are writable."""
-        with reporting(self._draft.target):
-            for start in range(0, self.count, size):
-                rows = np.empty(min(size, self.count - start), self.dtype)
-                self._draft.file.seek(start * self.dtype.itemsize)
-                if self._draft.file.readinto(rows.view(np.uint8)) != rows.nbytes:
-                    raise InputError(f"{self._draft.target}: its temporary file was cut by another program; run again")
-                yield rows
+        for start in range(0, self.count, size):
+            yield self.read(start, min(start + size, self.count))
 
     def close(self) -> None:
         """Remove the file; may be called twice."""

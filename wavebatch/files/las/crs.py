@@ -13,6 +13,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from wavebatch.files.las.geo_keys import GeoKeys, find_code
 from wavebatch.files.las.header import (
@@ -31,7 +32,7 @@ _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
 
 _TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)([\[(])?|([-+]?[0-9.][-+0-9.eE]*)|([\])])|,|\s+')
 
-_SHORT = {"metres": "m", "international feet": "ft", "US survey feet": "us-ft", "degrees": "deg"}
+_SHORT = {"metres": "m", "international feet": "ft", "US survey feet": "us-ft"}
 """Units of pictures and tables."""
 
 _EARTH = (6.34e6, 6.40e6)
@@ -67,9 +68,14 @@ class CrsUnits:
         if self.kind == "geographic":
             return "degrees"
         if self.kind == "geocentric":
-            return "geocentric (ECEF) without a height coordinate"
+            return "geocentric (ECEF)"
         along, up = (_name_unit(value) for value in (self.horizontal, self.vertical))
         return along if self.vertical is None or up == along else f"{along} with heights in {up}"
+
+
+def name_units(units: Sequence[CrsUnits]) -> str:
+    """Return the units of coordinates in words."""
+    return next((one.describe() for one in units if not one.is_metric), "metres")
 
 
 def metres_per_unit(units: Sequence[CrsUnits]) -> tuple[float, float, float]:
@@ -232,22 +238,31 @@ def _find(node: list, *words: str) -> list | None:
     return next((child for child in node if isinstance(child, list) and child[0] in words), None)
 
 
-def describe_crs(path: Path) -> tuple[str, str]:
-    """Return the name of a file's CRS, empty if it gives none, and the unit of x and y.
+class CrsWords(NamedTuple):
+    """What pictures say of a CRS."""
 
-    The unit is m if the file gives none: most strips without a CRS are in metres. Raises InputError for a file that is
-    not LAS.
-    """
+    name: str = ""
+    """Empty if the file gives no CRS."""
+    unit: str = "m"
+    """Unit of x and y; m if the file gives none: most strips without a CRS are in metres."""
+    upright_unit: str = "m"
+    """Unit of z."""
+    upright: str = "height"
+    """What z is: no height in geocentric coordinates."""
+
+
+def describe_crs(path: Path) -> CrsWords:
+    """Return the words for a file's CRS; raises InputError for a file that is not LAS."""
     header = read_header(path)
     text, units = read_crs(path, header)
-    along = next((one for one in units if one.kind == "geographic" or one.horizontal is not None), None)
-    words = "metres" if along is None else along.describe().split(" with ")[0]
+    kinds = {one.kind for one in units}
+    along, _, up = (_SHORT.get(_name_unit(metres), "units") for metres in metres_per_unit(units))
     code = find_code(header.vlrs)
     if text and text.rstrip().endswith("]"):
         name = name_crs(text)
     else:
         name = f"EPSG:{code}" if code else text or ""
-    return name, _SHORT.get(words, "m" if words == "metres" else "units")
+    return CrsWords(name, "deg" if "geographic" in kinds else along, up, "z" if "geocentric" in kinds else "height")
 
 
 def name_crs(text: str) -> str:

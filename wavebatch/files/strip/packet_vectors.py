@@ -115,13 +115,16 @@ def read_toward(points: np.ndarray, direction: str, form: str) -> np.ndarray:
     return vectors if direction == "toward" else -vectors
 
 
-def decide(tally: DirectionTally, option: str) -> Decision:
-    """Return the decision by the votes; with `auto`, contradicting or missing votes are a problem of the strip."""
+def decide(tally: DirectionTally, option: str, metres: float = 1.0) -> Decision:
+    """Return the decision by the votes; with `auto`, contradicting or missing votes are a problem of the strip.
+
+    metres: of a unit of the coordinates, in which vectors may be, too.
+    """
     if not any(len(part) for part in tally.ratios):
         chosen = "toward" if option == "auto" else option
         return Decision(chosen, tally.form, float("nan"), "no waveform to decide from", (), ())
     ratio = float(np.median(np.concatenate(tally.ratios)))
-    warnings, problems = list(_judge_length(ratio, tally.form)), []
+    warnings, problems = list(_judge_length(ratio, tally.form, metres)), []
     (toward, away), (up, down) = tally.pairs, tally.heights
     pairs, heights = _verdict(toward, away, _MOSTLY), _verdict(up, down, _CLEAR)
     evidence = f"{toward} of {toward + away} pairs that share a packet and {up} of {up + down} heights say toward"
@@ -139,13 +142,13 @@ def decide(tally: DirectionTally, option: str) -> Decision:
     return Decision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
 
 
-def _judge_length(ratio: float, form: str) -> Iterator[str]:
+def _judge_length(ratio: float, form: str, metres: float) -> Iterator[str]:
     if form == "range":
         yield (
             f"packet vectors are more than {RANGE_RATIO:g} times c/2 long; they are read as whole paths (as Optech "
             "wrote them) and divided by minus the return location"
         )
-    if not LEAST_RATIO <= ratio <= LARGEST_RATIO:
+    if not any(LEAST_RATIO <= length <= LARGEST_RATIO for length in (ratio, metres * ratio)):
         yield f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
+from wavebatch.files.disk.protect import list_packet_files
 from wavebatch.files.disk.raw_bytes import damaged, open_regular, read_exactly, reporting_reads
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.header import (
@@ -141,8 +142,8 @@ def refuse_compressed(path: Path, kind: int) -> InputError:
 
 
 def _find_packet_file(path: Path, suffix: str = "wdp") -> Path | None:
-    candidates = (path.with_suffix(f".{name}") for name in (suffix, suffix.upper()))
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    found = list_packet_files(path, (f".{suffix}", f".{suffix.upper()}"))
+    return next(filter(Path.is_file, found), None)
 
 
 def _locate_internal(checked: CheckedHeader) -> PacketPlace:

@@ -15,6 +15,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.raw_bytes import take_records
 from wavebatch.files.disk.spool import Spool
+from wavebatch.files.las.crs import metres_per_unit
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import PointSource
 from wavebatch.files.strip import shared_packets
@@ -234,7 +235,7 @@ class _Scanner:
     def _finish(self, packets: int, reach: int, overfull: np.ndarray) -> StripScan:
         tally, facts, points = self._tally, self._facts, self._facts.header.point_count
         usable, missing = int(tally.reasons[Reason.USABLE]), int(tally.reasons[Reason.NO_WAVEFORM])
-        decision = decide(self._votes, facts.direction_option)
+        decision = decide(self._votes, facts.direction_option, metres_per_unit(facts.units)[0])
         reasons = tally.describe()
         problems = list(decision.problems)
         if not usable and missing < points:

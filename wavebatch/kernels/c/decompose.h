@@ -4,12 +4,13 @@ static const double UNRESOLVED = 0.25;         /* distance, in its errors, below
                                                   of the pairs 1.5 widths apart with an amplitude ratio of 0.5 is lost */
 static const double FAINT = 1;                 /* height in the window, in noise, at which a fit found no echo */
 static const double MOST_SKEW = 0.6;           /* the half after the peak is then twice as wide as the half before it */
+static const double MOST_AMPLITUDE = 1e12;     /* above any count of 32 bits, also of the peak of a clipped echo */
 static const double ROOT_PI = 1.7724538509055161;
 
 /* Amplitudes from 0, times within 3 samples of the window, widths and skews as set. */
 static Limits limits_of(const Settings *s, const Window *w) {
     double first = s->pulse.kind == LOG_NORMAL ? fmax(-3, origin_of(s, w) + LEAST_AWAY) : -3;
-    return (Limits){{0, first, s->width_low, -MOST_SKEW}, {1e9, w->n + 2, s->width_high, MOST_SKEW}};
+    return (Limits){{0, first, s->width_low, -MOST_SKEW}, {MOST_AMPLITUDE, w->n + 2, s->width_high, MOST_SKEW}};
 }
 
 /* Takes out the echo with the least height in the window, if that is no more than noise; returns whether it did. It

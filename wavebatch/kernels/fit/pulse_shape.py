@@ -12,7 +12,7 @@ import numpy as np
 import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.kernels.elementary import exp, log, log1p
+from wavebatch.kernels.elementary import exp, log, log1p, solve
 from wavebatch.kernels.signal.runs import lobe_edges
 
 NO_SKEW = 1e-6
@@ -33,6 +33,8 @@ class PulseTable(NamedTuple):
     """Height, float32 (r,)."""
     slope: np.ndarray
     """Derivative of the height, float32 (r,)."""
+    datum: float
+    """Abscissa of the centre of the Gaussian that fits the pulse best (`fit_one_gaussian`)."""
 
 
 class PulseShape(NamedTuple):
@@ -161,9 +163,6 @@ def _evaluate_components(
     return pulse, by_time, by_width
 
 
-STEADY = 0.1
-"""Step of the peak's delay between two of 200 widths, in the smallest width, above which the peak has jumped."""
-
 LEAST_RISE = 1e-3
 """Share by which half widths are made to grow over the allowed widths where they would not."""
 
@@ -242,14 +241,12 @@ class PulseMeasures(NamedTuple):
     """Fitted width [samples], ascending."""
     peak: np.ndarray
     """Height of the peak over the amplitude of the main part."""
-    delay: np.ndarray
-    """Peak after the centre of the main part [samples]; for flat tops the middle of the main lobe."""
     half_width: np.ndarray
     """Full width at half maximum of the main lobe [samples], ascending."""
 
 
 def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
-    """Peak, its delay and full width at half maximum of a pulse, over a range of widths.
+    """Peak and full width at half maximum of a pulse, over a range of widths.
 
     Parameters
     ----------
@@ -267,10 +264,8 @@ def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
     reach = max([6 * high, *(abs(delay) + high for _, delay, _ in shape.components)])
     x = np.arange(-reach, reach, step)
     table = np.array([_measure_one(evaluate_pulse(shape, x, np.zeros(1), np.full(1, s))[0], x) for s in widths])
-    peak, delay, half_width, middle = table.T
-    # The peak of a flat top jumps from one end of it to the other; the middle of the lobe does not.
-    steady = np.abs(np.diff(delay)).max() <= STEADY * low
-    return PulseMeasures(widths, peak, delay if steady else middle, _make_rising(half_width))
+    peak, _, half_width = table.T
+    return PulseMeasures(widths, peak, _make_rising(half_width))
 
 
 def _make_rising(half_width: np.ndarray) -> np.ndarray:
@@ -285,11 +280,53 @@ def _make_rising(half_width: np.ndarray) -> np.ndarray:
     return level * (1 + LEAST_RISE * np.linspace(0, 1, len(level)))
 
 
-def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float, float]:
-    """Height and place of the peak, full width at half maximum of its lobe, and the middle of the lobe."""
+def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float]:
+    """Height and place of the peak, and full width at half maximum of its lobe."""
     top = int(np.argmax(pulse))
     begin, end = lobe_edges(x, pulse, 0.5 * pulse[top])
-    return float(pulse[top]), float(x[top]), end - begin, 0.5 * (begin + end)
+    return float(pulse[top]), float(x[top]), end - begin
+
+
+MOST_STEPS, LARGEST_STEP, SETTLED = 100, 0.25, 1e-9
+"""Steps of `fit_one_gaussian`, the largest one, and the one that ends it [widths]."""
+
+
+def fit_one_gaussian(x: np.ndarray, value: np.ndarray) -> tuple[float, float]:
+    """Centre and standard deviation of the Gaussian that fits a pulse best by least squares.
+
+    Parameters
+    ----------
+    x : float (r,)
+        Evenly spaced positions that cover the main lobe.
+    value : float (r,)
+        The pulse; what lies far from its main lobe does not matter.
+
+    Returns
+    -------
+    centre, sigma : float, unit of x
+
+    Notes
+    -----
+    The centre is the datum of times. All models that fit the same samples have it at the same place, because what they
+    leave is orthogonal to a shift of a pulse; their peaks differ, by .06 ns on a strip of Leica (docs/algorithms.md 0).
+    """
+    begin, end = lobe_edges(x, value, 0.5 * value.max())
+    centre, sigma = 0.5 * (begin + end), (end - begin) / FWHM_PER_SIGMA
+    for _ in range(MOST_STEPS):
+        rows = np.stack(_evaluate_gaussian((x - centre) / sigma))
+        height, by_time, by_width = solve(np.einsum("ir,jr->ij", rows, rows), np.einsum("ir,r->i", rows, value))
+        move, widen = np.clip([by_time / height, by_width / height], -LARGEST_STEP, LARGEST_STEP)
+        centre, sigma = centre + sigma * move, sigma * (1 + widen)
+        if max(abs(move), abs(widen)) < SETTLED:
+            break
+    return float(centre), float(sigma)
+
+
+def find_datum(shape: PulseShape, width: float) -> tuple[float, float]:
+    """Centre and standard deviation of the Gaussian that fits a pulse of this width best [samples]."""
+    reach = max([8 * width, *(abs(delay) + 4 * width for _, delay, _ in shape.components)])
+    x = np.arange(-reach, reach, width / 32)
+    return fit_one_gaussian(x, evaluate_pulse(shape, x, np.zeros(1), np.full(1, width))[0])
 
 
 TABLE_ROWS = 64
@@ -314,11 +351,12 @@ def tabulate_pulse(x: np.ndarray, value: np.ndarray) -> PulseTable:
     x = np.concatenate([x[0] - step * np.arange(3, 0, -1), x, x[-1] + step * np.arange(1, 4)])
     spline = scipy.interpolate.CubicSpline(x, np.concatenate([np.zeros(3), value, np.zeros(3)]))
     fine = np.arange(x[0], x[-1], step / 64)
-    height, peak, full, _ = _measure_one(spline(fine), fine)
+    height, peak, full = _measure_one(spline(fine), fine)
     unit = full / FWHM_PER_SIGMA
     rows = np.arange(np.ceil((x[0] - peak) / unit * TABLE_ROWS), np.floor((x[-1] - peak) / unit * TABLE_ROWS) + 1)
     z = rows / TABLE_ROWS
     shape, slope = spline(z * unit + peak) / height, spline(z * unit + peak, 1) * unit / height
     for column in (shape, slope):
         column[[0, -1]] = 0.0
-    return PulseTable(float(z[0]), 1 / TABLE_ROWS, shape.astype(np.float32), slope.astype(np.float32))
+    datum = (fit_one_gaussian(fine, spline(fine))[0] - peak) / unit
+    return PulseTable(float(z[0]), 1 / TABLE_ROWS, shape.astype(np.float32), slope.astype(np.float32), datum)

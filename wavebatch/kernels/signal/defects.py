@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet
 
 SPIKE, HEIGHT, HOLE = 4.5, 5.5, 6.5
@@ -51,7 +52,7 @@ def find_spikes(above: np.ndarray, std: float, width: float) -> np.ndarray:
     bool (s, n)
         Never the first or the last sample.
     """
-    drop = np.float32(CURVATURE * (1 - np.exp(-0.5 / width**2)))
+    drop = np.float32(CURVATURE * (1 - exp(-0.5 / width**2)))
     spikes = np.zeros(above.shape, bool)
     if len(above) < 5:
         return spikes
@@ -71,7 +72,7 @@ def _least_between(above: np.ndarray, width: np.float32) -> np.ndarray:
     at least the square of its neighbour over the next one, less that: between two strong echoes, whose sum falls to the
     valley, next to nothing. The neighbour itself is the most that it says.
     """
-    bend = np.exp(np.float32(-CURVATURE) / (width * width))
+    bend = exp(np.float32(-CURVATURE) / (width * width))
     sides = []
     for near, far in ((above[1:-3], above[:-4]), (above[3:-1], above[4:])):
         falls = np.maximum(near, np.float32(0)) / np.maximum(np.maximum(near, far), np.float32(1e-6))
@@ -125,6 +126,47 @@ def find_transient(above: np.ndarray, std: float) -> int:
     inner = np.clip(above[:LOOK], first_low[:, None], first_high[:, None]).mean(axis=1)
     jumps = (first_high - first_low > WILD * spread) | (np.abs(inner - centre) > max(OFF * std, 0.3))
     return 0 if jumps.all() else int(np.argmin(jumps))
+
+
+SEAM_ROWS, SEAM_SPAN, SEAM_REACH = 20, 20.0, 3
+"""Waveforms with signal at a seam, their least difference of counts near it, and how near it is [samples]."""
+
+SEAM_SHARE, USUAL_SHARE = 0.95, 0.5
+"""Share of them in which the sample is the mean of its neighbours, and how often that is so elsewhere, at most."""
+
+LEAST_RECORDING, MOST_SEAM_VALUES = 12, 1 << 20
+"""Samples of a recording at least, and samples of all waveforms in which a seam is looked for."""
+
+
+def find_seam(samples: np.ndarray) -> int:
+    """Sample between two recordings of a packet that was interpolated, not recorded; 0 for none.
+
+    It is the mean of its neighbours, up to rounding, in all waveforms that have signal there; echoes are bent.
+
+    Parameters
+    ----------
+    samples : uint (n, s), count
+        Packets of one length.
+
+    Returns
+    -------
+    int
+        Index of the sample.
+    """
+    n, s = samples.shape
+    values = samples[:: max(n * s // MOST_SEAM_VALUES, 1)].astype(np.int64)
+    if len(values) < SEAM_ROWS or s < 2 * LEAST_RECORDING:
+        return 0
+    near = np.lib.stride_tricks.sliding_window_view(values, 2 * SEAM_REACH + 1, axis=1)
+    active = near.max(axis=2) - near.min(axis=2) >= SEAM_SPAN
+    middle = values[:, SEAM_REACH:-SEAM_REACH]
+    bend = 2 * middle - values[:, SEAM_REACH - 1 : -SEAM_REACH - 1] - values[:, SEAM_REACH + 1 : 1 - SEAM_REACH]
+    number = active.sum(axis=0)
+    share = ((np.abs(bend) <= 1) & active).sum(axis=0) / np.maximum(number, 1)
+    known = number >= SEAM_ROWS
+    at = np.flatnonzero(known & (share >= SEAM_SHARE)) + SEAM_REACH
+    at = at[(at >= LEAST_RECORDING) & (at < s - LEAST_RECORDING)]
+    return int(at[0]) if len(at) == 1 and np.median(share[known]) <= USUAL_SHARE else 0
 
 
 def fit_slopes(

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
+from wavebatch.kernels.elementary import solve
 from wavebatch.kernels.signal.signal import (
     SMOOTH_GAIN,
     STRONG,
@@ -21,8 +22,10 @@ from wavebatch.kernels.signal.signal import (
     sum_samples,
 )
 
-ROUNDS = 2
-"""Times that quiet samples and their noise are found from each other, after the first look at the edges."""
+ROUNDS, SETTLED = 6, 0.01
+"""Times, at most, that quiet samples and their noise are found from each other, after the first look at the edges; and
+the change of the noise, as a share of it, below which it stays. Where weak echoes follow the last signal the first
+limits are too high for them."""
 
 DRIFT = 1.0
 """Spread of the baselines, over the noise, from which each waveform's level is found from itself."""
@@ -133,18 +136,22 @@ def _estimate_from(
     number = np.zeros(len(level), np.int32)
     for turn in range(ROUNDS):
         # The first level is that of few samples, and as wrong as they may be together.
-        width = limit * (_smoothed_std(covariance) + (0.0 if turn else std)) + 0.25
+        last = _smoothed_std(covariance)
+        width = limit * (last + (0.0 if turn else std)) + 0.25
         quiet = find_ends(signal - level, width, reach, recovery)
         if missing is not None:
             quiet &= ~missing
-        mean, number = quiet_mean(signal - np.nan_to_num(level), quiet)
-        measured = measure_covariance(signal, quiet, int(np.clip(2 * reach, *LAGS)))
+        above = signal - np.nan_to_num(level)
+        mean, number = quiet_mean(above, quiet)
+        measured = measure_covariance(signal, quiet & _find_calm(above - mean, quiet), int(np.clip(2 * reach, *LAGS)))
         if measured is None:
             known = level[np.isfinite(level)].astype(np.float64)
             middle = float(np.mean(known)) if len(known) else float(np.median(signal))
             return PooledNoise(middle, max(std, QUANTISATION_STD), 0.0, 0.0, recovery=recovery)
         covariance = measured
         level = np.where(number > 0, np.nan_to_num(level) + mean, np.float32(np.nan))
+        if turn and abs(_smoothed_std(covariance) - last) < SETTLED * last:
+            break
     known = number > 0
     middle, spread = _spread_of_levels(level[known].astype(np.float64), number[known], covariance)
     std = max(float(np.sqrt(covariance[0])), QUANTISATION_STD)
@@ -222,6 +229,18 @@ def find_ends(above: np.ndarray, width: float, reach: int, recovery: int = 0) ->
         last = np.where(strong.any(axis=0), s - 1 - np.argmax(strong[::-1], axis=0), -1 - recovery)
         quiet &= (place < first) | (place > last + recovery)
     return quiet
+
+
+def _find_calm(deviation: np.ndarray, quiet: np.ndarray) -> np.ndarray:
+    """Waveforms (n,) whose quiet samples scatter like those of most others: the foot of an echo may be below a limit.
+
+    deviation: of quiet samples from their mean (s, n).
+    """
+    number = quiet.sum(axis=0)
+    power = np.einsum("sn,sn->n", deviation * quiet, deviation) / np.maximum(number, 1)
+    enough = number >= EDGE
+    typical = float(np.median(power[enough])) if enough.any() else 0.0
+    return ~enough | (power <= ALIKE * max(typical, QUANTISATION_STD**2))
 
 
 def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0]) -> np.ndarray | None:
@@ -316,9 +335,9 @@ def measure_recovery(
 
     Notes
     -----
-    A tail of a hundredth of an echo lies below any limit of single samples, but the mean over thousands of waveforms
-    shows it; those with the stronger half of the echoes decide. Weak echoes after the first one have the same effect,
-    and the same remedy. Fewer samples make a noisier baseline: a slight tail of many samples is the lesser evil.
+    A tail of a hundredth of an echo lies below any limit of single samples, but the median of thousands of waveforms
+    shows it; those with the stronger half of the echoes decide. Weak echoes after the last strong one are in some of
+    the waveforms only. Fewer samples make a noisier baseline: a slight tail of many samples is the lesser evil.
     """
     s = len(signal)
     above = signal - np.float32(noise.level)
@@ -352,8 +371,10 @@ def measure_recovery(
     # Baselines from the samples before the signal and those at least 0, 1, 2 ... steps after it, less the former alone.
     kept = np.cumsum(count[::-1], axis=0)[::-1]
     difference = np.cumsum(total[::-1], axis=0)[::-1] / (kept + number[rows])
-    bias = np.abs(difference.mean(axis=1))
-    error = difference.std(axis=1) / np.sqrt(len(rows))
+    middle = np.median(difference, axis=1)
+    bias = np.abs(middle)
+    spread = MAD_TO_STD * np.median(np.abs(difference - middle[:, None]), axis=1)
+    error = MEDIAN_ERROR * spread / np.sqrt(len(rows))
     # Without those samples a baseline is that of a few before the signal, or the strip's: no worse than its spread.
     alone = min(noise.spread, noise.std / np.sqrt(np.median(number[rows])))
     least = np.clip(alone, RECOVERED, 2 * RECOVERED) * max(noise.std, 1.0)
@@ -485,10 +506,15 @@ def colour_factors(
     if not len(correlation):
         return 1.0, 1.0, 1.0, 1.0
     joint = np.stack([pulse, by_time, by_width], axis=1).astype(np.float64)
-    weights = np.linalg.solve(joint.T @ joint, joint.T)
+    weights = solve(np.einsum("sp,sq->pq", joint, joint), joint.T)
     matrix = correlation_matrix(correlation, len(joint))
     rows = (joint[:, 0], *weights)
-    return tuple(float(np.sqrt(max((row @ matrix @ row) / (row @ row), LEAST_FACTOR))) for row in rows)
+    return tuple(float(np.sqrt(max(_gain(row, matrix), LEAST_FACTOR))) for row in rows)
+
+
+def _gain(row: np.ndarray, matrix: np.ndarray) -> float:
+    """Variance of the sum of samples with these weights (s,) in coloured noise, over that in white noise."""
+    return float(np.einsum("i,i->", row, np.einsum("ij,j->i", matrix, row)) / np.einsum("i,i->", row, row))
 
 
 def correlation_matrix(correlation: tuple[float, ...] | np.ndarray, size: int) -> np.ndarray:

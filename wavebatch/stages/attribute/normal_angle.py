@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from wavebatch.core.echoes import RAY, EchoTable
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.geometry.normals import measure_normals
@@ -15,7 +15,7 @@ from wavebatch.stages.chain import Range, stage
 
 @stage(
     "attribute",
-    makes=("incidence_angle_normals", "incidence_angle_normals_err", *RAY),
+    makes=("incidence_angle_normals", "incidence_angle_normals_err"),
     needs=("x", "y", "z"),
     second_pass=measure_normals,
 )
@@ -52,10 +52,5 @@ def incidence_angle_normals(
     """
     if not (radius == 0 or 1e-3 <= radius <= 1e3) or min_points < 4 or not max_error > 0:
         raise ConfigError("radius must be 0 or lie in 0.001 to 1000 m, min_points be 4 at least, max_error above 0")
-    x, y, z = block.direction.T
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        length = np.sqrt(x * x + y * y + z * z)
-        unit = [(part / length).astype(np.float32) for part in (x, y, z)]
     none = np.full(len(echoes), np.nan, np.float32)
-    rays = {name: part[echoes.waveform] for name, part in zip(RAY, unit, strict=True)}
-    return echoes.with_attributes(incidence_angle_normals=none, incidence_angle_normals_err=none, **rays)
+    return echoes.with_attributes(incidence_angle_normals=none, incidence_angle_normals_err=none)

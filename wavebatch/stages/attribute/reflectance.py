@@ -7,7 +7,7 @@ Where neither is known, a column of another name takes the surface as level, wit
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -28,34 +28,13 @@ from wavebatch.stages.chain import Range, stage
 _ANGLE = {"normals": "incidence_angle_normals", "echo": "incidence_angle"}
 """Column of the angle, by the parameter `surface`."""
 
-_NEEDS = {"surface": {kind: (column, f"{column}_err") for kind, column in _ANGLE.items()}}
+
+def _needs(parameters: Mapping[str, Any]) -> tuple[str, ...]:
+    angle = _ANGLE[parameters["surface"]]
+    return (*POSITION, "range_err", angle, f"{angle}_err")
 
 
-def _complete(name: str, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Reflectance and error once the angles to the normals are known; see `Stage.complete`."""
-    angle, angle_err = (np.radians(columns[key].astype(np.float64)) for key in _NEEDS["surface"]["normals"])
-    facing = columns[f"facing_{name}"].astype(np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        relative = columns[f"facing_{name}_err"] / facing
-        value = 4.0 * radiometry.diffuse_reflectance(facing, angle)
-        return {name: value, f"{name}_err": value * radiometry.reflectance_error(relative, angle, angle_err)}
-
-
-def _complete_reflectance(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return _complete("reflectance", columns)
-
-
-def _complete_relative(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return _complete("relative_reflectance", columns)
-
-
-@stage(
-    "attribute",
-    makes=("reflectance", "reflectance_err", "facing_reflectance", "facing_reflectance_err"),
-    needs=POSITION,
-    needs_if=_NEEDS,
-    complete=_complete_reflectance,
-)
+@stage("attribute", makes=("reflectance", "reflectance_err", "facing_reflectance"), needs=_needs)
 def reflectance(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     surface: Literal["normals", "echo"] = "normals",
@@ -75,17 +54,13 @@ def reflectance(
     ----------
     docs/algorithms.md 5.
     """
-    return _reflectance(block, echoes, "reflectance", measure_light(block, system, echoes, 2), surface)
+    light = measure_light(block, system, echoes, 2)
+    facing = _divide(block, echoes, "reflectance", light, np.zeros(len(echoes)), light.relative_error)
+    echoes = echoes.with_attributes(facing_reflectance=facing.attributes["reflectance"])
+    return _reflectance(block, echoes, "reflectance", light, surface)
 
 
-@stage(
-    "attribute",
-    makes=("relative_reflectance", "relative_reflectance_err", "facing_relative_reflectance",
-           "facing_relative_reflectance_err"),
-    needs=POSITION,
-    needs_if=_NEEDS,
-    complete=_complete_relative,
-)  # fmt: skip
+@stage("attribute", makes=("relative_reflectance", "relative_reflectance_err"), needs=_needs)
 def relative_reflectance(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     surface: Literal["normals", "echo"] = "normals",
@@ -129,19 +104,12 @@ def level_reflectance(
 
 
 def _reflectance(block: WaveformBlock, echoes: EchoTable, name: str, light: Light, surface: str) -> EchoTable:
-    """Reflectance by widths; by normals only what it would be on a surface that faces the sensor, and no-data."""
+    """The column for surfaces struck at the angle that another column has."""
     unknown = np.full(len(echoes), np.nan)
-    none = np.zeros(len(echoes))
-    if surface == "echo":
-        known = (echoes.attributes.get(key, unknown) for key in _NEEDS["surface"]["echo"])
-        angle, angle_err = (np.radians(values.astype(np.float64)) for values in known)
-        facing = _divide(block, echoes, f"facing_{name}", light._replace(gamma=unknown), none, none)
-    else:
-        angle = angle_err = unknown
-        facing = _divide(block, echoes, f"facing_{name}", light, none, light.relative_error)
+    known = (echoes.attributes.get(key, unknown) for key in (_ANGLE[surface], f"{_ANGLE[surface]}_err"))
+    angle, angle_err = (np.radians(values.astype(np.float64)) for values in known)
     relative = radiometry.reflectance_error(light.relative_error, angle, angle_err)
-    hidden = {key: facing.attributes[key] for key in (f"facing_{name}", f"facing_{name}_err")}
-    return _divide(block, echoes, name, light, angle, relative).with_attributes(**hidden)
+    return _divide(block, echoes, name, light, angle, relative)
 
 
 def _divide(

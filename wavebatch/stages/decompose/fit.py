@@ -15,12 +15,18 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import fit_closed_form
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.decompose.solve import LeastWidth, MostWidth, fit_candidates, fit_gaussian, make_settings
+from wavebatch.stages.decompose.solve import FIT, EchoLimits, FitOptions, fit_candidates, fit_gaussian, make_settings
 from wavebatch.stages.flags import flag_echoes
-from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
+
+_ADAPTIVE = FitOptions(significance=4.5)
 
 CLOSED_VALUES = 1 << 21
 """Samples around peaks that the closed form takes at a time: noise has a peak at every fourth sample."""
+
+SINGLE_PRECISION = 2.0**-23
+"""Share of an amplitude that a fit in single precision cannot tell from none: it counts as misfit of the pulse. With
+amplitudes of 4e9 counts rounding is 200 times a noise of one count."""
 
 
 @stage("decompose")
@@ -29,14 +35,12 @@ def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTa
     return flag_echoes(block, noise, system, echoes)
 
 
-@stage("decompose", fits=fit_gaussian)
+@stage("decompose", fits=fit_gaussian, shares=EchoLimits())
 def closed_form(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     fraction: Annotated[float, Range(0.0, 1.0)] = 0.2,
     steps: Annotated[int, Range(0, 100)] = 2,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
+    **limits: float,
 ) -> EchoTable:  # fmt: skip
     """One Gaussian for every candidate alone: a closed form and a few Gauss-Newton steps.
 
@@ -49,64 +53,35 @@ def closed_form(
         Samples of at least this share of the peak enter the closed form.
     steps : int
         Gauss-Newton steps after it.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4.
 
     References
     ----------
     Guo (2011); docs/algorithms.md 4.1.
     """
-    widths = least_width, most_width
-    start = _start_closed_form(block, noise, system, echoes, fraction, widths)
-    settings = make_settings(
-        block, system, GAUSSIAN, widths=widths, tolerance=0.1, max_iterations=steps + 1, grow=False
-    )
-    return fit_candidates(block, noise, system, start, settings, significance=significance, most=1)
+    fit = FitOptions(tolerance=0.1, max_iterations=steps + 1, **limits)
+    start = _start_closed_form(block, noise, system, echoes, fraction, (fit.least_width, fit.most_width))
+    settings = make_settings(block, system, GAUSSIAN, fit, grow=False)
+    return fit_candidates(block, noise, system, start, settings, significance=fit.significance, most=1)
 
 
-@stage("decompose", fits=fit_gaussian)
+@stage("decompose", fits=fit_gaussian, shares=FIT)
 def gaussian(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    max_iterations: Annotated[int, Range(1, 1000)] = 40,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
-) -> EchoTable:  # fmt: skip
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: float
+) -> EchoTable:
     """Sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
 
     Levenberg-Marquardt. Widths stay within their limits, times within the window. No echo is added.
-
-    Parameters
-    ----------
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2; with 0.5 it is then within a few hundredths of a
-        standard deviation of the minimum.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4.
 
     References
     ----------
     Wagner et al. (2007) eq. 3; docs/algorithms.md 2.3.
     """
-    settings = make_settings(
-        block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
-        max_iterations=max_iterations, grow=False,
-    )  # fmt: skip
-    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
+    fit = replace(FIT, **options)
+    settings = make_settings(block, system, GAUSSIAN, fit, grow=False)
+    return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
 
 
-@stage("decompose")
+@stage("decompose", shares=_ADAPTIVE)
 def adaptive(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     acceptance: Annotated[float, Range(0.0, 1e6)] = 0.0,
@@ -114,11 +89,7 @@ def adaptive(
     gate_residual: Annotated[float, Range(0.0, 1e6)] = 4.2,
     gate_hermite: Annotated[float, Range(0.0, 1e6)] = 8.5,
     width_prior: Annotated[float, Range(0.0, 100.0)] = 0.1,
-    max_iterations: Annotated[int, Range(1, 1000)] = 40,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
-    significance: Annotated[float, Range(0.0, 1e6)] = 4.5,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
+    **options: float,
 ) -> EchoTable:  # fmt: skip
     """As many echoes as the waveform needs: a fit grows only where a test of its residual asks for it.
 
@@ -139,40 +110,27 @@ def adaptive(
     width_prior : float
         How far overlapping echoes may be narrower than the system pulse [one standard deviation, in system widths]; 0
         for no prior.
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2; with 0.5 it is then within a few hundredths of a
-        standard deviation of the minimum.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4.
 
     References
     ----------
     docs/algorithms.md 2.3, 4.2, H1, H3.
     """
+    fit = replace(_ADAPTIVE, **options)
     shape = pulse_shape(system, block.spacing)
-    ref = shape_limits(system, block.spacing).ref
     settings = make_settings(
         block,
         system,
         shape,
-        widths=(least_width, most_width),
-        tolerance=tolerance,
-        max_iterations=max_iterations,
+        fit,
         grow=True,
         acceptance=acceptance or system.acceptance,
-        misfit=system.misfit,
+        misfit=max(system.misfit, SINGLE_PRECISION),
         max_echoes=max_echoes,
-        prior_spread=width_prior * ref,
+        prior_spread=width_prior * shape_limits(system, block.spacing).ref,
         gate_residual=gate_residual,
         gate_hermite=gate_hermite,
     )
-    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
 
 
 def _start_closed_form(

@@ -20,10 +20,10 @@ from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference
 from wavebatch.stages.decompose.rebuild import loop_model, loop_shape, render_table
 from wavebatch.stages.decompose.skew import skewed, system_skew
-from wavebatch.stages.decompose.solve import LeastWidth, MostWidth, fit_gaussian
+from wavebatch.stages.decompose.solve import EchoLimits, fit_gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
 from wavebatch.stages.flags import flag_echoes
-from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH
+from wavebatch.stages.pulse_tables import LEAST_WIDTH
 
 
 def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
@@ -34,7 +34,7 @@ def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse
     return replace(system, components=(), kappa=system_skew(system)) if model == "skewed" else fit_gaussian(system, {})
 
 
-@stage("decompose", fits=_fit_loop)
+@stage("decompose", fits=_fit_loop, shares=EchoLimits())
 def residual_loop(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     model: Literal["auto", "gaussian", "skewed", "generalized", "learned"] = "auto",
@@ -42,9 +42,7 @@ def residual_loop(
     t_unit: Literal["noise", "count", "amplitude"] = "noise",
     max_echoes: Annotated[int, Range(1, 1000)] = 6,
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
+    **limits: float,
 ) -> EchoTable:  # fmt: skip
     """Pulses of a model, with one more at the largest residual of the waveform while that exceeds a threshold.
 
@@ -58,7 +56,8 @@ def residual_loop(
         The pulse that the survey chose (auto: learned, skewed or Gaussian); Gaussians, as in the paper; skewed pulses
         with the skew of the survey; generalized Gaussians; or the learned pulse.
     t_diff : float
-        Largest residual that adds no echo, T_diff of the paper, in the unit below.
+        Largest residual that adds no echo, T_diff of the paper, in the unit below; at least the noise, and the report
+        says so where it was raised.
     t_unit : {"noise", "count", "amplitude"}
         Standard deviations of the noise, counts of the digitizer, or shares of the waveform's largest sample above the
         baseline.
@@ -66,12 +65,6 @@ def residual_loop(
         Most echoes per waveform up to which echoes are added.
     max_iterations : int
         Of each fit; an echo that has not converged after so many is flagged.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo, of the paper's eq. 4 [widths of the system pulse].
-    most_width : float
-        Largest width of an echo, of the paper's eq. 4 [widths of the system pulse].
 
     References
     ----------
@@ -79,8 +72,7 @@ def residual_loop(
     """
     model = loop_model(system, model)
     shape = loop_shape(system, block.spacing, model)
-    options = {"max_iterations": max_iterations, "tolerance": 0.1, "significance": significance}
-    options |= {"least_width": least_width, "most_width": most_width}
+    options = {"max_iterations": max_iterations, "tolerance": 0.1, **limits}
     limit = _residual_limit(block, noise, t_diff, t_unit)
     rows = np.arange(len(block))
     before = np.full(len(block), -1)

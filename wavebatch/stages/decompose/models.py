@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,18 +15,11 @@ from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Solution, choose
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
-from wavebatch.stages.chain import Range, stage
+from wavebatch.stages.chain import stage
 from wavebatch.stages.decompose.group import find_clusters
-from wavebatch.stages.decompose.solve import (
-    LeastWidth,
-    MostWidth,
-    describe_solution,
-    fit_candidates,
-    fit_gaussian,
-    make_settings,
-)
+from wavebatch.stages.decompose.solve import FIT, describe_solution, fit_candidates, fit_gaussian, make_settings
 from wavebatch.stages.detect.candidates import samples_of
-from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
 
 POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
@@ -38,20 +31,17 @@ def _fit_reference(system: SystemPulse, parameters: Mapping[str, Any]) -> System
     return system if parameters["model"] == "broadened" else replace(system, components=(), kappa=0.0)
 
 
-@stage("decompose", fits=_fit_reference)
+@stage("decompose", fits=_fit_reference, shares=FIT)
 def reference(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     model: Literal["broadened", "stretched", "given"] = "broadened",
     pulse: str = "",
-    max_iterations: Annotated[int, Range(1, 1000)] = 40,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
+    **options: float,
 ) -> EchoTable:  # fmt: skip
     """Sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
 
-    Time and amplitude are those of the pulse's peak, the width is its full width at half maximum over 2.354820.
+    The amplitude is that of the pulse's peak, the time that of its datum (the Gaussian that fits a flat target's echo),
+    the width its full width at half maximum over 2.354820.
 
     Parameters
     ----------
@@ -60,29 +50,17 @@ def reference(
         `given` for the pulse below, stretched.
     pulse : str
         Samples of the given pulse, separated by spaces, with the spacing of the waveform.
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse].
 
     References
     ----------
     docs/algorithms.md R1; Mallet and Bretar (2009).
     """
     shape = reference_shape(system, block.spacing, model, pulse)
-    settings = make_settings(
-        block, system, shape, widths=(least_width, most_width), tolerance=tolerance, max_iterations=max_iterations,
-        grow=False,
-    )  # fmt: skip
+    fit = replace(FIT, **options)
+    settings = make_settings(block, system, shape, fit, grow=False)
     if model != "broadened":
         system = replace(system, components=())
-    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
 
 
 def reference_shape(system: SystemPulse, spacing: float, model: str, pulse: str) -> PulseShape:
@@ -123,41 +101,21 @@ def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> 
     return PulseShape(table=tabulate_pulse(x, value))
 
 
-@stage("decompose", fits=fit_gaussian)
+@stage("decompose", fits=fit_gaussian, shares=FIT)
 def generalized_gaussian(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    max_iterations: Annotated[int, Range(1, 1000)] = 40,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
-) -> EchoTable:  # fmt: skip
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: float
+) -> EchoTable:
     """Sum of generalized Gaussians exp(-|z|^p / 2); the exponent is chosen for each cluster of echoes.
 
     Exponents from 1.4 (peaked) over 2 (Gaussian) to 4 (flat) are tried, the least chi2 wins. The width is the full
     width at half maximum over 2.354820.
 
-    Parameters
-    ----------
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse].
-
     References
     ----------
     Chauve et al. (2007), eq. 4.
     """
-    plain = make_settings(
-        block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
-        max_iterations=max_iterations, grow=False,
-    )  # fmt: skip
+    fit = replace(FIT, **options)
+    plain = make_settings(block, system, GAUSSIAN, fit, grow=False)
     candidates, clusters = find_clusters(block, noise, system, echoes, plain)
     samples, solutions = samples_of(block, noise), []
     for power in POWERS:
@@ -168,7 +126,7 @@ def generalized_gaussian(
     chosen = np.argmin([solution.cost for solution in solutions], axis=0)
     best = choose(solutions, chosen)
     columns = {"power": np.array(POWERS, np.float32)[chosen[best.cluster]]}
-    return describe_solution(block, noise, system, clusters, best, plain, significance, columns)
+    return describe_solution(block, noise, system, clusters, best, plain, fit.significance, columns)
 
 
 def half_width_factor(power: float) -> float:

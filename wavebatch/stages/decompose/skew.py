@@ -16,15 +16,9 @@ from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import find_clusters
-from wavebatch.stages.decompose.solve import (
-    LeastWidth,
-    MostWidth,
-    describe_solution,
-    fit_candidates,
-    make_settings,
-)
+from wavebatch.stages.decompose.solve import FIT, describe_solution, fit_candidates, make_settings
 from wavebatch.stages.detect.candidates import samples_of
-from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape
+from wavebatch.stages.pulse_tables import pulse_shape
 
 UNKNOWN_SPREAD = 0.15
 """Spread of skews where the survey did not measure it: Wang et al. have 0 to 0.18 for two sensors and two targets."""
@@ -82,50 +76,34 @@ def _fit_skewed(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPul
     return replace(system, components=(), kappa=0.0 if kappa == "free" else kappa or system_skew(system))
 
 
-@stage("decompose", fits=_fit_skewed)
+@stage("decompose", fits=_fit_skewed, shares=FIT)
 def skewed(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     kappa: Annotated[float, Range(-0.9, 0.9)] | Literal["free"] = 0.0,
-    max_iterations: Annotated[int, Range(1, 1000)] = 40,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
+    **options: float,
 ) -> EchoTable:  # fmt: skip
     """Sum of skewed pulses: the log-normal of Wang et al. in its stable form, with one skew for the strip or per echo.
 
-    The time is that of the peak. With `kappa = "free"` every echo gets its skew, within 0.6 and with a prior: a normal
-    law around the strip's skew, as wide as the survey saw the skews of single echoes scatter. `attribute.skew` writes
-    it with its error.
+    With `kappa = "free"` every echo gets its skew, within 0.6 and with a prior: a normal law around the skew of the
+    strip, as wide as the survey saw the skews of single echoes scatter. `attribute.skew` writes it with its error. The
+    time is then that of the peak; of one skew for the strip it is that of the datum, as of every other pulse.
 
     Parameters
     ----------
     kappa : float or "free"
         Skew; 0 takes the value of the survey, "free" fits one per echo.
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse].
 
     References
     ----------
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 0, 1.2.
     """
     shape = skewed_shape(system, 0.0 if kappa == "free" else kappa)
-    settings = make_settings(
-        block, system, shape, widths=(least_width, most_width), tolerance=tolerance, max_iterations=max_iterations,
-        grow=False,
-    )  # fmt: skip
+    fit = replace(FIT, **options)
+    settings = make_settings(block, system, shape, fit, grow=False)
     if kappa != "free":
-        return fit_candidates(block, noise, system, echoes, settings, significance=significance)
+        return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
     free = settings._replace(skew_mean=shape.kappa, skew_spread=system.skew_spread or UNKNOWN_SPREAD)
-    return fit_each(block, noise, system, echoes, free, significance)
+    return fit_each(block, noise, system, echoes, free, fit.significance)
 
 
 def fit_each(

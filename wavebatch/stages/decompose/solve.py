@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,11 +11,10 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.cluster import Clusters
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Settings, Solution
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, measure_pulse
-from wavebatch.kernels.library import Samples
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
@@ -31,16 +29,49 @@ from wavebatch.stages.pulse_tables import (
     clip_level,
     describe_echoes,
     error_factors,
+    matched_gaussian,
     pulse_shape,
     shape_limits,
 )
 
-PER_WIDTH = 16
-"""Samples per width of a pulse to which a Gaussian is fitted: more change its width by less than 1e-4."""
 
-LeastWidth = Annotated[float, Range(0.05, 1.0)]
-MostWidth = Annotated[float, Range(1.0, BROADEST)]
-"""Limits of fitted widths, the box of Wang et al. eq. 4 [widths of the system pulse]."""
+@dataclass(frozen=True)
+class EchoLimits:
+    """What decomposers accept as an echo: options that they share.
+
+    Parameters
+    ----------
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+    least_width : float
+        Smallest width of an echo, of the box of Wang et al. eq. 4 [widths of the system pulse].
+    most_width : float
+        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4.
+    """
+
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0
+    least_width: Annotated[float, Range(0.05, 1.0)] = LEAST_WIDTH
+    most_width: Annotated[float, Range(1.0, BROADEST)] = MOST_WIDTH
+
+
+@dataclass(frozen=True)
+class FitOptions(EchoLimits):
+    """Options that decomposers with an iterative fit share.
+
+    Parameters
+    ----------
+    max_iterations : int
+        An echo that has not converged after so many is flagged.
+    tolerance : float
+        A fit ends with the step that promises a smaller fall of chi2; with 0.5 it is then within a few hundredths of a
+        standard deviation of the minimum.
+    """
+
+    max_iterations: Annotated[int, Range(1, 1000)] = 40
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5
+
+
+FIT = FitOptions()
 
 
 def fit_gaussian(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
@@ -61,30 +92,15 @@ def fit_gaussian(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPu
     shape = pulse_shape(system, 1.0)
     if shape == GAUSSIAN:
         return system
-    ref = _gaussian_width(shape, shape_limits(system, 1.0).ref)
+    ref = matched_gaussian(shape, shape_limits(system, 1.0).ref)[1]
     return replace(system, components=(), kappa=0.0, sigma_ref=ref)
-
-
-@lru_cache(maxsize=16)
-def _gaussian_width(shape: PulseShape, width: float) -> float:
-    """Width of the Gaussian that is fitted to a pulse of this width, within three widths of its peak [its unit]."""
-    unit = width / PER_WIDTH
-    measures = measure_pulse(shape, width, 1.001 * width)
-    x = np.arange(-3 * PER_WIDTH, 3 * PER_WIDTH + 1, dtype=np.float64)
-    whole = evaluate_pulse(shape, x[:, None] * unit + measures.delay[0], np.zeros(1), np.full(1, width))[0][:, 0]
-    samples = Samples(whole[None].astype(np.float32), np.zeros(1, np.float32), np.full(1, 1e-3, np.float32))
-    start = Candidates(np.zeros(1, int), x[-1:], measures.peak[:1], np.full(1, float(PER_WIDTH)))
-    one = Clusters(*(np.array([value]) for value in (0, 0, len(x), 0, 1)))
-    limits = Settings(PER_WIDTH, 0.3 * PER_WIDTH, 5.0 * PER_WIDTH, tolerance=1e-6, grow=False)
-    return float(decompose_clusters(samples, start, one, limits).parameters[0, 2] * unit)
 
 
 def make_settings(
     block: WaveformBlock,
     system: SystemPulse,
     shape: PulseShape,
-    *,
-    widths: tuple[float, float] = (LEAST_WIDTH, MOST_WIDTH),
+    fit: FitOptions,
     **options: Any,
 ) -> Settings:
     """Collect what a decomposition with this pulse may do: the strip's widths, digitizer and noise.
@@ -95,8 +111,7 @@ def make_settings(
         As for a stage.
     shape : PulseShape
         The pulse to fit.
-    widths : tuple of float
-        Smallest and largest width of an echo [widths of the system pulse].
+    fit : FitOptions
     **options
         Further fields of Settings.
 
@@ -105,8 +120,12 @@ def make_settings(
     Settings
         For `fit_candidates`.
     """
-    limits = shape_limits(system if shape.components else replace(system, components=()), block.spacing, *widths)
-    return Settings(*limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, **options)
+    pulse = system if shape.components else replace(system, components=())
+    limits = shape_limits(pulse, block.spacing, fit.least_width, fit.most_width)
+    return Settings(
+        *limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, tolerance=fit.tolerance,
+        max_iterations=fit.max_iterations, **options,
+    )  # fmt: skip
 
 
 def fit_candidates(

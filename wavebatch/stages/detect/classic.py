@@ -12,7 +12,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import log
+from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.signal.runs import find_runs, highest_samples, walk_down
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
@@ -20,9 +20,27 @@ from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
 
 
-def _smoothed_width(ref: float) -> float:
-    """Width of the system pulse after the [1 2 1]/4 filter [samples]."""
-    return float(np.sqrt(ref * ref + 0.5))
+def _smoothed_height(smoothed: np.ndarray, at: np.ndarray, waveform: np.ndarray, ref: float) -> tuple[np.ndarray, ...]:
+    """Amplitudes and widths to start with of peaks (m,), and heights of the smoothed signal between its samples."""
+    amplitude, _, width = estimate_starts(smoothed, waveform, at, ref)
+    top = smoothed[at, waveform]
+    height = np.maximum(amplitude / np.sqrt(1 + 0.5 / np.maximum(width, 0.3) ** 2), 0.0)
+    return amplitude, width, np.clip(height, top, 1.2 * top)
+
+
+def _time_to_peak(edge: np.ndarray, ratio: np.ndarray, ref: float) -> np.ndarray:
+    """Time from an edge to the peak of an echo of the system's width, smoothed by [1 2 1]/4 (m,) [samples].
+
+    edge: where a line between two samples meets the level. Flanks are bent, so that the line meets it too early, by .1
+    sample for strong echoes; by how much follows from where between the samples it is.
+    ratio: height of the peak over the level.
+    """
+    width = np.sqrt(ref * ref + 0.5)
+    away = width * np.sqrt(2 * log(np.maximum(ratio, 1.0)))
+    place = edge - np.floor(edge)
+    before, after = (ratio * exp(-0.5 * (lag / width) ** 2) for lag in (away + place, away - (1 - place)))
+    late = place - (1 - before) / np.maximum(after - before, 1e-9)
+    return away + np.where(after > 1, np.clip(late, 0.0, 0.5), 0.0)
 
 
 @stage("detect")
@@ -54,15 +72,13 @@ def threshold(
     waveform = starts // s
     peak = highest_samples(smoothed, starts, ends)
     ref = system.sigma_ref / block.spacing
-    amplitude, _, width = estimate_starts(smoothed, waveform, peak, ref)
+    amplitude, width, height = _smoothed_height(smoothed, peak, waveform, ref)
     first, trigger = starts - waveform * s, limit[waveform]
     inside, outside = smoothed[first, waveform], smoothed[np.maximum(first - 1, 0), waveform]
     rise = np.where(first > 0, inside - outside, np.float32(np.inf))
     time = first - (inside - trigger) / rise
     if correct_walk:
-        top = smoothed[peak, waveform]
-        time += _smoothed_width(ref) * np.sqrt(2 * log(np.maximum(top / trigger, 1.0)))
-        time = np.minimum(time, ends - waveform * s)
+        time = np.minimum(time + _time_to_peak(time, height / trigger, ref), ends - waveform * s)
     return candidate_table(block, system, waveform, time, amplitude, width)
 
 
@@ -93,10 +109,8 @@ def constant_fraction(
     smoothed = smooth_121(signal_above(block, noise))
     ref = system.sigma_ref / block.spacing
     waveform, sample = find_peaks(smoothed, np.float32(level * SMOOTH_GAIN) * noise.std)
-    amplitude, _, width = estimate_starts(smoothed, waveform, sample, ref)
-    height = np.maximum(amplitude / np.sqrt(1 + 0.5 / np.maximum(width, 0.3) ** 2), 0.0)
-    top = smoothed[sample, waveform]
-    height = np.clip(height, top, 1.2 * top)
-    edge = walk_down(smoothed, waveform, sample, np.minimum(fraction * height, 0.999 * top), -1)
-    time = edge + _smoothed_width(ref) * np.sqrt(-2 * log(fraction))
+    amplitude, width, height = _smoothed_height(smoothed, sample, waveform, ref)
+    level = np.minimum(fraction * height, 0.999 * smoothed[sample, waveform])
+    edge = walk_down(smoothed, waveform, sample, level, -1)
+    time = edge + _time_to_peak(edge, np.full(len(edge), 1 / fraction), ref)
     return candidate_table(block, system, waveform, time, amplitude, width)

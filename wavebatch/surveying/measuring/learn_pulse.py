@@ -9,6 +9,7 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
@@ -79,7 +80,7 @@ def _nearest_to_edge(echoes: EchoTable) -> EchoTable:
     """
     if len(echoes) < FEW:
         return echoes
-    distance = np.abs(np.log(echoes.sigma / find_edge(echoes.sigma)))
+    distance = np.abs(log(echoes.sigma / find_edge(echoes.sigma)))
     order = np.argsort(distance, kind="stable")
     near = int(np.count_nonzero(distance < NARROWEST))
     order = order[: max(min(len(echoes) // 2, near), ENOUGH_TO_LEARN)]

@@ -10,11 +10,12 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import MAD_TO_STD, SQRT_PI
+from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import promise_echoes
 from wavebatch.kernels.fit.problem import Settings
+from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.candidates import samples_of
@@ -22,7 +23,7 @@ from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW
-from wavebatch.surveying.measuring.residuals import subtract_echoes
+from wavebatch.surveying.measuring.residuals import find_common, render_own, subtract_echoes
 
 MISFIT_QUANTILE = 0.8
 """Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target."""
@@ -30,8 +31,17 @@ MISFIT_QUANTILE = 0.8
 SCATTERED = 1.4
 """The strongest echoes miss the pulse by so much more than those at the quantile: receivers compress the highest."""
 
+COMMON_QUANTILE = 0.95
+"""The same share of what echoes of about one height have in common: the strongest miss the pulse most."""
+
+CLIPPED = 0.1
+"""Share of clipped waveforms from which no such bound holds: what is clipped misses the pulse by more than the rest."""
+
 NOISE_PROMISE = 8.0
 """Fall of chi2 that noise alone promises: the best of some twenty places, exceeded by a fifth of right fits."""
+
+NORMAL_BELOW = 0.0228, 0.1587
+"""Shares of normal values that lie two standard deviations, and one, or more below their mean."""
 
 CORE_REACH = 4.0
 """Widths of the pulse around an echo in which its misfit is looked for; beyond them it is the tail's."""
@@ -50,6 +60,7 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
     ----------
     block : WaveformBlock
     system : SystemPulse
+        Its misfit is the least: 0, or that of a known sensor.
     strong : EchoTable
         The strongest single echoes that no target has widened, one per waveform.
 
@@ -63,8 +74,9 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
     -----
     Each strong echo is fitted alone; a score test says how much chi2 one more echo would gain. A wrong pulse promises
     the same share of the energy for all of them, a second target for a few: the share that MISFIT_QUANTILE of them
-    stay below is the pulse's. Receivers compress high amplitudes, so that echoes of middle strength fit better than
-    strong ones (docs/algorithms.md R3, R5).
+    stay below is the pulse's. In a canopy most of them have a second target, but at another lag in every waveform. So
+    the misfit is at most what echoes of about one height leave in common at every lag. Receivers compress high
+    amplitudes, so that echoes of middle strength fit better than strong ones (docs/algorithms.md R3, R5).
     """
     if len(strong) < FEW:
         return system
@@ -73,17 +85,20 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
     noise = pooled_noise(part, system)
     fitted = adaptive(part, noise, system, replace(strong, waveform=rows), max_echoes=1, significance=0.0)
     fitted = fitted.take(find_strongest(fitted, len(part))[0])
-    promise = _promise(part, noise, system, fitted)
-    ratio = fitted.amplitude.astype(np.float64) / system.noise_std
-    energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
-    share = (promise - NOISE_PROMISE) / energy
     misfit = 0.0
-    if len(share) >= FEW:
-        misfit = SCATTERED * float(np.sqrt(max(np.quantile(share, MISFIT_QUANTILE), 0.0)))
-    return replace(system, misfit=misfit, tail_misfit=_measure_tail(part, system, fitted))
+    if len(fitted) >= FEW:
+        ratio = fitted.amplitude.astype(np.float64) / system.noise_std
+        energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
+        every = (_promise(part, samples_of(part, noise), system, fitted) - NOISE_PROMISE) / energy
+        share = np.quantile(every, MISFIT_QUANTILE)
+        if np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) < CLIPPED:
+            share = min(share, np.quantile(_common_promise(part, noise, system, fitted) / energy, COMMON_QUANTILE))
+        misfit = SCATTERED * float(np.sqrt(max(share, 0.0)))
+    # A known sensor's pulse changes from shot to shot: of that echoes of a strip have nothing in common.
+    return replace(system, misfit=max(misfit, system.misfit), tail_misfit=_measure_tail(part, system, fitted))
 
 
-def _promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+def _promise(part: WaveformBlock, samples: Samples, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
     """Fall of chi2 (m,) that one more echo promises near each echo, the only one of its waveform."""
     spacing = part.spacing
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
@@ -98,7 +113,20 @@ def _promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: Ech
     amplitude, time, width = main.T
     settings = Settings(*limits, shape, clip_level(part, system), system.noise_gain)
     fitted = Candidates(windows.waveform, time, amplitude, width)
-    return promise_echoes(samples_of(part, noise), fitted, windows, settings)
+    return promise_echoes(samples, fitted, windows, settings)
+
+
+def _common_promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+    """The same for waveforms of the pulse and of what all echoes of about one height leave of it beyond chance."""
+    residual = subtract_echoes(part, system, echoes)[echoes.waveform] / echoes.amplitude[:, None]
+    lag = np.arange(residual.shape[1]) - (echoes.time / part.spacing)[:, None]
+    lag /= (echoes.sigma / part.spacing)[:, None]
+    near = (np.abs(lag) < CORE_REACH) & np.isfinite(residual)
+    height = np.broadcast_to(echoes.amplitude[:, None], lag.shape)[near]
+    common, _, error = find_common(residual[near].astype(np.float64), lag[near], height, CORE_REACH)
+    drawn, (row, place) = render_own(part, system, echoes, echoes.waveform, len(part)), np.nonzero(near)
+    drawn[echoes.waveform[row], place] += np.sign(common) * np.maximum(np.abs(common) - error, 0.0) * height
+    return _promise(part, Samples(drawn, np.zeros(len(part), np.float32), noise.std), system, echoes)
 
 
 def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[tuple[float, float], ...]:
@@ -116,9 +144,10 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
         here = left[(lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)]
         if abs(place) < 3 or len(here) < ENOUGH_TO_LEARN:
             continue
-        middle = np.median(here)
-        spread = MAD_TO_STD * np.median(np.abs(here - middle)) if len(here) else 0.0
-        share = abs(middle) + 2 * np.sqrt(max(spread**2 - expected**2, 0.0))
+        # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
+        lowest, low = np.quantile(here, NORMAL_BELOW)
+        spread = max(low - lowest, expected)
+        share = abs(low + spread) + 2 * np.sqrt(spread**2 - expected**2)
         if share > LEAST_TAIL:
             profile.append((float(place * system.sigma_ref), float(share)))
     return tuple(profile)

@@ -11,8 +11,10 @@ from itertools import combinations
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
+from wavebatch.core.order import group_medians
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.kernels.signal.noise import residual_noise
@@ -215,28 +217,54 @@ def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> np.ndarray:
     first three Hermite functions, whose squares add up to the leverage of a sample.
     """
     z = lag.astype(np.float64) ** 2
-    leverage = np.exp(-z) / np.sqrt(np.pi) * (1 + 2 * z + 0.5 * (2 * z - 1) ** 2) / width
+    leverage = exp(-z) / np.sqrt(np.pi) * (1 + 2 * z + 0.5 * (2 * z - 1) ** 2) / width
     return np.minimum(leverage, 0.9)
+
+
+def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: float) -> tuple[np.ndarray, ...]:
+    """What all echoes of about one height leave at one lag: the pulse's misfit, which a receiver may change with the
+    height. Second targets are at another lag in every waveform.
+
+    Parameters
+    ----------
+    values : float (k,)
+        Residuals, in any unit.
+    lag : float (k,)
+        After the echo's centre [its widths], up to `reach` on either side.
+    height : float (k,)
+        Of the echo.
+    reach : float
+        [widths].
+
+    Returns
+    -------
+    common : float64 (k,)
+        Median of the values at this lag and height.
+    number : int64 (k,)
+        Values that it comes from.
+    error : float64 (k,)
+        Its standard error, from their scatter.
+    """
+    classes = min(max(len(np.unique(height)) // GROWTH_CLASS, 1), 8)
+    bins = int(2 * reach / GROWTH_STEP)
+    place = np.clip(((lag + reach) / GROWTH_STEP).astype(np.int64), 0, bins - 1)
+    place += bins * np.searchsorted(np.quantile(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
+    number = np.bincount(place)
+    middle, spread = group_medians(values, place)
+    error = MEDIAN_ERROR * spread / np.sqrt(np.maximum(number, 1))
+    return middle[place], number[place], error[place]
 
 
 def _chance_part(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, core: np.ndarray) -> np.ndarray:
     """Residuals at `core` (mask) less what all echoes of about one height leave at one lag (k,).
 
-    That part is the pulse's misfit. It changes with the height where a receiver compresses, and would look like noise
-    that grows with the signal: one of 0.05 DN2/DN on a strip of Leica, whose noise does not grow.
+    That part changes with the height where a receiver compresses, and would look like noise that grows with the signal:
+    one of 0.05 DN2/DN on a strip of Leica, whose noise does not grow.
     """
-    height = model.max(axis=1)
-    classes = min(max(len(height) // GROWTH_CLASS, 1), 8)
-    of_height = np.searchsorted(np.quantile(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
-    bins = int(2 * GROWTH_REACH / GROWTH_STEP)
-    place = np.clip(((lag[core] + GROWTH_REACH) / GROWTH_STEP).astype(np.int64), 0, bins - 1)
-    place += bins * np.broadcast_to(of_height[:, None], lag.shape)[core]
+    height = np.broadcast_to(model.max(axis=1)[:, None], lag.shape)[core]
     values = residual[core].astype(np.float64)
-    middle, number = np.zeros(bins * classes), np.bincount(place, minlength=bins * classes)
-    order = np.argsort(place, kind="stable")
-    for cell, part in enumerate(np.split(values[order], np.cumsum(number)[:-1])):
-        middle[cell] = np.median(part) if len(part) else 0.0
-    return (values - middle[place]) * np.sqrt(number[place] / np.maximum(number[place] - 1, 1))
+    common, number, _ = find_common(values, lag[core], height, GROWTH_REACH)
+    return (values - common) * np.sqrt(number / np.maximum(number - 1, 1))
 
 
 def _fit_growth(terms: np.ndarray, values: np.ndarray, columns: tuple[int, ...]) -> tuple[np.ndarray, float]:
@@ -245,14 +273,19 @@ def _fit_growth(terms: np.ndarray, values: np.ndarray, columns: tuple[int, ...])
     The best of all subsets that need no bound. (scipy's nnls finds the same, but to import it takes as long as half a
     survey.)
     """
-    best, least = np.zeros(terms.shape[1]), float(values @ values)
+    best, least = np.zeros(terms.shape[1]), float(np.einsum("k,k->", values, values))
     for number in range(1, len(columns) + 1):
         for part in combinations(columns, number):
-            factors = np.linalg.lstsq(terms[:, part], values, rcond=None)[0]
-            rest = values - terms[:, part] @ factors
-            if (factors >= 0).all() and rest @ rest < least:
-                best, least = np.zeros(terms.shape[1]), float(rest @ rest)
-                best[list(part)] = factors
+            chosen = terms[:, part]
+            size = np.sqrt(np.einsum("kp,kp->p", chosen, chosen))
+            chosen = chosen / size
+            normal = np.einsum("kp,kq->pq", chosen, chosen)
+            factors = solve(normal, np.einsum("kp,k->p", chosen, values))
+            rest = values - np.einsum("kp,p->k", chosen, factors)
+            cost = float(np.einsum("k,k->", rest, rest))
+            if (factors >= 0).all() and cost < least:
+                best, least = np.zeros(terms.shape[1]), cost
+                best[list(part)] = factors / size
     return best, least
 
 
@@ -278,7 +311,7 @@ def _noise_gain(
     chi2 = [min(rest / chance, 1e6) for _, rest in fits]
     # The linear law alone, or both, as the data are likelier; and by degrees from 3 to 6 sigma: at a limit, tiles of
     # one strip would fall on either side.
-    share = 1 / (1 + np.exp(np.clip(0.5 * (chi2[1] - chi2[2]), -50, 50)))
+    share = 1 / (1 + exp(np.clip(0.5 * (chi2[1] - chi2[2]), -50, 50)))
     gain = share * fits[1][0][1] + (1 - share) * fits[3][0][1]
     sigma = np.sqrt(max(share * (chi2[0] - chi2[1]) + (1 - share) * (chi2[2] - chi2[3]), 0.0))
     # Of coloured noise the fit takes away more, at all levels alike, and `std` is what it does to a pulse: the growth

@@ -19,6 +19,7 @@ from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
+from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.flags import RINGING_REACH
@@ -46,11 +47,16 @@ of these widths, from which it is taken: a pulse that serves as well stretched i
 right one in strips of all sizes. Where the strip's is a guess, the second factor alone must be STEEP: any pulse with a
 tail serves better than a guess."""
 
-LESS = 0.9
-"""Cost of a strip's pulse drawn together, over that of it as it is, from which it is taken."""
-
-SHRUNK = 0.7, 0.75, 0.8, 0.85, 0.9, 0.95
+SHRUNK = 0.85, 0.7
 """Widths, over that of the isolated echoes, at which a strip's pulse is tried where isolated echoes are canopies."""
+
+WORTH, HOPELESS = 1.04, 1.2
+"""Cost of a Gaussian, over that of a learned pulse with tail or skew, up to which it is taken. In simulated canopies it
+is .9 to 1.03 where the pulse is one, and from 1.06 where it has a tail of 6 %; in strips of real sensors 1.28.
+From HOPELESS on other widths do not make up for it."""
+
+BEYOND = 3.0
+"""Standard errors by which waveforms must cost more with one pulse than with another for it to be worse."""
 
 NEARLY = 1.03
 """Cost of a narrower known pulse, over that of a learned one, up to which it is taken where it is STEEP: slopes within
@@ -213,39 +219,68 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
     -----
     A pulse is right if it explains all waveforms, not only isolated echoes, with the fewest echoes and the least misfit
     (`measure_cost`): in a canopy isolated echoes are several, and a pulse learned from them is too wide. Nothing is
-    tried where a learned pulse leaves less than SHORT per echo. A known pulse of the strip's spacing is taken if it
-    costs less than the strip's, and less than it does when it is stretched or drawn together (SURE); if it is narrower
-    and costs hardly more (NEARLY); or where the strip's must be drawn together and costs hardly less then (ALMOST).
+    tried where a learned pulse leaves less than SHORT per echo. Else the simplest and widest is taken of those that
+    cost no more (`_simplify`). A known pulse of the strip's spacing is taken if it costs less than the strip's, and
+    less than it does when it is stretched or drawn together (SURE); if it is narrower and costs hardly more (NEARLY);
+    or where the strip's must be drawn together and costs hardly less then (ALMOST).
     """
     part = block.rows(np.unique(np.linspace(0, len(block) - 1, COMPARED).astype(np.int64)))
     own = measure_cost(part, system)
     if own.echoes < LEAST_ECHOES or (learned and own.misfit < SHORT * own.echoes):
         return system
-    shrunk = [scale_pulse(system, scale) for scale in SHRUNK] if learned else []
-    costs = [(measure_cost(part, pulse).typical, "", pulse) for pulse in shrunk]
-    best = min(costs, default=None, key=lambda one: one[0])
-    if best is not None and best[0] > LESS * own.typical:
-        best = None
+    pulse, cost = _simplify(part, system, own) if learned else (system, own)
+    drawn = pulse.sigma_ref < system.sigma_ref
     tried = []
     for known in known_systems():
         ratio = known.system.sigma_ref / system.sigma_ref
         if abs(block.spacing / known.spacing - 1) < SAME_SPACING and WIDTHS[0] < ratio < WIDTHS[1]:
             taken = with_pulse(system, known.system)
-            cost = measure_cost(part, taken).typical
-            if cost < NEARLY * own.typical:
-                rest = min(measure_cost(part, scale_pulse(taken, scale)).typical for scale in SCALES)
-                sure = own.typical * rest > SURE * cost**2 and (learned or rest > STEEP * cost)
-                sure &= cost < own.typical
-                sure |= learned and ratio < 1 and rest > STEEP * cost
-                sure |= best is not None and cost < ALMOST * best[0]
-                tried += [(cost, known.name, taken)] if sure else []
+            found = measure_cost(part, taken)
+            if found.typical < NEARLY * own.typical and (
+                (drawn and found.typical < ALMOST * cost.typical)
+                or _is_sure(part, taken, found.typical, own.typical, learned=learned, narrower=ratio < 1)
+            ):
+                tried.append((found.typical, known.name, taken, found))
     if tried:
-        best = min(tried, key=lambda one: one[:2])
-    if best is None:
-        return system
-    cost, _, pulse = best
-    figures |= {"pulse_cost": cost, "isolated_pulse_cost": own.typical}
+        _, _, pulse, cost = min(tried, key=lambda one: one[:2])
+    if pulse is not system:
+        figures |= {"pulse_cost": cost.typical, "isolated_pulse_cost": own.typical}
     return pulse
+
+
+def _simplify(part: WaveformBlock, system: SystemPulse, own: Cost) -> tuple[SystemPulse, Cost]:
+    """The simplest and widest pulse that explains waveforms as well as the learned one, and its cost.
+
+    In a canopy the neighbours of echoes become a tail of the learned pulse, and their sums widen it.
+    """
+    tried = [(own, system), *_draw_together(part, system)]
+    if system.components or system.kappa:
+        plain = replace(system, components=(), kappa=0.0, ringing=0.0)
+        bare = [(measure_cost(part, plain), plain)]
+        if bare[0][0].typical < HOPELESS * own.typical:
+            bare += _draw_together(part, plain)
+        if _least(bare).typical < WORTH * _least(tried).typical:
+            tried = bare
+    least = _least(tried)
+    return next((pulse, cost) for cost, pulse in tried if cost.exceeds(least) < BEYOND)
+
+
+def _draw_together(part: WaveformBlock, system: SystemPulse) -> list[tuple[Cost, SystemPulse]]:
+    narrower = (scale_pulse(system, scale) for scale in SHRUNK)
+    return [(measure_cost(part, pulse), pulse) for pulse in narrower]
+
+
+def _least(tried: list[tuple[Cost, SystemPulse]]) -> Cost:
+    return min((cost for cost, _ in tried), key=lambda cost: cost.typical)
+
+
+def _is_sure(
+    part: WaveformBlock, taken: SystemPulse, cost: float, own: float, *, learned: bool, narrower: bool
+) -> bool:
+    """Whether a known pulse serves better than the strip's, of cost `own`, and only at its width."""
+    rest = min(measure_cost(part, scale_pulse(taken, scale)).typical for scale in SCALES)
+    steep = rest > STEEP * cost
+    return (learned and narrower and steep) or (cost < own and own * rest > SURE * cost**2 and (learned or steep))
 
 
 class Cost(NamedTuple):
@@ -254,9 +289,18 @@ class Cost(NamedTuple):
     misfit: float
     """Sum of squares left beyond the noise of quiet samples, over the noise of a pulse squared."""
     echoes: int
-    typical: float
-    """Of a waveform: its misfit, and for each echo what it has to explain; the geometric mean of waveforms, so that the
-    few that no pulse explains do not decide."""
+    logarithm: np.ndarray
+    """Of each waveform's cost: its misfit, and for each echo what it has to explain (n,)."""
+
+    @property
+    def typical(self) -> float:
+        """Geometric mean of the waveforms, so that the few that no pulse explains do not decide."""
+        return float(exp(np.mean(self.logarithm)))
+
+    def exceeds(self, other: Cost) -> float:
+        """Standard errors by which waveforms cost more than with another pulse; 0 for the same."""
+        more = self.logarithm - other.logarithm
+        return float(np.mean(more) / max(np.std(more) / np.sqrt(len(more)), 1e-12))
 
 
 def measure_cost(block: WaveformBlock, system: SystemPulse) -> Cost:
@@ -267,7 +311,7 @@ def measure_cost(block: WaveformBlock, system: SystemPulse) -> Cost:
     samples = left.shape[1] if block.missing is None else (~block.missing).sum(axis=1)
     misfit = (np.einsum("ns,ns->n", left, left) - samples * noise**2) / system.noise_std**2
     cost = np.maximum(misfit, 0.0) + system.acceptance * (1 + echoes.count(len(block)))
-    return Cost(max(float(np.sum(misfit)), 0.0), len(echoes), float(np.exp(np.mean(np.log(cost)))))
+    return Cost(max(float(np.sum(misfit)), 0.0), len(echoes), log(cost))
 
 
 def scale_pulse(system: SystemPulse, ratio: float) -> SystemPulse:

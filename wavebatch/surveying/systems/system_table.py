@@ -65,6 +65,9 @@ PATTERN_LIMITS = ((-1e6, 1e6),)
 TAIL_LIMITS = ((-1e5, 1e5), (0.0, 10.0))
 """Allowed lag [ns] and share of the misfit of a tail."""
 
+SEAM_LIMITS = ((3, 1e9), (1, 1e9))
+"""Allowed samples of a packet and place of its seam."""
+
 HIDDEN_LIMITS = ((0.0, 1e4), (0.0, 10.0), (0.0, 10.0))
 """Allowed excess variance of a width, and variance of times over it, of lone and other echoes."""
 
@@ -83,10 +86,11 @@ _FIGURE_LIMITS = {
 """Allowed figures of a survey by the ends of their names; others are any numbers."""
 
 _NOISE, _COMPONENTS, _DIGITIZERS, _INDEX = "noise_by_kind_dn", "components", "digitizers", "index"
-_CORRELATION, _TAIL, _PATTERN, _HIDDEN = "correlation", "tail_misfit", "pattern_dn", "hidden"
+_CORRELATION, _TAIL, _PATTERN, _SEAMS, _HIDDEN = "correlation", "tail_misfit", "pattern_dn", "seams", "hidden"
 _ABOUT_COMPONENTS = "(weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first"
 _ABOUT_CORRELATION = "of the noise of two samples 1, 2, ... spacings apart; empty: white noise"
 _ABOUT_PATTERN = "offsets that repeat along the samples, taken off; empty: none"
+_ABOUT_SEAMS = "(samples of a packet, sample of it that was interpolated between two recordings)"
 _ABOUT_HIDDEN = "(excess variance of a width, that of times over it for lone and other echoes) by unseen neighbours"
 _ABOUT_TAIL = "(lag [ns], share of the amplitude) that the pulse leaves before and after strong echoes"
 REMEDY = "`wavebatch survey STRIP -o FILE` writes all"
@@ -108,6 +112,7 @@ def _describe_pulse(system: SystemPulse) -> dict[str, Any]:
         _PATTERN: [float(value) for value in system.pattern],
         _COMPONENTS: [[float(value) for value in component] for component in system.components],
         _TAIL: [[float(value) for value in row] for row in system.tail_misfit],
+        **({_SEAMS: [list(seam) for seam in sorted(system.seams.items())]} if system.seams else {}),
         _HIDDEN: [[float(value) for value in row] for row in system.hidden],
     }
 
@@ -116,7 +121,7 @@ def comment_system() -> dict[str, str]:
     """Return the comments of a file by dotted key."""
     meanings = {key: quantity.meaning for key, quantity in QUANTITIES.items()}
     meanings |= {_COMPONENTS: _ABOUT_COMPONENTS, _CORRELATION: _ABOUT_CORRELATION, _TAIL: _ABOUT_TAIL}
-    meanings |= {_PATTERN: _ABOUT_PATTERN, _HIDDEN: _ABOUT_HIDDEN}
+    meanings |= {_PATTERN: _ABOUT_PATTERN, _SEAMS: _ABOUT_SEAMS, _HIDDEN: _ABOUT_HIDDEN}
     places = ("system", f"system.{_DIGITIZERS}")
     comments = {f"{place}.{key}": meaning for place in places for key, meaning in meanings.items()}
     comments[places[1]] = "a digitizer that records otherwise"
@@ -137,7 +142,8 @@ def read_system(table: TomlTable) -> SystemPulse:
 def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
     """A pulse from a table that may hold one extra key."""
     needed = (*(key for key, quantity in QUANTITIES.items() if not quantity.optional), _COMPONENTS, _NOISE)
-    table.check_keys((*QUANTITIES, _COMPONENTS, _NOISE, _CORRELATION, _TAIL, _PATTERN, _HIDDEN, extra), needed, REMEDY)
+    keys = (*QUANTITIES, _COMPONENTS, _NOISE, _CORRELATION, _TAIL, _PATTERN, _SEAMS, _HIDDEN, extra)
+    table.check_keys(keys, needed, REMEDY)
     values = {
         quantity.field: table.number(key, quantity.low, quantity.high)
         for key, quantity in QUANTITIES.items()
@@ -151,6 +157,7 @@ def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
         pattern=tuple(row[0] for row in _read_rows(table, _PATTERN, PATTERN_LIMITS, "numbers")),
         components=_read_components(table),
         tail_misfit=_read_rows(table, _TAIL, TAIL_LIMITS, "[lag, share]"),
+        seams={int(length): int(at) for length, at in _read_rows(table, _SEAMS, SEAM_LIMITS, "[samples, sample]")},
         hidden=_read_rows(table, _HIDDEN, HIDDEN_LIMITS, "[excess, lone, others]"),
     )
 

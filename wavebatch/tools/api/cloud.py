@@ -56,7 +56,7 @@ class _TableReader(ColumnReader):
     """A ColumnReader whose pieces have several columns, of `dtype`."""
 
     def __init__(self, path: Path, columns: Sequence[str] | None) -> None:
-        super().__init__(path, None)
+        super().__init__(path)
         names = self._name_columns()
         chosen = names if columns is None else columns
         try:

@@ -12,6 +12,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
+from wavebatch.kernels.signal.runs import lobe_edges
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 from wavebatch.tools.simulate.pulses import PulseModel, main_lobe, spread_lobes
 from wavebatch.tools.simulate.render import Recording, paint_echoes
@@ -22,13 +23,12 @@ _STEP = 0.02
 
 
 def describe_truth(truth: EchoTable, pulse: PulseModel) -> EchoTable:
-    """The truth with the time of the peak and, as sigma, the full width at half maximum over 2.354820.
+    """The truth with, as sigma, the full width at half maximum over 2.354820.
 
-    Simulation gives time and sigma of the main lobe; decomposers report those of the whole pulse. For a Gaussian they
-    are equal.
+    Simulation gives the sigma of the main lobe; decomposers report that of the whole pulse. For a Gaussian they are
+    equal.
     """
-    delay, sigma = _measure(pulse, truth.sigma.astype(np.float64))
-    return replace(truth, time=truth.time + delay, sigma=sigma.astype(np.float32))
+    return replace(truth, sigma=_measure(pulse, truth.sigma.astype(np.float64)).astype(np.float32))
 
 
 def effective_noise(recording: Recording) -> float:
@@ -79,12 +79,9 @@ def _differentiate(recording: Recording, truth: EchoTable) -> tuple[np.ndarray, 
     step = _STEP * recording.pulse.sigma
     echo = paint(truth.time, sigma)
     by_time = (paint(truth.time + step, sigma) - paint(truth.time - step, sigma)) / (2 * step)
-    delay, _ = _measure(recording.pulse, sigma)
-    sides = []
-    for width in (sigma + step, sigma - step):
-        moved, whole = _measure(recording.pulse, width)
-        sides.append((paint(truth.time + delay - moved, width), whole))
-    by_sigma = (sides[0][0] - sides[1][0]) / np.maximum(sides[0][1] - sides[1][1], 1e-9)[:, None]
+    wider, narrower = sigma + step, sigma - step
+    grown = _measure(recording.pulse, wider) - _measure(recording.pulse, narrower)
+    by_sigma = (paint(truth.time, wider) - paint(truth.time, narrower)) / np.maximum(grown, 1e-9)[:, None]
     return np.stack([by_time, echo / amplitude[:, None], by_sigma], axis=1).astype(np.float64), echo
 
 
@@ -108,14 +105,14 @@ def _invert(columns: np.ndarray) -> np.ndarray:
     return np.where(known, np.sqrt(np.where(known, variance, 1.0)) / np.where(scale > 0, scale, 1.0), np.inf)
 
 
-def _measure(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Delay of the peak after the truth's time and full width at half maximum over 2.354820 [ns], each (m,)."""
+def _measure(pulse: PulseModel, sigma: np.ndarray) -> np.ndarray:
+    """Full width at half maximum over 2.354820 of true echoes [ns], (m,)."""
     if not pulse.lobes:
         skew = abs(pulse.kappa)
         wider = 2 * np.sinh(skew * FWHM_PER_SIGMA / 2) / (skew * FWHM_PER_SIGMA) if skew > 1e-6 else 1.0
-        return np.zeros_like(sigma), sigma * wider
+        return sigma * wider
     if not len(sigma):
-        return sigma, sigma
+        return sigma
     grid = np.linspace(sigma.min(), max(sigma.max(), 1.001 * sigma.min()), _GRID)
     step = grid[0] / 100
     x = np.arange(-int(4 * grid[-1] / step), int(6 * grid[-1] / step))[:, None] * step
@@ -123,19 +120,5 @@ def _measure(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarr
     total = np.zeros((len(x), _GRID))
     for number, (start, height, width) in enumerate(spread_lobes(pulse, 0 * ones, ones, grid)):
         total += height * main_lobe((x - start) / width, pulse.kappa if number == 0 else 0.0)
-    peak, wide = np.array([_measure_curve(x[:, 0], total[:, i]) for i in range(_GRID)]).T
-    return np.interp(sigma, grid, peak), np.interp(sigma, grid, wide / FWHM_PER_SIGMA)
-
-
-def _measure_curve(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Place of the peak and full width at half maximum around it of one finely sampled curve."""
-    top = int(np.argmax(y))
-    bend = y[top - 1] - 2 * y[top] + y[top + 1]
-    shift = 0.5 * (y[top - 1] - y[top + 1]) / bend if bend < 0 else 0.0
-    half = 0.5 * y[top]
-    right = top + int(np.argmax(y[top:] < half))
-    left = top - int(np.argmax(y[top::-1] < half))
-    step = x[1] - x[0]
-    end = x[right] - step * (half - y[right]) / (y[right - 1] - y[right])
-    start = x[left] + step * (half - y[left]) / (y[left + 1] - y[left])
-    return float(x[top] + shift * step), float(end - start)
+    edges = np.array([lobe_edges(x[:, 0], curve, 0.5 * curve.max()) for curve in total.T])
+    return np.interp(sigma, grid, np.diff(edges, axis=1)[:, 0] / FWHM_PER_SIGMA)

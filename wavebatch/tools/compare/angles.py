@@ -12,10 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.cloud.angle_reader import ANGLE_DTYPE, NORMALS, WIDTHS, AngleReader
+from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time
 from wavebatch.tools.compare.differences import SPEED
 from wavebatch.tools.compare.pairing import check_tolerance, pair_echoes
+
+WIDTHS, NORMALS = "incidence_angle", "incidence_angle_normals"
+_COLUMNS = (WIDTHS, f"{WIDTHS}_err", NORMALS, f"{NORMALS}_err")
+ANGLE_DTYPE = np.dtype([("gps_time", "<f8"), ("xyz", "<f8", 3), *((name, "<f8") for name in _COLUMNS)])
+"""What is read of clouds: angles and their errors [deg]."""
 
 BIN, DIFFERENCE_BIN = 5.0, 2.0
 """Bin widths of the histograms [deg]: of angles, and of their differences."""
@@ -65,13 +70,13 @@ def compare_angles(a: Path, b: Path | None = None, *, tolerance_ns: float = 1.0)
     check_tolerance(tolerance_ns)
     tally = _Tally()
     if b is None:
-        with AngleReader(a) as cloud:
+        with CloudReader(a, ANGLE_DTYPE) as cloud:
             _demand(cloud, WIDTHS, NORMALS)
             for rows in cloud.read_pieces():
                 tally.add(rows, rows)
         return tally.finish(str(a), None)
-    with AngleReader(a) as first, AngleReader(b) as second:
-        turned = WIDTHS not in first.has or NORMALS not in second.has
+    with CloudReader(a, ANGLE_DTYPE) as first, CloudReader(b, ANGLE_DTYPE) as second:
+        turned = WIDTHS not in first.columns or NORMALS not in second.columns
         widths, normals = (second, first) if turned else (first, second)
         _demand(widths, WIDTHS)
         _demand(normals, NORMALS)
@@ -79,14 +84,14 @@ def compare_angles(a: Path, b: Path | None = None, *, tolerance_ns: float = 1.0)
     return tally.finish(str(a), str(b))
 
 
-def _demand(cloud: AngleReader, *columns: str) -> None:
-    missing = [name for name in columns if name not in cloud.has]
+def _demand(cloud: CloudReader, *columns: str) -> None:
+    missing = [name for name in columns if name not in cloud.columns]
     if missing:
         stages = " and ".join(f"attribute.{name}" for name in missing)
         raise InputError(f"{cloud.path}: has no column {' nor '.join(missing)}; run the strip with stage {stages}")
 
 
-def _pair(widths: AngleReader, normals: AngleReader, reach: float, tally: _Tally) -> None:
+def _pair(widths: CloudReader, normals: CloudReader, reach: float, tally: _Tally) -> None:
     """Adds the echoes that both clouds have; pulses are sorted into buckets, so that memory is bounded."""
     for cloud in (widths, normals):
         if not cloud.has_gps_time:

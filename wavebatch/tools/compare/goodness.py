@@ -13,6 +13,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import Step
+from wavebatch.stages.clean import sample_noise
 from wavebatch.stages.decompose.rebuild import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
 
@@ -35,7 +36,8 @@ def measure_fit(
     """E and E0 of each waveform, f8 (n,); NaN without an echo, or if the model of the decomposer is not known.
 
     f is the sum of the fitted pulses, y the samples above the baseline; samples at the digitizer's limit are left out
-    of both. E0 = n sn^2 / |f|^2 with n samples. Source: Wang, Wang and Tseng eq. 5; docs/algorithms.md 1.2.
+    of both. E0 = n sn^2 / |f|^2 with n samples and sn of one sample: what fits and thresholds use is larger where noise
+    is coloured. Source: Wang, Wang and Tseng eq. 5; docs/algorithms.md 1.2.
     """
     model = rebuild_waveforms(block, system, decomposer, echoes)
     if model is None:
@@ -47,7 +49,8 @@ def measure_fit(
     residual = np.where(used, block.samples - noise.level.astype(np.float64) - model, 0.0)
     energy = np.square(model).sum(axis=1)
     energy[energy <= 0] = np.nan
-    floor = np.count_nonzero(used, axis=1) * np.square(noise.std.astype(np.float64))
+    std = noise.std.astype(np.float64) * (sample_noise(system) / system.noise_std)
+    floor = np.count_nonzero(used, axis=1) * np.square(std)
     return np.square(residual).sum(axis=1) / energy, floor / energy
 
 

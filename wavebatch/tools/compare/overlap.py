@@ -14,15 +14,27 @@ from pathlib import Path
 
 import numpy as np
 
+from wavebatch.core.echoes import PASSED_THROUGH, UNCLEAN
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
-from wavebatch.files.cloud.overlap_reader import (
-    LIGHT_COLUMNS,
-    OVERLAP_COLUMNS,
-    OVERLAP_DTYPE,
-    OverlapReader,
-)
+from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, choose_size, hash_squares, measure_ties
+
+LIGHT_COLUMNS = ("backscatter_coefficient", "relative_backscatter")
+"""Columns that depend on the angle of incidence, as the cosine does on matt surfaces."""
+
+OVERLAP_COLUMNS = (*LIGHT_COLUMNS, "reflectance", "relative_reflectance")
+"""These, and columns from which the angle is taken off."""
+
+ANGLE = "incidence_angle_normals"
+
+OVERLAP_DTYPE = np.dtype(
+    [
+        ("xyz", "<f8", 3), ("scan_angle", "<f4"), (ANGLE, "<f4"), ("total", "u1"), ("flags", "<u2"),
+        *((f"{name}{end}", "<f4") for name in OVERLAP_COLUMNS for end in ("", "_err")),
+    ]  # fmt: skip
+)
+"""What is read of clouds."""
 
 MOST_ECHOES = 1_000_000
 """Most echoes of a cloud that are used; they come from whole squares of 10 m, spread by chance."""
@@ -83,8 +95,8 @@ def compare_overlap(a: Path, b: Path) -> OverlapComparison:
     """
     with _open_both(a, b) as readers:
         rows = [_read(reader, other) for reader, other in (readers, readers[::-1])]
-        shared = readers[0].has & readers[1].has
-        angles = "normals" if "incidence_angle_normals" in shared else "scan angle"
+        shared = set(readers[0].columns) & set(readers[1].columns)
+        angles = "normals" if ANGLE in shared else "scan angle"
     if not all(map(len, rows)):
         raise InputError(f"{a} and {b}: have no single echoes in a common area; they do not overlap")
     origin = rows[0]["xyz"][0]
@@ -107,17 +119,18 @@ def compare_overlap(a: Path, b: Path) -> OverlapComparison:
 
 
 @contextmanager
-def _open_both(a: Path, b: Path) -> Iterator[tuple[OverlapReader, OverlapReader]]:
-    with OverlapReader(a) as first, OverlapReader(b) as second:
+def _open_both(a: Path, b: Path) -> Iterator[tuple[CloudReader, CloudReader]]:
+    with CloudReader(a, OVERLAP_DTYPE) as first, CloudReader(b, OVERLAP_DTYPE) as second:
         yield first, second
 
 
-def _read(reader: OverlapReader, other: OverlapReader) -> np.ndarray:
+def _read(reader: CloudReader, other: CloudReader) -> np.ndarray:
     """Single echoes of a cloud inside the box of the other, array of OVERLAP_DTYPE."""
     low, high = (np.array(corner[:2]) for corner in other.bounds)
     share = min(1.0, MOST_ECHOES / max(reader.point_count, 1))
     parts = [np.empty(0, OVERLAP_DTYPE)]
     for rows in reader.read_pieces():
+        rows = rows[(rows["total"] <= 1) & ((rows["flags"] & np.uint16(PASSED_THROUGH | UNCLEAN)) == 0)]
         near = ((rows["xyz"][:, :2] >= low) & (rows["xyz"][:, :2] <= high)).all(axis=1)
         near &= hash_squares(rows["xyz"]) < share
         parts.append(rows[near])
@@ -128,7 +141,7 @@ def _take_off_angle(rows: np.ndarray, name: str, angles: str) -> np.ndarray:
     """The column as a surface that faces the sensor would have it."""
     if name not in LIGHT_COLUMNS:
         return rows[name].astype(np.float64)
-    angle = rows["angle" if angles == "normals" else "scan_angle"].astype(np.float64)
+    angle = rows[ANGLE if angles == "normals" else "scan_angle"].astype(np.float64)
     angle[~(np.abs(angle) < 90)] = np.nan  # no surface is seen from there
     return rows[name] / np.cos(np.radians(angle))
 

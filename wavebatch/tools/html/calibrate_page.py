@@ -19,6 +19,9 @@ from wavebatch.tools.html.page import write_page
 
 UNIT = "1/(m2 DN ns)"
 
+MOST_DRAWN = 60
+"""Pairs that are drawn; more would be too small to read."""
+
 
 def write_calibrate_page(target: Path, flight: FlightCalibration) -> None:
     """Write the page of a calibration of one strip or of several."""
@@ -52,8 +55,13 @@ def _parts(flight: FlightCalibration, found: Calibration) -> Iterator[str]:
                   markup.percent(one.spread), markup.rounded(one.height, ".3f")]
                  for one in flight.pairs]  # fmt: skip
         head = ["a", "over b", "cells", "light %", "calibrated %", "spread %", "height m"]
-        yield markup.section("Overlaps", markup.table(head, pairs, sortable=True))
-    provenance = {"wavebatch": __version__, "strip": found.strip, "date of the strip": found.date}
+        some = flight.pairs[:MOST_DRAWN]
+        light, spread = zip(*((100 * (one.after - 1), 100 * one.spread) for one in some), strict=True)
+        chart = draw_values([f"{one.a} / {one.b}" for one in some], light, spread,
+                            title="Calibrated light of the first over the second", label="%")  # fmt: skip
+        yield markup.section("Overlaps", markup.table(head, pairs, sortable=True), figures([chart]))
+    days = {"day of the flight": found.flight or "not in the strip", "calibrated on": found.date}
+    provenance = {"wavebatch": __version__, "strip": found.strip, **days}
     yield markup.section("Provenance", markup.facts(provenance), markup.code(format_calibration(found)))
 
 

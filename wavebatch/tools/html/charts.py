@@ -185,10 +185,10 @@ def draw_map(found: Raster, note: str = "") -> str:
         add_colorbar(axes, shown, found.values, found.shown, label, length=up, flat=False, place=place)
         axes.locator_params(axis="x", nbins=4 if across > 1.5 else 1)
         axes.locator_params(axis="y", nbins=4 if up > 1.5 else 1)
-        axes.set_xlabel(f"east [{found.unit}]")
-        axes.set_ylabel(f"north [{found.unit}]")
+        axes.set_xlabel(f"east [{found.crs.unit}]")
+        axes.set_ylabel(f"north [{found.crs.unit}]")
 
-    words = f"Cells of {grid.size:g} {found.unit}; origin {west:.10g} E, {south:.10g} N{note}."
+    words = f"Cells of {grid.size:g} {found.crs.unit}; origin {west:.10g} E, {south:.10g} N{note}."
     return picture(f"{found.statistic} of {found.facts.name}", size, draw, words)
 
 

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.even_sample import EvenSample
-from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.files.cloud.columns_reader import ColumnsReader
+from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.tools.html.charts import draw_histogram, draw_map
 from wavebatch.tools.plots.raster import Raster, choose_grid, find_shown
@@ -31,7 +30,7 @@ BINS = 60
 def picture_cloud(path: Path, columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """Histograms and maps (figures) of the columns that the cloud has; raises InputError if it cannot be read."""
     sample = EvenSample(SAMPLED)
-    with ColumnsReader(path, columns, missing_ok=True) as reader:
+    with ColumnReader(path, *columns, missing_ok=True) as reader:
         for rows in reader.read_pieces():
             good = np.isfinite(rows["x"]) & np.isfinite(rows["y"])
             sample.add({"place": np.stack([rows["x"], rows["y"]], axis=1)[good], "values": rows["values"][good]})
@@ -62,7 +61,7 @@ def map_columns(path: Path, facts: Sequence[ColumnFacts], sample: EvenSample) ->
     places = seen["place"]
     box = (*places.min(axis=0).tolist(), *places.max(axis=0).tolist())
     grid = choose_grid(str(path), sample, box, None, fixed=False, most=MOST_CELLS)
-    crs, unit = describe_crs(path)
+    crs = describe_crs(path)
     row, column, inside = grid.place(*places.T)
     cell = (row * grid.columns + column)[inside]
     every = np.full(len(places), float(sample.step))
@@ -74,5 +73,5 @@ def map_columns(path: Path, facts: Sequence[ColumnFacts], sample: EvenSample) ->
         found = compute_cells(statistic, cell, values[inside], size, grid.size**2 / sample.step)
         if np.isfinite(found).any():
             found = found.reshape(grid.rows, grid.columns)
-            maps.append(Raster(one, statistic, grid, found, Tally(), 0, find_shown(found), crs, unit))
+            maps.append(Raster(one, statistic, grid, found, Tally(), 0, find_shown(found), crs))
     return maps

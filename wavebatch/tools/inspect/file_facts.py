@@ -16,10 +16,10 @@ import numpy as np
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.core.no_data import without_nan
-from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.cloud.provenance import read_provenance
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
-from wavebatch.files.las.crs import read_crs
+from wavebatch.files.las.crs import name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
 from wavebatch.files.las.point_formats import WITHOUT_WAVES, locate, read_angles, read_classes, split_numbers
@@ -29,6 +29,7 @@ from wavebatch.tools.inspect.provenance import describe_provenance
 _GPS_EPOCH = datetime(1980, 1, 6)
 _ADJUSTED = 1e9
 """Seconds that adjusted standard GPS time leaves out."""
+_WEEK = 604_800.0
 _STANDARD_TIME = 0b1
 """Bit of the global encoding: times are adjusted standard GPS time, not seconds of the week."""
 _MOST_SOURCES = 20
@@ -67,11 +68,13 @@ def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
     header = checked.header
     evlrs, _ = find_evlrs(path, header, 1000)
     day, year = header.creation
+    crs, units = read_crs(path, header)
     return {
         "las_version": "{}.{}".format(*header.version),
         "point_format": header.point_format,
         "compressed": header.compressed,
-        "crs": read_crs(path, header)[0],
+        "crs": crs,
+        "coordinates": name_units(units),
         "scales": list(header.scales),
         "offsets": list(header.offsets),
         "system_identifier": decode_text(header.system_identifier),
@@ -144,24 +147,13 @@ def _count(counter: Counter[int], values: np.ndarray) -> None:
     counter.update(dict(zip(found.tolist(), numbers.tolist(), strict=True)))
 
 
-class _RawReader(ColumnReader):
-    """A ColumnReader whose pieces are the raw records."""
-
-    def flags_of(self, raw: np.ndarray) -> np.ndarray | None:
-        """EchoFlag bits; None without such a column."""
-        return raw[self._sources["echo_flags"].name].astype(np.uint16) if self.has_flags else None
-
-    def _convert(self, raw: np.ndarray) -> np.ndarray:
-        return raw
-
-
 def _describe_points(path: Path, header: LasHeader, is_ours: bool) -> dict[str, Any]:
     """Sums over all points; counts of echoes only of a cloud with provenance, whose flags are known to be ours."""
     totals = _Totals()
-    with _RawReader(path, None) as reader:
+    with CloudReader(path, np.dtype([("flags", "<u2")])) as reader:
         has_flags = reader.has_flags and is_ours
-        for raw in reader.read_pieces():
-            totals.add(raw, header, reader.flags_of(raw) if has_flags else None)
+        for rows in reader.read_pieces():
+            totals.add(reader.records, header, rows["flags"] if has_flags else None)
     found = totals.extremes
     bounds = {}
     if found:
@@ -191,7 +183,10 @@ def _describe_time(header: LasHeader, found: tuple[float, float] | None) -> dict
     if found is None:
         return None
     standard = bool(header.global_encoding & _STANDARD_TIME)
-    times = {"least": found[0], "largest": found[1], "kind": "adjusted standard" if standard else "seconds of the week"}
+    kind = "adjusted standard" if standard else "seconds of the week"
+    if not standard and found[1] > _WEEK:
+        kind = "unknown (the header says seconds of the week, but they are too large)"
+    times = {"least": found[0], "largest": found[1], "kind": kind}
     if standard and -_ADJUSTED < found[0] <= found[1] < 4 * _ADJUSTED:
         dates = [_GPS_EPOCH + timedelta(seconds=value + _ADJUSTED) for value in found]
         times["dates_gps"] = [date.isoformat(sep=" ", timespec="seconds") for date in dates]

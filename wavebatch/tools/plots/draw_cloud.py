@@ -179,14 +179,14 @@ def draw_map(found: Raster, target: Path, *, names: tuple[str, ...], overwrite: 
         )  # fmt: skip
         length = width if flat else height
         add_colorbar(axes, shown, found.values, found.shown, found.label, length=length, flat=flat, place=place)
-        _place_ticks(axes, width, height, found.unit)
+        _place_ticks(axes, width, height, found.crs.unit)
 
 
 def _map_title(figure: Figure, found: Raster, names: tuple[str, ...], inches: float) -> str:
-    where = f"{found.statistic} in cells of {found.grid.size:g} {found.unit}"
+    where = f"{found.statistic} in cells of {found.grid.size:g} {found.crs.unit}"
     title = _title(names, found.total, found.facts.name, {"outside the map": found.outside})
     parts = [part for line in (*title.split("\n"), where) for part in line.split("   ")]
-    return fit_parts(figure, [*parts, f"CRS: {plain_text(found.crs, 90) or 'not given'}"], inches, size=10.5)
+    return fit_parts(figure, [*parts, f"CRS: {plain_text(found.crs.name, 90) or 'not given'}"], inches, size=10.5)
 
 
 def add_colorbar(

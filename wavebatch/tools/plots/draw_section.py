@@ -49,8 +49,8 @@ def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite
         axes.set_xlim(0.0, length)
         axes.set_ylim(low, high)
         axes.set_aspect(aspect)
-        axes.set_xlabel(f"along the line [{found.unit}]")
-        axes.set_ylabel(f"height [{found.unit}]")
+        axes.set_xlabel(f"along the line [{found.crs.unit}]")
+        axes.set_ylabel(f"{found.crs.upright} [{found.crs.upright_unit}]")
         axes.ticklabel_format(useOffset=False)
         space_ticks(axes.yaxis, width * tall, 0.3)
         label = ("mean of " if found.voxel else "") + found.facts.label
@@ -68,14 +68,14 @@ def _parts(found: Section, aspect: float) -> list[str]:
     drawn = "" if len(found.value) == found.inside - found.outside else f", of which {len(found.value):,} are drawn"
     parts = [
         name_clouds(found.names), found.facts.name, f"{found.inside:,} of {found.total.values:,} {kind}{drawn}",
-        f"from {x0} {y0} to {x1} {y1}", f"{found.width:.4g} {found.unit} wide",
+        f"from {x0} {y0} to {x1} {y1}", f"{found.width:.4g} {found.crs.unit} wide",
     ]  # fmt: skip
     parts += [f"{found.total.no_data:,} without data"] if found.total.no_data else []
     parts += [f"{found.total.left_out:,} left out"] if found.total.left_out else []
     parts += [f"{found.outside:,} outside"] if found.outside else []
     parts += [f"below {100 * FAINT:g} % of the scale: empty"] * (found.voxel > 0 and found.facts.name in LIGHT)
     parts.append("equal scales" if aspect == 1.0 else f"heights {aspect:g} times exaggerated")
-    return [*parts, f"CRS: {plain_text(found.crs, 90) or 'not given'}"]
+    return [*parts, f"CRS: {plain_text(found.crs.name, 90) or 'not given'}"]
 
 
 def _draw_points(axes, found: Section):
@@ -134,10 +134,9 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
         if not log:
             axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
             axes.xaxis.get_major_locator().set_params(nbins=6)
-        axes.ticklabel_format(axis="y", useOffset=False)
-        axes.set_xlabel(fit_text(figure, plain_text(f"{found.label} of {found.edges[1] - found.edges[0]:.4g} "
-                                                    f"{found.unit.split()[0]}", 300), 5.0, size=9.5))  # fmt: skip
-        axes.set_ylabel(f"height [{found.unit}]")
+        axes.ticklabel_format(axis="y", useOffset=False, style="plain")
+        axes.set_xlabel(fit_text(figure, plain_text(found.label, 300), 5.0, size=9.5))
+        axes.set_ylabel(f"{found.upright} [{found.unit}]")
         parts = [name_clouds(found.names), f"{found.total.values:,} {found.noun}"]
         parts[1:1] = [found.facts.name] if found.facts.name != found.noun else []
         rest = {"without data": found.total.no_data, "left out": found.total.left_out, "outside": found.outside}

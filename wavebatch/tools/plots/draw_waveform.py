@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.kernels.signal.runs import find_stretches
 from wavebatch.tools.plots.detector_signals import DetectorSignal
-from wavebatch.tools.plots.echo_table import list_echoes, name_flags
+from wavebatch.tools.plots.echo_table import list_echoes
 from wavebatch.tools.plots.labels import fit_parts, fit_text, place_labels
 from wavebatch.tools.plots.waveform import WaveformView
 
@@ -111,14 +112,16 @@ def _draw_panels(
     if view.seen is not None:
         draw_detector(panels[1], view.seen, times, small=small)
     _draw_residual(panels[-1], view, times)
-    panels[0].set_title(fit_text(figure, _title(view, times, short=small), room, size=9 if small else 10.5),
-                        fontsize=9 if small else 10.5)  # fmt: skip
+    size = 9 if small else 10.5
+    lines = [fit_text(figure, _title(view, times, short=small), room, size=size),
+             fit_parts(figure, _list_flags(view), room, size=size)]  # fmt: skip
+    panels[0].set_title("\n".join(lines), fontsize=size)
     panels[-1].set_xlim(times)
     return panels
 
 
 def _title(view: WaveformView, times: tuple[float, float], *, short: bool) -> str:
-    """Which waveform it is, which part of it is shown, what the detector is, and the flags of each echo."""
+    """Which waveform it is, which part of it is shown, and what the detector is."""
     parts = [f"packet {view.packet}"] if view.packet >= 0 else []
     parts += [f"point {view.point}"] + ([] if short else [f"GPS time {view.gps_time:.6f} s"])
     if view.span_is_cut(times):
@@ -126,9 +129,14 @@ def _title(view: WaveformView, times: tuple[float, float], *, short: bool) -> st
     lines = ["   ".join(parts)]
     if view.seen is not None:
         lines.append(view.seen.stage)
-    flags = [(row, name_flags(int(bits))) for row, bits in enumerate(view.echoes.flags, 1) if bits]
-    lines.append("   ".join(f"{row}: {names}" for row, names in flags) or "no flags")
     return "\n".join(lines)
+
+
+def _list_flags(view: WaveformView) -> list[str]:
+    """Each flag with the numbers of the echoes that have it."""
+    rows = {flag: [str(row) for row, bits in enumerate(view.echoes.flags.tolist(), 1) if bits & flag]
+            for flag in EchoFlag}  # fmt: skip
+    return [f"{flag.name} {','.join(found)}" for flag, found in rows.items() if found] or ["no flags"]
 
 
 def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, small: bool) -> None:

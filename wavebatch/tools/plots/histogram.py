@@ -173,13 +173,13 @@ def _check_columns(where: str, columns: Sequence[Clouds]) -> ColumnFacts:
 def _split(rows: np.ndarray, by: str | None) -> Iterator[tuple[float, np.ndarray]]:
     """The groups of some rows: value, and the rows' values."""
     if by is None:
-        yield 0.0, rows["value"]
+        yield 0.0, rows["values"][:, 0]
         return
-    group = rows["others"][:, 0]
+    group = rows["values"][:, 1]
     for value in np.unique(group[~np.isnan(group)]).tolist():
-        yield value, rows["value"][group == value]
+        yield value, rows["values"][:, 0][group == value]
     if np.isnan(group).any():
-        yield math.nan, rows["value"][np.isnan(group)]
+        yield math.nan, rows["values"][:, 0][np.isnan(group)]
 
 
 _SMALL = math.inf
@@ -318,7 +318,7 @@ def count_flags(paths: Sequence[Path], selection: Selection) -> FlagCounts:
     clouds = Clouds(paths, selection)
     for _, rows, tally in clouds.read():
         total += tally
-        flags = rows["flags"]
+        flags = rows["values"][:, 0].astype(np.uint16)
         counts += [int(np.count_nonzero(flags & np.uint16(flag))) for flag in EchoFlag]
         clean += int(np.count_nonzero(flags == 0))
     if not total.values:

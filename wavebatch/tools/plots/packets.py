@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 
 FARTHEST = 1e-3
 """Largest distance of a pulse from the wanted GPS time [s]."""
+
+FEW = 6
+"""Waveforms of a picture if their number is not given."""
 
 MOST = 24
 """Most waveforms of a picture: more would be too small to read."""
@@ -45,8 +49,8 @@ class Wanted:
     """EchoFlag bits: the first waveforms with an echo that has one of them."""
     where: Condition | None = None
     """The first waveforms with an echo that meets this."""
-    most: int = 6
-    """Most waveforms with flags, with echoes that meet `where`, or spread evenly."""
+    most: int | None = None
+    """Most waveforms with flags, that meet `where`, or spread evenly; None: FEW of them, or a full sheet."""
     random: int = 0
     """Number of packets to draw at random; 0: none."""
     seed: int = 0
@@ -58,6 +62,11 @@ class Wanted:
     def limit(self) -> int:
         """Most waveforms of the picture."""
         return MOST_ON_SHEET if self.sheet else MOST
+
+    @property
+    def number(self) -> int:
+        """Most waveforms with flags, or spread evenly."""
+        return self.most or (MOST_ON_SHEET if self.sheet else FEW)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,12 +91,13 @@ def find_places(
     path = reader.facts.path
     if not scan.packets:
         raise InputError(f"{path}: holds no waveform to draw; `wavebatch check` shows what it holds")
+    if wanted.number > wanted.limit:
+        raise _too_many(path, wanted)
     if wanted.flags or wanted.where is not None:
         return _find_flagged(reader, scan, wanted, run)
     numbers = _list_numbers(scan, wanted, str(path))
-    number = len(numbers) + len(wanted.points) + len(wanted.times)
-    if number > wanted.limit:
-        raise ConfigError(f"{path}: {number} waveforms are too many for a picture; {wanted.limit} fit")
+    if len(numbers) + len(wanted.points) + len(wanted.times) > wanted.limit:
+        raise _too_many(path, wanted)
     for point in wanted.points:
         if not 0 <= point < scan.points:
             raise ConfigError(f"{path}: there is no point {point}; points are 0 to {scan.points - 1}")
@@ -119,13 +129,18 @@ def find_places(
     return list({(place.unit, place.row): place for place in places}.values())
 
 
+def _too_many(path: Any, wanted: Wanted) -> ConfigError:
+    more = "" if wanted.sheet else f", {MOST_ON_SHEET} with --sheet"
+    return ConfigError(f"{path}: too many waveforms for a picture; {wanted.limit} fit{more}")
+
+
 def _list_numbers(scan: StripScan, wanted: Wanted, path: str) -> list[int]:
     """Numbers of the wanted packets; by default a few, spread evenly."""
     if wanted.random:
         number = min(wanted.random, scan.packets)
         return np.sort(np.random.default_rng(wanted.seed).choice(scan.packets, number, replace=False)).tolist()
     if not (wanted.packets or wanted.points or wanted.times):
-        return np.unique(np.linspace(0, scan.packets - 1, min(wanted.most, wanted.limit)).round().astype(int)).tolist()
+        return np.unique(np.linspace(0, scan.packets - 1, wanted.number).round().astype(int)).tolist()
     numbers: list[int] = []
     for first, end in wanted.packets:
         end = scan.packets if end is None else end
@@ -173,7 +188,6 @@ def _find_flagged(
 ) -> list[Place]:
     """The first waveforms in the file with an echo that has one of the flags and meets the condition."""
     found: list[Place] = []
-    most = min(wanted.most, wanted.limit)
     for unit, base in _read_units(reader, scan):
         rows = np.flatnonzero(unit.packets.owned)
         for begin in range(0, len(rows), _BLOCK):
@@ -182,8 +196,8 @@ def _find_flagged(
                 table = run(block)
                 hits += index[np.unique(table.waveform[_is_wanted(table, len(block), wanted)])].tolist()
             found += [_place(unit, base, row) for row in sorted(hits)]
-            if len(found) >= most:
-                return found[:most]
+            if len(found) >= wanted.number:
+                return found[: wanted.number]
     if not found:
         text = "has one of these flags" if wanted.where is None else f"meets {wanted.where.text!r}"
         raise InputError(f"{reader.facts.path}: no echo {text}: nothing to draw")

@@ -17,7 +17,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.geotiff_file import TILE
-from wavebatch.files.las.crs import describe_crs
+from wavebatch.files.las.crs import CrsWords, describe_crs
 from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
 from wavebatch.tools.rasters.cells import Grid
 from wavebatch.tools.rasters.tiles import CellOptions, Placed, compute_tiles
@@ -66,10 +66,8 @@ class Raster:
     """Points with a value outside the grid."""
     shown: tuple[float, float]
     """The percentiles SHOWN of the cells."""
-    crs: str = ""
-    """Name of the CRS of the clouds; empty if they give none."""
-    unit: str = "m"
-    """Unit of x and y."""
+    crs: CrsWords = CrsWords()
+    """Of the clouds."""
 
     @property
     def label(self) -> str:
@@ -77,7 +75,7 @@ class Raster:
         if self.statistic == "count":
             return "points per cell [-]"
         if self.statistic == "density":
-            return f"points per area [1/{self.unit}2]"
+            return f"points per area [1/{self.crs.unit}2]"
         return f"{self.statistic} of {self.facts.label}"
 
 
@@ -103,7 +101,7 @@ def grid_values(
             f"{paths[0]}: {clouds.facts.name} are bits, which have no {statistic}; count the points with a flag: "
             "--statistic count --flags NAME"
         )
-    crs, unit = check_crs(paths)
+    crs = check_crs(paths)
     total, sample, box = _survey(clouds, bounds)
     if not total.values:
         raise clouds.complain(total)
@@ -112,7 +110,7 @@ def grid_values(
         raise InputError(f"{paths[0]}: nothing to draw: no point {where} has a value")
     grid = choose_grid(str(paths[0]), sample, box, size, fixed=bounds is not None)
     values, placed = _fill(paths, selection, statistic, grid, total.values)
-    return Raster(clouds.facts, statistic, grid, values, total, total.values - placed, find_shown(values), crs, unit)
+    return Raster(clouds.facts, statistic, grid, values, total, total.values - placed, find_shown(values), crs)
 
 
 def find_shown(values: np.ndarray) -> tuple[float, float]:
@@ -194,8 +192,8 @@ def _refuse_far(paths: Sequence[Path], places: Sequence[np.ndarray]) -> None:
         )
 
 
-def check_crs(paths: Sequence[Path]) -> tuple[str, str]:
-    """The CRS and the unit of x and y that all clouds have; ConfigError where they differ.
+def check_crs(paths: Sequence[Path]) -> CrsWords:
+    """The CRS that all clouds have; ConfigError where they differ.
 
     A cloud without a CRS is taken to have that of the others.
     """

@@ -17,6 +17,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.las.crs import CrsWords
 from wavebatch.tools.plots.raster import check_crs
 from wavebatch.tools.plots.values import MARGIN, Clouds, Selection, Tally, name_paths, robust_limits
 from wavebatch.tools.voxels.voxel_points import VoxelFile
@@ -35,7 +36,7 @@ _CHOSEN_BINS = 60
 
 
 def open_heights(paths: Sequence[Path], selection: Selection) -> Clouds | VoxelFile:
-    """Clouds or one file of voxels, whose rows have the height in `others`."""
+    """Clouds or one file of voxels, whose rows have the height as second value."""
     voxels = [path for path in paths if path.suffix.lower() == ".npz"]
     if voxels and len(paths) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
@@ -66,8 +67,7 @@ class Section:
     """Limits of the colours."""
     voxel: float
     """Edge of a voxel; 0 for points."""
-    crs: str
-    unit: str
+    crs: CrsWords
 
 
 def cut_section(
@@ -84,7 +84,9 @@ def cut_section(
     """
     clouds = open_heights(paths, selection)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
-    crs, unit = (clouds.crs, "m") if isinstance(clouds, VoxelFile) else check_crs(paths)
+    crs = _find_crs(clouds)
+    if crs.unit == "deg":
+        raise ConfigError(f"{paths[0]}: coordinates are degrees, heights are not: project the cloud to draw a section")
     line = line or _choose_line(clouds)
     start, end = np.array(line[:2]), np.array(line[2:])
     length = float(np.hypot(*(end - start)))
@@ -107,7 +109,7 @@ def cut_section(
         raise clouds.complain(total)
     if not sample.seen:
         raise InputError(
-            f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} {unit} of the line from "
+            f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} {crs.unit} of the line from "
             f"{start[0]:.10g} {start[1]:.10g} to {end[0]:.10g} {end[1]:.10g}"
         )
     places = sample.read()["place"]
@@ -121,16 +123,20 @@ def cut_section(
     shown = tuple(np.percentile(value, (2, 98)).tolist())
     names = tuple(path.name for path in paths)
     return Section(clouds.facts, names, tuple(map(float, line)), width, along, height, value, total, sample.seen,
-                   outside, shown, voxel, crs, unit)  # fmt: skip
+                   outside, shown, voxel, crs)  # fmt: skip
+
+
+def _find_crs(clouds: Clouds | VoxelFile) -> CrsWords:
+    return CrsWords(clouds.crs) if isinstance(clouds, VoxelFile) else check_crs(clouds.paths)
 
 
 def _cut_rows(rows: np.ndarray, start: np.ndarray, along: np.ndarray, length: float, width: float) -> np.ndarray:
     """Distance along the line, height and value of the points beside it, f8 (k, 3); along: its unit vector."""
     offset = np.stack([rows["x"], rows["y"]], axis=1) - start
     far, aside = offset @ along, offset @ np.array([-along[1], along[0]])
-    height = rows["others"][:, 0]
+    height = rows["values"][:, 1]
     keep = (far >= 0) & (far <= length) & (np.abs(aside) <= 0.5 * width) & np.isfinite(height)
-    return np.stack([far, height, rows["value"]], axis=1)[keep]
+    return np.stack([far, height, rows["values"][:, 0]], axis=1)[keep]
 
 
 def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
@@ -187,17 +193,20 @@ class Profile:
     """Points below or above the edges."""
     total: Tally
     unit: str
-
+    """Of heights."""
+    upright: str = "height"
+    """What z is."""
     noun: str = "values"
     """What is counted, in the title."""
 
     @property
     def label(self) -> str:
         """Label of the axis of values."""
+        step = f"{self.edges[1] - self.edges[0]:.4g} {self.unit.split()[0]} of {self.upright}"
         if self.statistic == "count":
             kind = self.facts.name if self.facts.name in ("voxels", "segments") else "points"
-            return f"{kind} per height [-]"
-        return f"{self.statistic} of {self.facts.label} per height"
+            return f"{kind} per {step}"
+        return f"{self.statistic} of {self.facts.label} {'in' if self.statistic == 'mean' else 'per'} {step}"
 
 
 def measure_profile(
@@ -209,7 +218,7 @@ def measure_profile(
     outliers in height are left out and counted. Raises InputError without any value.
     """
     clouds = open_heights(paths, selection)
-    unit = "m" if isinstance(clouds, VoxelFile) else check_crs(paths)[1]
+    crs = _find_crs(clouds)
     if statistic != "count" and selection.column is None:
         raise ConfigError(f"--statistic {statistic} needs a --column; only count needs none")
     if statistic != "count" and clouds.facts.is_flags:
@@ -217,7 +226,7 @@ def measure_profile(
     sample, total, least, largest = EvenSample(), Tally(), math.inf, -math.inf
     for _, rows, tally in clouds.read():
         total += tally
-        height = rows["others"][:, 0]
+        height = rows["values"][:, 1]
         height = height[np.isfinite(height)]
         if len(height):
             sample.add({"height": height})
@@ -229,17 +238,18 @@ def measure_profile(
     series = len(paths) if each else 1
     sums, numbers, outside = np.zeros((series, len(edges) - 1)), np.zeros((series, len(edges) - 1)), 0
     for cloud, rows, _ in clouds.read():
-        at = np.searchsorted(edges, rows["others"][:, 0], side="right") - 1
+        at = np.searchsorted(edges, rows["values"][:, 1], side="right") - 1
         good = (at >= 0) & (at < len(edges) - 1)
         outside += int(np.count_nonzero(~good))
         row = cloud if each else 0
         numbers[row] += np.bincount(at[good], minlength=len(edges) - 1)
-        sums[row] += np.bincount(at[good], rows["value"][good], minlength=len(edges) - 1)
+        sums[row] += np.bincount(at[good], rows["values"][:, 0][good], minlength=len(edges) - 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         values: Any = {"count": numbers, "sum": sums, "mean": np.where(numbers > 0, sums / numbers, np.nan)}[statistic]
     names = name_paths(paths)
     names = names if each or len(paths) == 1 else (f"{len(paths)} clouds",)
-    return Profile(clouds.facts, statistic, names, edges, values, outside, total, unit)
+    return Profile(clouds.facts, statistic, names, edges, values, outside, total, crs.upright_unit,
+                   crs.upright)  # fmt: skip
 
 
 def place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:

@@ -6,17 +6,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.condition import Condition
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike, select_points
+from wavebatch.files.las.crs import describe_crs
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""
+
+MOST = (5.0, 95.0)
+"""Percentiles of most values: histograms show 1.5 times their distance on both sides, which cuts only long tails."""
 
 MARGIN = 0.25
 """Also shown on both sides of these percentiles, as a share of the distance between them."""
@@ -36,15 +40,6 @@ class Selection:
     """Further columns that are read with it."""
     where: Condition | None = None
     """Points must meet this."""
-
-    def choose(self, rows: np.ndarray) -> np.ndarray:
-        """The rows (VALUE_DTYPE) with the right flags."""
-        if not self.flags_with and not self.flags_without:
-            return rows
-        keep = (rows["flags"] & np.uint16(self.flags_without)) == 0
-        if self.flags_with:
-            keep &= (rows["flags"] & np.uint16(self.flags_with)) != 0
-        return rows[keep]
 
 
 @dataclass(slots=True)
@@ -79,26 +74,26 @@ class Clouds:
         self.paths, self.selection = tuple(paths), selection
         found: list[tuple[Path, ColumnFacts]] = []
         for path in self.paths:
-            with ColumnReader(path, selection.column, selection.others) as reader:
-                found.append((path, reader.facts))
-                self.other_facts = reader.other_facts
-                select_points(reader, selection.where)  # its columns exist
-                if (selection.flags_with or selection.flags_without) and not reader.has_flags:
-                    raise ConfigError(f"{path}: has no column echo_flags to select points by")
+            with ColumnReader(path, selection.column, *selection.others) as reader:
+                found.append((path, reader.facts[0]))
+                self.other_facts = reader.facts[1:]
+                select_points(reader, selection.where, selection.flags_with, selection.flags_without)  # it can
         self.facts: ColumnFacts = check_alike(found)
+        if selection.column in ("x", "y", "z"):
+            words = describe_crs(self.paths[0])
+            unit = words.upright_unit if selection.column == "z" else words.unit
+            self.facts = replace(self.facts, unit=unit)
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
         """Pieces of all clouds: number of the cloud, selected points with a value, and counts of the piece."""
         for number, path in enumerate(self.paths):
-            with ColumnReader(path, self.selection.column, self.selection.others) as reader:
-                select_points(reader, self.selection.where)
+            with ColumnReader(path, self.selection.column, *self.selection.others) as reader:
+                select_points(reader, self.selection.where, self.selection.flags_with, self.selection.flags_without)
                 seen = 0
                 for rows in reader.read_pieces():
-                    chosen = self.selection.choose(rows)
-                    more, seen = reader.left_out - seen, reader.left_out
-                    good = chosen[~np.isnan(chosen["value"])]
-                    left = len(rows) + more - len(chosen)
-                    yield number, good, Tally(len(rows) + more, left, len(chosen) - len(good), len(good))
+                    left, seen = reader.left_out - seen, reader.left_out
+                    good = rows[~np.isnan(rows["values"][:, 0])]
+                    yield number, good, Tally(len(rows) + left, left, len(rows) - len(good), len(good))
 
     def complain(self, tally: Tally) -> InputError:
         """The error that says why nothing can be drawn."""
@@ -115,14 +110,16 @@ class Clouds:
 
 
 def shown_limits(samples: Sequence[np.ndarray], least: float, largest: float) -> tuple[float, float]:
-    """Limits that show at least the percentiles OUTER of every sample: rare far values would compress the rest.
+    """Limits that show the percentiles MOST of every sample, and 1.5 times their distance on both sides.
 
-    Below a thousand values these are all of a sample. Samples of one value only are shown from `least` to `largest`.
+    Rare far values would compress the rest. Samples of one value only are shown from `least` to `largest`.
     """
-    ends = [np.percentile(sample, end, method=side) for sample in samples if len(sample)
-            for end, side in zip(OUTER, ("lower", "higher"), strict=True)]  # fmt: skip
-    low, high = float(min(ends)), float(max(ends))
-    return (low, high) if low < high else (least, largest)
+    ends = []
+    for sample in filter(len, samples):
+        low, high = np.percentile(sample, MOST)
+        near = sample[np.abs(sample - 0.5 * (low + high)) <= 2.0 * (high - low)]
+        ends += [float(near.min()), float(near.max())] if len(near) else []
+    return (min(ends), max(ends)) if ends and min(ends) < max(ends) else (least, largest)
 
 
 def robust_limits(sample: np.ndarray, least: float, largest: float) -> tuple[float, float]:

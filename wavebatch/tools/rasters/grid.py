@@ -14,8 +14,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.files.cloud.columns_reader import ColumnsReader
+from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
@@ -63,6 +62,9 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     crs, unit = _find_crs(paths, options.crs)
     facts = _find_facts(paths, options.columns)
     box, points, largest = _find_extent(paths, options)
+    if unit == "degree" and options.size > max(box[2] - box[0], box[3] - box[1]):
+        raise ConfigError(f"{paths[0]}: coordinates are degrees, and cells of {options.size:g} degrees are larger than "
+                          "the clouds; --size 1e-05 gives cells of about 1 m")  # fmt: skip
     grid = _lay_out(str(paths[0]), box, options)
     west, _, _, north = grid.extent
     layout = RasterLayout(
@@ -126,7 +128,7 @@ def _find_facts(paths: Sequence[Path], columns: Sequence[str]) -> tuple[ColumnFa
     """The columns' facts, which all clouds must share."""
     known: tuple[ColumnFacts, ...] | None = None
     for path in paths:
-        with ColumnsReader(path, columns) as reader:
+        with ColumnReader(path, *columns) as reader:
             for mine, other in zip(reader.facts, known or reader.facts, strict=True):
                 if mine.unit != other.unit:
                     raise ConfigError(f"{path}: {mine.name} is in [{mine.unit}], in {paths[0]} in [{other.unit}]; make "

@@ -13,9 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.condition import Condition
-from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.column_reader import select_points
-from wavebatch.files.cloud.columns_reader import ColumnsReader
+from wavebatch.files.cloud.column_reader import ColumnReader, select_points
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.tools.rasters.cells import Grid, compute_cells
@@ -82,17 +80,12 @@ def _across(grid: Grid) -> int:
 def read_pieces(paths: Sequence[Path], options: CellOptions) -> Iterator[tuple[np.ndarray, int]]:
     """Pieces of all clouds: points with the right flags that meet the condition, and the number of those left out."""
     for path in paths:
-        with ColumnsReader(path, options.columns) as reader:
-            if (options.flags_with or options.flags_without) and not reader.has_flags:
-                raise ConfigError(f"{path}: has no column echo_flags to select points by")
-            select_points(reader, options.where)
+        with ColumnReader(path, *options.columns) as reader:
+            select_points(reader, options.where, options.flags_with, options.flags_without)
             seen = 0
             for rows in reader.read_pieces():
-                keep = (rows["flags"] & np.uint16(options.flags_without)) == 0
-                if options.flags_with:
-                    keep &= (rows["flags"] & np.uint16(options.flags_with)) != 0
                 more, seen = reader.left_out - seen, reader.left_out
-                yield rows[keep], int(len(rows) - keep.sum()) + more
+                yield rows, more
 
 
 def is_inside(rows: np.ndarray, bounds: tuple[float, float, float, float] | None) -> np.ndarray:

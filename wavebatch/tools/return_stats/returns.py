@@ -18,8 +18,7 @@ from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
 from wavebatch.files.cloud.column_reader import select_points
-from wavebatch.files.cloud.echo_reader import CloudReader
-from wavebatch.files.cloud.return_io import ReturnReader
+from wavebatch.files.cloud.echo_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.disk.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
 from wavebatch.tools.return_stats.areas import (
     MOST_AREAS,
@@ -120,7 +119,7 @@ def count_returns(
     return each, total.finish("total")
 
 
-def pulses_told_apart(reader: ReturnReader | CloudReader) -> bool:
+def pulses_told_apart(reader: CloudReader) -> bool:
     """Whether the GPS times of the first points separate pulses."""
     if not reader.has_gps_time:
         return False
@@ -129,7 +128,7 @@ def pulses_told_apart(reader: ReturnReader | CloudReader) -> bool:
 
 
 def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | None) -> _Tally:
-    with ReturnReader(path) as reader:
+    with CloudReader(path, RETURN_DTYPE) as reader:
         by_time = pulses_told_apart(reader)  # by all points
         select_points(reader, where)
         placed = [division.place(path) for division in divisions]

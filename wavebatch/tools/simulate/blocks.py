@@ -60,9 +60,9 @@ def simulate_block(
     """A block of n waveforms of the scene and the truth: an EchoTable of the echoes in it.
 
     scene: a Scene or the name of one. recording: replaces the scene's receiver.
-    In the truth, time is the peak [ns after sample 0], amplitude the height of the peak above the baseline [count] and
-    sigma the standard deviation of the main lobe [ns]; the flags are those of `flag_truth`. The block's origin is the
-    true position of sample 0. Raises ConfigError for an unknown scene.
+    In the truth, time is the datum of the pulse [ns after sample 0], amplitude the height of the peak above the
+    baseline [count] and sigma the standard deviation of the main lobe [ns]; the flags are those of `flag_truth`. The
+    block's origin is the true position of sample 0. Raises ConfigError for an unknown scene.
     """
     scene = find_scene(scene)
     simulated = simulate_pulses(replace(scene, recording=recording) if recording else scene, n, rng)

@@ -18,7 +18,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.cloud.return_io import ReturnReader
+from wavebatch.files.cloud.echo_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.las.header import is_projection, read_header
 from wavebatch.files.strip.writer import FullwaveWriter
@@ -194,7 +194,7 @@ def synthesize_strip(
     """
     options = options or SynthesisOptions()
     recordings = [options.recording(length) for length in _LENGTHS]
-    with protecting([cloud]), ReturnReader(cloud) as reader:
+    with protecting([cloud]), CloudReader(cloud, RETURN_DTYPE) as reader:
         if not reader.has_gps_time:
             raise InputError(
                 f"{cloud}: point format {reader.point_format} has no GPS times, which are needed to group points into "
@@ -227,7 +227,7 @@ def synthesize_strip(
     return summary
 
 
-def _read_pulses(reader: ReturnReader) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _read_pulses(reader: CloudReader) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Rows and raw records in pieces that cut no pulse."""
     rows, records = None, None
     for piece in reader.read_pieces(_PIECE):
@@ -241,7 +241,7 @@ def _read_pulses(reader: ReturnReader) -> Iterator[tuple[np.ndarray, np.ndarray]
         yield rows, records
 
 
-def _open_writer(reader: ReturnReader, target: Path, options: SynthesisOptions, overwrite: bool) -> FullwaveWriter:
+def _open_writer(reader: CloudReader, target: Path, options: SynthesisOptions, overwrite: bool) -> FullwaveWriter:
     point_format = _FORMATS[reader.point_format]
     lengths = enumerate(_LENGTHS, 1)
     return FullwaveWriter(
@@ -257,7 +257,7 @@ def _open_writer(reader: ReturnReader, target: Path, options: SynthesisOptions, 
     )
 
 
-def _choose_gain(reader: ReturnReader, options: SynthesisOptions, light: LightModel) -> float:
+def _choose_gain(reader: CloudReader, options: SynthesisOptions, light: LightModel) -> float:
     """The gain that fills the digitizer; reads all points."""
     counts = np.zeros(len(_LEVELS) + 1, np.int64)
     for rows, records in _read_pulses(reader):
@@ -285,7 +285,7 @@ def _model_pulses(
     starts = group_pulses(rows["gps_time"], rows["number"])
     count = np.diff(np.append(starts, len(rows)))
     pulse = np.repeat(np.arange(len(starts)), count)
-    ray = fit_rays(rows["xyz"], starts, rows["angle"], rows["source"])
+    ray = fit_rays(rows["xyz"], starts, rows["scan_angle"], rows["source"])
     seen: Light = light.measure(rows, records, starts)
     sigma = seen.sigma
     delay = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], ray[pulse]) / HALF_C

@@ -7,26 +7,29 @@ main lobe, so both must scale the other lobes alike.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
+from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 
 
 @dataclass(frozen=True, slots=True)
 class PulseModel:
     """The system pulse: a main lobe, Gaussian or skewed, and further lobes.
 
-    The time of an echo is where the pulse of a flat target has its peak. A target that broadens the main lobe from
-    `sigma` to s adds the variance s^2 - sigma^2 to every lobe, and lobes lose height as they widen.
+    The time of an echo is the datum of the pulse: the centre of the Gaussian that fits the echo of a flat target best.
+    A target that broadens the main lobe from `sigma` to s adds the variance s^2 - sigma^2 to every lobe, and lobes lose
+    height as they widen. A skewed main lobe is stretched instead, and placed as such a target would place it.
     The amplitude of an echo is the height of the peak of all lobes together.
     """
 
     sigma: float = 2.0
     """Standard deviation of the main lobe for a flat target [ns]."""
     kappa: float = 0.0
-    """Skew of the main lobe (docs/algorithms.md 0); its peak stays at the echo's time, its height is the amplitude."""
+    """Skew of the main lobe (docs/algorithms.md 0); its height is the amplitude."""
     lobes: tuple[tuple[float, float, float], ...] = ()
     """(height relative to the main lobe, delay [ns], sigma [ns]) of every further lobe."""
 
@@ -88,13 +91,11 @@ def spread_lobes(
     time, amplitude, sigma: (m,) as in the truth table. Heights are scaled so that all lobes together peak at
     `amplitude`.
     """
+    start = time - _find_delay(pulse, sigma)
     if not pulse.lobes:
-        return [(time, amplitude, sigma)]
-    shift = _find_peak(pulse, np.array([pulse.sigma]))[0][0]
+        return [(start, amplitude, sigma)]
     grid = np.linspace(sigma.min(initial=pulse.sigma), sigma.max(initial=pulse.sigma), 129)
-    height = np.interp(sigma, grid, _find_peak(pulse, grid)[1])
-    main = amplitude / height
-    start = time - shift
+    main = amplitude / np.interp(sigma, grid, _paint(pulse, grid)[1].max(axis=0))
     parts = [(start, main, sigma)]
     for share, delay, width, scale in _widen(pulse, sigma):
         parts.append((start + delay, main * share * scale, width))
@@ -109,15 +110,31 @@ def _widen(pulse: PulseModel, sigma: np.ndarray):
         yield share, delay, width, flat / width * sigma / pulse.sigma
 
 
-def _find_peak(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Delay of the peak after the main lobe's centre [ns] and its height per unit of the main lobe, each (m,)."""
-    step = pulse.sigma / 200
-    x = np.arange(-400, 401)[:, None] * step
-    total = main_lobe(x / sigma, pulse.kappa)
+def _find_delay(pulse: PulseModel, sigma: np.ndarray) -> np.ndarray | float:
+    """Datum after the main lobe's peak of echoes of these widths [ns], (m,)."""
+    if not (pulse.lobes or pulse.kappa):
+        return 0.0
+    delay = _find_flat(pulse)
+    if not pulse.kappa:
+        return delay
+    ratio = np.maximum(sigma / pulse.sigma, 0.7)
+    return delay + _find_flat(replace(pulse, lobes=())) * (ratio + ratio**-2 - 2)
+
+
+@cache
+def _find_flat(pulse: PulseModel) -> float:
+    """Datum after the main lobe's peak of a flat target's echo [ns]."""
+    x, total = _paint(pulse, np.array([pulse.sigma]))
+    return fit_one_gaussian(x, total[:, 0])[0]
+
+
+def _paint(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times after the main lobe's peak [ns], (r,), and the pulse there per unit of its main lobe, (r, m)."""
+    x = np.arange(-1200, 1201) * (pulse.sigma / 200)
+    total = main_lobe(x[:, None] / sigma, pulse.kappa)
     for share, delay, width, scale in _widen(pulse, sigma):
-        total = total + share * scale * np.exp(-0.5 * ((x - delay) / width) ** 2)
-    at = np.argmax(total, axis=0)
-    return x[at, 0], total.max(axis=0)
+        total = total + share * scale * np.exp(-0.5 * ((x[:, None] - delay) / width) ** 2)
+    return x, total
 
 
 def main_lobe(z: np.ndarray, kappa: float) -> np.ndarray:

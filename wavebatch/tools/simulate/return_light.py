@@ -223,23 +223,23 @@ def open_light(
             continue
         with ExitStack() as stack:
             reader = stack.enter_context(ColumnReader(path, column))
-            if reader.facts.unit not in units:
-                raise ConfigError(f"{path}: --{name} {column}: is in [{reader.facts.unit}], needed is [{units[-1]}]")
-            if reader.facts.is_standard:
+            if reader.facts[0].unit not in units:
+                raise ConfigError(f"{path}: --{name} {column}: is in [{reader.facts[0].unit}], needed is [{units[-1]}]")
+            if reader.facts[0].is_standard:
                 needed = "the width of each echo in ns" if name == "widths" else "the share of each return, 0 to 1"
                 raise ConfigError(
-                    f"{path}: --{name} {column}: is the LAS field {reader.facts.name}; give an extra dimension with "
+                    f"{path}: --{name} {column}: is the LAS field {reader.facts[0].name}; give an extra dimension with "
                     f"{needed}"
                 )
             if name == "widths":
-                counts.assumed_unit = reader.facts.unit == "-"
+                counts.assumed_unit = reader.facts[0].unit == "-"
             read[name] = reader.find_value(column)
     return LightModel(path, radar, sigma, spacing, read["widths"], read["shares"], shares, widths, counts)
 
 
 def _receive(reflectance: np.ndarray, rows: np.ndarray, radar: Radar, path: Path) -> np.ndarray:
     """Received power of surfaces that fill the beam [W]."""
-    distance = (radar.height - rows["xyz"][:, 2]) / np.cos(np.radians(np.clip(rows["angle"], -80, 80)))
+    distance = (radar.height - rows["xyz"][:, 2]) / np.cos(np.radians(np.clip(rows["scan_angle"], -80, 80)))
     if len(distance) and distance.min() <= 0:
         highest = rows["xyz"][:, 2].max()
         raise InputError(f"{path}: points as high as {highest:g} m lie above the sensor at {radar.height:g} m")

@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.cloud.return_io import ReturnWriter
+from wavebatch.files.cloud.return_writer import ReturnWriter
 from wavebatch.files.las.point_formats import WITHOUT_WAVES
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated

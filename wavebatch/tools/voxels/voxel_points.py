@@ -57,15 +57,15 @@ class VoxelFile:
         self.facts = ColumnFacts(name or "voxels", unit, meaning, 0.0)
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
-        """As Clouds.read, with the height of the centre in `others`."""
-        dtype = [("x", "<f8"), ("y", "<f8"), ("value", "<f8"), ("others", "<f8", (1,))]
+        """As Clouds.read, with the height of the centre as second value."""
+        dtype = [("x", "<f8"), ("y", "<f8"), ("values", "<f8", (2,))]
         for start in range(0, len(self._index), _PIECE):
             part = slice(start, start + _PIECE)
             place = self._origin + (self._index[part] + 0.5) * self.size
             rows = np.zeros(len(place), dtype)
-            rows["x"], rows["y"], rows["others"][:, 0] = place.T
-            rows["value"] = 1.0 if self.selection.column is None else self._data[self.selection.column][part]
-            good = rows[~np.isnan(rows["value"])]
+            rows["x"], rows["y"], rows["values"][:, 1] = place.T
+            rows["values"][:, 0] = 1.0 if self.selection.column is None else self._data[self.selection.column][part]
+            good = rows[~np.isnan(rows["values"][:, 0])]
             yield 0, good, Tally(len(rows), 0, len(rows) - len(good), len(good))
 
     def complain(self, tally: Tally) -> InputError:
