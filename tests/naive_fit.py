@@ -144,7 +144,7 @@ def tail_reach(first, values, step, ratio):
 
 
 def measure(shape, width):
-    """Peak, its place and the full width at half of it, of a sum of Gaussians: on a fine grid, by root finding."""
+    """Peak and the full width at half of it, of a sum of Gaussians: on a fine grid, by root finding."""
     def value(x):
         return naive.pulse(x, 0.0, width, **shape)
 
@@ -155,4 +155,4 @@ def measure(shape, width):
         brentq(lambda x: value(x) - half, *sorted((top, next(g for g in side if value(g) < half))))
         for side in (grid[grid < top][::-1], grid[grid > top])
     )
-    return float(value(top)), top, right - left
+    return float(value(top)), right - left

@@ -14,7 +14,15 @@ from wavebatch.kernels.fit.closed_form import estimate_starts, fit_parabola, sta
 from wavebatch.kernels.fit.hermite import residual_moments
 from wavebatch.kernels.fit.learn_pulse import fit_bounded, stack_pulse
 from wavebatch.kernels.fit.problem import Solution, choose
-from wavebatch.kernels.fit.pulse_shape import TAIL_STEP, PulseShape, PulseTail, measure_pulse, tail_at, tail_reach
+from wavebatch.kernels.fit.pulse_shape import (
+    TAIL_STEP,
+    PulseShape,
+    PulseTail,
+    fit_one_gaussian,
+    measure_pulse,
+    tail_at,
+    tail_reach,
+)
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.filters import refine_peaks
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
@@ -178,7 +186,18 @@ def test_measures_of_pulses_are_those_of_roots(shape):
     found = measure_pulse(PulseShape(**shape), 1.2, 4.0)
     for row in (0, 90, 199):
         expected = naive_fit.measure(shape, found.width[row])
-        assert (found.peak[row], found.delay[row], found.half_width[row]) == pytest.approx(expected, abs=0.015)
+        assert (found.peak[row], found.half_width[row]) == pytest.approx(expected, abs=0.015)
+
+
+def test_the_one_gaussian_of_a_pulse_is_that_of_scipy():
+    x = np.linspace(-8, 14, 300)
+    value = naive.pulse(x, 1.3, 1.7, kappa=0.2)
+
+    def misfit(p):
+        return p[0] * naive.pulse(x, p[1], p[2]) - value
+
+    expected = least_squares(misfit, [1.0, 1.0, 1.5], xtol=1e-12, ftol=1e-12).x
+    assert fit_one_gaussian(x, value) == pytest.approx(expected[1:], abs=1e-4)
 
 
 def test_refined_peaks_are_those_of_single_waveforms(rng):

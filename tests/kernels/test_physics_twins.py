@@ -191,7 +191,7 @@ def test_the_ratio_of_canopy_and_ground_is_that_of_a_loop(rng, n, ratio, scatter
     assert (found is None) == (expected is None) == (n == 80 or scatter > 1)
     if found is not None:
         assert found.ratio == pytest.approx(expected[0], rel=2e-3)
-        assert found.error == pytest.approx(expected[1], rel=0.05)
+        assert found.error == pytest.approx(expected[1], rel=0.015)
 
 
 def test_energies_are_judged_as_by_a_loop(rng):

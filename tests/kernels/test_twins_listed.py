@@ -73,8 +73,8 @@ TWINS = {
 
 LIBRARIES = {
     "exp": "math.exp", "log": "math.log", "log1p": "math.log1p", "solve": "np.linalg.solve",
-    "fit_parabola": "np.polyfit", "fit_bounded": "least_squares", "wiener_taps": "wiener_taps",
-    "correlation_matrix": "correlation_matrix",
+    "fit_parabola": "np.polyfit", "fit_bounded": "least_squares", "fit_one_gaussian": "least_squares",
+    "wiener_taps": "wiener_taps", "correlation_matrix": "correlation_matrix",
 }  # fmt: skip
 """Kernels that a test compares with a function of NumPy, SciPy or the standard library."""
 
@@ -87,6 +87,8 @@ BY_LOOP = {
 """Kernels whose loop is short and stands in their test."""
 
 NO_TWIN = {
+    "find_datum": "tests of pulses with a known place",
+    "find_seam": "tests on plain counts with a known seam",
     "bound_time": "a formula; crlb, which has a twin, is made of it",
     "fit_gaussians": "its fit is fit_bounded, its model naive.pulse; tests learn known sums again",
     "fit_skewed": "the same with the skewed pulse",
