@@ -2,6 +2,7 @@
 
 import naive
 import numpy as np
+from scipy.optimize import brentq
 
 GAIN_121 = np.sqrt(6.0) / 4.0
 
@@ -105,3 +106,53 @@ def decompose(y, std, start, s, clip=np.inf, **shape):
             return best
         target = chi2 - fall
     return best
+
+
+def start_errors(amplitude, width, std):
+    """Errors of amplitude and width of a start, by differences of the log-parabola by each sample around the peak."""
+    at = 12
+    peak = naive.pulse(np.arange(25.0), at, width) * amplitude
+
+    def start(samples):
+        # The pulse behind [1 2 1]/4 as the starts take it: a Gaussian of variance width^2 + 1/2.
+        wide = np.sqrt(width**2 + 0.5)
+        smooth = amplitude * width / wide * naive.pulse(np.arange(25.0), at, wide) + naive.smooth_121(samples - peak)
+        height, _, found = naive.log_parabola(smooth, at, width)
+        return np.array([height, found])
+
+    slopes = naive.differentiate(start, peak, 1e-6 * amplitude)
+    return std * np.sqrt((slopes**2).sum(axis=1))
+
+
+def stack(signal, amplitude, time, before, after, step):
+    """(lag, median, robust error of it) of the samples of all echoes in each step of the lag; five at least."""
+    bins = {}
+    for row, height, at in zip(signal, amplitude, time, strict=True):
+        for i, value in enumerate(row):
+            if -before <= i - at <= after and np.isfinite(value):
+                bins.setdefault(int((i - at + before) // step), []).append(value / height)
+    return [
+        ((number + 0.5) * step - before, np.median(values), len(values), values)
+        for number, values in sorted(bins.items()) if len(values) >= 5
+    ]  # fmt: skip
+
+
+def tail_reach(first, values, step, ratio):
+    """Samples behind an echo within which its tail is above the noise."""
+    above = [first + i * step for i, value in enumerate(values) if first + i * step >= 0 and abs(value) * ratio > 1]
+    return int(np.ceil(max(above) + step)) if above else 0
+
+
+def measure(shape, width):
+    """Peak and the full width at half of it, of a sum of Gaussians: on a fine grid, by root finding."""
+    def value(x):
+        return naive.pulse(x, 0.0, width, **shape)
+
+    grid = np.linspace(-6 * width, 6 * width, 6001)
+    top = grid[np.argmax(value(grid))]
+    half = value(top) / 2
+    left, right = (
+        brentq(lambda x: value(x) - half, *sorted((top, next(g for g in side if value(g) < half))))
+        for side in (grid[grid < top][::-1], grid[grid > top])
+    )
+    return float(value(top)), right - left

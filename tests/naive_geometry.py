@@ -1,8 +1,10 @@
-"""Slow, plain references for kernels/geometry and kernels/physics: one pulse, point or direction after the other."""
+"""Slow, plain references for kernels/geometry: one pulse, point or direction after the other."""
 
 from collections import defaultdict
+from itertools import groupby, pairwise
 
 import numpy as np
+from scipy.optimize import least_squares
 
 
 def find_pulses(gps_time, longest=64):
@@ -59,11 +61,282 @@ def total_until(profile, time, spacing):
     return sum(y * min(max(time / spacing - i + 0.5, 0.0), 1.0) for i, y in enumerate(profile))
 
 
-def slope_error(incidence, slope, directions=3600):
-    """Root mean square of cos(incidence) / cos(true angle) - 1 over surfaces that slope in any direction."""
-    ray = np.array([np.sin(incidence), 0.0, np.cos(incidence)])
-    off = []
-    for turn in 2 * np.pi * np.arange(directions) / directions:
-        normal = np.array([np.sin(slope) * np.cos(turn), np.sin(slope) * np.sin(turn), np.cos(slope)])
-        off.append(ray[2] / (ray @ normal) - 1)
-    return np.sqrt(np.mean(np.square(off)))
+def _runs_of(values):
+    """[value, length] of each run of equal values."""
+    return [[value, len(list(run))] for value, run in groupby(values)]
+
+
+def find_turns(angle, lag):
+    """Pulses at which the angle turns: runs of one direction, the short ones joined with what is around them."""
+    if len(angle) <= 2 * lag:
+        return []
+    runs = _runs_of([bool(angle[i + lag] > angle[i]) for i in range(len(angle) - lag)])
+    while len(runs) > 1 and min(length for _, length in runs) < lag:
+        short = [length for _, length in runs].index(min(length for _, length in runs))
+        around = runs[max(short - 1, 0) : short + 2]
+        direction = next(value for value, _ in around if value != runs[short][0])
+        runs[max(short - 1, 0) : short + 2] = [[direction, sum(length for _, length in around)]]
+    turns, edge = [], 0
+    for rising, length in runs[:-1]:
+        edge += length
+        near = range(max(edge - lag, 0), min(edge + 2 * lag, len(angle)))
+        turns.append((max if rising else min)(near, key=lambda i: angle[i]))
+    return turns
+
+
+def find_sweeps(angle, time, lag):
+    """First pulse of every scan line: after jumps, pauses and times that run backwards, and where the angle turns."""
+    steps = [abs(b - a) for a, b in pairwise(angle)]
+    waits = [b - a for a, b in pairwise(time)]
+    moving, passing = [step for step in steps if step > 0], [wait for wait in waits if wait > 0]
+    jump = max(20 * np.median(moving), 0.25 * (max(angle) - min(angle))) if moving else np.inf
+    pause = 20 * np.median(passing) if passing else np.inf
+    starts = [i for i in range(len(angle)) if not i or steps[i - 1] > jump or not 0 <= waits[i - 1] <= pause]
+    turns = [a + i for a, b in pairwise([*starts, len(angle)]) for i in find_turns(angle[a:b], lag)]
+    return sorted({*starts, *turns})
+
+
+def strongest_line(points, weight):
+    """Angle [rad] and rho of the largest sum of weights; a point votes for the two nearest rho of each half degree."""
+    sums = defaultdict(float)
+    for place, height in zip(points, weight, strict=True):
+        for number in range(360):
+            angle = np.radians(number / 2 - 90)
+            rho = np.cos(angle) * place[0] + np.sin(angle) * place[1]
+            low = int(np.floor(rho))
+            sums[number, low] += height * (low + 1 - rho)
+            sums[number, low + 1] += height * (rho - low)
+    number, rho = max(sums, key=sums.get)
+    return np.radians(number / 2 - 90), rho
+
+
+def longest_run(rows, place, gap):
+    """Rows of the longest run of places, none further than the gap from the one before."""
+    order = sorted(range(len(rows)), key=lambda i: place[i])
+    runs = [[]]
+    for i in order:
+        if runs[-1] and place[i] - place[runs[-1][-1]] > gap:
+            runs.append([])
+        runs[-1].append(i)
+    best = max(runs, key=lambda run: place[run[-1]] - place[run[0]])
+    return sorted(rows[i] for i in best)
+
+
+def main_axis(points, weight):
+    """Weighted centre of points and the direction of least weighted distances, towards larger x."""
+    middle = np.average(points, axis=0, weights=weight)
+    along = np.linalg.svd((points - middle) * np.sqrt(weight)[:, None])[2][0]
+    return middle, along * (1 if along[0] > 0 else -1)
+
+
+def follow_line(points, weight, rows, start, band, gap, shortest):
+    """(middle, along, rows, ends) of the segment near a line or None, and the rows to remove."""
+    angle, rho = start
+    normal = np.array([np.cos(angle), np.sin(angle)])
+    middle = rho * normal
+    first = inside = [i for i in rows if abs((points[i] - middle) @ normal) <= band]
+    for _ in range(5):
+        along = np.array([normal[1], -normal[0]])
+        near = [i for i in rows if abs((points[i] - middle) @ normal) <= band]
+        run = longest_run(near, [(points[i] - middle) @ along for i in near], gap) if near else []
+        if len(run) < 2:
+            return None, first
+        inside = run
+        middle, along = main_axis(points[inside], weight[inside])
+        normal = np.array([-along[1], along[0]])
+    place = np.array([(points[i] - middle) @ along for i in inside])
+    quarters = [[], [], [], []]
+    for i, at in zip(inside, place, strict=True):
+        quarters[min(int(4 * (at - place.min()) / np.ptp(place)), 3)].append(i)
+    spreads = [
+        np.average([((points[i] - middle) @ normal) ** 2 for i in part], weights=weight[part])
+        for part in quarters if part
+    ]  # fmt: skip
+    if np.ptp(place) < shortest or np.sqrt(np.median(spreads)) > 1.4 * band / 3:
+        return None, sorted({*first, *inside})
+    return (middle, along, inside, (place.min(), place.max())), inside
+
+
+def find_lines(x, y, weight, sigma, gap, shortest, most):
+    """(rows, start, end, weight) of every segment, the strongest line first, without cuts at bends."""
+    centre = np.array([np.mean(x), np.mean(y)])
+    points = np.stack([x, y], axis=1) - centre
+    left, found, failures = list(range(len(x))), [], 0
+    while len(found) < most and failures < 5 and len(left) >= 2:
+        start = strongest_line(points[left], weight[left])
+        line, used = follow_line(points, weight, left, start, 3 * sigma, gap, shortest)
+        if not used:
+            break
+        left = [i for i in left if i not in set(used)]
+        if line is None:
+            failures += 1
+            continue
+        middle, along, rows, ends = line
+        found.append((rows, *(centre + middle + at * along for at in ends), sum(weight[i] for i in rows)))
+    return found
+
+
+def _usable(time, point, direction, weight):
+    rows = [
+        i for i in range(len(time))
+        if np.isfinite([time[i], *point[i], *direction[i]]).all() and np.any(direction[i] != 0)
+    ]  # fmt: skip
+    unit = np.array([direction[i] / np.linalg.norm(direction[i]) for i in rows])
+    return time[rows], point[rows], unit, np.ones(len(rows)) if weight is None else weight[rows]
+
+
+def _without_outliers(error, weight):
+    """Weights, 0 beyond four robust standard deviations."""
+    return np.where(error <= 4 * 1.482602 * np.median(error), weight, 0.0)
+
+
+def meet_lines(powers, ground, unit, weight):
+    """Coefficients of the path that comes nearest to the lines, each weighed by its distance, without outliers."""
+    used, found = weight, None
+    for _ in range(3):
+        rows, right = [], []
+        for power, place, along, w in zip(powers, ground, unit, used, strict=True):
+            across = np.sqrt(w) * (np.eye(3) - np.outer(along, along))
+            rows.append(np.hstack([p * across for p in power]))
+            right.append(across @ place)
+        found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0].reshape(-1, 3)
+        away = ground - powers @ found
+        distance = np.linalg.norm(away, axis=1)
+        off = np.linalg.norm(np.cross(unit, away), axis=1)
+        used = _without_outliers(off / distance * np.sqrt(weight), weight / distance**2)
+    return found
+
+
+def sum_correlation(values):
+    """1 + 2 sum of the autocorrelation (n, 3) until it first falls to what noise shows, lag by lag."""
+    n = len(values)
+    whole, total = np.sum(values * values), 1.0
+    for lag in range(1, n // 4):
+        share = np.sum(values[lag:] * values[:-lag]) / whole
+        if share < 1 / np.sqrt(n):
+            break
+        total += 2 * share
+    return total
+
+
+def fit_sensor(time, point, direction, weight, order):
+    """Path by scipy's least squares of the angles: dict of the values of a SensorFit."""
+    time, point, unit, weight = _usable(time, point, direction, weight)
+    centre, half = (min(time) + max(time)) / 2, (max(time) - min(time)) / 2
+    origin = np.median(point, axis=0)
+    ground = point - origin
+    powers = np.array([[((t - centre) / half) ** k for k in range(order + 1)] for t in time])
+    found = meet_lines(powers, ground, unit, weight)
+    unit = np.array([u if u @ a >= 0 else -u for u, a in zip(unit, ground - powers @ found, strict=True)])
+
+    def angles(flat):
+        away = ground - powers @ flat.reshape(-1, 3)
+        return unit - away / np.linalg.norm(away, axis=1)[:, None]
+
+    for _ in range(6):
+        used = _without_outliers(np.linalg.norm(angles(found), axis=1) * np.sqrt(weight), weight)
+        result = least_squares(
+            lambda flat, used=used: (angles(flat) * np.sqrt(used)[:, None]).ravel(), found.ravel(), x_scale="jac",
+            xtol=1e-13, ftol=1e-14, gtol=1e-14,
+        )  # fmt: skip
+        found = result.x.reshape(-1, 3)
+    away = ground - powers @ found
+    normal, side = 0.0, []
+    for power, ahead, r, w in zip(powers, away, angles(found), used, strict=True):
+        distance = np.linalg.norm(ahead)
+        across = np.eye(3) - np.outer(ahead, ahead) / distance**2
+        normal = normal + w / distance**2 * np.kron(np.outer(power, power), across)
+        side.append(np.sqrt(w) * (across @ r))
+    side, off = np.array(side), unit - unit.mean(axis=0)
+    residual = np.sqrt(2 * result.cost / max(2 * np.count_nonzero(used) - found.size, 1))
+    turned = off @ np.linalg.svd(off)[2][0]
+    by_time, by_angle = (sum_correlation(side[np.argsort(key, kind="stable")]) for key in (time, turned))
+    mean = unit.mean(axis=0) / np.linalg.norm(unit.mean(axis=0))
+    return {
+        "coefficients": found + np.vstack([origin, np.zeros((order, 3))]),
+        "covariance": residual**2 * max(np.sqrt(by_time), 1 + 4 * (by_angle - 1)) * np.linalg.inv(normal),
+        "condition": np.linalg.cond(normal[:3, :3]),
+        "distance": np.median([np.linalg.norm(ahead) for ahead in away]),
+        "spread": 2 * np.quantile([np.arccos(min(u @ mean, 1.0)) for u in unit], 0.98),
+        "residual": residual,
+        "half": half,
+        "centre": centre,
+    }
+
+
+def sensor_at(fit, time):
+    """Position and velocity at one time, from the values of `fit_sensor`."""
+    tau = (time - fit["centre"]) / fit["half"]
+    curves = [np.polynomial.Polynomial(column) for column in np.transpose(fit["coefficients"])]
+    return np.array([c(tau) for c in curves]), np.array([c.deriv()(tau) / fit["half"] for c in curves])
+
+
+def range_error(fit, time, direction):
+    """Standard deviation of the distance at one time, with the motion that the order does not follow."""
+    tau, order = (time - fit["centre"]) / fit["half"], len(fit["coefficients"]) - 1
+    along = np.concatenate([tau**k * np.asarray(direction) for k in range(order + 1)])
+    # Root mean squares over the window of a speed and of an acceleration that the model does not have.
+    stray = (80.0 * fit["half"] / np.sqrt(3), 1.0 * fit["half"] ** 2 / 6, 0.0)[order]
+    return np.sqrt(along @ fit["covariance"] @ along + stray**2 * fit["condition"])
+
+
+def fit_best(time, point, direction, weight):
+    """Order of the fit with the least error of the range, None where none is sound."""
+    errors = {}
+    for order in (2, 1, 0):
+        fit = fit_sensor(time, point, direction, weight, order)
+        if fit["condition"] < 1e5 and fit["spread"] > np.radians(2):
+            places = np.linspace(fit["centre"] - fit["half"], fit["centre"] + fit["half"], 9)
+            error = np.sqrt(np.mean([range_error(fit, at, [0, 0, -1]) ** 2 for at in places]))
+            errors[order] = error / fit["distance"]
+    best = min(errors, key=errors.get, default=None)
+    return best if best is not None and errors[best] < 0.01 else None
+
+
+def number_returns(pulse, xyz, direction):
+    """(number, count, ordered) of each point: its place along the first ray that is known of its pulse."""
+    found = []
+    for row, own in enumerate(pulse):
+        same = [i for i in range(len(pulse)) if pulse[i] == own]
+        ray = next((i for i in same if np.any(direction[i] != 0)), None)
+        head = same[0] if ray is None else ray
+        place = {i: sum((xyz[i] - xyz[head]) * direction[head]) for i in same}
+        found.append((1 + sorted(same, key=place.get).index(row), len(same), ray is not None))
+    return found
+
+
+def fit_slopes(tangent, slopes):
+    """(constant, factor) of the slopes (m, 2) by the tangent, fitted three times without outliers."""
+    used = list(range(len(tangent)))
+    for _ in range(3):
+        lines = [np.polyfit(tangent[used], slopes[used, axis], 1) for axis in (0, 1)]
+        off = [np.hypot(*(slopes[i] - [np.polyval(line, tangent[i]) for line in lines])) for i in range(len(tangent))]
+        used = [i for i, one in enumerate(off) if one <= 4 * max(1.482602 * np.median(off), 1e-6)]
+    return lines
+
+
+def fit_rays(xyz, starts, angle, source):
+    """Unit vector of each pulse: from its first to its last return, by the scan angle, or straight down."""
+    ends = [*starts[1:], len(xyz)]
+    span = [xyz[b - 1] - xyz[a] for a, b in zip(starts, ends, strict=True)]
+    rays = []
+    for k, (start, own) in enumerate(zip(starts, span, strict=True)):
+        ray = np.array([0.0, 0.0, -1.0])
+        sure = [
+            j for j, other in enumerate(span)
+            if source[starts[j]] == source[start] and np.linalg.norm(other) >= 2
+            and -other[2] > 0.3 * np.linalg.norm(other)
+        ]  # fmt: skip
+        if np.linalg.norm(own) >= 0.5:
+            ray = own
+        elif len(sure) >= 20:
+            tangent = np.tan(np.radians(np.clip(angle[starts], -80, 80)))
+            lines = fit_slopes(tangent[sure], np.array([span[j][:2] / -span[j][2] for j in sure]))
+            ray = np.array([*(np.polyval(line, tangent[k]) for line in lines), -1.0])
+        rays.append(ray / np.linalg.norm(ray))
+    return rays
+
+
+def near_tiles(low, high, point, buffer):
+    """Numbers of the boxes that a point lies in after they grew by the buffer on all sides."""
+    return [i for i in range(len(low)) if all(low[i] - buffer <= point) and all(point < high[i] + buffer)]

@@ -269,3 +269,82 @@ def fit_height(profile, waveform, taps, support):
     """One profile scaled so that its sum of pulses has the energy of the waveform over the support."""
     made = (naive.pulse_matrix(len(waveform), taps) @ profile)[support].sum()
     return profile * (max(waveform[support].sum(), 0.0) / made if made > 0 else 0.0)
+
+
+def refine_peak(waveform, at):
+    """Time and height of one peak by a parabola through the logarithms of three samples."""
+    if not 0 < at < len(waveform) - 1 or min(waveform[at - 1 : at + 2]) <= 0:
+        return at, waveform[at]
+    c2, c1, c0 = np.polyfit([-1, 0, 1], np.log(waveform[at - 1 : at + 2]), 2)
+    if 2 * c2 >= -1e-12:
+        return at, waveform[at]
+    shift = min(max(-c1 / (2 * c2), -0.5), 0.5)
+    return at + shift, np.exp(c0 + 0.5 * c1 * shift)
+
+
+def measure_offset(profile, places, reach):
+    """Mean distance of the signal near the returns of one waveform from them, searched twice; None without signal."""
+    offset = 0.0
+    for _ in range(2):
+        weight = moment = 0.0
+        for place in places:
+            middle = round(place + offset)
+            for i in range(max(middle - reach, 0), min(middle + reach + 1, len(profile))):
+                weight += profile[i]
+                moment += profile[i] * (i - place)
+        offset = moment / weight if weight > 0 else 0.0
+    return offset if weight > 0 else None
+
+
+def keep_runs(profile, support, least, floor):
+    """Signal of one profile: its runs on the support whose sum reaches the least, without what is below the floor."""
+    signal = np.zeros(len(profile))
+    for _, first, end in find_stretches(support[None]):
+        part = profile[first:end]
+        high = np.where(part > floor, part, 0.0)
+        if part.sum() >= least and high.sum() > 0:
+            signal[first:end] = high * part.sum() / high.sum()
+    return signal
+
+
+def find_reference(samples, quiet_widths=3.5, lags=4):
+    """(width, noise, gain, level, spread) of outgoing pulses that rise from a quiet level."""
+    samples = samples.astype(float)
+    width = max(np.median([sum(y - min(y) > 0.5 * (max(y) - min(y))) for y in samples]) / 2.3548, 0.5)
+    quiet = [[v for i, v in enumerate(y) if i < np.argmax(y) - quiet_widths * width] for y in samples]
+    quiet = [values for values in quiet if len(values) >= 3]
+    noise = np.sqrt(sum(len(v) * np.var(v) for v in quiet) / sum(len(v) - 1 for v in quiet))
+    noise = max(noise, QUANTISATION_STD)
+    means = [np.mean(v) for v in quiet]
+    level = np.median(means)
+    variance = np.mean([(v - level) ** 2 for values in quiet for v in values])
+    gain = 1.0
+    for lag in range(1, lags + 1):
+        pairs = [(v[i] - level) * (v[i + lag] - level) for v in quiet for i in range(len(v) - lag)]
+        gain += 2 * max(np.mean(pairs) / variance, 0.0) if len(pairs) >= 100 else 0.0
+    total = 1.482602 * np.median(np.abs(means - level))
+    within = noise**2 * gain / np.median([len(v) for v in quiet])
+    return width, noise, gain, level, np.sqrt(max(total**2 - within, 0.0))
+
+
+def measure_outgoing(y, width, noise, gain, level, spread):
+    """Energy, height, place and level of one outgoing pulse, and the errors of the first two; None without a pulse."""
+    y = y.astype(float)
+    at = min(max(int(np.argmax(y)), 1), len(y) - 2)
+    quiet = [v for i, v in enumerate(y) if i < at - 3.5 * width]
+    variance = spread**2
+    if quiet:
+        within = noise**2 * gain / len(quiet)
+        share = spread**2 / (spread**2 + within)
+        level, variance = level + share * (np.mean(quiet) - level), share * within
+    a, b, c = np.log(np.maximum(y[at - 1 : at + 2] - level, 0.5 * noise))
+    shift = min(max((a - c) / 2 / (a + c - 2 * b), -1.0), 1.0) if a + c < 2 * b else 0.0
+    height, time = np.exp(b - (a - c) * shift / 4), at + shift
+    energy = total = squares = 0.0
+    for i, value in enumerate(y):
+        inside = min(max(i - time + 4 * width + 0.5, 0), 1) * min(max(6 * width + 0.5 - i + time, 0), 1)
+        energy, total, squares = energy + inside * (value - level), total + inside, squares + inside**2
+    if not (height > 8 * noise and energy > 0):
+        return None
+    errors = np.sqrt(noise**2 * gain * squares + variance * total**2), np.sqrt((1.1 * noise) ** 2 + variance)
+    return energy, height, time, level, *errors

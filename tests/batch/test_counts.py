@@ -77,6 +77,15 @@ def test_quantiles_are_those_of_the_values_to_the_width_of_a_bin(rng):
     assert AMPLITUDE_BINS.quantile(AMPLITUDE_BINS.count(np.empty(0)), 0.5) is None
 
 
+@pytest.mark.parametrize("bins", [AMPLITUDE_BINS, WIDTH_BINS])
+def test_a_quantile_is_the_middle_of_its_bin(bins):
+    for place in (0, 200, 700):
+        centre = bins.low * np.exp((place + 0.5) * bins.step)
+        edges = centre * np.exp(0.49 * bins.step * np.array([-1.0, 1.0]))
+        for value in edges:
+            assert bins.quantile(bins.count(np.array([value])), 0.5) == pytest.approx(centre, rel=5e-4)
+
+
 def test_histograms_leave_out_what_is_no_positive_number_and_keep_what_is_beyond():
     counts = WIDTH_BINS.count(np.array([np.nan, np.inf, -1.0, 0.0, 1e-9, 1e9]))
     assert counts.sum() == 2 and counts[0] == 1 and counts[-1] == 1

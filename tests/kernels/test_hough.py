@@ -104,6 +104,14 @@ def test_scan_lines_end_where_the_mirror_turns(rng):
     assert np.abs(found[1:] - np.arange(200, 1200, 200)).max() <= 2
 
 
+def test_scan_lines_of_a_noisy_angle_end_at_the_turn(rng):
+    """Noise may turn the direction around for some pulses just before the mirror turns."""
+    angle = zigzag(40, 200) + 0.02 * rng.standard_normal(8000)
+    found = find_sweeps(angle, np.arange(8000) * 1e-5)
+    assert len(found) == 40
+    assert np.abs(found[1:] - np.arange(200, 8000, 200)).max() <= 12
+
+
 def test_scan_lines_end_where_the_mirror_jumps_back_or_pauses():
     angle = np.tile(np.linspace(0.4, -0.4, 150), 4)
     assert find_sweeps(angle, np.arange(600.0)).tolist() == [0, 150, 300, 450]

@@ -170,3 +170,5 @@ def test_offsets_are_those_of_the_returns_of_a_packet():
     offset, known = measure_offsets(profile, row, sample, 3)
     assert known.tolist() == [True, False, False]
     assert offset == pytest.approx([0.4, 0.0, 0.0])
+    profile[2, 0] = 7.0
+    assert not measure_offsets(profile, np.array([2]), np.array([-30.0]), 3)[1].any()

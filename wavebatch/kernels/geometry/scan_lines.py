@@ -57,7 +57,7 @@ def _find_turns(angle: np.ndarray) -> np.ndarray:
     for edge in edges.tolist():
         low, high = max(edge - LAG, 0), min(edge + 2 * LAG, len(angle))
         part = angle[low:high]
-        turns.append(low + int(np.argmax(part) if rising[max(edge - LAG // 2, 0)] else np.argmin(part)))
+        turns.append(low + int(np.argmax(part) if rising[edge - 1] else np.argmin(part)))
     return np.array(turns, np.int64)
 
 

@@ -137,7 +137,7 @@ def measure_offsets(
     lag = np.arange(-reach, reach + 1)
     for _ in range(2):
         middle = np.rint(sample + offset[row])
-        at = np.clip(middle, -reach, s + reach).astype(np.int64)[:, None] + lag
+        at = np.clip(middle, -reach - 1, s + reach).astype(np.int64)[:, None] + lag
         near = np.where((at >= 0) & (at < s), profile[row[:, None], np.clip(at, 0, s - 1)], 0.0)
         weight, first = np.zeros(len(row)), np.zeros(len(row))
         for column in range(len(lag)):

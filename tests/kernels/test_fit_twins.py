@@ -1,0 +1,239 @@
+"""Kernels around the fit, and those of outgoing pulses and profiles, against slow twins and the math module."""
+
+import math
+
+import naive
+import naive_fit
+import naive_signal
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from wavebatch.kernels.elementary import exp, log, log1p, solve
+from wavebatch.kernels.fit.closed_form import estimate_starts, fit_parabola, start_errors
+from wavebatch.kernels.fit.hermite import residual_moments
+from wavebatch.kernels.fit.learn_pulse import fit_bounded, stack_pulse
+from wavebatch.kernels.fit.problem import Solution, choose
+from wavebatch.kernels.fit.pulse_shape import (
+    TAIL_STEP,
+    PulseShape,
+    PulseTail,
+    fit_one_gaussian,
+    measure_pulse,
+    tail_at,
+    tail_reach,
+)
+from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.signal.filters import refine_peaks
+from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
+from wavebatch.kernels.signal.profiles import keep_signal, measure_offsets
+from wavebatch.kernels.signal.signal import recorded_lengths
+
+
+def test_functions_are_those_of_the_math_module(rng):
+    x = np.r_[rng.uniform(-700, 700, 300), 0.0, -0.0, 1e-300, -1e-300, 1.0, -1.0]
+    assert exp(x) == pytest.approx([math.exp(value) for value in x], rel=1e-15)
+    positive = np.exp(x)
+    assert log(positive) == pytest.approx([math.log(value) for value in positive], rel=1e-14, abs=1e-15)
+    small = rng.uniform(-0.99, 3, 300) * 10.0 ** rng.integers(-17, 1, 300)
+    assert log1p(small) == pytest.approx([math.log1p(value) for value in small], rel=1e-14)
+    assert log(np.array([0.0]))[0] == -math.inf and math.isnan(log(np.array([-1.0]))[0])
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 9, 20])
+def test_equations_are_solved_as_by_numpy(rng, size):
+    half = rng.normal(size=(size + 3, size)) * 10.0 ** rng.uniform(-3, 3, size)
+    matrix, right = half.T @ half, rng.normal(size=(size, 4))
+    for wanted in (right, right[:, 0]):
+        np.testing.assert_allclose(matrix @ solve(matrix, wanted), wanted, rtol=1e-6, atol=1e-6 * np.abs(wanted).max())
+        np.testing.assert_allclose(solve(matrix, wanted), np.linalg.solve(matrix, wanted), rtol=1e-5)
+
+
+def test_parabolas_are_those_of_numpy(rng):
+    x, y, weight = rng.normal(0, 2, (7, 40)), rng.normal(0, 5, (7, 40)), rng.uniform(0.1, 3, (7, 40))
+    found = np.stack(fit_parabola(weight, x, y, axis=0))
+    for column in range(40):
+        expected = np.polyfit(x[:, column], y[:, column], 2, w=np.sqrt(weight[:, column]))[::-1]
+        assert found[:, column] == pytest.approx(expected, rel=1e-6)
+    assert not np.any(fit_parabola(np.ones(7), np.zeros(7), y[:, 0], axis=0)), "all in one place"
+
+
+def test_starts_are_those_of_single_peaks(rng):
+    """Peaks, samples that are none, and those at both ends."""
+    z = (np.arange(30)[:, None] - rng.uniform(0, 29, 20)) / 2.5
+    smoothed = rng.normal(3, 2, (30, 20)) + 60 * np.exp(-0.5 * z**2)
+    waveform = np.arange(20).repeat(2)
+    sample = np.stack([smoothed.argmax(axis=0), rng.integers(0, 30, 20)], axis=1).ravel()
+    keep = smoothed[sample, waveform] > 1
+    waveform, sample = waveform[keep], sample[keep]
+    found = estimate_starts(smoothed.astype(np.float32), waveform, sample, 2.0)
+    for row, (w, at) in enumerate(zip(waveform, sample, strict=True)):
+        assert [part[row] for part in found] == pytest.approx(naive.log_parabola(smoothed[:, w], at, 2.0), rel=1e-3)
+
+
+def test_recorded_lengths_are_those_of_single_packets(rng):
+    samples = rng.integers(3, 200, (200, 60)).astype(np.uint8)
+    for row, end in enumerate(rng.integers(0, 61, 200)):
+        samples[row, end:] = 0
+        samples[row, rng.integers(0, 60)] = rng.integers(0, 9)
+    assert recorded_lengths(samples).tolist() == [naive_signal.recorded_length(y) for y in samples]
+
+
+def test_errors_of_starts_are_those_of_each_sample():
+    amplitude, width = np.array([20.0, 300.0, 300.0, 50.0]), np.array([0.9, 1.5, 3.0, 6.0])
+    std = np.array([1, 2, 0.5, 1])
+    found = start_errors(amplitude, width, std)
+    for row in range(4):
+        expected = naive_fit.start_errors(amplitude[row], width[row], std[row])
+        assert (found[0][row], found[1][row]) == pytest.approx(expected, rel=0.02)
+
+
+def test_moments_of_residuals_are_those_of_the_twin(rng):
+    """Also of echoes at the ends of the waveform, and narrower or wider than it."""
+    s = 60
+    residual = rng.normal(0, 2, (30, s)).astype(np.float32)
+    time, width = rng.uniform(-2, s + 2, 30), rng.uniform(0.6, 5, 30)
+    width[:2] = 40.0
+
+    def read(rows, at):
+        return np.take_along_axis(residual[rows], at, axis=1)
+
+    h3, h4 = residual_moments(read, s, time, width, np.full(30, 2.0))
+    x = np.arange(float(s))
+    for row in range(30):
+        expected = naive_fit.moments(np.array([[1.0], [time[row]], [width[row]]]), x, residual[row].astype(float), 2.0)
+        assert (h3[row], h4[row]) == pytest.approx((expected[0][0], expected[1][0]), abs=0.02)
+
+
+@pytest.mark.parametrize("s", [40, 1300])
+@pytest.mark.parametrize(
+    "shape", [{}, {"kappa": 0.2}, {"components": ((0.3, 4.0, 2.0), (-0.1, 9.0, 0.5))}], ids=["gauss", "skewed", "sum"]
+)
+def test_rendered_waveforms_are_sums_of_pulses(rng, shape, s):
+    """Long waveforms are made in parts, with the echoes that reach each part."""
+    m = 60
+    waveform = np.sort(rng.integers(0, 7, m))
+    time, amplitude, width = rng.uniform(-3, s + 3, m), rng.uniform(-5, 200, m), rng.uniform(0.8, 6, m)
+    found = render_echoes(PulseShape(**shape), 8, s, waveform, time, amplitude, width)
+    x = np.arange(float(s))
+    for row in range(8):
+        own = waveform == row
+        expected = naive.model(np.stack([amplitude, time, width])[:, own], x, **shape) if own.any() else np.zeros(s)
+        np.testing.assert_allclose(found[row], expected, atol=0.02)
+
+
+def test_a_stacked_pulse_is_the_median_of_single_samples(rng):
+    time, amplitude = rng.uniform(10, 20, 90), rng.uniform(50, 200, 90)
+    signal = amplitude[:, None] * np.exp(-0.5 * ((np.arange(32) - time[:, None]) / 2) ** 2) + rng.normal(0, 1, (90, 32))
+    signal[5, 3:9], signal[7] = np.nan, np.inf
+    found = stack_pulse(signal, amplitude, time, 8.0, 12.0)
+    step = found.lag[1] - found.lag[0]
+    expected = naive_fit.stack(signal, amplitude, time, 8.0, 12.0, step)
+    assert found.lag == pytest.approx([lag for lag, *_ in expected])
+    assert found.value == pytest.approx([middle for _, middle, *_ in expected], abs=1e-5)
+    scatter = [np.std(values) / np.sqrt(number) for *_, number, values in expected]
+    assert np.median(found.error / scatter) == pytest.approx(1.25, rel=0.15)
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+def test_bounded_fits_are_those_of_scipy(rng, bounded):
+    x = np.linspace(-6, 9, 80)
+    y = 1.3 * np.exp(-0.5 * ((x - 0.4) / 1.7) ** 2) + 0.02 * rng.standard_normal(80)
+    low, high = np.array([0.0, -3.0, 0.3]), np.array([1.1 if bounded else 9.0, 3.0, 5.0])
+
+    def misfit(p):
+        return p[0] * np.exp(-0.5 * ((x - p[1]) / p[2]) ** 2) - y
+
+    start = np.array([1.0, 0.0, 1.0])
+    found = fit_bounded(misfit, lambda p: naive.differentiate(misfit, p), start, low, high, 200)
+    expected = least_squares(misfit, start, bounds=(low, high), xtol=1e-12, ftol=1e-12).x
+    assert found == pytest.approx(expected, abs=1e-4) and (found[0] == 1.1) == bounded
+
+
+def test_chosen_solutions_are_those_of_a_loop(rng):
+    solutions = []
+    for _ in range(3):
+        number = rng.integers(0, 4, 12)
+        m = number.sum()
+        per_cluster = rng.random(12) < 0.5, *rng.random((2, 12))
+        per_echo = *rng.random((2, m, 4)), rng.random((m, 2)), rng.random(m) < 0.5
+        solutions.append(Solution(number, *per_cluster, *per_echo))
+    chosen = rng.integers(0, 3, 12)
+    found = choose(solutions, chosen)
+    for name in Solution._fields:
+        per_echo = name in ("parameters", "errors", "shared", "at_bound")
+        rows = []
+        for cluster, which in enumerate(chosen):
+            values = getattr(solutions[which], name)
+            rows += list(values[solutions[which].cluster == cluster]) if per_echo else [values[cluster]]
+        np.testing.assert_array_equal(getattr(found, name), np.array(rows), name)
+
+
+def test_tails_are_those_of_a_loop(rng):
+    first, values = -3.0, rng.normal(0, 0.1, 60)
+    tail = PulseTail(first, values)
+    lag = rng.uniform(-6, 16, 200)
+    places = first + TAIL_STEP * np.arange(60)
+    expected = [values[np.argmin(np.abs(places - at))] if -3.1 < at < 11.8 else 0.0 for at in lag]
+    inside = (np.abs(lag + 3.125) > 0.03) & (np.abs(lag - 11.875) > 0.2)
+    assert tail_at(tail, lag)[inside] == pytest.approx(np.array(expected)[inside])
+    ratio = np.r_[0.0, 1.0, 5.0, rng.uniform(1, 200, 30)]
+    assert tail_reach(tail, ratio).tolist() == [naive_fit.tail_reach(first, values, TAIL_STEP, one) for one in ratio]
+
+
+@pytest.mark.parametrize("shape", [{}, {"components": ((0.2, 2.5, 1.0),)}, {"kappa": -0.2}])
+def test_measures_of_pulses_are_those_of_roots(shape):
+    found = measure_pulse(PulseShape(**shape), 1.2, 4.0)
+    for row in (0, 90, 199):
+        expected = naive_fit.measure(shape, found.width[row])
+        assert (found.peak[row], found.half_width[row]) == pytest.approx(expected, abs=0.015)
+
+
+def test_the_one_gaussian_of_a_pulse_is_that_of_scipy():
+    x = np.linspace(-8, 14, 300)
+    value = naive.pulse(x, 1.3, 1.7, kappa=0.2)
+
+    def misfit(p):
+        return p[0] * naive.pulse(x, p[1], p[2]) - value
+
+    expected = least_squares(misfit, [1.0, 1.0, 1.5], xtol=1e-12, ftol=1e-12).x
+    assert fit_one_gaussian(x, value) == pytest.approx(expected[1:], abs=1e-4)
+
+
+def test_refined_peaks_are_those_of_single_waveforms(rng):
+    filtered = rng.normal(2, 2, (30, 20))
+    waveform, sample = rng.integers(0, 20, 300), rng.integers(0, 30, 300)
+    time, height = refine_peaks(filtered, waveform, sample)
+    expected = [naive_signal.refine_peak(filtered[:, w], i) for w, i in zip(waveform, sample, strict=True)]
+    assert time == pytest.approx([t for t, _ in expected]) and height == pytest.approx([h for _, h in expected])
+
+
+def test_offsets_and_signal_of_profiles_are_those_of_single_ones(rng):
+    profile = np.maximum(rng.normal(0, 1, (40, 50)), 0) * (rng.random((40, 50)) < 0.3)
+    row = np.sort(rng.integers(0, 40, 70))
+    sample = rng.uniform(-30, 80, 70)
+    offset, known = measure_offsets(profile, row, sample, 4)
+    raw, support = rng.normal(0.3, 1, (40, 50)), rng.random((40, 50)) < 0.6
+    least, floor = rng.uniform(0, 2, 40), rng.uniform(0, 0.5, 40)
+    signal, seen = keep_signal(raw, support, least, floor)
+    for n in range(40):
+        expected = naive_signal.measure_offset(profile[n], sample[row == n], 4)
+        assert known[n] == (expected is not None) and offset[n] == pytest.approx(expected or 0.0)
+        kept = naive_signal.keep_runs(raw[n], support[n], least[n], floor[n])
+        assert signal[n] == pytest.approx(kept) and seen[n] == kept.any()
+
+
+def test_outgoing_pulses_are_measured_as_by_a_loop(rng):
+    """Levels that differ, coloured noise, clipped and empty recordings, peaks near both ends."""
+    x, centre = np.arange(40), rng.uniform(2, 38, 250)
+    noise = rng.normal(0, 1, (250, 41))
+    level = rng.normal(20, 3, 250)[:, None] + 1.2 * noise[:, 1:] + 0.8 * noise[:, :-1]
+    height = np.where(np.arange(250) % 30 == 0, 0.0, rng.uniform(60, 220, 250))[:, None]
+    z = (x - centre[:, None]) / 1.8
+    samples = np.clip(np.rint(level + height * np.exp(-0.5 * z**2)), 0, 200).astype(np.uint8)
+    reference = find_reference(samples)
+    assert reference == pytest.approx(naive_signal.find_reference(samples), rel=1e-4)
+    found = np.stack(measure_outgoing(samples, reference), axis=1)
+    for own, y in zip(found, samples, strict=True):
+        expected = naive_signal.measure_outgoing(y, *reference)
+        assert own == pytest.approx(np.full(6, np.nan) if expected is None else expected, rel=1e-4, nan_ok=True)

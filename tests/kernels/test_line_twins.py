@@ -1,0 +1,66 @@
+"""Scan lines, lines in slices and tiles against slow twins, on random, noisy and degenerate inputs."""
+
+import naive_geometry
+import numpy as np
+import pytest
+
+from wavebatch.kernels.geometry.hough import find_lines
+from wavebatch.kernels.geometry.scan_lines import LAG, find_sweeps
+from wavebatch.kernels.geometry.tiles import cut_tiles, is_inside, sort_into_tiles
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.02, 0.1])
+def test_scan_lines_are_those_of_a_loop(rng, noise):
+    """Mirrors that swing, rotate or stand still, with jitter, lost pulses, pauses and clocks that run backwards."""
+    for _ in range(40):
+        n = int(rng.integers(0, 400))
+        phase = np.cumsum(rng.choice([1, 1, 1, 5], n)) / rng.integers(20, 150)
+        shape = [np.sin(phase), np.abs(phase % 2 - 1), phase % 1, np.zeros(n)][rng.integers(0, 4)]
+        angle = shape + noise * rng.standard_normal(n)
+        time = np.cumsum(rng.choice([1.0, 1.0, 1.0, 0.0, 40.0, -3.0], n, p=[0.5, 0.2, 0.2, 0.08, 0.01, 0.01]))
+        assert find_sweeps(angle, time).tolist() == naive_geometry.find_sweeps(angle, time, LAG)
+
+
+def slice_of(rng, kind):
+    """Pixels (x, y), weights of one or two lines among scattered pixels."""
+    along = rng.uniform(0, 60, 70)
+    x, y = along, {"flat": 0.1, "steep": 3.0}.get(kind, -0.7) * along + rng.normal(0, 1.0, 70)
+    if kind == "crossing":
+        y[::3] = 0.7 * along[::3] - 40
+    if kind == "gaps":
+        x[::2] += 90
+    noise = rng.uniform(-10, 80, (2, 25 if kind != "noise" else 200))
+    if kind == "noise":
+        x = y = np.empty(0)
+    return np.r_[x, noise[0]], np.r_[y, noise[1]], rng.uniform(0.5, 3.0, len(x) + noise.shape[1])
+
+
+@pytest.mark.parametrize("kind", ["flat", "steep", "crossing", "gaps", "noise"])
+def test_lines_of_a_slice_are_those_of_loops(rng, kind):
+    x, y, weight = slice_of(rng, kind)
+    options = {"sigma": 1.0, "gap": 12.0, "shortest": 15.0, "most": 3}
+    lines = find_lines(x, y, weight, **options)
+    expected = naive_geometry.find_lines(x, y, weight, **options)
+    assert len(lines) == len(expected) and (lines or kind == "noise")
+    for line, (rows, start, end, total) in zip(lines, expected, strict=True):
+        assert line.rows.tolist() == rows
+        assert line.start == pytest.approx(start, abs=1e-6) and line.end == pytest.approx(end, abs=1e-6)
+        assert line.weight == pytest.approx(total)
+
+
+@pytest.mark.parametrize("kind", ["random", "equal", "line"])
+def test_points_are_in_the_tiles_that_a_loop_finds(rng, kind):
+    xyz = rng.normal(0, 10, (300, 3)).round(1)
+    if kind != "random":
+        xyz[:, 1:] = 0.0
+        xyz[: 200 if kind == "equal" else 0] = 0.0
+    tiles = cut_tiles(xyz[::2], 12, 0.5)
+    for buffer in (0.0, 1.5):
+        rows, numbers = sort_into_tiles(tiles, xyz, buffer)
+        near = [(i, n) for i in range(300) for n in naive_geometry.near_tiles(tiles.low, tiles.high, xyz[i], buffer)]
+        found = list(zip(rows.tolist(), numbers.tolist(), strict=True))
+        assert set(near) <= set(found) if buffer else sorted(found) == near
+        assert len(set(found)) == len(found)
+    for number in range(len(tiles)):
+        expected = [number in naive_geometry.near_tiles(tiles.low, tiles.high, point, 0.0) for point in xyz]
+        assert is_inside(tiles, number, xyz).tolist() == expected

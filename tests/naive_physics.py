@@ -1,0 +1,237 @@
+"""Slow, plain references for kernels/physics: one echo, one pulse or one angle after the other, by the math module."""
+
+import math
+
+import numpy as np
+from scipy.integrate import quad
+from scipy.optimize import brentq, curve_fit
+from scipy.special import log_ndtr
+
+from wavebatch.kernels.physics.angle_errors import RADIUS
+
+LIGHT = 0.299792458
+
+
+def median(values):
+    values = sorted(values)
+    return (values[(len(values) - 1) // 2] + values[len(values) // 2]) / 2
+
+
+def transmit(distance, attenuation):
+    """Share of light that is left after a way there and back through air that takes so many dB per kilometre."""
+    return 10 ** (-2 * distance / 1000 * attenuation / 10)
+
+
+def backscatter(constant, distance, amplitude, sigma, attenuation):
+    if not 0 < distance < math.inf:
+        return math.nan
+    return constant * distance**2 * amplitude * sigma / transmit(distance, attenuation)
+
+
+def cross_section(gamma, distance, divergence):
+    """Gamma times the area of the footprint."""
+    return gamma * math.pi * (distance * divergence / 2) ** 2 if 0 < distance < math.inf else math.nan
+
+
+def diffuse_reflectance(gamma, incidence):
+    return gamma / (4 * math.cos(incidence)) if math.cos(incidence) > math.cos(math.radians(85)) else math.nan
+
+
+def energy_error(amplitude, sigma, amplitude_err, sigma_err):
+    """By the covariance of both, whose correlation is -1 / sqrt(3)."""
+    if not (amplitude > 0 and sigma > 0):
+        return math.nan
+    shared = -amplitude_err * sigma_err / math.sqrt(3)
+    slope = np.array([1 / amplitude, 1 / sigma])
+    return math.sqrt(slope @ [[amplitude_err**2, shared], [shared, sigma_err**2]] @ slope)
+
+
+def backscatter_error(energy_err, distance, distance_err, constant_err, attenuation, power, attenuation_err):
+    """From differences of the logarithm of R^power / transmission."""
+    if not 0 < distance < math.inf:
+        return math.nan
+
+    def logarithm(r, a):
+        return power * math.log(r) - math.log(transmit(r, a))
+
+    step = 1e-4 * distance
+    by_range = (logarithm(distance + step, attenuation) - logarithm(distance - step, attenuation)) / (2 * step)
+    by_air = (logarithm(distance, attenuation + 0.01) - logarithm(distance, attenuation - 0.01)) / 0.02
+    parts = energy_err, constant_err, by_range * distance_err, by_air * attenuation_err
+    return math.sqrt(sum(part * part for part in parts))
+
+
+def reflectance_error(relative, incidence, incidence_err):
+    return math.sqrt(relative**2 + (math.tan(incidence) * incidence_err) ** 2)
+
+
+def receive_power(section, distance, transmitted, aperture, divergence, efficiency, attenuation):
+    """Light on the footprint, scattered over the sphere, caught by the lens."""
+    density = transmitted / (math.pi * (distance * divergence / 2) ** 2)
+    caught = density * section / (4 * math.pi * distance**2) * math.pi * (aperture / 2) ** 2
+    return caught * efficiency * transmit(distance, attenuation)
+
+
+def spread_cross_section(reflectance, distance, divergence):
+    return 4 * reflectance * math.pi * (distance * divergence / 2) ** 2
+
+
+def slope_error(incidence, slope, directions=3600):
+    """Root mean square of cos(incidence) / cos(true angle) - 1 over surfaces that slope in any direction."""
+    ray = np.array([np.sin(incidence), 0.0, np.cos(incidence)])
+    off = []
+    for turn in 2 * np.pi * np.arange(directions) / directions:
+        normal = np.array([np.sin(slope) * np.cos(turn), np.sin(slope) * np.sin(turn), np.cos(slope)])
+        off.append(ray[2] / (ray @ normal) - 1)
+    return np.sqrt(np.mean(np.square(off)))
+
+
+def spread_of_angle(angle, distance, divergence):
+    """Two-way time of the slant across half a footprint."""
+    return 2 * (distance * divergence / 4) * math.tan(angle) / LIGHT
+
+
+def angle_of_spread(spread, distance, divergence):
+    return math.copysign(1, spread) * math.atan(abs(spread) * LIGHT / 2 / (distance * divergence / 4))
+
+
+def radius(variance, error):
+    """Half of the range of the spread that holds 68.3 %: from the table, or by propagation far from 0."""
+    place = variance / error if variance < 0 else math.sqrt(variance / error)
+    table = list(zip(*RADIUS, strict=True))
+    if place > table[-1][0]:
+        return error / (2 * math.sqrt(variance))
+    if place <= table[0][0]:
+        return table[0][1] * math.sqrt(error)
+    right = next(i for i, (at, _) in enumerate(table) if at >= place)
+    (a, low), (b, high) = table[right - 1], table[right]
+    return (low + (high - low) * (place - a) / (b - a)) * math.sqrt(error)
+
+
+def angle_of_variance(variance, error, distance, divergence):
+    """Angle of one echo and its error."""
+    if not (math.isfinite(variance) and math.isfinite(error) and error > 0 and distance > 0):
+        return math.nan, math.nan
+    spread, around = math.sqrt(max(variance, 0.0)), radius(variance, error)
+    low, angle, high = (angle_of_spread(spread + step, distance, divergence) for step in (-around, 0.0, around))
+    return (angle, (high - low) / 2) if angle <= math.radians(80) else (math.nan, math.nan)
+
+
+def mean_above(over, share):
+    """Mean of the normal law of which so many of the draws above 0 lie above `over`."""
+    return brentq(lambda mean: log_ndtr(mean - over) - log_ndtr(mean) - math.log(share), -3000, over + 9, xtol=1e-10)
+
+
+def angle_above(variance, error, distance, divergence, threshold):
+    """Angle of one echo that is seen because its variance exceeds the threshold, and its error."""
+    over = variance / error - threshold
+    angles = []
+    for share in (0.1587, 0.5, 0.8413):
+        true = threshold + mean_above(over, share)
+        angles.append(angle_of_spread(math.sqrt(max(error * true, 0.0)), distance, divergence))
+    low, angle, high = angles
+    facing = angle_of_spread(radius(0.0, error), distance, divergence)
+    off = (high - low) / 2 if angle > 0 else max(high, facing)
+    return (angle, off) if angle <= math.radians(80) else (math.nan, math.nan)
+
+
+def spread_pulse(time, exponent, spread, tau, causal=False):
+    """t^exponent exp(-t) spread by a Gaussian, at one time; of any height."""
+
+    def product(delay):
+        late = (time - delay) / tau
+        return late**exponent * math.exp(-late - 0.5 * (delay / spread) ** 2) if late > 0 else 0.0
+
+    first, last = max(-8 * spread, time - 60 * tau, 0.0 if causal else -math.inf), min(8 * spread, time)
+    return quad(product, first, last, limit=200)[0] if first < last else 0.0
+
+
+def fitted_width(time, curve, spacing):
+    """Width of the Gaussian that scipy fits to samples of a curve, mean of four places of the first sample."""
+    widths = []
+    for phase in (0.0, 0.25, 0.5, 0.75):
+        at = np.arange(time[0] + phase * spacing, time[-1], spacing)
+        start = 1.0, time[np.argmax(curve)], (curve > 0.5).sum() * (time[1] - time[0]) / 2.3548
+        bell = lambda x, a, t, s: a * np.exp(-0.5 * ((x - t) / s) ** 2)  # noqa: E731
+        widths.append(abs(curve_fit(bell, at, np.interp(at, time, curve), start)[0][2]))
+    return np.mean(widths)
+
+
+def spread_variance(spread, width, cut, measured):
+    """Variance of one measured width: what the pulse adds is interpolated, and constant beyond the ends."""
+    own = [w * w - s * s for s, w in zip(spread, width, strict=True)]
+    if measured > width[-1]:
+        return math.nan if cut else measured**2 - own[-1]
+    if measured <= width[0]:
+        return measured**2 - own[0]
+    right = next(i for i, w in enumerate(width) if w >= measured)
+    share = (measured - width[right - 1]) / (width[right] - width[right - 1])
+    return measured**2 - (own[right - 1] + share * (own[right] - own[right - 1]))
+
+
+def light_slope(pulses, ratio):
+    """Slope of the logarithm of all light over the ground's share, fitted three times without outliers."""
+    share = [ratio * g / (c + ratio * g) for c, g in pulses]
+    light = [math.log(c + ratio * g) for c, g in pulses]
+    used = range(len(pulses))
+    for _ in range(3):
+        line = np.polyfit([share[i] for i in used], [light[i] for i in used], 1)
+        off = [abs(y - line[0] * x - line[1]) for x, y in zip(share, light, strict=True)]
+        used = [i for i, one in enumerate(off) if one <= 4 * max(1.482602 * median(off), 1e-9)]
+    return line[0], np.std(share)
+
+
+def canopy_ratio(pulses, logs):
+    """Logarithm of the ratio at which light has no slope over the ground's share; None where there is not one."""
+    slopes = [light_slope(pulses, math.exp(value))[0] for value in logs]
+    rises = [i for i in range(len(logs) - 1) if slopes[i] < 0 <= slopes[i + 1]]
+    if len(rises) != 1:
+        return None
+    low, high = logs[rises[0]], logs[rises[0] + 1]
+    found = brentq(lambda value: light_slope(pulses, math.exp(value))[0], low, high, xtol=2e-4)
+    return found if light_slope(pulses, math.exp(found))[1] >= 0.1 else None
+
+
+def estimate_canopy_ratio(canopy, ground):
+    """(ratio, error) from all pulses, and from all but one of ten parts of the strip."""
+    pulses = [(c, g) for c, g in zip(canopy, ground, strict=True) if c >= 0 and g >= 0 and 0 < c + g < math.inf]
+    found = canopy_ratio(pulses, np.linspace(math.log(0.02), math.log(50.0), 33)) if len(pulses) >= 100 else None
+    if found is None:
+        return None
+    parts = [i * 10 // len(pulses) for i in range(len(pulses))]
+    near = found + np.linspace(-math.log(2), math.log(2), 5)
+    others = [
+        canopy_ratio([p for p, own in zip(pulses, parts, strict=True) if own != left], near) for left in range(10)
+    ]
+    if None in others:
+        return None
+    light = [math.log(c + math.exp(found) * g) for c, g in pulses]
+    scatter = 1.482602 * median([abs(value - median(light)) for value in light])
+    error = math.sqrt(9 * np.var(others) + 0.03**2 + scatter**4)
+    return (math.exp(found), math.exp(found) * error) if error < 0.25 else None
+
+
+def energy_slope(light, energy):
+    """Slope of the steps of the logarithm of light over those of energy, and its error; the ends do not count."""
+    steps = []
+    for i in range(1, len(light) - 2):
+        four = light[i], light[i + 1], energy[i], energy[i + 1]
+        if all(0 < value < math.inf for value in four):
+            steps.append((math.log(four[1] / four[0]), math.log(four[3] / four[2])))
+    whole = sum(step**2 for _, step in steps)
+    if not whole > 0:
+        return 0.0, math.inf
+    limit = 4 * median([abs(rise) for rise, _ in steps])
+    steps = [(min(max(rise, -limit), limit), step) for rise, step in steps]
+    slope = sum(rise * step for rise, step in steps) / whole
+    return slope, math.sqrt(2 * sum((rise - slope * step) ** 2 for rise, step in steps) / len(steps) / whole)
+
+
+def judge_energies(light, energy):
+    """"" where light follows the energies or nothing is known; else "early", "late" or "others"."""
+    slope, error = energy_slope(light, energy)
+    if error > 0.15 or slope + 3 * error > 0.5:
+        return ""
+    if energy_slope(light, [energy[-1], *energy[:-1]])[0] > 0.5:
+        return "early"
+    return "late" if energy_slope(light, [*energy[1:], energy[0]])[0] > 0.5 else "others"
