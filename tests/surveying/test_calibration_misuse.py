@@ -175,7 +175,6 @@ def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_pat
     assert np.nanmedian(stated) == pytest.approx(growth, abs=0.1)
 
 
-@pytest.mark.slow
 def test_reflectances_above_one_are_one_line_whatever_the_reason(tmp_path, calibrated):
     wrong = write_targets(tmp_path / "t.csv")
     wrong.write_text(wrong.read_text().replace("field,0.3", "field,0.9"))
