@@ -60,6 +60,13 @@ def _area(path, box):
     return path
 
 
+def test_points_on_the_edge_of_a_box_are_in_it(riegl, full, tmp_path):
+    las, _ = full
+    x, y = np.asarray(las.x), np.asarray(las.y)
+    some, report = _run(riegl, tmp_path, bbox=(x.min(), y.min(), x.max(), y.max()))
+    assert len(some.points) == len(las.points) and report["counts"]["left_out"]["bbox"] == 0
+
+
 def test_each_option_writes_points_of_the_full_run_and_counts_the_others(riegl, full, tmp_path):
     las, whole = full
     box = _box(las)
