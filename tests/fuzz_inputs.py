@@ -158,7 +158,7 @@ voxelize {base}/strip.las -o {out}/a.npz --size 1
 _ARRAYS = {
     "truth.npz": """
 compare {base}/cloud.laz --truth {input}
-compare {base}/cloud.laz --truth {input} --json --tolerance 3
+compare {base}/cloud.laz --truth {input} --json --within 3
 """,
     "voxels.npz": """
 plot section {input} -o {out}/a.svg

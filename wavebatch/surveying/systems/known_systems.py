@@ -230,6 +230,7 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
         return system
     pulse, cost = _simplify(part, system, own) if learned else (system, own)
     drawn = pulse.sigma_ref < system.sigma_ref
+    certain = learned and len(block) >= COMPARED  # one learned from few echoes has their noise, and loses to any other
     tried = []
     for known in known_systems():
         ratio = known.system.sigma_ref / system.sigma_ref
@@ -238,7 +239,7 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
             found = measure_cost(part, taken)
             if found.typical < NEARLY * own.typical and (
                 (drawn and found.typical < ALMOST * cost.typical)
-                or _is_sure(part, taken, found.typical, own.typical, learned=learned, narrower=ratio < 1)
+                or _is_sure(part, taken, found.typical, own.typical, learned=certain, narrower=ratio < 1)
             ):
                 tried.append((found.typical, known.name, taken, found))
     if tried:
