@@ -38,6 +38,8 @@ _LEAST_SCALE = 5.0
 _ERROR_ROOM = 0.5
 """Error bars may widen the signal panel by this share of the signal on each side; longer ones are cut."""
 _DASHED = (0, (4, 2))
+_LETTER = 0.085
+"""Width of a letter of a title [inches]."""
 
 
 def draw_waveforms(
@@ -65,6 +67,10 @@ def draw_waveforms(
     # The table gets a row as high as its lines.
     below = 0.155 * (text.count("\n") + 1) if text else 0.0
     width = max(width, 0.0665 * max(map(len, text.split("\n"))) + 0.4) if text else width
+    room = (width - 0.8) / columns - 0.5
+    # And a title gets its lines: panels keep their height.
+    flags = max(sum(len(part) + 3 for part in _list_flags(view)) for view in views)
+    height += 0.16 * rows * int(_LETTER * flags / room)
     with open_picture(target, (width, height + below), overwrite=overwrite) as figure:
         title = fit_parts(figure, (plain_text(strip), plain_text(chain, 300)), width - 0.2, size=11, weight="bold")
         figure.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
@@ -72,7 +78,6 @@ def draw_waveforms(
         inner = outer[0].subgridspec(rows, columns)
         panels = []
         for number, view in enumerate(views):
-            room = (width - 0.8) / columns - 0.5
             panel = _draw_panels(figure, inner[number], view, times or view.span, small=small, room=room)
             _label_axes(panel, view, left=number % columns == 0, bottom=number + columns >= len(views))
             panels.append(panel[0])
