@@ -1,6 +1,6 @@
 # A bare machine needs Python 3.11 or later (with venv) and make: everything else is installed into .venv.
 #   make demo      simulate a forest strip, run it, compare the result with the truth
-#   make test      the fast tests          make test-all   all of them, each with its own surveys
+#   make test      the fast tests          make slow   the others      make test-all   both
 #   make papers    the tables and pictures of five papers on simulated data: papers.html
 #   make bench     error against run time  make docs       the documentation as a site, in site/
 #   make readers   other programs' LAS readers, from PyPI and npm as far as these have them, for `make test`
@@ -21,7 +21,7 @@ MINUTES ?= 10
 RUNS   ?= 1000
 SEED   ?= 1
 
-.PHONY: demo test test-all readers papers bench fuzz attack docs man lint clean
+.PHONY: demo test slow test-all readers papers bench fuzz attack docs man lint clean
 .DELETE_ON_ERROR:
 # Without cached bytecode every process compiles all of its modules anew: a second each.
 unexport PYTHONDONTWRITEBYTECODE
@@ -65,8 +65,10 @@ readers: $(VENV)/.test
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -q -n auto --dist loadfile -m 'not slow'
 
-test-all: $(VENV)/.test
-	$(BIN)/python -m pytest -q -n auto
+slow: $(VENV)/.test
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m slow
+
+test-all: test slow
 
 papers: $(VENV)/.plot
 	$(BIN)/python examples/papers/page.py -o papers.html
