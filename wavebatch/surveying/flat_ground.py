@@ -20,7 +20,7 @@ from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.units import SQUARED_NORMAL_MEDIAN, C, format_measure
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.point_formats import locate
-from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.geometry.normals import Surroundings, measure_normals, thin_out
 from wavebatch.kernels.geometry.two_lines import in_two_lines
 from wavebatch.stages.attribute.light import is_alone
@@ -113,10 +113,7 @@ def choose_radius(reader: StripReader, scan: StripScan) -> float:
         Radius [m] in which nine tenths of the points have half more than LEAST_NEIGHBOURS, and these lie on more than
         two scan lines; at least 1.5, at most 12.
     """
-    if not reader.unit_count():
-        return RADII[0]
-    unit = reader.read_unit(reader.unit_count() // 2, scan)
-    return _choose_radius(locate(unit.points, reader.facts.header)) if len(unit.points) else RADII[0]
+    return _choose_radius(_read_middle(reader, scan))
 
 
 def measure_slope(reader: StripReader, scan: StripScan) -> float:
@@ -132,12 +129,10 @@ def measure_slope(reader: StripReader, scan: StripScan) -> float:
     float
         Slope [deg] that 84 % of the sampled planes in the middle of the strip do not exceed; 0 where there are too few.
     """
-    if not reader.unit_count():
+    xyz = _read_middle(reader, scan)
+    if len(xyz) < ENOUGH_TO_LEARN:
         return 0.0
-    xyz = locate(reader.read_unit(reader.unit_count() // 2, scan).points, reader.facts.header)
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    radius, some = _choose_radius(xyz), xyz[:: max(len(xyz) // ENOUGH_SLOPES, 1)]
-    around = Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)])
+    some, (around, radius) = xyz[:: max(len(xyz) // ENOUGH_SLOPES, 1)], _surround(xyz)
     (slope, _), _ = measure_normals(
         some, np.tile([0.0, 0.0, -1.0], (len(some), 1)), around,
         radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR,
@@ -146,8 +141,25 @@ def measure_slope(reader: StripReader, scan: StripScan) -> float:
     return float(np.quantile(known, 0.84)) if len(known) >= ENOUGH_TO_LEARN else 0.0
 
 
+def _read_middle(reader: StripReader, scan: StripScan) -> np.ndarray:
+    """Places of the points in the middle of a strip, as `_list_places` has them."""
+    units = reader.unit_count()
+    return _list_places(reader, reader.read_unit(units // 2, scan)) if units else np.empty((0, 3))
+
+
+def _list_places(reader: StripReader, unit: Unit) -> np.ndarray:
+    """Finite positions of the points of a unit [m], f8 (n, 3)."""
+    xyz = locate(unit.points, reader.facts.header)
+    return xyz[np.isfinite(xyz).all(axis=1)]
+
+
+def _surround(xyz: np.ndarray) -> tuple[Surroundings, float]:
+    """Points in which neighbours are looked for, and the radius for that [m]."""
+    radius = _choose_radius(xyz)
+    return Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)]), radius
+
+
 def _choose_radius(xyz: np.ndarray) -> float:
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
     number = LEAST_NEIGHBOURS * 3 // 2
     if len(xyz) <= number:
         return RADII[0]
@@ -192,10 +204,7 @@ def sample_slopes(reader: StripReader, scan: StripScan, fill: object, n_waveform
         unit = reader.read_unit(number, scan)
         rows = np.flatnonzero(unit.packets.owned)
         rows = rows[:: max(len(rows) * len(chosen) // max(n_waveforms, 1), 1)]
-        xyz = locate(unit.points, reader.facts.header)
-        xyz = xyz[np.isfinite(xyz).all(axis=1)]
-        radius = _choose_radius(xyz)
-        around = Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)])
+        around, radius = _surround(_list_places(reader, unit))
         for block, _ in reader.read_rows(unit, rows, 4096):
             yield _measure_slopes(fill.fill(block), around, radius)
 

@@ -39,7 +39,6 @@ _NUMBERS = struct.Struct("<HHBBHqqIIIIqIi2d2q6d")
 _RECORD = struct.Struct("<16sIIq64s")
 _COMPOSITION = struct.Struct("<IIiHHfII")
 _SAMPLING = struct.Struct("<IIBBBBffBBHIHHfI")
-_DESCRIPTION = 64
 _INTEGERS = (0, 8, 16, 32)
 _POINT_SOURCE = {1: "<u2", 2: "<u4"}
 
