@@ -67,10 +67,8 @@ class Cluster:
     """
 
     is_remote = True
-    compresses = False
-    """Whether workers compress chunks: here rows would travel back to them."""
-    memory = None
-    """Folder of memory that processes share: those of other machines do not."""
+    jobs = 1
+    """Threads of this machine that compress."""
 
     def __init__(
         self,
