@@ -144,7 +144,7 @@ class _Edges(NamedTuple):
 def _look_at_edges(
     samples: np.ndarray, marks: np.ndarray, row: np.ndarray, first: np.ndarray, side: np.ndarray
 ) -> _Edges:
-    """Edges of runs, all of which `marks` (n, s) holds; first: sample next to the run, side: away from it, 1 or -1."""
+    """Edges of runs; `marks` (n, s) holds all runs. first: sample next to the run, side: away from it, 1 or -1."""
     s = samples.shape[1]
     at = first[:, None] + side[:, None] * np.arange(LEAST_RECORDED)
     place = row[:, None], np.clip(at, 0, s - 1)
