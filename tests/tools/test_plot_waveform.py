@@ -54,7 +54,7 @@ def test_residuals_are_those_of_the_cleaned_samples():
     block = WaveformBlock.from_samples(counts)
     system, chain = survey_block(block).system, load_profile("accurate")
     chain = replace(chain, steps=chain.steps[:3])
-    assert system.slope_spread > 0.05
+    assert system.defects.slope_spread > 0.05
     views = build_views(block, chain, system, range(1000))
     residual = np.array([np.sqrt(np.nanmean(view.residual**2)) for view in views])
     assert np.median(residual) == pytest.approx(1.0, abs=0.1)
@@ -103,7 +103,7 @@ def test_where_nothing_says_what_was_fitted_nothing_is_drawn(name):
 
 def test_view_against_a_plain_sum_of_gaussians():
     block = simulate(PulseShape(), [(100.0, 30.3, 2.0), (60.0, 37.0, 2.5)])
-    system = replace(PULSE, noise_gain=0.05)
+    system = replace(PULSE, noise=replace(PULSE.noise, gain=0.05))
     chain = make_chain("decompose.gaussian")
     whole = chain.run(block, system)
     for row, view in enumerate(build_views(block, chain, system, range(len(block)))):
@@ -460,6 +460,6 @@ def test_a_listed_range_has_the_error_of_the_sensor_too(tiny_strip):
         places = find_places(reader, scan, Wanted(packets=((0, 5),)), None)
         chain, fill, error = add_ranges(load_profile("balanced"), reader, scan)
         assert error > 0.05  # the error of a fit is millimetres
-        views = read_views(reader, scan, places, chain, replace(PULSE, sensor_error=error), None, fill)
+        views = read_views(reader, scan, places, chain, PULSE.with_radiometry(sensor_error=error), None, fill)
     places = [line.split("\N{PLUS-MINUS SIGN}")[-1].split()[0] for line in list_echoes(views).splitlines()[1:]]
     assert places and all(float(place) == pytest.approx(error, rel=0.1) for place in places)

@@ -241,10 +241,10 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
     `noise_std` is what coloured noise does to amplitudes; times and widths suffer less from noise that changes slowly
     (docs/algorithms.md H11).
     """
-    if not system.correlation:
+    if not system.noise.correlation:
         return np.ones((len(width), 4))
     shape = pulse_shape(system, spacing)
-    widths, factors = _factor_table(shape, shape_limits(system, spacing), system.correlation)
+    widths, factors = _factor_table(shape, shape_limits(system, spacing), system.noise.correlation)
     return np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
 
 

@@ -49,7 +49,7 @@ def measure_fit(
     residual = np.where(used, block.samples - noise.level.astype(np.float64) - model, 0.0)
     energy = np.square(model).sum(axis=1)
     energy[energy <= 0] = np.nan
-    std = noise.std.astype(np.float64) * (sample_noise(system) / system.noise_std)
+    std = noise.std.astype(np.float64) * (sample_noise(system) / system.noise.std)
     floor = np.count_nonzero(used, axis=1) * np.square(std)
     return np.square(residual).sum(axis=1) / energy, floor / energy
 
