@@ -16,7 +16,7 @@ import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.stages.chain_file import list_profiles
-from wavebatch.surveying.figures import describe_figures
+from wavebatch.surveying.systems.figures import describe_figures
 from wavebatch.tools.simulate import simulate_strip
 
 PACKAGE = Path(wb.__file__).parent

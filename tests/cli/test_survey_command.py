@@ -12,8 +12,8 @@ from wavebatch.cli.survey import NOISE_KINDS
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.stages.chain_file import load_chain
 from wavebatch.surveying.auto_chain import chain_text, decide
-from wavebatch.surveying.figures import describe_figures
 from wavebatch.surveying.system_file import load_survey
+from wavebatch.surveying.systems.figures import describe_figures
 from wavebatch.tools.simulate import simulate_strip
 
 

@@ -18,7 +18,7 @@ from wavebatch.surveying.auto_chain import (
     widest_chain,
     without_columns,
 )
-from wavebatch.surveying.figures import Figures
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.tools.simulate import find_pulse
 
 OPEN_FIGURES = Figures(empty_share=0.2, overlapped_share=0.0005)

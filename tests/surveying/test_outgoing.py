@@ -12,9 +12,9 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
 from wavebatch.surveying import Survey
-from wavebatch.surveying.figures import Figures
 from wavebatch.surveying.outgoing import compare_outgoing, learn_shape, save_outgoing
 from wavebatch.surveying.system_file import SavedSurvey, format_survey
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 

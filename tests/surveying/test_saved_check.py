@@ -9,8 +9,8 @@ from writer_tools import data_file
 
 from wavebatch.cli import main
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.figures import Figures
 from wavebatch.surveying.system_file import load_survey
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import known_systems
 from wavebatch.surveying.systems.saved_check import find_contradiction
 from wavebatch.tools.api.strip import survey

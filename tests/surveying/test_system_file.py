@@ -15,7 +15,6 @@ from wavebatch.core.system import Defects, LevelWidths, Radiometry, ReceiverNois
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.text_file import write_text
 from wavebatch.surveying import Decision, Survey, survey_block
-from wavebatch.surveying.figures import Figures
 from wavebatch.surveying.system_file import (
     SYSTEM_SCHEMA,
     SavedSurvey,
@@ -24,6 +23,7 @@ from wavebatch.surveying.system_file import (
     load_survey,
     parse_survey,
 )
+from wavebatch.surveying.systems.figures import Figures, Kind, Level, Look
 from wavebatch.surveying.systems.system_table import NUMBERS, ROWS
 
 SYSTEM = SystemPulse(
@@ -102,6 +102,15 @@ def test_a_real_survey_comes_back():
 def test_figures_that_are_no_numbers_are_left_out():
     text = format_survey(SavedSurvey(Survey(SYSTEM, 0, Figures(bits=1.0, kappa=math.nan), ())))
     assert parse_survey(text, "x").survey.figures == Figures(bits=1.0)
+
+
+def test_figures_of_other_versions_are_left_out_and_a_flight_is_whole_or_none():
+    others = "new_figure = 3.0\nflight_width = 2.0\nflight_descriptor_1_bits = 8.0\n"
+    text = TEXT.replace("[figures]\n", f"[figures]\n{others}")
+    assert parse_survey(text, "x").survey.figures == SURVEY.figures
+    look = Look(Level(7, 12.0, 0.5, 1.0, 99, None), 2.0, 0.9, 0.01)
+    figures = replace(SURVEY.figures, look=look, kinds={3: Kind(8.0, 1.0, 0.5, -1.0), 12: Kind(16.0, 2.0, 1.0, 0.0)})
+    assert parse_survey(format_survey(SavedSurvey(Survey(SYSTEM, 5, figures))), "x").survey.figures == figures
 
 
 def test_every_number_of_the_system_has_a_key():

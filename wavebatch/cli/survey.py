@@ -188,8 +188,8 @@ def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Pat
 
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
     from wavebatch.surveying.auto_chain import chain_text
-    from wavebatch.surveying.figures import describe_figures
     from wavebatch.surveying.system_file import SYSTEM_SCHEMA, describe_system
+    from wavebatch.surveying.systems.figures import describe_figures
 
     return {
         "schema": SYSTEM_SCHEMA,

@@ -7,14 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wavebatch.core.units import AIR_ATTENUATION, QUANTISATION_STD
-
-if TYPE_CHECKING:
-    from wavebatch.core.waveforms import WaveformBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,27 +98,6 @@ class Radiometry:
     """Standard deviation of the attenuation [dB/km]."""
     sensor_error: float = 0.0
     """Standard deviation of the distance to the sensor's position [m]."""
-
-    def calibrate(self, block: WaveformBlock) -> tuple[np.ndarray, np.ndarray]:
-        """Calibration of each waveform's channel.
-
-        Returns
-        -------
-        constant : float64 (n,), 1/(m2 count ns)
-            NaN where the channel is not calibrated.
-        error : float64 (n,)
-            Relative standard deviation.
-        """
-        n = len(block)
-        constant = np.full(n, np.nan if self.constant is None else self.constant)
-        error = np.full(n, self.constant_error)
-        for (digitizer, scanner), (value, value_err) in self.channels.items():
-            if digitizer == block.digitizer.index:
-                same = np.full(n, scanner == 0) if block.scanner is None else block.scanner == scanner
-                constant[same], error[same] = value, value_err
-        if self.swath:
-            constant *= np.exp(swath_columns(angle_to_vertical(block.direction), self.swath[0]) @ self.swath[1:])
-        return constant, error
 
 
 def angle_to_vertical(direction: np.ndarray) -> np.ndarray:

@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import StageError
-from wavebatch.core.system import Defects, LevelWidths, Radiometry, ReceiverNoise
+from wavebatch.core.system import (
+    Defects,
+    LevelWidths,
+    Radiometry,
+    ReceiverNoise,
+    angle_to_vertical,
+    swath_columns,
+)
 from wavebatch.core.units import HALF_C
 
 
@@ -282,3 +289,24 @@ class SystemPulse:
     def with_radiometry(self, **values: Any) -> SystemPulse:
         """The system with other values of its radiometry, by field."""
         return replace(self, radiometry=replace(self.radiometry, **values))
+
+    def calibrate(self, block: WaveformBlock) -> tuple[np.ndarray, np.ndarray]:
+        """Calibration of each waveform's channel.
+
+        Returns
+        -------
+        constant : float64 (n,), 1/(m2 count ns)
+            NaN where the channel is not calibrated.
+        error : float64 (n,)
+            Relative standard deviation.
+        """
+        n, given = len(block), self.radiometry
+        constant = np.full(n, np.nan if given.constant is None else given.constant)
+        error = np.full(n, given.constant_error)
+        for (digitizer, scanner), (value, value_err) in given.channels.items():
+            if digitizer == block.digitizer.index:
+                same = np.full(n, scanner == 0) if block.scanner is None else block.scanner == scanner
+                constant[same], error[same] = value, value_err
+        if given.swath:
+            constant *= np.exp(swath_columns(angle_to_vertical(block.direction), given.swath[0]) @ given.swath[1:])
+        return constant, error

@@ -136,7 +136,7 @@ def find_seams(blocks: Iterable[WaveformBlock]) -> dict[int, int]:
 
 
 def sample_noise(system: SystemPulse) -> float:
-    """Return the noise of a quiet sample: `noise_std` is larger where noise is coloured."""
+    """Return the noise of a quiet sample: `noise.std` is larger where noise is coloured."""
     return system.noise.quiet
 
 

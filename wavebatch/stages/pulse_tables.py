@@ -219,7 +219,7 @@ FACTOR_WIDTHS = 12
 
 
 def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.ndarray:
-    """Errors of echoes in the noise's colour over those that a fit in white noise of `noise_std` gives.
+    """Errors of echoes in the noise's colour over those that a fit in white noise of `noise.std` gives.
 
     Parameters
     ----------
@@ -238,7 +238,7 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
 
     Notes
     -----
-    `noise_std` is what coloured noise does to amplitudes; times and widths suffer less from noise that changes slowly
+    `noise.std` is what coloured noise does to amplitudes; times and widths suffer less from noise that changes slowly
     (docs/algorithms.md H11).
     """
     if not system.noise.correlation:

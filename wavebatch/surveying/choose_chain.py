@@ -19,10 +19,10 @@ from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import SAMPLE, Decision, Survey, join_digitizers, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain, decide, widest_chain
-from wavebatch.surveying.figures import describe_figures
 from wavebatch.surveying.outgoing import compare_outgoing
 from wavebatch.surveying.predict_error import WAVEFORMS, Prediction, leave_out_false, predict_errors
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
+from wavebatch.surveying.systems.figures import describe_figures
 
 SAMPLE_SAMPLES = 1 << 21
 """Most samples that a survey reads: 8192 waveforms of 256 samples."""

@@ -78,7 +78,7 @@ class Reference:
     """What echoes of surfaces of known slope show."""
 
     system: SystemPulse
-    """With `level_variance`, `level_error` and `width_scatter`."""
+    """With its `widths`."""
     echoes: int
     """Clean single echoes whose surface is known."""
     divergence: float | None = None

@@ -26,7 +26,6 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.auto_chain import decide
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.figures import Kind, Look
 from wavebatch.surveying.measuring.noise_and_width import (
     FAR_OFF,
     FEW,
@@ -37,6 +36,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
 )
 from wavebatch.surveying.survey import Survey, compare_levels, describe_level, pool_blocks, survey_blocks
 from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.systems.figures import Kind, Look
 from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, take_strongest, with_pulse
 
 LEAST_SHARE = 64
@@ -418,12 +418,12 @@ def list_kinds(blocks: Iterable[WaveformBlock]) -> dict[int, Kind]:
     return {block.digitizer.index: _kind(block) for block in blocks}
 
 
-def read_flight(survey: Survey) -> tuple[Look, Mapping[int, Kind]]:
+def read_flight(survey: Survey) -> tuple[Look, dict[int, Kind]]:
     """Return what a surveyed flight records, and its descriptors; raises ConfigError for a survey of no flight."""
     look, kinds = survey.figures.look, survey.figures.kinds
     if look is None or not kinds:
         raise ConfigError("holds no survey of a flight; `wavebatch run --survey flight --overwrite` makes one")
-    return look, kinds
+    return look, dict(sorted(kinds.items()))
 
 
 def surveys_agree(surveys: Sequence[Survey]) -> bool:

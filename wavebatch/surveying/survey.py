@@ -17,7 +17,6 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.figures import Figures, Level
 from wavebatch.surveying.hidden_neighbours import measure_hidden
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
@@ -39,6 +38,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
+from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import choose_pulse, find_source, guess_pulse
 from wavebatch.surveying.systems.skew import measure_skew
 

@@ -188,7 +188,7 @@ def measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, 
     """
     given = system.radiometry
     distance = sensor_distance(block, echoes)
-    constant, constant_err = (values[echoes.waveform] for values in given.calibrate(block))
+    constant, constant_err = (values[echoes.waveform] for values in system.calibrate(block))
     guess = (echoes.flags & np.uint16(EchoFlag.AMPLITUDE_UNRELIABLE)) != 0
     bound = (echoes.flags & np.uint16(EchoFlag.AT_BOUND)) != 0
     energy, shot_error = (values[echoes.waveform] for values in _emitted(block, system))

@@ -15,10 +15,10 @@ from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import model_parameters, pulse_measures, pulse_shape, shape_limits
-from wavebatch.surveying.figures import Figures
 from wavebatch.surveying.measuring.lone_echoes import ALONE, MIN_SNR, fit_lone
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, find_edge
 from wavebatch.surveying.measuring.residuals import subtract_echoes
+from wavebatch.surveying.systems.figures import Figures
 
 MOST_STACKED = 3000
 """Isolated echoes that a stack takes; more do not make it better."""

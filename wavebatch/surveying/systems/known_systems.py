@@ -25,9 +25,9 @@ from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
-from wavebatch.surveying.figures import Figures
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.system_table import read_system
 
 LEAST_ECHOES = 8

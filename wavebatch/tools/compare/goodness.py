@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.even_sample import EvenSample
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import Step
 from wavebatch.stages.clean import sample_noise
 from wavebatch.stages.decompose.rebuild import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.tools.even_sample import EvenSample
 
 
 @dataclass(frozen=True, slots=True)

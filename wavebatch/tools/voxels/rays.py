@@ -132,7 +132,7 @@ def _measure_sections(
     if block.sensor is None:
         return section, profiles.seen
     row, sample = np.nonzero(profiles.value)
-    constant, _ = system.radiometry.calibrate(block)
+    constant, _ = system.calibrate(block)
     off = start[row] + block.direction[row] * (sample * block.spacing)[:, None] - block.sensor[row]
     distance = radiometry.known_distance(measure_lengths(off))
     with np.errstate(over="ignore", invalid="ignore"):

@@ -176,4 +176,4 @@ def _read_kinds(numbers: Mapping[str, float]) -> dict[int, Kind]:
     for match in filter(None, map(_DESCRIPTOR.fullmatch, numbers)):
         parts.setdefault(int(match[1]), {})[match[2]] = numbers[match[0]]
     whole = all(part.keys() == set(Kind._fields) for part in parts.values())
-    return {index: Kind(**parts[index]) for index in sorted(parts)} if whole else {}
+    return {index: Kind(**part) for index, part in parts.items()} if whole else {}
