@@ -132,7 +132,7 @@ def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
 
 
 def _sample_noise(system: SystemPulse) -> float:
-    """Noise of one sample [count]; `noise_std` is what coloured noise does to the amplitude of a pulse."""
+    """Noise of one sample [count]; `noise.std` is what coloured noise does to the amplitude of a pulse."""
     kinds = system.noise.by_kind
     return kinds.get("outside") or kinds.get("quiet") or system.noise.std
 
