@@ -15,7 +15,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_names import describe_roundings
-from wavebatch.stages.decompose.rebuild import loop_model
+from wavebatch.stages.decompose.loops import loop_model
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.sensor import SensorSource
