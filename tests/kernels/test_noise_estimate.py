@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from wavebatch import surveying
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import estimate_noise
@@ -86,7 +87,7 @@ def test_coloured_noise_shows_in_the_covariance(rho, factor):
     pooled = estimate_noise(block.samples.T.astype(np.float32), 6)
     first, second = pooled.correlation[:2]
     assert np.sqrt((6 + 8 * first + 2 * second) / 6) == pytest.approx(factor, rel=0.03)
-    assert surveying.survey_block(block).system.noise_std >= 0.99 * factor * pooled.std
+    assert surveying.survey_block(block).system.noise.std >= 0.99 * factor * pooled.std
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.5, 2.0, 6.0])
@@ -113,7 +114,7 @@ def test_tail_noise_follows_a_drifting_baseline():
     rng = np.random.default_rng(9)
     base = np.linspace(10, 90, n)[:, None]
     block = WaveformBlock.from_samples(np.rint(base + rng.standard_normal((n, 64))).astype(np.uint8))
-    noise = STAGES["noise.tail"].function(block, SystemPulse(2.0, noise_std=0.5), samples=20)
+    noise = STAGES["noise.tail"].function(block, SystemPulse(2.0, noise=ReceiverNoise(std=0.5)), samples=20)
     assert np.abs(noise.baseline - base[:, 0]).max() < 1.5
     assert np.median(noise.std) == pytest.approx(1.04, rel=0.1)
 

@@ -109,10 +109,10 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     (docs/algorithms.md R3, H10, H12).
     """
     n, s = block.samples.shape
-    if not system.noise_by_kind["quiet"]:
+    if not system.noise.by_kind["quiet"]:
         system = _measure_outside(block, system, echoes)
     alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
-    alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise_std))
+    alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise.std))
     if len(alone) < ENOUGH_TO_LEARN:
         return system
     time, width = alone.time / block.spacing, alone.sigma / block.spacing
@@ -122,16 +122,16 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     residual = subtract_echoes(part, system, replace(alone, waveform=rows.astype(np.int32)))
     lag = (np.arange(s) - time[:, None]) / width[:, None]
     lag[~np.isfinite(residual)] = np.inf
-    kinds = dict(system.noise_by_kind)
+    kinds = dict(system.noise.by_kind)
     kinds["core"] = _robust_std(residual[np.abs(lag) < 2.5])
-    std = system.noise_std
+    std = system.noise.std
     weak = alone.amplitude < WEAK * DITHERED
     if kinds.get("outside", kinds["quiet"]) < UNDITHERED and np.count_nonzero(weak) >= ENOUGH_TO_LEARN:
         kinds["weak_echoes"] = _robust_std(residual[weak][np.abs(lag[weak]) < 2.5])
         std = max(std, kinds["weak_echoes"])
     sample = kinds.get("outside") or kinds["quiet"] or std
     gain = _noise_gain(residual, model, lag, width, std, std > COLOURED * sample)
-    return replace(system, noise_std=std, noise_by_kind=kinds, noise_gain=gain)
+    return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, gain=gain))
 
 
 def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
@@ -142,7 +142,7 @@ def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     """
     strongest = np.zeros(len(block))
     np.maximum.at(strongest, echoes.waveform, echoes.amplitude)
-    clear = (echoes.amplitude > 8 * system.noise_std) & (echoes.amplitude > 0.05 * strongest[echoes.waveform])
+    clear = (echoes.amplitude > 8 * system.noise.std) & (echoes.amplitude > 0.05 * strongest[echoes.waveform])
     clear = echoes.take(np.flatnonzero(clear))
     residual = subtract_echoes(block, system, clear)
     used = np.isfinite(residual)
@@ -154,11 +154,12 @@ def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
         return system
     std, correlation = found[0], tuple(found[1].tolist())
     hidden = DITHERED if std < UNDITHERED else QUANTISATION_STD
-    kinds = {**system.noise_by_kind, "outside": std, "outside_pulse": seen}
+    kinds = {**system.noise.by_kind, "outside": std, "outside_pulse": seen}
     # The residual is a few percent too small, because the baseline comes from the same samples. The estimate from quiet
     # samples is corrected for that: it is the floor, unless they hold tails of echoes, which the residual does not.
     floor = kinds["quiet_pulse"] if 0 < kinds["quiet"] < SAME_NOISE * std else 0.0
-    return replace(system, noise_std=float(max(seen, std, hidden, floor)), noise_by_kind=kinds, correlation=correlation)
+    std = float(max(seen, std, hidden, floor))
+    return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, correlation=correlation))
 
 
 def _cover(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
