@@ -42,12 +42,12 @@ QUIET_EDGES = 0.25
 
 LOPSIDED = 1.5
 """Sum of squares of smoothed quiet samples above their median, over that of those below it, from which weak echoes are
-among them: of noise it is 1, of the receivers of real strips 0.55 to 1.31. Echoes of 3 to 8 standard deviations make the
-noise 15 % too large where it is 1.4, and four times where it is 6."""
+among them: of noise it is 1, of the receivers of real strips 0.55 to 1.31. Echoes of 3 to 8 standard deviations make
+the noise 15 % too large where it is 1.4, and four times where it is 6."""
 
 TIGHTER, LEAST_LIMIT = 0.8, 2.6
-"""Factor by which the limit of signal then falls, and the limit up to which it does: at 2.56 a few per cent of noise are
-cut off."""
+"""Factor by which the limit of signal then falls, and the limit up to which it does: at 2.56 a few per cent of noise
+are cut off."""
 
 MOST_LEAST = 0.05
 """Share of the quiet samples with the least count of all from which noise is cut off there."""
