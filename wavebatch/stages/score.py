@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.units import MAD_TO_STD
+from wavebatch.core.order import robust_std
 
 TOLERANCE_NS = 1.5
 """A found and a true echo further apart than this are not the same echo."""
@@ -194,6 +194,4 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _nmad(values: np.ndarray) -> float:
-    if not len(values):
-        return float("nan")
-    return float(MAD_TO_STD * np.median(np.abs(values - np.median(values))))
+    return robust_std(values) if len(values) else float("nan")
