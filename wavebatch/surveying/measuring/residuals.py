@@ -45,8 +45,8 @@ GROWTH_REACH, GROWTH_STEP, GROWTH_CLASS = 1.5, 0.25, 60
 class of heights: misfit of the pulse is taken off by lag and class."""
 
 BROUGHT, BROUGHT_CROSS = np.sqrt(2 / 3) * np.array([1, 2 / 3, 1 / 2]), -np.sqrt(2 / 3) / 3
-"""Integrals of the squares of the first three Hermite functions times exp(-z^2 / 2); and of the product of the first and
-the third one, times 2 / sqrt(2) as it enters the sum."""
+"""Integrals of the squares of the first three Hermite functions times exp(-z^2 / 2); and of the product of the first
+and the third one, times 2 / sqrt(2) as it enters the sum."""
 
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
