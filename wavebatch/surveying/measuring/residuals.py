@@ -44,6 +44,10 @@ GROWTH_REACH, GROWTH_STEP, GROWTH_CLASS = 1.5, 0.25, 60
 """Widths of an echo around it in which the growth of noise is looked for, steps of the lag there, and the echoes of a
 class of heights: misfit of the pulse is taken off by lag and class."""
 
+BROUGHT, BROUGHT_CROSS = np.sqrt(2 / 3) * np.array([1, 2 / 3, 1 / 2]), -np.sqrt(2 / 3) / 3
+"""Integrals of the squares of the first three Hermite functions times exp(-z^2 / 2); and of the product of the first
+and the third one, times 2 / sqrt(2) as it enters the sum."""
+
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
 fits leave at no signal."""
@@ -211,15 +215,19 @@ def _robust_std(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean((kept.astype(np.float64) - np.mean(kept, dtype=np.float64)) ** 2)))
 
 
-def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Share of a sample's variance that the fit of amplitude, time and width takes away.
+def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Share h of a sample's variance that the fit of amplitude, time and width takes away, and what it brings there of
+    a variance that is the pulse itself, of height 1: the sum of h_ij^2 S_j over the samples j.
 
     lag: after the echo's centre, in widths. width: of the echo [samples]. The three derivatives of a Gaussian span the
-    first three Hermite functions, whose squares add up to the leverage of a sample.
+    first three Hermite functions: their products add up to h_ij, times the width.
     """
     z = lag.astype(np.float64) ** 2
-    leverage = exp(-z) / np.sqrt(np.pi) * (1 + 2 * z + 0.5 * (2 * z - 1) ** 2) / width
-    return np.minimum(leverage, 0.9)
+    # Squares of the three, and the product of the first and the last one, over exp(-z^2) / sqrt(pi).
+    squares = np.ones_like(z), 2 * z, 0.5 * (2 * z - 1) ** 2
+    bell = exp(-z) / np.sqrt(np.pi) / width
+    brought = sum(part * share for part, share in zip(squares, BROUGHT, strict=True)) + (2 * z - 1) * BROUGHT_CROSS
+    return np.minimum(bell * sum(squares), 0.9), bell * brought
 
 
 def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: float) -> tuple[np.ndarray, ...]:
@@ -295,8 +303,11 @@ def _noise_gain(
 ) -> float:
     """Growth of the variance per count of signal, 0 where it cannot be told from none (H12)."""
     core = np.abs(lag) < GROWTH_REACH
-    signal, squared = model[core].astype(np.float64), _chance_part(residual, model, lag, core) ** 2
-    squared /= 1 - _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
+    taken, brought = _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
+    squared = _chance_part(residual, model, lag, core) ** 2 / (1 - taken)
+    height = np.broadcast_to(model.max(axis=1)[:, None], lag.shape)[core]
+    # Noise without signal counts once, as if nothing were taken. That of the signal is largest where most is taken.
+    signal = (model[core].astype(np.float64) * (1 - 2 * taken) + height * brought) / (1 - taken)
     if len(signal) < 2000:
         return 0.0
     edges = np.quantile(signal, np.linspace(0, 1, 13))
