@@ -296,13 +296,13 @@ def test_worker_answers_raises_and_dies():
             worker.call(os.stat, "/no/such/file")
         memory = worker.call(peak_memory)
         assert memory is None or 5e6 < memory < 1e9
-        worker.submit(time.sleep, 60)
+        worker.submit(time.sleep, 600)
         with pytest.raises(TimeoutError):
             worker.take(0.05)
     with Worker() as worker:
         worker.submit(os._exit, 3)
         with pytest.raises(WorkerDied):
-            worker.take(30)
+            worker.take(300)
 
 
 FAKE = """
