@@ -10,6 +10,7 @@ from pathlib import Path
 import kept_surveys
 import numpy as np
 import pytest
+from bench_tools import time_here
 from child_signals import give_children_default_signals
 from hypothesis import HealthCheck, settings
 
@@ -24,7 +25,7 @@ def pytest_configure(config):
     """The fast tests share surveys and draw fewer examples; examples are the same in every run, however slow."""
     fast = config.option.markexpr == "not slow"
     if fast:
-        kept_surveys.install()
+        kept_surveys.install(config)
     unhurried = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
     examples = 40 if fast else 200
     settings.register_profile("wavebatch", derandomize=True, deadline=None, max_examples=examples,
@@ -43,8 +44,8 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Tests of surveys make their own."""
-    kept_surveys.active = "surveying" not in item.path.parts
+    """Tests of surveys make their own, unless they have the mark."""
+    kept_surveys.active = "surveying" not in item.path.parts or item.get_closest_marker("kept_surveys") is not None
 
 
 @pytest.fixture
@@ -126,12 +127,4 @@ def edit_points() -> Callable[[Path, Path, Callable[[np.ndarray], np.ndarray]], 
 @pytest.fixture
 def timed_here(monkeypatch):
     """The bench times chains in this process: starting one for each takes a second, and no test looks at the times."""
-
-    class Here:
-        def call(self, function, *arguments):
-            return function(*arguments)
-
-        def close(self):
-            pass
-
-    monkeypatch.setattr("wavebatch.tools.bench.speed.Worker", Here)
+    time_here(monkeypatch)
