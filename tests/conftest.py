@@ -4,6 +4,7 @@ import fnmatch
 import importlib
 import os
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,13 +34,24 @@ def pytest_configure(config):
     settings.load_profile("wavebatch")
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """All cases but those that `quick_cases` names are slow."""
+LONG = (
+    "test_fuzz.py", "test_processor.py", "test_canopy.py", "test_kill.py", "test_wdz.py", "test_village.py",
+    "test_signed_physics.py", "test_processes.py", "test_dask_cluster.py", "test_signals.py", "test_neighbour_pass.py",
+)  # fmt: skip
+"""Files of few tests that take long: started last, they would keep one process busy while the others have ended."""
+
+
+@pytest.hookimpl(hookwrapper=True, tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """All cases but those that `quick_cases` names are slow; processes of xdist get the long files first."""
     for item in items:
         quick = item.get_closest_marker("quick_cases")
         if quick and not any(fnmatch.fnmatchcase(item.callspec.id, name) for name in quick.args):
             item.add_marker("slow")
+    yield
+    if hasattr(config, "workerinput"):
+        number = Counter(item.path for item in items)
+        items.sort(key=lambda item: (item.path.name not in LONG, -number[item.path], item.path))
 
 
 @pytest.hookimpl(tryfirst=True)
