@@ -27,6 +27,7 @@ from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.system_table import read_system
 
 LEAST_ECHOES = 8
@@ -198,7 +199,7 @@ def guess_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Sy
     return replace(system, ringing=_find_ringing(block, system, lone))
 
 
-def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, figures: dict[str, float]) -> SystemPulse:
+def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, figures: Figures) -> SystemPulse:
     """Compare the strip's pulse with those of known sensors, and with itself drawn together.
 
     Parameters
@@ -208,7 +209,7 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
         With the pulse of the isolated echoes.
     learned : bool
         Whether it was learned; a Gaussian that is a guess is never drawn together.
-    figures : dict
+    figures : Figures
         Gets the costs of the two pulses, where one was taken for another.
 
     Returns
@@ -245,7 +246,7 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
     if tried:
         _, _, pulse, cost = min(tried, key=lambda one: one[:2])
     if pulse is not system:
-        figures |= {"pulse_cost": cost.typical, "isolated_pulse_cost": own.typical}
+        figures.pulse_cost, figures.isolated_pulse_cost = cost.typical, own.typical
     return pulse
 
 
@@ -308,9 +309,9 @@ def measure_cost(block: WaveformBlock, system: SystemPulse) -> Cost:
     """Measure how well a pulse explains waveforms, all echoes fitted together."""
     echoes = decompose_sample(block, system)
     left = np.nan_to_num(subtract_echoes(block, system, echoes)).astype(np.float64)
-    noise = min(system.noise_by_kind.get("quiet") or system.noise_std, system.noise_std)
+    noise = system.noise.quiet
     samples = left.shape[1] if block.missing is None else (~block.missing).sum(axis=1)
-    misfit = (np.einsum("ns,ns->n", left, left) - samples * noise**2) / system.noise_std**2
+    misfit = (np.einsum("ns,ns->n", left, left) - samples * noise**2) / system.noise.std**2
     cost = np.maximum(misfit, 0.0) + system.acceptance * (1 + echoes.count(len(block)))
     return Cost(max(float(np.sum(misfit)), 0.0), len(echoes), log(cost))
 
@@ -323,8 +324,9 @@ def scale_pulse(system: SystemPulse, ratio: float) -> SystemPulse:
 
 def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
     """Return a strip's system with the pulse of another one, and with how far strong echoes deviate from it."""
-    names = ("sigma_ref", "kappa", "components", "ringing", "acceptance", "misfit", "tail_misfit", "width_scatter")
-    return replace(system, **{name: getattr(known, name) for name in names})
+    names = ("sigma_ref", "kappa", "components", "ringing", "acceptance", "misfit", "tail_misfit")
+    widths = replace(system.widths, scatter=known.widths.scatter)
+    return replace(system, widths=widths, **{name: getattr(known, name) for name in names})
 
 
 def find_source(system: SystemPulse) -> KnownSystem | None:
