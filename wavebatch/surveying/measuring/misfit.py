@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import SQRT_PI
+from wavebatch.core.units import MEDIAN_ERROR, SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import promise_echoes
@@ -123,7 +123,9 @@ def _common_promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echo
     lag /= (echoes.sigma / part.spacing)[:, None]
     near = (np.abs(lag) < CORE_REACH) & np.isfinite(residual)
     height = np.broadcast_to(echoes.amplitude[:, None], lag.shape)[near]
-    common, _, error = find_common(residual[near].astype(np.float64), lag[near], height, CORE_REACH)
+    common, number, spread = find_common(residual[near].astype(np.float64), lag[near], height, CORE_REACH)
+    chance = (system.noise_by_kind.get("quiet") or system.noise_std) / height
+    error = MEDIAN_ERROR * spread / np.sqrt(number) + 2 * np.maximum(spread - chance, 0.0)
     drawn, (row, place) = render_own(part, system, echoes, echoes.waveform, len(part)), np.nonzero(near)
     drawn[echoes.waveform[row], place] += np.sign(common) * np.maximum(np.abs(common) - error, 0.0) * height
     return _promise(part, Samples(drawn, np.zeros(len(part), np.float32), noise.std), system, echoes)
