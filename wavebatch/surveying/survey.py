@@ -380,8 +380,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = choose_pulse(part, system, learned=learned, figures=figures)
         before, echoes = system, decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
-        # The strongest echoes are the same, and clear, whatever pulse is learned from them.
-        system = measure_misfit(block, system, find_strong(clear))
+        # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its misfit;
+        # a few echoes of a small strip, full of neighbours, do not know better.
+        system = measure_misfit(block, system, find_strong(clear, FEW if find_source(system) is None else 0))
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
     else:

@@ -155,12 +155,13 @@ def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     return np.flatnonzero(good)
 
 
-def find_strong(echoes: EchoTable) -> EchoTable:
-    """The strongest fifth of the clear echoes that their target has not widened."""
+def find_strong(echoes: EchoTable, least: int = FEW) -> EchoTable:
+    """The strongest fifth of the clear echoes that their target has not widened, `least` where there are so many."""
     if len(echoes) < FEW:
         return echoes
     narrow = echoes.sigma < WIDENED * find_edge(echoes.sigma)
-    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], 0.8)))
+    share = max(1 - least / np.count_nonzero(narrow), 0.0)
+    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], min(share, 0.8))))
     return echoes.take(strong[:: max(len(strong) // MOST_STRONG, 1)])
 
 
