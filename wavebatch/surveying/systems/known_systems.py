@@ -275,8 +275,8 @@ def _drop_tail(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     if not (system.components or system.kappa):
         return system
     part, plain = _spread(block, JUDGED), replace(system, components=(), kappa=0.0, ringing=0.0)
-    more = measure_cost(part, plain).typical
-    return plain if more < WORTH * measure_cost(part, system).typical else system
+    more = measure_cost(part, plain).logarithm - measure_cost(part, system).logarithm
+    return plain if np.mean(more) + np.std(more) / np.sqrt(len(more)) < log(WORTH) else system
 
 
 def _draw_together(part: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
