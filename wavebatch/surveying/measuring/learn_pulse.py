@@ -16,7 +16,7 @@ from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import model_parameters, pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import ALONE, MIN_SNR, fit_lone
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, find_edge
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, SMALL, find_edge
 from wavebatch.surveying.measuring.residuals import subtract_echoes
 
 MOST_STACKED = 3000
@@ -196,7 +196,8 @@ def _learn(
     stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = max(REACHED * system.noise_std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
-    sums = fit_gaussians(stack, width, most, goal)
+    small = len(block) < SMALL
+    sums = fit_gaussians(stack, width, most, 0.0 if small else goal)
     skewed = fit_skewed(stack, width)
     figures["misfit_goal"] = goal
     figures["misfit_skewed"], figures["kappa"] = skewed.rms, skewed.kappa
@@ -204,7 +205,7 @@ def _learn(
         figures.pop(f"misfit_{number}_gaussians", None)
     for fit in sums:
         figures[f"misfit_{len(fit.components)}_gaussians"] = fit.rms
-    best = _simplest([sums[0], skewed, *sums[1:]], goal)
+    best = sums[-1] if small else _simplest([sums[0], skewed, *sums[1:]], goal)
     if len(best.components) > 1:
         # All components that were worth fitting: fewer would save nothing, and tiles would disagree on their number.
         best = sums[-1]

@@ -26,6 +26,7 @@ from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
+from wavebatch.surveying.measuring.noise_and_width import SMALL
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
 from wavebatch.surveying.systems.system_table import read_system
 
@@ -231,7 +232,7 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
     part = _spread(block, COMPARED)
     own = measure_cost(part, system)
     clear = learned and own.misfit < SHORT * own.echoes
-    if own.echoes < LEAST_ECHOES or (clear and own.echoes < CROWDED * len(part)):
+    if own.echoes < LEAST_ECHOES or (clear and own.echoes < CROWDED * len(part) and len(block) >= SMALL):
         return system
     plain = _drop_tail(block, system) if learned else system
     if clear and plain is system:
