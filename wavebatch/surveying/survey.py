@@ -33,6 +33,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     FIRST_WIDTH,
     RESIDUAL_LOOK,
     SETTLED,
+    SMALL,
     find_saturation,
     measure_gaussian,
     thin_block,
@@ -61,6 +62,10 @@ STRANGE, STRANGE_NOISE = 6.0, 1.3
 
 COUNTED = 256
 """Samples of a waveform that count where the main digitizer is chosen."""
+
+
+PULSE_SAMPLES = 2.5
+"""Quiet samples, in widths of the pulse, that say as much of the noise of a pulse as one value."""
 
 
 class Part(StrEnum):
@@ -380,11 +385,15 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = choose_pulse(part, system, learned=learned, figures=figures)
         before, echoes = system, decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
-        # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its misfit;
-        # a few echoes of a small strip, full of neighbours, do not know better.
-        system = measure_misfit(block, system, find_strong(clear, FEW if find_source(system) is None else 0))
+        # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its
+        # misfit; a few echoes of a small strip, full of neighbours, do not know better.
+        strong = find_strong(clear, FEW if find_source(system) is None else 0)
+        unsure, system = system, measure_misfit(block, system, strong)
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
+        if len(block) < SMALL:
+            doubt = 1 - len(_find_sure(block, unsure, strong)) / max(len(echoes), 1)
+            figures["echoes_in_doubt"] = max(doubt, figures.get("echoes_in_doubt", 0.0))
     else:
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
@@ -393,6 +402,22 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     figures.update(_describe(part, system, echoes))
     decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system))
     return Survey(system, len(block), figures, decisions)
+
+
+def _find_sure(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> EchoTable:
+    """The echoes of a small strip that noise and misfit leave no doubt of.
+
+    The noise is two standard errors larger, by its quiet samples. What few strong echoes miss a pulse of the strip's
+    own by is all misfit: it may change from shot to shot, and have nothing in common.
+    """
+    width = system.sigma_ref / block.spacing
+    _, quiet, _ = find_levels(transpose_samples(block.samples), system.noise_std, int(np.ceil(3 * width)))
+    if block.missing is not None:
+        quiet &= ~block.missing.T
+    error = np.sqrt(PULSE_SAMPLES * width / (2 * max(np.count_nonzero(quiet), 1)))
+    if find_source(system) is None:
+        system = measure_misfit(block, system, strong, bounded=False)
+    return decompose_sample(block, replace(system, noise_std=float(system.noise_std * (1 + 2 * error))))
 
 
 def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:

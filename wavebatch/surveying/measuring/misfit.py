@@ -53,7 +53,9 @@ LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says."""
 
 
-def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
+def measure_misfit(
+    block: WaveformBlock, system: SystemPulse, strong: EchoTable, *, bounded: bool = True
+) -> SystemPulse:
     """The system with what its pulse leaves unexplained of strong single echoes, as shares of their amplitude.
 
     Parameters
@@ -63,6 +65,8 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
         Its misfit is the least: 0, or that of a known sensor.
     strong : EchoTable
         The strongest single echoes that no target has widened, one per waveform.
+    bounded : bool
+        The misfit is at most what the echoes have in common.
 
     Returns
     -------
@@ -91,7 +95,7 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
         energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
         every = (_promise(part, samples_of(part, noise), system, fitted) - NOISE_PROMISE) / energy
         share = np.quantile(every, MISFIT_QUANTILE)
-        if np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) < CLIPPED:
+        if bounded and np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) < CLIPPED:
             share = min(share, np.quantile(_common_promise(part, noise, system, fitted) / energy, COMMON_QUANTILE))
         misfit = SCATTERED * float(np.sqrt(max(share, 0.0)))
     # A known sensor's pulse changes from shot to shot: of that echoes of a strip have nothing in common.

@@ -214,7 +214,8 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
     learned : bool
         Whether it was learned; a Gaussian that is a guess is never drawn together.
     figures : dict
-        Gets the costs of the two pulses, where one was taken for another.
+        Gets the costs of the two pulses, where one was taken for another, and the share of the echoes that is in doubt
+        because the two cost about the same.
 
     Returns
     -------
@@ -224,43 +225,53 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
     -----
     A pulse is right if it explains all waveforms, not only isolated echoes, with the fewest echoes and the least misfit
     (`measure_cost`): in a canopy isolated echoes are several, and a pulse learned from them is too wide. Nothing is
-    tried where a learned pulse leaves less than SHORT per echo. Else the simplest and widest is taken of those that
-    cost no more (`_simplify`). A known pulse of the strip's spacing is taken if it costs less than the strip's, and
-    less than it does when it is stretched or drawn together (SURE); if it is narrower and costs hardly more (NEARLY);
-    or where the strip's must be drawn together and costs hardly less then (ALMOST).
+    tried where a learned pulse leaves less than SHORT per echo; but where echoes are CROWDED or waveforms few it may be
+    a Gaussian all the same. Else the simplest and widest is taken of those that cost no more (`_drop_tail`,
+    `_draw_together`). A known pulse of the strip's spacing is taken if it costs less than the strip's, and less than it
+    does when it is stretched or drawn together (SURE); if it is narrower and costs hardly more (NEARLY); or where the
+    strip's must be drawn together and costs hardly less then (ALMOST).
     """
     part = _spread(block, COMPARED)
-    own = measure_cost(part, system)
+    own = cost = measure_cost(part, system)
     clear = learned and own.misfit < SHORT * own.echoes
     if own.echoes < LEAST_ECHOES or (clear and own.echoes < CROWDED * len(part) and len(block) >= SMALL):
         return system
-    plain = _drop_tail(block, system) if learned else system
-    if clear and plain is system:
-        return system
-    pulse, cost = (plain, measure_cost(part, plain)) if plain is not system else (system, own)
-    if clear:
+    pulse = _drop_tail(block, system) if learned else system
+    if pulse is not system:
+        cost = measure_cost(part, pulse)
+    if not clear:
+        pulse, cost = _draw_together(part, pulse, cost) if learned else (pulse, cost)
+        # One learned from few echoes has their noise, and loses to any other.
+        certain = learned and len(block) >= SMALL
+        pulse, cost = _compare_known(part, (system, own), (pulse, cost), certain=certain)
+    if pulse is not system:
         figures |= {"pulse_cost": cost.typical, "isolated_pulse_cost": own.typical}
-        return pulse
-    if learned:
-        pulse, cost = _draw_together(part, pulse, cost)
+        if own.exceeds(cost) < BEYOND and find_source(pulse) is None:
+            figures["echoes_in_doubt"] = abs(own.echoes / max(cost.echoes, 1) - 1)
+    return pulse
+
+
+def _compare_known(
+    part: WaveformBlock, own: tuple[SystemPulse, Cost], best: tuple[SystemPulse, Cost], *, certain: bool
+) -> tuple[SystemPulse, Cost]:
+    """The known pulse that serves better than the strip's and its cost, or the best of the strip's and its cost.
+
+    own: the pulse of the isolated echoes and its cost; certain: it was learned from many.
+    """
+    (system, own_cost), (pulse, cost) = own, best
     drawn = pulse.sigma_ref < system.sigma_ref
-    certain = learned and len(block) >= COMPARED  # one learned from few echoes has their noise, and loses to any other
     tried = []
     for known in known_systems():
         ratio = known.system.sigma_ref / system.sigma_ref
-        if abs(block.spacing / known.spacing - 1) < SAME_SPACING and WIDTHS[0] < ratio < WIDTHS[1]:
+        if abs(part.spacing / known.spacing - 1) < SAME_SPACING and WIDTHS[0] < ratio < WIDTHS[1]:
             taken = with_pulse(system, known.system)
             found = measure_cost(part, taken)
-            if found.typical < NEARLY * own.typical and (
+            if found.typical < NEARLY * own_cost.typical and (
                 (drawn and found.typical < ALMOST * cost.typical)
-                or _is_sure(part, taken, found.typical, own.typical, learned=certain, narrower=ratio < 1)
+                or _is_sure(part, taken, found.typical, own_cost.typical, learned=certain, narrower=ratio < 1)
             ):
                 tried.append((found.typical, known.name, taken, found))
-    if tried:
-        _, _, pulse, cost = min(tried, key=lambda one: one[:2])
-    if pulse is not system:
-        figures |= {"pulse_cost": cost.typical, "isolated_pulse_cost": own.typical}
-    return pulse
+    return min(tried, key=lambda one: one[:2])[2:] if tried else best
 
 
 def _spread(block: WaveformBlock, number: int) -> WaveformBlock:
