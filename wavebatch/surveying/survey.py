@@ -382,12 +382,13 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             if len(chosen) < ENOUGH_TO_LEARN or abs(system.sigma_ref / last - 1) < SETTLED:
                 break
         learned |= len(chosen) >= ENOUGH_TO_LEARN
-        system = choose_pulse(part, system, learned=learned, figures=figures)
+        strong = find_strong(clear)
+        system = choose_pulse(block, system, strong, learned=learned, figures=figures)
         before, echoes = system, decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
         # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its
         # misfit; a few echoes of a small strip, full of neighbours, do not know better.
-        strong = find_strong(clear, FEW if find_source(system) is None else 0)
+        strong = strong if find_source(system) is None else find_strong(clear, 0)
         unsure, system = system, measure_misfit(block, system, strong)
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
@@ -26,7 +26,8 @@ from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
-from wavebatch.surveying.measuring.noise_and_width import SMALL
+from wavebatch.surveying.measuring.misfit import measure_misfit
+from wavebatch.surveying.measuring.noise_and_width import FEW, SMALL
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
 from wavebatch.surveying.systems.system_table import read_system
 
@@ -50,12 +51,6 @@ tail serves better than a guess."""
 
 SHRUNK = 0.85, 0.7
 """Widths, over that of the isolated echoes, at which a strip's pulse is tried where isolated echoes are canopies."""
-
-WORTH, JUDGED = 1.05, 1024
-"""Cost of a Gaussian, over that of a learned pulse with tail or skew, up to which it is taken, and the waveforms in
-which both are measured. In simulated canopies it is .99 to 1.03 where the pulse is one, and from 1.075 where it has a
-tail of 6 %; in simulated forests of other pulses from 1.09, in strips of real sensors 1.27. The standard error is .006
-to .008."""
 
 CROWDED = 1.5
 """Echoes per waveform from which a learned pulse may have taken neighbours for a tail, however well it fits."""
@@ -203,7 +198,9 @@ def guess_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Sy
     return replace(system, ringing=_find_ringing(block, system, lone))
 
 
-def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, figures: dict[str, float]) -> SystemPulse:
+def choose_pulse(
+    block: WaveformBlock, system: SystemPulse, strong: EchoTable, *, learned: bool, figures: dict[str, float]
+) -> SystemPulse:
     """Compare the strip's pulse with those of known sensors, and with itself drawn together.
 
     Parameters
@@ -211,6 +208,8 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
     block : WaveformBlock
     system : SystemPulse
         With the pulse of the isolated echoes.
+    strong : EchoTable
+        The strongest single echoes of the block.
     learned : bool
         Whether it was learned; a Gaussian that is a guess is never drawn together.
     figures : dict
@@ -236,7 +235,7 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
     clear = learned and own.misfit < SHORT * own.echoes
     if own.echoes < LEAST_ECHOES or (clear and own.echoes < CROWDED * len(part) and len(block) >= SMALL):
         return system
-    pulse = _drop_tail(block, system) if learned else system
+    pulse = _drop_tail(block, system, strong) if learned else system
     if pulse is not system:
         cost = measure_cost(part, pulse)
     if not clear:
@@ -279,16 +278,18 @@ def _spread(block: WaveformBlock, number: int) -> WaveformBlock:
     return block.rows(np.unique(np.linspace(0, len(block) - 1, number).astype(np.int64)))
 
 
-def _drop_tail(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
-    """The learned pulse as a plain Gaussian where that explains waveforms as well, else the system itself.
+def _drop_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
+    """The learned pulse as a plain Gaussian where strong echoes have no tail in common, else the system itself.
 
-    In a canopy the neighbours of echoes become a tail of the learned pulse.
+    In a canopy the neighbours of echoes become a tail of the learned pulse. They are at another lag in every waveform.
     """
-    if not (system.components or system.kappa):
+    if len(strong) < FEW or not (system.components or system.kappa):
         return system
-    part, plain = _spread(block, JUDGED), replace(system, components=(), kappa=0.0, ringing=0.0)
-    more = measure_cost(part, plain).logarithm - measure_cost(part, system).logarithm
-    return plain if np.mean(more) + np.std(more) / np.sqrt(len(more)) < log(WORTH) else system
+    plain = replace(system, components=(), kappa=0.0, ringing=0.0)
+    missed = measure_misfit(block, plain, strong, reach=RINGING_REACH).misfit
+    ratio = float(np.median(strong.amplitude)) / system.noise_std
+    energy = SQRT_PI * ratio**2 * system.sigma_ref / block.spacing
+    return plain if missed**2 * energy < system.acceptance else system
 
 
 def _draw_together(part: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
