@@ -36,9 +36,9 @@ suits a strip; 35 % on a RIEGL and 80 % on a Leica strip of Gaussians in place o
 INVERTED = 5.0
 """Signals are inverted where counts reach this many times further below the baseline than above it."""
 
-MOST_DOUBTED = 0.15
-"""Share of the echoes that one of two pulses, or of two misfits, finds and the other does not, from which a survey's
-pulse is called a guess."""
+MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
+"""Share of the echoes in doubt, because another pulse, misfit or noise serves as well, from which a survey's pulse is
+called a guess; of a known pulse, from which its noise is."""
 
 _NEEDS: dict[str, tuple[NoData, ...]] = {
     "range": (),
@@ -207,7 +207,8 @@ def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
     if not report.count("echoes") or alone is None:
         return
     known = "pulse_cost" in figures and find_source(system) is not None
-    reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt > MOST_DOUBTED else ""
+    most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
+    reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt > most else ""
     if alone < FEW and not (known or system.components):
         reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
     if reason:

@@ -13,7 +13,7 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
-from wavebatch.kernels.signal.noise import find_levels
+from wavebatch.kernels.signal.noise import estimate_noise, find_levels, keep_longest
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
@@ -412,10 +412,9 @@ def _find_sure(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> 
     own by is all misfit: it may change from shot to shot, and have nothing in common.
     """
     width = system.sigma_ref / block.spacing
-    _, quiet, _ = find_levels(transpose_samples(block.samples), system.noise_std, int(np.ceil(3 * width)))
-    if block.missing is not None:
-        quiet &= ~block.missing.T
-    error = np.sqrt(PULSE_SAMPLES * width / (2 * max(np.count_nonzero(quiet), 1)))
+    missing = None if block.missing is None else keep_longest(block.missing.T)
+    quiet = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing).share
+    error = np.sqrt(PULSE_SAMPLES * width / (2 * max(quiet * block.samples.size, 1)))
     if find_source(system) is None:
         system = measure_misfit(block, system, strong, bounded=False)
     return decompose_sample(block, replace(system, noise_std=float(system.noise_std * (1 + 2 * error))))
