@@ -14,7 +14,6 @@ from child_signals import give_children_default_signals
 from hypothesis import HealthCheck, settings
 
 from wavebatch.stages.chain import STAGES
-from wavebatch.stages.decompose.rebuild import MODELS
 from wavebatch.tools.simulate import simulate_strip
 
 give_children_default_signals()
@@ -56,11 +55,10 @@ def rng():
 @pytest.fixture
 def paper_stages():
     """The plug-in of examples/papers, for one test: other tests list the stages of wavebatch alone."""
-    before = dict(STAGES), dict(MODELS)
+    before = dict(STAGES)
     yield importlib.import_module("paper_stages")
-    for known, stages in zip((STAGES, MODELS), before, strict=True):
-        known.clear()
-        known.update(stages)
+    STAGES.clear()
+    STAGES.update(before)
     for name in [name for name in sys.modules if name.partition(".")[0] == "paper_stages"]:
         del sys.modules[name]
 

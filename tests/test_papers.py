@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from html_tools import Page
 
-from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.kernels.geometry import hough
 from wavebatch.kernels.physics import radar, radiometry
 from wavebatch.stages.attribute import width_angle
@@ -231,7 +230,7 @@ def drop_from_section(monkeypatch, load):
 
 def forget_the_skew(monkeypatch, load):
     monkeypatch.setattr(skew, "system_skew", lambda system: 0.0)
-    monkeypatch.setattr(skew, "skewed_shape", lambda system, kappa: PulseShape())
+    monkeypatch.setattr(skew, "fit_skewed", lambda system, _: replace(system, components=(), kappa=0.0))
     return load("s1_wang").table_of_estimates(600, 0)
 
 

@@ -245,7 +245,7 @@ def take_all(second, number):
     second.cut()
     found, units = [], 0
     while second.has_more:
-        function, arguments = second.next_call(b"", None)
+        function, arguments = second.next_call(b"")
         if function is process_tile:
             assert second.take(function(*arguments))[0] is None
         else:

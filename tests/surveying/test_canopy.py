@@ -21,7 +21,7 @@ def test_a_canopy_is_no_noise_and_no_pulse(surveys):
     for survey in surveys[1]:
         system = survey.system
         assert system.sigma_ref * FWHM_PER_SIGMA == pytest.approx(CANOPY_SIGMA * FWHM_PER_SIGMA, rel=0.05)
-        assert system.noise_std < 1.25 * CANOPY_NOISE and system.slope_spread == 0 and not system.components
+        assert system.noise.std < 1.25 * CANOPY_NOISE and system.defects.slope_spread == 0 and not system.components
         assert system.misfit < 0.01 and max(share for _, share in system.tail_misfit) < 0.05
 
 

@@ -40,7 +40,7 @@ def test_fifty_packets_of_a_stranger_have_the_echoes_of_its_whole_strip(scene, p
     small, whole = (survey_block(one) for one in (part, block))
     found, right = (len(choose_chain(one).run(part, one.system)) for one in (small, whole))
     assert small.system.components and found == pytest.approx(right, rel=0.1)
-    assert small.figures["echoes_in_doubt"] < MOST_DOUBTED and "echoes_in_doubt" not in whole.figures
+    assert small.figures.echoes_in_doubt < MOST_DOUBTED and whole.figures.echoes_in_doubt is None
 
 
 @pytest.mark.parametrize("scene", ["flat", "urban"])
@@ -48,25 +48,25 @@ def test_a_gaussian_stays_one_in_fifty_packets(scene):
     scene = make_scene(scene, pulse=PulseModel(2.6), n_samples=100)
     survey = survey_block(make_block(scene, 50, seed=11)[0])
     assert not survey.system.components and not survey.system.kappa
-    assert survey.figures["echoes_in_doubt"] < MOST_DOUBTED
+    assert survey.figures.echoes_in_doubt < MOST_DOUBTED
 
 
 def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path, monkeypatch):
     """50 packets of LVIS as those of a stranger: 1.17 to 2.2 times the echoes, in silence."""
     path = cut_strip(data_file("lvis/lvis1.las"), tmp_path / "cut.las", 50)
-    assert _survey(path).figures["echoes_in_doubt"] < 0.05
+    assert _survey(path).figures.echoes_in_doubt < 0.05
     _leave_out(monkeypatch, "nasa-lvis")
-    assert _survey(path).figures["echoes_in_doubt"] > MOST_DOUBTED
+    assert _survey(path).figures.echoes_in_doubt > MOST_DOUBTED
 
 
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_fifty_packets_of_level_ground_are_sure(strip, request, tmp_path):
     survey = _survey(cut_strip(request.getfixturevalue(strip), tmp_path / "cut.las", 120))
-    assert survey.figures["echoes_in_doubt"] < MOST_DOUBTED
+    assert survey.figures.echoes_in_doubt < MOST_DOUBTED
 
 
 def test_a_known_pulse_keeps_its_misfit_in_a_small_strip():
     """Packets of a dense forest with eight quiet samples each."""
     survey = _survey(data_file("neon/neon_harv_a.las"))
     assert find_source(survey.system).name == "neon-gemini" and survey.system.misfit == 0
-    assert 0.01 < survey.figures["echoes_in_doubt"] < MOST_DOUBTED_KNOWN
+    assert 0.01 < survey.figures.echoes_in_doubt < MOST_DOUBTED_KNOWN

@@ -24,6 +24,7 @@ import wavebatch
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
@@ -201,7 +202,7 @@ def test_groups_differ_and_are_surveyed():
 def known_group(n=300) -> Group:
     scene = find_bench_scene("flat")
     ((block, truth),) = simulate_blocks(scene, n, seed=2, size=n)
-    return make_group(scene, 0, block, truth, Survey(SystemPulse(2.0, noise_std=1.04), n, {}, ()))
+    return make_group(scene, 0, block, truth, Survey(SystemPulse(2.0, noise=ReceiverNoise(std=1.04)), n))
 
 
 def test_tally_of_perfect_echoes_and_of_none():
@@ -327,10 +328,11 @@ def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()
     samples[7, 40], samples[20, 40] = 950, 850
-    result = peers.run_peer("gdecomp", replace(block, samples=samples), SystemPulse(2.0, baseline=12.0, noise_std=1.04))
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.04))
+    result = peers.run_peer("gdecomp", replace(block, samples=samples), system)
     assert result.failures == 2 and result.waveforms == 38
     assert sorted(set(range(40)) - set(result.found.waveform.tolist())) == [7, 20]
-    group = make_group(scene, 0, block, truth, Survey(SystemPulse(2.0), 40, {}, ()))
+    group = make_group(scene, 0, block, truth, Survey(SystemPulse(2.0), 40))
     tally = Tally()
     tally.add(group, result.found)
     assert tally.figures()["completeness"].value == pytest.approx(38 / 40)

@@ -55,7 +55,7 @@ class Setup:
     @property
     def system(self) -> SystemPulse:
         """The pulse with its calibration and the error of the sensor's position."""
-        system = replace(self.choice.survey.system, sensor_error=self.sensor.error)
+        system = self.choice.survey.system.with_radiometry(sensor_error=self.sensor.error)
         return system if self.calibration is None else self.calibration.apply(system)
 
 

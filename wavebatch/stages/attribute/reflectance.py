@@ -13,7 +13,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.no_data import NoData
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock, angle_to_vertical
+from wavebatch.core.system import angle_to_vertical
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.physics import radiometry
 from wavebatch.stages.attribute.light import (
     POSITION,

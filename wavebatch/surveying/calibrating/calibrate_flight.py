@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.waveforms import swath_columns
+from wavebatch.core.system import swath_columns
 from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
 from wavebatch.surveying.calibrating.flight_strips import FlightStrip, find_box, read_strip

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.waveforms import angle_to_vertical
+from wavebatch.core.system import angle_to_vertical
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.calibrating.setting import SCANNERS, see_channels

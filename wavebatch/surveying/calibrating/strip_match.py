@@ -143,15 +143,15 @@ def _find_pulses(
     """
     systems = {0: system, **system.digitizers}
     known = [row.pulse_ns for row in calibration.channels if row.pulse_ns]
-    divergence = system.divergence or calibration.divergence
+    divergence = system.radiometry.divergence or calibration.divergence
     widest = max(one.sigma_ref for one in systems.values()) * FWHM_PER_SIGMA
     if known and divergence and widest > NEAR_PULSE * min(known):
         main = max(scan.by_descriptor, key=lambda index: (index not in system.digitizers, scan.by_descriptor[index]))
         spacing = reader.facts.digitizers[main].spacing
-        seen = sample_reference(reader, scan, sensor, replace(system, divergence=divergence), spacing).system
+        seen = sample_reference(reader, scan, sensor, system.with_radiometry(divergence=divergence), spacing).system
         systems = {0: seen, **seen.digitizers}
     return {
-        index: FWHM_PER_SIGMA * math.sqrt(max(one.sigma_ref**2 + one.level_variance, 0.0))
+        index: FWHM_PER_SIGMA * math.sqrt(max(one.sigma_ref**2 + one.widths.variance, 0.0))
         for index, one in systems.items()
     }
 

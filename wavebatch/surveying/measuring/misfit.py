@@ -93,7 +93,7 @@ def measure_misfit(
     fitted = fitted.take(find_strongest(fitted, len(part))[0])
     misfit = 0.0
     if len(fitted) >= FEW:
-        ratio = fitted.amplitude.astype(np.float64) / system.noise_std
+        ratio = fitted.amplitude.astype(np.float64) / system.noise.std
         energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
         every = (_promise(part, samples_of(part, noise), system, fitted, reach) - NOISE_PROMISE) / energy
         share = np.quantile(every, MISFIT_QUANTILE)
@@ -120,7 +120,7 @@ def _promise(
     echo = np.arange(len(echoes))
     windows = Clusters(echoes.waveform.astype(np.int64), low, high, echo, np.ones_like(echo))
     amplitude, time, width = main.T
-    settings = Settings(*limits, shape, clip_level(part, system), system.noise_gain)
+    settings = Settings(*limits, shape, clip_level(part, system), system.noise.gain)
     fitted = Candidates(windows.waveform, time, amplitude, width)
     return promise_echoes(samples, fitted, windows, settings)
 
@@ -135,7 +135,7 @@ def _common_promise(
     near = (np.abs(lag) < reach) & np.isfinite(residual)
     height = np.broadcast_to(echoes.amplitude[:, None], lag.shape)[near]
     common, number, spread = find_common(residual[near].astype(np.float64), lag[near], height, reach)
-    chance = (system.noise_by_kind.get("quiet") or system.noise_std) / height
+    chance = system.noise.quiet / height
     error = MEDIAN_ERROR * spread / np.sqrt(number) + 2 * np.maximum(spread - chance, 0.0)
     drawn, (row, place) = render_own(part, system, echoes, echoes.waveform, len(part)), np.nonzero(near)
     drawn[echoes.waveform[row], place] += np.sign(common) * np.maximum(np.abs(common) - error, 0.0) * height
@@ -151,7 +151,7 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     left = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
     left /= echoes.amplitude[:, None]
     lag = (np.arange(residual.shape[1]) - (echoes.time / part.spacing)[:, None]) / ref
-    expected = system.noise_std / np.median(echoes.amplitude) / np.sqrt(energy)
+    expected = system.noise.std / np.median(echoes.amplitude) / np.sqrt(energy)
     profile = []
     for place in range(-TAIL_BEFORE, TAIL_AFTER):
         here = left[(lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)]

@@ -29,6 +29,7 @@ from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
 from wavebatch.surveying.measuring.misfit import measure_misfit
 from wavebatch.surveying.measuring.noise_and_width import FEW, SMALL
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.system_table import read_system
 
 LEAST_ECHOES = 8
@@ -199,7 +200,7 @@ def guess_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Sy
 
 
 def choose_pulse(
-    block: WaveformBlock, system: SystemPulse, strong: EchoTable, *, learned: bool, figures: dict[str, float]
+    block: WaveformBlock, system: SystemPulse, strong: EchoTable, *, learned: bool, figures: Figures
 ) -> SystemPulse:
     """Compare the strip's pulse with those of known sensors, and with itself drawn together.
 
@@ -212,7 +213,7 @@ def choose_pulse(
         The strongest single echoes of the block.
     learned : bool
         Whether it was learned; a Gaussian that is a guess is never drawn together.
-    figures : dict
+    figures : Figures
         Gets the costs of the two pulses, where one was taken for another, and the share of the echoes that is in doubt
         because the two cost about the same.
 
@@ -244,9 +245,9 @@ def choose_pulse(
         certain = learned and len(block) >= SMALL
         pulse, cost = _compare_known(part, (system, own), (pulse, cost), certain=certain)
     if pulse is not system:
-        figures |= {"pulse_cost": cost.typical, "isolated_pulse_cost": own.typical}
+        figures.pulse_cost, figures.isolated_pulse_cost = cost.typical, own.typical
         if own.exceeds(cost) < BEYOND and find_source(pulse) is None:
-            figures["echoes_in_doubt"] = abs(own.echoes / max(cost.echoes, 1) - 1)
+            figures.echoes_in_doubt = abs(own.echoes / max(cost.echoes, 1) - 1)
     return pulse
 
 
@@ -287,7 +288,7 @@ def _drop_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> 
         return system
     plain = replace(system, components=(), kappa=0.0, ringing=0.0)
     missed = measure_misfit(block, plain, strong, reach=RINGING_REACH).misfit
-    ratio = float(np.median(strong.amplitude)) / system.noise_std
+    ratio = float(np.median(strong.amplitude)) / system.noise.std
     energy = SQRT_PI * ratio**2 * system.sigma_ref / block.spacing
     return plain if missed**2 * energy < system.acceptance else system
 
@@ -336,9 +337,9 @@ def measure_cost(block: WaveformBlock, system: SystemPulse) -> Cost:
     """Measure how well a pulse explains waveforms, all echoes fitted together."""
     echoes = decompose_sample(block, system)
     left = np.nan_to_num(subtract_echoes(block, system, echoes)).astype(np.float64)
-    noise = min(system.noise_by_kind.get("quiet") or system.noise_std, system.noise_std)
+    noise = system.noise.quiet
     samples = left.shape[1] if block.missing is None else (~block.missing).sum(axis=1)
-    misfit = (np.einsum("ns,ns->n", left, left) - samples * noise**2) / system.noise_std**2
+    misfit = (np.einsum("ns,ns->n", left, left) - samples * noise**2) / system.noise.std**2
     cost = np.maximum(misfit, 0.0) + system.acceptance * (1 + echoes.count(len(block)))
     return Cost(max(float(np.sum(misfit)), 0.0), len(echoes), log(cost))
 
@@ -351,8 +352,9 @@ def scale_pulse(system: SystemPulse, ratio: float) -> SystemPulse:
 
 def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
     """Return a strip's system with the pulse of another one, and with how far strong echoes deviate from it."""
-    names = ("sigma_ref", "kappa", "components", "ringing", "acceptance", "misfit", "tail_misfit", "width_scatter")
-    return replace(system, **{name: getattr(known, name) for name in names})
+    names = ("sigma_ref", "kappa", "components", "ringing", "acceptance", "misfit", "tail_misfit")
+    widths = replace(system.widths, scatter=known.widths.scatter)
+    return replace(system, widths=widths, **{name: getattr(known, name) for name in names})
 
 
 def find_source(system: SystemPulse) -> KnownSystem | None:

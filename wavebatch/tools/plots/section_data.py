@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.las.crs import CrsWords
+from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots.raster import check_crs
 from wavebatch.tools.plots.values import MARGIN, Clouds, Selection, Tally, name_paths, robust_limits
 from wavebatch.tools.voxels.voxel_points import VoxelFile
