@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,15 +100,12 @@ def compare(
         if angles or overlap:
             raise click.UsageError("-o has no meaning with --angles and --overlap; --json writes their figures")
         check_target(output, overwrite=overwrite)
-    if overlap:
-        found = _measure_overlap(a, b, {**options, "strip": strip, "truth": truth, "angles": angles or None})
-        print_result(as_json, found, list_overlap(found), "overlap")
+    if angles or overlap:
+        mode = "overlap" if overlap else "angles"
+        others = {"strip": strip, "truth": truth, "angles": angles and overlap}
+        found, lines = _measure(mode, a, b, {**options, **others})
+        print_result(as_json, found, lines, mode)
         _write_page(html_file, found, [])
-        return
-    if angles:
-        agreement = _measure_angles(a, b, {**options, "strip": strip, "truth": truth})
-        print_result(as_json, agreement, list_angles(agreement), "angles")
-        _write_page(html_file, agreement, [])
         return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
@@ -166,7 +164,8 @@ def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: di
     from wavebatch.core.suggest import nearest
     from wavebatch.surveying.choose_chain import COSTS
     from wavebatch.surveying.system_file import load_survey
-    from wavebatch.tools.compare.chains import AUTO, find_contender, match_sides
+    from wavebatch.tools.api.chain import AUTO
+    from wavebatch.tools.compare.chains import find_contender, match_sides
 
     if truth is not None:
         raise click.UsageError("--truth is for a cloud; `wavebatch bench` compares chains with a truth")
@@ -204,25 +203,22 @@ def _check_thresholds(result: Comparison, options: dict) -> list[str]:
     return lines
 
 
-def _measure_angles(a: Path, b: Path | None, options: dict) -> AngleAgreement:
-    """The agreement of the angles of one or two clouds; UsageError for options that have no meaning here."""
-    from wavebatch.tools.compare.angles import compare_angles
-
-    _refuse_others(options, "--angles", "within")
-    return compare_angles(a, b, **_tolerance(options))
-
-
-def _refuse_others(options: dict, mode: str, *allowed: str) -> None:
-    """UsageError for options that have no meaning in this mode."""
+def _measure(
+    mode: str, a: Path, b: Path | None, options: dict
+) -> tuple[AngleAgreement | OverlapComparison, Iterator[str]]:
+    """What --angles or --overlap finds, and its tables; UsageError for options that have no meaning with it."""
+    used = {"angles": ("debug", "quiet", "within"), "overlap": ("debug", "quiet")}[mode]
     for name, value in options.items():
-        if value not in (None, False) and name not in (*allowed, "debug", "quiet"):
-            raise click.UsageError(f"--{name.removesuffix('_file').replace('_', '-')} has no meaning with {mode}")
+        if value not in (None, False) and name not in used:
+            raise click.UsageError(f"--{name.replace('_', '-')} has no meaning with --{mode}")
+    if mode == "angles":
+        from wavebatch.tools.compare.angles import compare_angles
 
-
-def _measure_overlap(a: Path, b: Path | None, options: dict) -> OverlapComparison:
-    from wavebatch.tools.compare.overlap import compare_overlap
-
-    _refuse_others(options, "--overlap")
+        agreement = compare_angles(a, b, **_tolerance(options))
+        return agreement, list_angles(agreement)
     if b is None:
         raise click.UsageError("--overlap needs two clouds, A and B")
-    return compare_overlap(a, b)
+    from wavebatch.tools.compare.overlap import compare_overlap
+
+    found = compare_overlap(a, b)
+    return found, list_overlap(found)

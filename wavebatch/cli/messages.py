@@ -37,7 +37,15 @@ _PLAIN = {
 """Click's words for values of a wrong type, and plain ones."""
 
 
-class WrongUsage(click.ClickException):
+class _OneLine(click.ClickException):
+    """An error that is printed as one line."""
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        """The line on stderr."""
+        click.echo(f"error: {self.message}", file=file, err=file is None)
+
+
+class WrongUsage(_OneLine):
     """Wrong usage as one line, like all other errors; click would print four."""
 
     exit_code = EXIT_USAGE
@@ -52,20 +60,12 @@ class WrongUsage(click.ClickException):
             text += f"{'' if text.endswith('?') else ';'} see `{error.ctx.command_path} --help`"
         super().__init__(text)
 
-    def show(self, file: IO[Any] | None = None) -> None:
-        """The line on stderr."""
-        click.echo(f"error: {self.message}", file=file, err=file is None)
 
-
-class Unprinted(click.ClickException):
+class Unprinted(_OneLine):
     """stdout that cannot be written, such as a full disk, as one line."""
 
     def __init__(self, error: OSError) -> None:
         super().__init__(f"stdout: cannot be written: {error.strerror or error}")
-
-    def show(self, file: IO[Any] | None = None) -> None:
-        """The line on stderr."""
-        click.echo(f"error: {self.message}", file=file, err=file is None)
 
 
 class Interrupted(click.ClickException):

@@ -5,8 +5,6 @@ Reads options and writes the text, the CSV table and the JSON document; counting
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -31,6 +29,7 @@ from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.inputs import find_files
 from wavebatch.files.text_file import write_text
+from wavebatch.tools.csv_table import format_csv
 from wavebatch.tools.return_stats.areas import RANKS, AreaStats, Grid, PolygonSet, Separation, describe_pairs
 from wavebatch.tools.return_stats.dead_zones import BIN, BINS, LEAST_PAIRS, DeadZone
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
@@ -41,9 +40,8 @@ EXIT_UNREADABLE = 1
 SHOWN = 20
 """Areas of a cloud that are printed: about a screen; -o and --json have all of them."""
 
-
-_ZONE = ("dead_zone_m", "dead_zone_err_m")
-"""Columns of the table for a dead zone: of all pairs, then with the numbers of the returns appended."""
+_COUNTED = ("by_number", "by_count")
+"""Shares by return number, and of pulses by their number of returns."""
 
 
 @click.command()
@@ -151,36 +149,30 @@ def _list_areas(areas: Sequence[AreaStats]) -> Iterator[str]:
 def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:
     """CSV: one row per cloud and per area of it; for several clouds also the total."""
     every = [*each, total] if len(each) > 1 else each
-    rows = [(one.cloud, part) for one in every for part in (one, *one.areas)]
-    numbers = range(1, 1 + max((max(part.by_number, default=0) for _, part in rows), default=0))
-    counts = range(1, 1 + max((max(part.by_count, default=0) for _, part in rows), default=0))
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    head = ["cloud", "kind", "area", "x", "y", "points", "pulses", "returns_per_pulse"]
-    head += [*(f"return_{k}" for k in numbers), *(f"pulses_with_{k}" for k in counts), "pairs", "mean_m", "least_m"]
-    ranks = [pair.replace("-", "_").rstrip("_") for pair in RANKS]
-    head += [f"{name}_{pair}" for pair in ranks for name in ("pairs", "mean_m", "least_m")]
-    head += ["pulses_with_several", "first_above_last_m"]
-    head += [f"{name}{pair}" for pair in ("", *(f"_{pair}" for pair in ranks)) for name in _ZONE]
-    table.writerow(head)
-    for cloud, part in rows:
-        if isinstance(part, AreaStats):
-            place, apart = [part.kind, part.name, part.x, part.y], (part.pairs, part.mean, part.least)
-        else:
-            alone = part.separations["all"]
-            place, apart = ["cloud", "", math.nan, math.nan], (alone.pairs, alone.mean, alone.least)
-        shares = [part.by_number.get(k, 0.0) for k in numbers] + [part.by_count.get(k, 0.0) for k in counts]
-        values = [*place, part.points, part.pulses, part.returns_per_pulse, *shares, *apart]
-        for one in _rank_pairs(part):
-            values += [one.pairs, one.mean, one.least]
-        values += [part.several, part.depth]
-        # Distances are collected per cloud only: a histogram per area would need too much memory.
-        zones = {} if isinstance(part, AreaStats) else part.dead_zones
-        for name in ("all", *RANKS):
-            zone = zones.get(name, DeadZone(0, math.nan, math.nan))
-            values += [zone.size, zone.error]
-        table.writerow([cloud, *(_cell(value) for value in values)])
-    return text.getvalue()
+    parts = [(one.cloud, part) for one in every for part in (one, *one.areas)]
+    most = [max((max(getattr(part, name), default=0) for _, part in parts), default=0) for name in _COUNTED]
+    rows = [_table_row(cloud, part, *most) for cloud, part in parts]
+    return format_csv(list(rows[0]), (row.values() for row in rows))
+
+
+def _table_row(cloud: str, part: ReturnStats | AreaStats, most_number: int, most_count: int) -> dict[str, Any]:
+    """Values of a cloud or an area by column; most_...: largest return number and number of returns of the table."""
+    is_area = isinstance(part, AreaStats)
+    place = (part.kind, part.name, part.x, part.y) if is_area else ("cloud", "", math.nan, math.nan)
+    found: dict[str, Any] = dict(zip(("cloud", "kind", "area", "x", "y"), (cloud, *place), strict=True))
+    found |= {"points": part.points, "pulses": part.pulses, "returns_per_pulse": part.returns_per_pulse}
+    found |= {f"return_{k}": part.by_number.get(k, 0.0) for k in range(1, 1 + most_number)}
+    found |= {f"pulses_with_{k}": part.by_count.get(k, 0.0) for k in range(1, 1 + most_count)}
+    ends = ["", *(f"_{pair.replace('-', '_').rstrip('_')}" for pair in RANKS)]
+    for end, one in zip(ends, [part if is_area else part.separations["all"], *_rank_pairs(part)], strict=True):
+        found |= {f"pairs{end}": one.pairs, f"mean_m{end}": one.mean, f"least_m{end}": one.least}
+    found |= {"pulses_with_several": part.several, "first_above_last_m": part.depth}
+    # Distances are collected per cloud only: a histogram per area would need too much memory.
+    zones = {} if is_area else part.dead_zones
+    for end, name in zip(ends, ("all", *RANKS), strict=True):
+        zone = zones.get(name, DeadZone(0, math.nan, math.nan))
+        found |= {f"dead_zone_m{end}": zone.size, f"dead_zone_err_m{end}": zone.error}
+    return found
 
 
 def _rank_pairs(part: ReturnStats | AreaStats) -> list[Separation]:
@@ -192,13 +184,6 @@ def _rank_pairs(part: ReturnStats | AreaStats) -> list[Separation]:
     pairs = sum(one.pairs for one in rest)
     least = min((one.least for one in rest), default=math.nan)
     return [*found.values(), describe_pairs(pairs, sum(one.pairs * one.mean for one in rest), least)]
-
-
-def _cell(value: Any) -> Any:
-    """The value for the table; an unknown number is an empty cell."""
-    if not isinstance(value, float):
-        return value
-    return f"{value:.10g}" if math.isfinite(value) else ""
 
 
 def _plain(found: ReturnStats) -> dict[str, Any]:

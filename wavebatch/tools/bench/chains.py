@@ -14,12 +14,10 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import effective, load_chain, load_profile
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.tools.api.chain import AUTO
 
 PROFILES = ("fast", "balanced", "accurate")
 """Shipped chains that are always measured, cheapest first."""
-
-AUTO = "auto"
-"""Name of the chain that a survey chooses."""
 
 ATTRIBUTES = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
 """Attributes that the shipped chains compute too, so that times can be compared."""

@@ -16,6 +16,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.shared_packets import expand
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import SAMPLE, survey_blocks
 from wavebatch.surveying.survey import pool_blocks
@@ -70,8 +71,7 @@ class StripScene(Scene):
         chosen = rng.integers(0, len(sample.count), n)
         count = sample.count[chosen]
         waveform = np.repeat(np.arange(n), count)
-        within = np.arange(len(waveform)) - np.repeat(np.cumsum(count) - count, count)
-        row = np.repeat(sample.first[chosen], count) + within
+        row = expand(sample.first[chosen], count)
         start = sample.time[np.repeat(sample.first[chosen], count)]
         stretch = np.exp(JITTER * rng.standard_normal(n))[waveform]
         shift = rng.uniform(-0.5, 0.5, n)[waveform] * recording.spacing

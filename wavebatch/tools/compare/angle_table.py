@@ -6,8 +6,6 @@ attribute.incidence_angle, so that the table is what a run writes for surfaces t
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +25,7 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.angle_limits import REFERENCE_ERROR
+from wavebatch.tools.csv_table import format_csv
 from wavebatch.tools.plots.draw_cloud import SERIES
 from wavebatch.tools.plots.labels import fit_parts
 
@@ -141,14 +140,11 @@ def write_angles(
 
 def format_angles(found: AngleTable) -> str:
     """The table as CSV; empty cells are no data."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["angle_deg", "spread_ns", "echo_width_ns", "angle_err_deg", "distance_m", "divergence_mrad",
-                    "amplitude_DN"])  # fmt: skip
-    for row in zip(found.angle, found.spread, found.width, found.error, strict=True):
-        values = (*row, found.distance, found.divergence, found.amplitude)
-        table.writerow([f"{value:.6g}" if math.isfinite(value) else "" for value in values])
-    return text.getvalue()
+    head = ("angle_deg", "spread_ns", "echo_width_ns", "angle_err_deg", "distance_m", "divergence_mrad",
+            "amplitude_DN")  # fmt: skip
+    same = map(float, (found.distance, found.divergence, found.amplitude))
+    columns = (found.angle, found.spread, found.width, found.error, *(np.full(len(found.angle), one) for one in same))
+    return format_csv(head, zip(*columns, strict=True), digits=6)
 
 
 def draw_angles(tables: Sequence[AngleTable], target: Path, *, strip: str = "", overwrite: bool = False) -> None:

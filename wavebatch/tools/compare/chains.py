@@ -18,19 +18,17 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
+from wavebatch.stages.chain_file import list_profiles
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.tools.api.chain import AUTO, load_chain
 from wavebatch.tools.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.tools.compare.differences import SPEED
 from wavebatch.tools.compare.goodness import FitQuality, Goodness, measure_fit
 from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
-
-AUTO = "auto"
-"""Name of the chain that the survey of the strip chooses."""
 
 _BLOCK = 8192
 """Waveforms that run through the chains at once."""
@@ -56,9 +54,8 @@ class Contender:
 
 def find_contender(name: str) -> Contender:
     """A shipped chain by its name, `auto`, a chain file (.toml), or else a cloud; ConfigError for a wrong chain."""
-    if name in list_profiles():
-        return Contender(name, load_profile(name))
-    return Contender(name, load_chain(name) if Path(name).suffix.lower() == ".toml" else None)
+    is_chain = name in list_profiles() or Path(name).suffix.lower() == ".toml"
+    return Contender(name, load_chain(name) if is_chain else None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any
+
+from wavebatch.tools.csv_table import format_csv
 
 HEAD = ("table", "side", "class", "name", "figure", "value")
 """Columns: e.g. `missed`, `B`, `return`, `1 of 2`, `share`, `0.012`."""
@@ -24,12 +24,7 @@ def format_comparison(document: Mapping[str, Any]) -> str:
 
     document: of `Comparison.to_json`, or of `Matchup.to_json`.
     """
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(HEAD)
-    for *place, value in _list_rows(document):
-        table.writerow([*place, _cell(value)])
-    return text.getvalue()
+    return format_csv(HEAD, _list_rows(document))
 
 
 def _list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
@@ -82,9 +77,3 @@ def _list_nested(table: str, values: Mapping[str, Any], *path: str) -> Iterator[
             side = path[0].upper() if path and path[0] in ("a", "b") else ""
             rest = path[1:] if side else path
             yield table, side, " ".join(rest[:-1]), rest[-1] if rest else "", str(name), value
-
-
-def _cell(value: Any) -> Any:
-    if value is None or isinstance(value, float) and not math.isfinite(value):
-        return ""
-    return f"{value:.10g}" if isinstance(value, float) else value
