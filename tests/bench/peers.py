@@ -12,6 +12,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -164,11 +165,11 @@ def _drive_gdecomp(signal: Path, results: Path, n: int, height: float) -> int:
     """Runs gdecomp, starting it again after every waveform on which it crashes or hangs; returns their number."""
     failures, place = 0, 0
     while place < n:
-        with Worker() as worker:
+        with ThreadPoolExecutor(1) as caller, Worker() as worker:
             worker.call(os.getpid)  # so that starting up does not look like hanging
-            worker.submit(fit_gdecomp, signal, results, place, height)
+            call = caller.submit(worker.call, fit_gdecomp, signal, results, place, height)
             try:
-                _wait(worker, results, place)
+                _wait(call, results, place)
                 break
             except WorkerDied:
                 pass
@@ -178,12 +179,12 @@ def _drive_gdecomp(signal: Path, results: Path, n: int, height: float) -> int:
     return failures
 
 
-def _wait(worker: Worker, results: Path, place: int) -> None:
+def _wait(call: Future, results: Path, place: int) -> None:
     """Waits until the worker is done; raises WorkerDied when it ends or makes no progress."""
     before = -1
     while True:
         try:
-            worker.take(PATIENCE)
+            call.result(PATIENCE)
             return
         except TimeoutError:
             now = int(np.isfinite(np.load(results, mmap_mode="r")[place:, 0]).sum())

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -311,13 +312,15 @@ def test_worker_answers_raises_and_dies():
             worker.call(os.stat, "/no/such/file")
         memory = worker.call(peak_memory)
         assert memory is None or 5e6 < memory < 1e9
-        worker.submit(time.sleep, 600)
-        with pytest.raises(TimeoutError):
-            worker.take(0.05)
-    with Worker() as worker:
-        worker.submit(os._exit, 3)
-        with pytest.raises(WorkerDied):
-            worker.take(300)
+    with Worker() as worker, pytest.raises(WorkerDied):
+        worker.call(os._exit, 3)
+
+
+def test_closing_a_worker_ends_a_call_that_hangs():
+    with ThreadPoolExecutor(1) as caller, Worker() as worker:
+        worker.call(os.getpid)
+        call = caller.submit(worker.call, time.sleep, 600)
+    assert isinstance(call.exception(), WorkerDied)
 
 
 FAKE = """

@@ -6,12 +6,11 @@ the caller's main module into the measured process.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
-import queue
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -36,50 +35,29 @@ class Worker(Closing):
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
         )
-        self._replies: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
 
-    def submit(self, function: Callable, *arguments: Any) -> None:
-        """Starts `function(*arguments)`; `take` returns the answer."""
+    def call(self, function: Callable, *arguments: Any) -> Any:
+        """`function(*arguments)` computed in the process; the function must be importable by name.
+
+        Raises WorkerDied, or whatever the function raised. A caller that cannot wait uses a thread: `close` ends it.
+        """
         try:
             pickle.dump((function, arguments), self._process.stdin, pickle.HIGHEST_PROTOCOL)
             self._process.stdin.flush()
-        except OSError:
-            self._replies.put(("died", None))
-
-    def take(self, timeout: float | None = None) -> Any:
-        """The answer to the last `submit`; raises TimeoutError, WorkerDied, or whatever the function raised."""
-        try:
-            kind, value = self._replies.get(timeout=timeout)
-        except queue.Empty:
-            raise TimeoutError from None
-        if kind == "died":
-            raise WorkerDied("the measuring process ended")
+            kind, value = pickle.load(self._process.stdout)
+        except (EOFError, OSError, ValueError, pickle.UnpicklingError):
+            raise WorkerDied("the measuring process ended") from None
         if kind == "raised":
             raise value
         return value
-
-    def call(self, function: Callable, *arguments: Any) -> Any:
-        """`function(*arguments)` computed in the process; the function must be importable by name."""
-        self.submit(function, *arguments)
-        return self.take()
 
     def close(self) -> None:
         """Kills the process."""
         self._process.kill()
         self._process.wait()
-        self._reader.join()
-        self._process.stdin.close()
+        with contextlib.suppress(OSError):  # what a call had not sent yet
+            self._process.stdin.close()
         self._process.stdout.close()
-
-    def _read(self) -> None:
-        while True:
-            try:
-                self._replies.put(pickle.load(self._process.stdout))
-            except (EOFError, OSError, ValueError, pickle.UnpicklingError):
-                self._replies.put(("died", None))
-                return
 
 
 def serve() -> None:

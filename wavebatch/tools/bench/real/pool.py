@@ -12,6 +12,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.kernels.signal.runs import find_stretches
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.rebuild import rebuild_waveforms
 from wavebatch.surveying import Survey, survey_blocks
@@ -125,8 +126,6 @@ def find_fill(samples: np.ndarray, shortest: int = 12, gap: int = 3) -> np.ndarr
     near = (samples - lowest < gap) & ~at_low
     rows = np.flatnonzero(~near.any(axis=1) & (at_low.sum(axis=1) >= shortest) & ~at_low.all(axis=1))
     fill = np.zeros(samples.shape, bool)
-    for row in rows:
-        edges = np.flatnonzero(np.diff(np.r_[False, at_low[row], False].astype(np.int8)))
-        for start, end in zip(edges[::2], edges[1::2], strict=True):
-            fill[row, start:end] = end - start >= shortest
+    for place, start, end in zip(*find_stretches(at_low[rows]), strict=True):
+        fill[rows[place], start:end] = end - start >= shortest
     return fill
