@@ -33,6 +33,19 @@ def test_candidates_where_nothing_is_do_not_keep_others_out():
     assert np.count_nonzero(both & (found.number >= 2)) > 170
 
 
+@pytest.mark.parametrize("apart", [1.5, 2.0])
+def test_echoes_that_their_errors_do_not_tell_apart_are_not_kept(apart):
+    """chi2 falls by more than the acceptance, but the pair is closer than its errors allow."""
+    noise = np.random.default_rng(3).standard_normal((300, LENGTH))
+    y = np.rint(bell(20, 100) + bell(20 + apart, 70) + noise)
+    start = np.stack([y.max(axis=1), y.argmax(axis=1), np.full(300, 2.0)], axis=1)[:, :, None]
+    found = decompose(y, start, grow=True, prior_spread=0.2, acceptance=4.0)
+    for last, number in zip(np.cumsum(found.number), found.number, strict=True):
+        rows = slice(last - number, last)
+        assert naive_fit.is_resolved(found.parameters[rows, :3].T, found.errors[rows, :3].T)
+    assert np.count_nonzero(found.number > 1) > 10
+
+
 def test_candidates_of_nothing_are_left_out():
     found = repeat(bell(20, 100) - bell(30, 8, 3.0), [20.0, 30.0], [100.0, 4.0])
     assert np.count_nonzero(found.number == 1) > 160
