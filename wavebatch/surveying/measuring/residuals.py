@@ -12,7 +12,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.order import group_medians
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
+from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.render import render_echoes
@@ -45,8 +45,8 @@ GROWTH_REACH, GROWTH_STEP, GROWTH_CLASS = 1.5, 0.25, 60
 class of heights: misfit of the pulse is taken off by lag and class."""
 
 BROUGHT, BROUGHT_CROSS = np.sqrt(2 / 3) * np.array([1, 2 / 3, 1 / 2]), -np.sqrt(2 / 3) / 3
-"""Integrals of the squares of the first three Hermite functions times exp(-z^2 / 2); and of the product of the first and
-the third one, times 2 / sqrt(2) as it enters the sum."""
+"""Integrals of the squares of the first three Hermite functions times exp(-z^2 / 2); and of the product of the first
+and the third one, times 2 / sqrt(2) as it enters the sum."""
 
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
@@ -251,8 +251,8 @@ def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: 
         Median of the values at this lag and height.
     number : int64 (k,)
         Values that it comes from.
-    error : float64 (k,)
-        Its standard error, from their scatter.
+    spread : float64 (k,)
+        Their standard deviation, from the median of their distances from it.
     """
     classes = min(max(len(np.unique(height)) // GROWTH_CLASS, 1), 8)
     bins = int(2 * reach / GROWTH_STEP)
@@ -260,8 +260,7 @@ def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: 
     place += bins * np.searchsorted(np.quantile(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
     number = np.bincount(place)
     middle, spread = group_medians(values, place)
-    error = MEDIAN_ERROR * spread / np.sqrt(np.maximum(number, 1))
-    return middle[place], number[place], error[place]
+    return middle[place], number[place], spread[place]
 
 
 def _chance_part(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, core: np.ndarray) -> np.ndarray:
