@@ -11,10 +11,10 @@ from wavebatch.surveying.auto_chain import choose_chain
 
 @pytest.fixture(scope="module")
 def surveys():
-    """The canopy, and the surveys of all of it and of its two tiles."""
+    """The canopy, and the surveys of all of it and of a tile."""
     block = grow_canopy(1)
     half = len(block) // 2
-    return block, [survey_block(part) for part in (block, block.rows(slice(0, half)), block.rows(slice(half, None)))]
+    return block, [survey_block(part) for part in (block, block.rows(slice(0, half)))]
 
 
 def test_a_canopy_is_no_noise_and_no_pulse(surveys):
@@ -30,7 +30,7 @@ def test_echoes_of_a_canopy_are_found_with_the_survey_of_any_tile(surveys):
     block, found = surveys
     counts = [choose_chain(one).run(block, one.system).count(len(block)) for one in found]
     assert min(number.mean() for number in counts) > 2.65
-    assert np.mean(counts[1] != counts[2]) < 0.025
+    assert np.mean(counts[0] != counts[1]) < 0.025
 
 
 @pytest.mark.parametrize(("seed", "density"), [(2, 0.3), (2, 0.8)])

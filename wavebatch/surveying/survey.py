@@ -421,7 +421,7 @@ def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
 
     From those narrower than the system pulse: slopes and plants only widen. 0 with too few of them.
     """
-    clear = (echoes.count(len(block))[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise.std)
+    clear = echoes.alone(len(block)) & (echoes.amplitude > MIN_SNR * system.noise.std)
     clear &= (echoes.flags & np.uint16(UNCLEAN)) == 0
     below = clear & (echoes.sigma < system.sigma_ref)
     if np.count_nonzero(below) < ENOUGH_TO_LEARN:

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, SQRT_PI
+from wavebatch.core.order import robust_std
+from wavebatch.core.units import MEDIAN_ERROR, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
@@ -382,7 +383,7 @@ def _find_ringing(block: WaveformBlock, system: SystemPulse, lone: EchoTable) ->
             continue
         value = np.nanmean(here[rows], axis=1)
         middle = float(np.median(value))
-        error = MEDIAN_ERROR * MAD_TO_STD * float(np.median(np.abs(value - middle))) / np.sqrt(len(value))
+        error = MEDIAN_ERROR * robust_std(value) / np.sqrt(len(value))
         if middle > max(LEAST_RINGING, RINGING_ERRORS * error):
             largest = max(largest, float(np.quantile(value, 0.9)))
     return min(largest, LARGEST_RINGING)
