@@ -57,12 +57,14 @@ class Division(Protocol):
 
     def place(self, cloud: Path) -> Division:
         """The division in the coordinates of a cloud."""
+        return self
 
     def miss(self, cloud: Path) -> str:
         """Says that no area lies in the cloud, once it is placed; empty where one does."""
+        return ""
 
 
-class Grid:
+class Grid(Division):
     """Square cells whose borders are multiples of `size`, in the unit of the coordinates."""
 
     def __init__(self, size: float) -> None:
@@ -87,16 +89,8 @@ class Grid:
         x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
         return Area("cell", f"{x:.10g} {y:.10g}", x, y)
 
-    def place(self, cloud: Path) -> Grid:
-        """As Division.place."""
-        return self
 
-    def miss(self, cloud: Path) -> str:
-        """As Division.miss."""
-        return ""
-
-
-class PolygonSet:
+class PolygonSet(Division):
     """Polygons; where polygons overlap, a position belongs to the first one."""
 
     def __init__(self, polygons: Sequence[Polygon]) -> None:
@@ -124,7 +118,7 @@ class PolygonSet:
         return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
 
 
-class Whole:
+class Whole(Division):
     """One area without borders, which counts also where it holds no pulse."""
 
     def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -197,7 +191,7 @@ class AreaStats:
 class AreaTally:
     """Sums per area of one division; tallies of several clouds can be merged."""
 
-    def __init__(self, division: Division | Whole, ranks: tuple[str, ...] = RANKS) -> None:
+    def __init__(self, division: Division, ranks: tuple[str, ...] = RANKS) -> None:
         self.division, self._ranks = division, ranks
         n = int(isinstance(division, Whole))
         self._areas = np.zeros(n, np.int64)

@@ -15,9 +15,9 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.protect import protecting
+from wavebatch.files.disk.publish import Draft
 from wavebatch.tools.voxels.profile import Profiles
 from wavebatch.tools.voxels.rays import RayTable
 
@@ -42,8 +42,8 @@ SAMPLE_COLUMNS = {
 """Arrays with a value per sample with signal; cross_section only with a calibration."""
 
 
-class ProfileWriter(NpzWriter, Closing):
-    """Writes profiles block by block: `add_block` for each, then `publish_profiles`. A context manager."""
+class ProfileWriter(NpzWriter):
+    """Writes profiles block by block: `add_block` for each, then `complete_profiles`."""
 
     def __init__(self, target: Path, strip: Path, *, sections: bool, overwrite: bool) -> None:
         if target.suffix.lower() != ".npz":
@@ -81,11 +81,7 @@ class ProfileWriter(NpzWriter, Closing):
         self.pulses += len(rows)
         self.samples += len(sample)
 
-    def publish_profiles(self, meta: Mapping[str, Any], crs: str) -> None:
-        """Gives the file its name, with how it was made as JSON in `meta`."""
+    def complete_profiles(self, meta: Mapping[str, Any], crs: str) -> Draft:
+        """Writes the file, with how it was made as JSON in `meta`."""
         text = json.dumps({**meta, "columns": self._meanings}, sort_keys=True)
-        self.publish({"crs": crs, "meta": text})
-
-    def close(self) -> None:
-        """Removes what is temporary."""
-        self.discard()
+        return self.complete({"crs": crs, "meta": text})

@@ -234,15 +234,11 @@ def _write_both(
     target: Path, space: VoxelSpace, grid: VoxelGrid, writer: ProfileWriter | None, overwrite: bool
 ) -> int:
     """Writes profiles and voxels, or neither; the number of voxels."""
-    if writer is None:
-        return write_voxels(target, space, grid.pieces(), overwrite=overwrite)
-    meta = {name: value for name, value in space.meta.items() if name not in ("columns", "size_m", "headroom_m")}
-    writer.publish_profiles(meta, space.facts.crs or "")
-    try:
-        return write_voxels(target, space, grid.pieces(), overwrite=overwrite)
-    except BaseException:
-        writer.withdraw()
-        raise
+    others = []
+    if writer is not None:
+        meta = {name: value for name, value in space.meta.items() if name not in ("columns", "size_m", "headroom_m")}
+        others.append(writer.complete_profiles(meta, space.facts.crs or ""))
+    return write_voxels(target, space, grid.pieces(), others=others, overwrite=overwrite)
 
 
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
