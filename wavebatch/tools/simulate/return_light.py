@@ -232,29 +232,25 @@ class LightModel:
         return np.where(known, limited, self.options.sigma)
 
     def _measure_shares(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        known = over = 0
         if self._read_share is None:
             share = share_equally(rows["total"], starts)
-            self._count_shares(share, 0, 0, starts)
-            return share
-        share = self._read_share(records).astype(float)
-        wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
-        if len(wrong):
-            raise InputError(
-                f"{self.path}: {self.options.shares} holds {share[wrong[0]]:g}, which is no share of a footprint: "
-                "shares are 0 to 1; give a column with such values to --shares"
-            )
-        known = int(np.count_nonzero(np.isfinite(share)))
-        share, over = fill_shares(share, starts)
-        self._count_shares(share, known, over, starts)
+        else:
+            share = self._read_share(records).astype(float)
+            wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
+            if len(wrong):
+                raise InputError(
+                    f"{self.path}: {self.options.shares} holds {share[wrong[0]]:g}, which is no share of a footprint: "
+                    "shares are 0 to 1; give a column with such values to --shares"
+                )
+            known = int(np.count_nonzero(np.isfinite(share)))
+            share, over = fill_shares(share, starts)
+        self.counts.own_share += known
+        self.counts.assumed_share += len(share) - known
+        self.counts.over_one += over
+        self.counts.pulses += len(starts)
+        self.counts.shares += float(share.sum())
         return share
-
-    def _count_shares(self, share: np.ndarray, known: int, over: int, starts: np.ndarray) -> None:
-        counts = self.counts
-        counts.own_share += known
-        counts.assumed_share += len(share) - known
-        counts.over_one += over
-        counts.pulses += len(starts)
-        counts.shares += float(share.sum())
 
 
 def share_equally(total: np.ndarray, starts: np.ndarray) -> np.ndarray:
