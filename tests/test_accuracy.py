@@ -5,6 +5,7 @@ from dataclasses import replace
 import naive
 import numpy as np
 import pytest
+from scoring import score
 
 from wavebatch import surveying
 from wavebatch.core.echoes import EchoFlag, EchoTable
@@ -14,7 +15,6 @@ from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.decompose.merge import merge_unresolved
-from wavebatch.stages.score import score
 from wavebatch.tools.simulate import Recording, find_scene, simulate_block
 
 STD = float(np.hypot(1, 1 / np.sqrt(12)))

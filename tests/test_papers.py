@@ -265,7 +265,10 @@ def test_what_is_right_is_accepted(name, load):
     assert not table.failures and len(table.rows) >= 4
 
 
-@pytest.mark.parametrize("spoil", WRONG, ids=lambda spoil: spoil.__qualname__.split(".")[0])
+@pytest.mark.parametrize("spoil", [
+    pytest.param(spoil, marks=pytest.mark.slow) if spoil in (zero_the_heights, refine_without_weights) else spoil
+    for spoil in WRONG
+], ids=lambda spoil: spoil.__qualname__.split(".")[0])  # fmt: skip
 def test_scripts_fail_where_the_code_is_wrong(spoil, load, monkeypatch):
     """Deliberate errors: in synthesize, the angles, the slices, the powers of the range, the skew, the distances."""
     assert spoil(monkeypatch, load).failures

@@ -43,7 +43,7 @@ def strips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("strips")
     (folder / "chain.toml").write_text(CHAIN)
     for scene in ("slope", "urban"):
-        simulate_strip(scene, folder / f"{scene}.las", pulses=24_000, seed=5)
+        simulate_strip(scene, folder / f"{scene}.las", pulses=12_000, seed=5)
     return folder
 
 

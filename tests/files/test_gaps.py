@@ -303,7 +303,7 @@ def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
     assert report["counts"]["echoes"] > 1500
     for options in ([], ["--sheet"]):
         target = tmp_path / f"a{len(options)}.png"
-        arguments = ["plot", "waveform", str(strip), "--random", "4", "-o", str(target), *options]
+        arguments = ["plot", "waveform", str(strip), "--random", "2", "-o", str(target), *options]
         result = CliRunner().invoke(main, arguments)
         assert result.exit_code == 0, result.output
     text = CliRunner().invoke(main, ["info", str(strip)]).stdout

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
+from scoring import score
 
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile, parse_chain
-from wavebatch.stages.score import score
 from wavebatch.surveying import Decision, Survey, survey_block
 from wavebatch.surveying.auto_chain import (
     LOST,

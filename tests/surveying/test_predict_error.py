@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
+from scoring import score
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.chain_file import list_profiles, load_profile
-from wavebatch.stages.score import score
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import COSTS
 from wavebatch.surveying.predict_error import Prediction, leave_out_false, predict_errors, simulate_again

@@ -18,6 +18,7 @@ from bench.jobs_model import Parts
 from bench.promises import SPEEDS, judge
 from bench.release import SCENES, format_release, measure_cases, read_options
 from bench.stability import FAILURES, count_changes, count_failures
+from bench_tools import time_here
 from click.testing import CliRunner
 
 import wavebatch
@@ -47,7 +48,19 @@ SMALL = BenchOptions(
 
 @pytest.fixture(scope="module")
 def document():
-    """A small benchmark with everything in it."""
+    """A small benchmark with everything in it, whose chains are timed in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        time_here(patch)
+        return measure_small()
+
+
+@pytest.fixture(scope="module")
+def timed_document():
+    """The same, timed in processes of their own."""
+    return measure_small()
+
+
+def measure_small():
     found = run_bench(SMALL, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=60))
     cases = measure_cases(SMALL, list_cases(["H10"]), lambda text: None, waveforms=90)
     return {**found, "stability": cases, "promises": judge(found)}
@@ -58,7 +71,8 @@ def find_row(document, name):
 
 
 @pytest.mark.slow
-def test_document_has_a_row_per_chain_and_peer(document):
+def test_document_has_a_row_per_chain_and_peer(timed_document):
+    document = timed_document
     assert document["schema"] == command.SCHEMA
     names = [row["name"] for row in document["scenes"][0]["rows"]]
     assert names[:4] == ["fast", "balanced", "accurate", "auto"] and "scipy leastsq" in names
@@ -297,13 +311,13 @@ def test_worker_answers_raises_and_dies():
             worker.call(os.stat, "/no/such/file")
         memory = worker.call(peak_memory)
         assert memory is None or 5e6 < memory < 1e9
-        worker.submit(time.sleep, 60)
+        worker.submit(time.sleep, 600)
         with pytest.raises(TimeoutError):
             worker.take(0.05)
     with Worker() as worker:
         worker.submit(os._exit, 3)
         with pytest.raises(WorkerDied):
-            worker.take(30)
+            worker.take(300)
 
 
 FAKE = """

@@ -19,7 +19,7 @@ from wavebatch.stages.decompose.loops import loop_model
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.sensor import SensorSource
-from wavebatch.surveying.systems.known_systems import COMPARED, find_source
+from wavebatch.surveying.systems.known_systems import find_source
 
 _ANGLE = "incidence_angle"
 
@@ -35,6 +35,10 @@ suits a strip; 35 % on a RIEGL and 80 % on a Leica strip of Gaussians in place o
 
 INVERTED = 5.0
 """Signals are inverted where counts reach this many times further below the baseline than above it."""
+
+MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
+"""Share of the echoes in doubt, because another pulse, misfit or noise serves as well, from which a survey's pulse is
+called a guess; of a known pulse, from which its noise is."""
 
 _NEEDS: dict[str, tuple[NoData, ...]] = {
     "range": (),
@@ -197,19 +201,23 @@ def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
 
 
 def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """A system pulse that is a guess: the survey had too few echoes to measure it, or to tell it from plants."""
-    found, system = prepared.choice.survey, prepared.system
-    alone, drawn = found.figures.isolated_echoes, found.figures.pulse_cost is not None
-    if not report.count("echoes") or alone is None or (drawn and find_source(system) is not None):
+    """A pulse or noise that is a guess: too few echoes to learn a pulse from, or echoes that another one does not find.
+    """
+    figures, system = prepared.choice.survey.figures, prepared.system
+    alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
+    if not report.count("echoes") or alone is None:
         return
-    reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed" if alone < FEW else ""
-    if drawn and not reason and found.waveforms < COMPARED:
-        reason = f"only {found.waveforms} waveforms, with close echoes in most of them"
+    known = figures.pulse_cost is not None and find_source(system) is not None
+    most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
+    reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
+    if alone < FEW and not (known or system.components):
+        reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
     if reason:
+        guess = f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
+        guess = f"noise is a guess, of {system.noise.std:.3g} DN" if known else guess
         yield (
-            f"the survey found {reason}: the system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns, "
-            "and widths, errors and the number of echoes depend on it; give --system, a survey of a longer strip of "
-            "this sensor"
+            f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
+            "give --system, a survey of a longer strip of this sensor"
         )
 
 

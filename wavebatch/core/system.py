@@ -34,7 +34,7 @@ class ReceiverNoise:
 
     @property
     def quiet(self) -> float:
-        """Noise of quiet samples where it was measured, at most `std` [count]."""
+        """Noise of a quiet sample [count]: `std` is larger where noise is coloured."""
         return min(self.std, self.by_kind.get("quiet") or self.std)
 
 

@@ -91,7 +91,7 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
         signal -= _slopes(signal, system, block.spacing, missing)
     if defects.spikes > 0:
         level = np.median(signal, axis=0) if defects.slope_spread > 0 else np.float32(system.noise.baseline)
-        fill_spikes(signal, find_spikes(signal - level, sample_noise(system), system.sigma_ref / block.spacing))
+        fill_spikes(signal, find_spikes(signal - level, system.noise.quiet, system.sigma_ref / block.spacing))
     clipped = raw >= clip_level(block, system)
     np.copyto(signal, raw, where=clipped)
     samples = np.ascontiguousarray(signal.T)
@@ -135,15 +135,10 @@ def find_seams(blocks: Iterable[WaveformBlock]) -> dict[int, int]:
     return {length: at for length, at in found.items() if at}
 
 
-def sample_noise(system: SystemPulse) -> float:
-    """Return the noise of a quiet sample: `noise.std` is larger where noise is coloured."""
-    return system.noise.quiet
-
-
 def _slopes(signal: np.ndarray, system: SystemPulse, spacing: float, missing: np.ndarray | None) -> np.ndarray:
     """The sloping part of each baseline (s, n), 0 in its middle: own slopes, drawn towards none by their errors."""
     reach = int(np.ceil(GUARD * system.sigma_ref / spacing))
-    slope, error = fit_slopes(signal, sample_noise(system), reach, missing=missing)
+    slope, error = fit_slopes(signal, system.noise.quiet, reach, missing=missing)
     spread = system.defects.slope_spread * spacing
     slope = np.where(np.isfinite(error), slope * spread**2 / (spread**2 + np.minimum(error, 1e6) ** 2), 0.0)
     x = np.arange(len(signal), dtype=np.float32) - np.float32(0.5 * (len(signal) - 1))
@@ -169,7 +164,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     block = block.rows(slice(None, None, max(len(block) // MOST_WAVEFORMS, 1)))
     signal = transpose_samples(block.samples)
     missing = None if block.missing is None else block.missing.T
-    std, width = sample_noise(system), system.sigma_ref / block.spacing
+    std, width = system.noise.quiet, system.sigma_ref / block.spacing
     reach = int(np.ceil(3 * width))
     spread, defects = _slope_spread(signal, std, reach, missing), Defects()
     if spread:

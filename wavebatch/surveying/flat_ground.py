@@ -24,7 +24,6 @@ from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.geometry.normals import Surroundings, measure_normals, thin_out
 from wavebatch.kernels.geometry.two_lines import in_two_lines
-from wavebatch.stages.attribute.light import is_alone
 from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
@@ -296,7 +295,7 @@ def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:
     block = sample.block
     system = replace(system.of(block), widths=LevelWidths())
     echoes = decompose_sample(block, system)
-    clean = is_alone(block, echoes) & (echoes.amplitude > MIN_SNR * system.noise.std)
+    clean = echoes.alone(len(block)) & (echoes.amplitude > MIN_SNR * system.noise.std)
     echoes = echoes.take(np.flatnonzero(clean & ((echoes.flags & np.uint16(UNCLEAN)) == 0)))
     variance, error = added_variance(block, system, echoes, "system", 0.0)
     row = echoes.waveform

@@ -113,7 +113,7 @@ def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) ->
     time = np.stack([middle - half, middle + half], axis=1)
     pairs = EchoTable.build(np.repeat(np.arange(n), 2), time.ravel(), echoes.amplitude[chosen], echoes.sigma[chosen])
     found = decompose_sample(*simulate_again(block, system, pairs, rng))
-    one = (found.count(n)[found.waveform] == 1) & (found.amplitude > CLEAR * system.noise.std)
+    one = found.alone(n) & (found.amplitude > CLEAR * system.noise.std)
     found = found.take(np.flatnonzero(one))
     shift = np.abs(time[found.waveform] - found.time[:, None]).min(axis=1)
     return excess_variance(found, system), shift / ref

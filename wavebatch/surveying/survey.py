@@ -13,7 +13,7 @@ from wavebatch.core.system import Defects, LevelWidths
 from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
-from wavebatch.kernels.signal.noise import find_levels
+from wavebatch.kernels.signal.noise import estimate_noise, find_levels, keep_longest
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
@@ -33,6 +33,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     FIRST_WIDTH,
     RESIDUAL_LOOK,
     SETTLED,
+    SMALL,
     find_saturation,
     measure_gaussian,
     thin_block,
@@ -62,6 +63,10 @@ STRANGE, STRANGE_NOISE = 6.0, 1.3
 
 COUNTED = 256
 """Samples of a waveform that count where the main digitizer is chosen."""
+
+
+PULSE_SAMPLES = 2.5
+"""Quiet samples, in widths of the pulse, that say as much of the noise of a pulse as one value."""
 
 
 class Part(StrEnum):
@@ -364,13 +369,19 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             if len(chosen) < ENOUGH_TO_LEARN or abs(system.sigma_ref / last - 1) < SETTLED:
                 break
         learned |= len(chosen) >= ENOUGH_TO_LEARN
-        system = choose_pulse(part, system, learned=learned, figures=figures)
+        strong = find_strong(clear)
+        system = choose_pulse(block, system, strong, learned=learned, figures=figures)
         before, echoes = system, decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
-        # The strongest echoes are the same, and clear, whatever pulse is learned from them.
-        system = measure_misfit(block, system, find_strong(clear))
+        # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its
+        # misfit; a few echoes of a small strip, full of neighbours, do not know better.
+        strong = strong if find_source(system) is None else find_strong(clear, 0)
+        unsure, system = system, measure_misfit(block, system, strong)
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
+        if len(block) < SMALL:
+            doubt = 1 - len(_find_sure(block, unsure, strong)) / max(len(echoes), 1)
+            figures.echoes_in_doubt = max(doubt, figures.echoes_in_doubt or 0.0)
     else:
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
@@ -380,6 +391,22 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     figures = _describe(part, system, echoes, figures)
     decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system.defects))
     return Survey(system, len(block), figures, decisions)
+
+
+def _find_sure(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> EchoTable:
+    """The echoes of a small strip that noise and misfit leave no doubt of.
+
+    The noise is two standard errors larger, by its quiet samples. What few strong echoes miss a pulse of the strip's
+    own by is all misfit: it may change from shot to shot, and have nothing in common.
+    """
+    width = system.sigma_ref / block.spacing
+    missing = None if block.missing is None else keep_longest(block.missing.T)
+    quiet = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing).share
+    error = np.sqrt(PULSE_SAMPLES * width / (2 * max(quiet * block.samples.size, 1)))
+    if find_source(system) is None:
+        system = measure_misfit(block, system, strong, bounded=False)
+    noise = replace(system.noise, std=float(system.noise.std * (1 + 2 * error)))
+    return decompose_sample(block, replace(system, noise=noise))
 
 
 def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
@@ -394,7 +421,7 @@ def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
 
     From those narrower than the system pulse: slopes and plants only widen. 0 with too few of them.
     """
-    clear = (echoes.count(len(block))[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise.std)
+    clear = echoes.alone(len(block)) & (echoes.amplitude > MIN_SNR * system.noise.std)
     clear &= (echoes.flags & np.uint16(UNCLEAN)) == 0
     below = clear & (echoes.sigma < system.sigma_ref)
     if np.count_nonzero(below) < ENOUGH_TO_LEARN:

@@ -52,24 +52,6 @@ def sensor_distance(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     return radiometry.known_distance(np.sqrt(squares))
 
 
-def is_alone(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
-    """Find echoes that are the only one of their waveform.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-        n waveforms.
-    echoes : EchoTable
-        m echoes.
-
-    Returns
-    -------
-    bool array, shape (m,)
-        True for single echoes.
-    """
-    return echoes.count(len(block))[echoes.waveform] == 1
-
-
 def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
     """Measure the energy of each echo as the amplitude times sigma of a Gaussian.
 

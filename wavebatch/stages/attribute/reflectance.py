@@ -20,7 +20,6 @@ from wavebatch.stages.attribute.light import (
     POSITION,
     Light,
     add_column,
-    is_alone,
     measure_light,
     without_calibration,
 )
@@ -117,7 +116,7 @@ def _divide(
     block: WaveformBlock, echoes: EchoTable, name: str, light: Light, angle: np.ndarray, relative: np.ndarray
 ) -> EchoTable:
     """The column gamma / (4 cos(angle)) of echoes that are alone, with relative errors (m,)."""
-    alone = is_alone(block, echoes)
+    alone = echoes.alone(len(block))
     rho = np.where(alone & ~light.bound, radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
     steep = angle >= radiometry.STEEPEST
     more = (

@@ -18,7 +18,7 @@ from wavebatch.kernels.physics.incidence import (
     pulse_table,
     spread_variance,
 )
-from wavebatch.stages.attribute.light import is_alone, sensor_distance
+from wavebatch.stages.attribute.light import sensor_distance
 from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 
@@ -131,7 +131,7 @@ def incidence_angle(
         (NoData.OTHER_PULSE, _other_pulse(system, mode)),
         (NoData.NO_LEVEL, unproven),
         (NoData.SHORT_PULSE, short),
-        (NoData.SHARED_PULSE, ~is_alone(block, echoes) & alone),
+        (NoData.SHARED_PULSE, ~echoes.alone(len(block)) & alone),
         *((reason, (echoes.flags & np.uint16(flags)) != 0) for reason, flags in _UNCLEAN.items()),
         (NoData.TOO_STEEP, steep),
         (NoData.OTHER, np.isnan(error)),

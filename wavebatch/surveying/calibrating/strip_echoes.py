@@ -151,7 +151,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None
 
     given: values of a column for each waveform, f8 (n,).
     """
-    alone = echoes.count(len(block))[echoes.waveform] == 1
+    alone = echoes.alone(len(block))
     echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.UNANCHORED)) == 0)))
     rows = np.zeros(len(echoes), ECHO)
     rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)

@@ -16,7 +16,7 @@ from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import model_parameters, pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import ALONE, MIN_SNR, fit_lone
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, find_edge
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, SMALL, find_edge
 from wavebatch.surveying.measuring.residuals import subtract_echoes
 from wavebatch.surveying.systems.figures import Figures
 
@@ -156,12 +156,13 @@ def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     return np.flatnonzero(good)
 
 
-def find_strong(echoes: EchoTable) -> EchoTable:
-    """The strongest fifth of the clear echoes that their target has not widened."""
+def find_strong(echoes: EchoTable, least: int = FEW) -> EchoTable:
+    """The strongest fifth of the clear echoes that their target has not widened, `least` where there are so many."""
     if len(echoes) < FEW:
         return echoes
     narrow = echoes.sigma < WIDENED * find_edge(echoes.sigma)
-    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], 0.8)))
+    share = max(1 - least / np.count_nonzero(narrow), 0.0)
+    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], min(share, 0.8))))
     return echoes.take(strong[:: max(len(strong) // MOST_STRONG, 1)])
 
 
@@ -196,11 +197,12 @@ def _learn(
     stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = max(REACHED * system.noise.std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
-    sums = fit_gaussians(stack, width, most, goal)
+    small = len(block) < SMALL
+    sums = fit_gaussians(stack, width, most, 0.0 if small else goal)
     skewed = fit_skewed(stack, width)
     figures.misfit_goal, figures.misfit_skewed, figures.kappa = goal, skewed.rms, skewed.kappa
     figures.misfit_gaussians = {len(fit.components): fit.rms for fit in sums}
-    best = _simplest([sums[0], skewed, *sums[1:]], goal)
+    best = sums[-1] if small else _simplest([sums[0], skewed, *sums[1:]], goal)
     if len(best.components) > 1:
         # All components that were worth fitting: fewer would save nothing, and tiles would disagree on their number.
         best = sums[-1]

@@ -40,6 +40,10 @@ RESIDUAL_LOOK = 4096
 FEW = 20
 """Isolated echoes below which the width of the system pulse is a guess."""
 
+SMALL = 256
+"""Waveforms below which a stack of echoes cannot show that a pulse is simple: a tail of 6 % drowns in its errors, and
+adds a fifth to the echoes. What pulse such a strip has is decided by all of its waveforms."""
+
 ENOUGH_TO_LEARN = 20
 """Isolated echoes from which a pulse can be learned (R2): at SNR 20 their stack is known to a hundredth of its peak, a
 Gaussian misses the pulses of real sensors by two to six."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.order import group_medians
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
+from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.render import render_echoes
@@ -251,8 +251,8 @@ def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: 
         Median of the values at this lag and height.
     number : int64 (k,)
         Values that it comes from.
-    error : float64 (k,)
-        Its standard error, from their scatter.
+    spread : float64 (k,)
+        Their standard deviation, from the median of their distances from it.
     """
     classes = min(max(len(np.unique(height)) // GROWTH_CLASS, 1), 8)
     bins = int(2 * reach / GROWTH_STEP)
@@ -260,8 +260,7 @@ def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: 
     place += bins * np.searchsorted(np.quantile(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
     number = np.bincount(place)
     middle, spread = group_medians(values, place)
-    error = MEDIAN_ERROR * spread / np.sqrt(np.maximum(number, 1))
-    return middle[place], number[place], error[place]
+    return middle[place], number[place], spread[place]
 
 
 def _chance_part(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, core: np.ndarray) -> np.ndarray:
