@@ -19,7 +19,8 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
 from wavebatch.files.cloud.column_reader import select_points
 from wavebatch.files.cloud.echo_reader import RETURN_DTYPE, CloudReader
-from wavebatch.files.disk.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
+from wavebatch.files.disk.buckets import count_buckets, spread_keys, tell_pulses_apart, time_keys
+from wavebatch.files.disk.spool import Spool
 from wavebatch.tools.return_stats.areas import (
     MOST_AREAS,
     AreaStats,
@@ -141,12 +142,12 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | N
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
         number = count_buckets(reader.point_count)
-        with Buckets(_ROW, number) as buckets:
+        with Spool(number, _ROW) as buckets:
             keys = _Keys(by_time)
             for rows in reader.read_pieces():
                 tally.add_points(rows)
                 shaped = _shape(rows, keys.of(rows))
-                buckets.add(shaped, lambda part: (np.arange(len(part)), spread_keys(part["key"], number)))
+                buckets.append(spread_keys(shaped["key"], number), shaped)
             for bucket in range(number):
                 tally.add_pulses(buckets.read(bucket))
         if keys.untimed:
