@@ -15,6 +15,7 @@ from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
 from wavebatch.tools.plots.labels import fit_text, set_head, space_ticks
 from wavebatch.tools.plots.section_data import Profile, Section
+from wavebatch.tools.rasters.cells import compute_cells
 
 LIGHT, FAINT = ("energy", "cross_section"), 0.02
 """Columns of voxels of which less than this share of the scale is not drawn: deconvolution leaves tails of a few per
@@ -94,11 +95,9 @@ def _draw_voxels(axes, found: Section):
     row = np.floor((found.height - base) / edge + 1e-6).astype(np.int64)
     shape = (int(row.max()) + 1, int(column.max()) + 1)
     cell = row * shape[1] + column
-    number = np.bincount(cell, minlength=shape[0] * shape[1])
-    with np.errstate(invalid="ignore"):
-        image = (np.bincount(cell, found.value, shape[0] * shape[1]) / number).reshape(shape)
-        if found.facts.name in LIGHT:
-            image[image < FAINT * found.shown[1]] = np.nan
+    image = compute_cells("mean", cell, found.value, shape[0] * shape[1], 1.0).reshape(shape)
+    if found.facts.name in LIGHT:
+        image[image < FAINT * found.shown[1]] = np.nan
     extent = (0.0, shape[1] * edge, base, base + shape[0] * edge)
     axes.grid(visible=False)
     shown = axes.imshow(image, extent=extent, origin="lower", cmap="viridis", interpolation="nearest", aspect="auto")
