@@ -61,12 +61,14 @@ readers: $(VENV)/.test
 	-command -v npm >/dev/null && npm install --silent --no-save --no-audit --no-fund --prefix $(VENV)/npm \
 	  copc@0.0.8 laz-perf@0.0.7 @loaders.gl/core@4.4.5 @loaders.gl/las@4.5.1
 
-# A file at a time for each process: its strips and surveys are then made once.
+# A file at a time for each process: its strips and surveys are then made once. tests/conftest.py orders the files.
+BY_FILE := -n auto --dist loadfile --no-loadscope-reorder
+
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m 'not slow'
+	$(BIN)/python -m pytest -q $(BY_FILE) -m 'not slow'
 
 slow: $(VENV)/.test
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m slow
+	$(BIN)/python -m pytest -q $(BY_FILE) -m slow
 
 test-all: test slow
 

@@ -4,17 +4,18 @@ import fnmatch
 import importlib
 import os
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import kept_surveys
 import numpy as np
 import pytest
+from bench_tools import time_here
 from child_signals import give_children_default_signals
 from hypothesis import HealthCheck, settings
 
 from wavebatch.stages.chain import STAGES
-from wavebatch.stages.decompose.rebuild import MODELS
 from wavebatch.tools.simulate import simulate_strip
 
 give_children_default_signals()
@@ -24,7 +25,7 @@ def pytest_configure(config):
     """The fast tests share surveys and draw fewer examples; examples are the same in every run, however slow."""
     fast = config.option.markexpr == "not slow"
     if fast:
-        kept_surveys.install()
+        kept_surveys.install(config)
     unhurried = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
     examples = 40 if fast else 200
     settings.register_profile("wavebatch", derandomize=True, deadline=None, max_examples=examples,
@@ -32,19 +33,30 @@ def pytest_configure(config):
     settings.load_profile("wavebatch")
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """All cases but those that `quick_cases` names are slow."""
+LONG = (
+    "test_fuzz.py", "test_processor.py", "test_canopy.py", "test_kill.py", "test_wdz.py", "test_village.py",
+    "test_signed_physics.py", "test_processes.py", "test_dask_cluster.py", "test_signals.py", "test_neighbour_pass.py",
+)  # fmt: skip
+"""Files of few tests that take long: started last, they would keep one process busy while the others have ended."""
+
+
+@pytest.hookimpl(hookwrapper=True, tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """All cases but those that `quick_cases` names are slow; processes of xdist get the long files first."""
     for item in items:
         quick = item.get_closest_marker("quick_cases")
         if quick and not any(fnmatch.fnmatchcase(item.callspec.id, name) for name in quick.args):
             item.add_marker("slow")
+    yield
+    if hasattr(config, "workerinput"):
+        number = Counter(item.path for item in items)
+        items.sort(key=lambda item: (item.path.name not in LONG, -number[item.path], item.path))
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Tests of surveys make their own."""
-    kept_surveys.active = "surveying" not in item.path.parts
+    """Tests of surveys make their own, unless they have the mark."""
+    kept_surveys.active = "surveying" not in item.path.parts or item.get_closest_marker("kept_surveys") is not None
 
 
 @pytest.fixture
@@ -56,11 +68,10 @@ def rng():
 @pytest.fixture
 def paper_stages():
     """The plug-in of examples/papers, for one test: other tests list the stages of wavebatch alone."""
-    before = dict(STAGES), dict(MODELS)
+    before = dict(STAGES)
     yield importlib.import_module("paper_stages")
-    for known, stages in zip((STAGES, MODELS), before, strict=True):
-        known.clear()
-        known.update(stages)
+    STAGES.clear()
+    STAGES.update(before)
     for name in [name for name in sys.modules if name.partition(".")[0] == "paper_stages"]:
         del sys.modules[name]
 
@@ -126,12 +137,4 @@ def edit_points() -> Callable[[Path, Path, Callable[[np.ndarray], np.ndarray]], 
 @pytest.fixture
 def timed_here(monkeypatch):
     """The bench times chains in this process: starting one for each takes a second, and no test looks at the times."""
-
-    class Here:
-        def call(self, function, *arguments):
-            return function(*arguments)
-
-        def close(self):
-            pass
-
-    monkeypatch.setattr("wavebatch.tools.bench.speed.Worker", Here)
+    time_here(monkeypatch)

@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 from wavebatch.tools.simulate import simulate_block
@@ -16,14 +17,17 @@ DTYPES = {"waveform": np.int32, "time": np.float64, "flags": np.uint16}
 
 
 SYSTEMS = {
-    "gaussian": SystemPulse(2.0, baseline=12.0, baseline_spread=0.4, noise_std=1.0, saturation=255.0),
-    "skewed": SystemPulse(2.0, baseline=12.0, noise_std=1.0, kappa=0.1),
+    "gaussian": SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.4, std=1.0), saturation=255.0),
+    "skewed": SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0), kappa=0.1),
     "learned": SystemPulse(
-        2.0, baseline=12.0, noise_std=1.0, components=((1.0, 0.0, 2.0), (0.1, 5.0, 2.0), (-0.03, 10.0, 3.0)), skew=0.05
+        2.0,
+        noise=ReceiverNoise(baseline=12.0, std=1.0),
+        components=((1.0, 0.0, 2.0), (0.1, 5.0, 2.0), (-0.03, 10.0, 3.0)),
+        skew=0.05,
     ),
-    "noise grows": SystemPulse(2.0, baseline=12.0, noise_std=1.0, noise_gain=0.05),
-    "short": SystemPulse(0.6, baseline=12.0, noise_std=0.3),
-    "long": SystemPulse(15.0, baseline=12.0, noise_std=2.0),
+    "noise grows": SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0, gain=0.05)),
+    "short": SystemPulse(0.6, noise=ReceiverNoise(baseline=12.0, std=0.3)),
+    "long": SystemPulse(15.0, noise=ReceiverNoise(baseline=12.0, std=2.0)),
 }
 
 

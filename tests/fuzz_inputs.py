@@ -53,7 +53,7 @@ synthesize {{input}} -o {{out}}/a.laz --external --bits 16 --noise 1 -q
 voxelize {{input}} -o {{out}}/a.npz --size 0.5
 voxelize {{input}} -o {{out}}/a.laz --size 1 --method wiener --profiles {{out}}/b.npz --all-crossed -q
 calibrate {{input}} --targets {{base}}/targets.csv -o {{out}}/a.toml --flight-height 500 --report {{out}}/a.json
-plot waveform {{input}} -o {{out}}/a.svg --profile fast -q
+plot waveform {{input}} -o {{out}}/a.svg --profile fast -q --random 2
 plot waveform {{input}} -o {{out}}/a.csv --echoes --profile fast
 grid {{input}} --statistic density --size 5 -o {{out}}/a.tif
 """

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.tools.simulate import Scene, find_scene, simulate_blocks
+
+CANOPY_SAMPLES, CANOPY_BEGIN, CANOPY_SIGMA, CANOPY_NOISE = 60, 5, 2.0, 1.2
 
 
 def make_scene(name: str, **recording) -> Scene:
@@ -18,3 +22,27 @@ def make_scene(name: str, **recording) -> Scene:
 def make_block(scene: str | Scene, n: int, seed: int = 0) -> tuple[WaveformBlock, EchoTable]:
     """One block of n waveforms and its truth."""
     return next(simulate_blocks(scene, n, seed=seed, size=n))
+
+
+def grow_canopy(seed, n=8000, density=0.5, tail=0.0):
+    """Packets that begin a few samples before their first echo: layers of leaves, each of which takes some light."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(15, CANOPY_SAMPLES - CANOPY_BEGIN - 10, n)
+    number = rng.poisson(density * depth) + 1
+    waveform, last = np.repeat(np.arange(n), number), np.cumsum(number) - 1
+    first = np.r_[0, last[:-1] + 1]
+    time = rng.random(len(waveform)) * depth[waveform]
+    taken = rng.beta(1.0, 2.5, len(waveform))
+    time[last] = depth
+    time = time[np.lexsort((time, waveform))]
+    taken[last] = rng.uniform(0.3, 1, n)
+    passed = np.log1p(-np.minimum(taken, 0.999))
+    before = np.cumsum(passed) - passed
+    left = np.exp(before - np.repeat(before[first], number))
+    amplitude = 150.0 * rng.lognormal(0, 0.4, n)[waveform] * taken * left
+    time += CANOPY_BEGIN + rng.random(n)[waveform] - time[first][waveform]
+    away = np.arange(CANOPY_SAMPLES) - time[:, None]
+    pulse = np.exp(-0.5 * (away / CANOPY_SIGMA) ** 2) + tail * np.exp(-0.5 * ((away - 5) / (1.5 * CANOPY_SIGMA)) ** 2)
+    signal = np.add.reduceat(amplitude[:, None] * pulse, first, axis=0)
+    counts = np.rint(12 + signal + CANOPY_NOISE * rng.standard_normal(signal.shape))
+    return WaveformBlock.from_samples(np.clip(counts, 0, 255).astype(np.uint8))

@@ -3,11 +3,12 @@
 import laspy
 import numpy as np
 
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.chain import STAGES, Chain, Step
 
-PULSE = SystemPulse(sigma_ref=2.0, baseline=12.0, noise_std=1.0)
+PULSE = SystemPulse(sigma_ref=2.0, noise=ReceiverNoise(baseline=12.0, std=1.0))
 POINTS = 5000
 
 

@@ -5,15 +5,16 @@ from dataclasses import replace
 import naive
 import numpy as np
 import pytest
+from scoring import score
 
 from wavebatch import surveying
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.decompose.merge import merge_unresolved
-from wavebatch.stages.score import score
 from wavebatch.tools.simulate import Recording, find_scene, simulate_block
 
 STD = float(np.hypot(1, 1 / np.sqrt(12)))
@@ -21,7 +22,7 @@ STD = float(np.hypot(1, 1 / np.sqrt(12)))
 SIGMA = 2.0
 BASELINE = 12.0
 N_SAMPLES = 64
-KNOWN = SystemPulse(SIGMA, baseline=BASELINE, noise_std=STD)
+KNOWN = SystemPulse(SIGMA, noise=ReceiverNoise(baseline=BASELINE, std=STD))
 DECOMPOSERS = ("closed_form", "gaussian", "adaptive")
 
 
@@ -69,7 +70,7 @@ def test_isolated_echoes_reach_the_bound(snr, name, knowledge):
         system = surveying.survey_block(block).system
         noise = STAGES["noise.pooled"].function(block, system)
         assert system.sigma_ref == pytest.approx(SIGMA, rel=0.05)
-        assert system.noise_std == pytest.approx(STD, rel=0.03)
+        assert system.noise.std == pytest.approx(STD, rel=0.03)
     echoes = alone(decompose(name, block, system, noise), n)
     assert len(echoes) > 0.995 * n
     true = (time[echoes.waveform], snr * STD, SIGMA)
@@ -180,7 +181,7 @@ def test_clipped_echoes_are_unbiased(share, rms, bound):
     top = int(100 + share * 400)
     block = WaveformBlock.from_samples(np.rint(np.minimum(y, top)).astype(np.uint16))
     noise = Noise(np.full(n, 100, np.float32), np.full(n, STD, np.float32))
-    system = SystemPulse(SIGMA, baseline=100.0, noise_std=STD, saturation=float(top))
+    system = SystemPulse(SIGMA, noise=ReceiverNoise(baseline=100.0, std=STD), saturation=float(top))
     echoes = alone(decompose("gaussian", block, system, noise), n)
     assert len(echoes) > 0.99 * n
     assert bound <= rms

@@ -16,6 +16,7 @@ import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.stages.chain_file import list_profiles
+from wavebatch.surveying.systems.figures import describe_figures
 from wavebatch.tools.simulate import simulate_strip
 
 PACKAGE = Path(wb.__file__).parent
@@ -144,7 +145,7 @@ def test_survey_takes_a_path_and_says_what_the_command_says(strips):
     assert survey.waveforms == 500
     result = CliRunner().invoke(main, ["survey", str(strips[0]), "--waveforms", "500", "--json"])
     told = json.loads(result.stdout)
-    assert told["waveforms"] == 500 and told["figures"] == dict(survey.figures)
+    assert told["waveforms"] == 500 and told["figures"] == describe_figures(survey.figures)
     assert told["decisions"] == [
         {"part": one.part, "needed": one.needed, "reason": one.reason} for one in survey.decisions
     ]

@@ -17,7 +17,7 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 INSIDE = {
     "batch": [
         {"counts", "options", "output_rows", "workers"}, {"selection"}, {"job"}, {"unit"},
-        {"explain", "neighbour_pass", "row_transfer"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
+        {"explain", "neighbour_pass"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
     ],
     "surveying/measuring": [{"lone_echoes"}, {"noise_and_width"}, {"residuals"}, {"misfit", "learn_pulse"}],
     "batch/workers": [

@@ -8,13 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import list_profiles, load_profile
 
 CORE = ("waveform", "time", "amplitude", "sigma", "time_err", "amplitude_err", "sigma_err", "residual", "flags")
 N_SAMPLES = 72
-SYSTEM = SystemPulse(2.0, baseline=40.0, noise_std=1.5)
+SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=40.0, std=1.5))
 DECOMPOSERS = ["none", "closed_form", "gaussian", "adaptive"]
 
 echoes = st.tuples(st.floats(25, 3000), st.floats(22, 50), st.floats(1.6, 4.5))
@@ -36,7 +37,7 @@ def record(scene, n_samples=N_SAMPLES, later=0):
 def run(samples, decomposer, system=SYSTEM, spacing=1.0):
     block = WaveformBlock.from_samples(samples, spacing=spacing)
     n = len(block)
-    noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
+    noise = Noise(np.full(n, system.noise.baseline, np.float32), np.full(n, system.noise.std, np.float32))
     candidates = STAGES["detect.maximum"].function(block, noise, system)
     return STAGES[f"decompose.{decomposer}"].function(block, noise, system, candidates)
 
@@ -51,7 +52,8 @@ def assert_same(a, b, names=CORE):
 @given(scene=scenes, level=st.integers(1, 20_000))
 def test_a_constant_added_to_samples_and_baseline_leaves_the_echoes(decomposer, scene, level):
     samples = record(scene)
-    shifted = run(samples + np.uint16(level), decomposer, replace(SYSTEM, baseline=40.0 + level))
+    system = replace(SYSTEM, noise=replace(SYSTEM.noise, baseline=40.0 + level))
+    shifted = run(samples + np.uint16(level), decomposer, system)
     assert_same(shifted, run(samples, decomposer))
 
 
@@ -62,9 +64,8 @@ def test_scaled_samples_scale_amplitudes_only(decomposer, scene, power):
     samples = record(scene).astype(np.uint32)
     factor = 2**power
     plain = run(samples, decomposer)
-    scaled = run(
-        samples * np.uint32(factor), decomposer, replace(SYSTEM, baseline=40.0 * factor, noise_std=1.5 * factor)
-    )
+    system = replace(SYSTEM, noise=replace(SYSTEM.noise, baseline=40.0 * factor, std=1.5 * factor))
+    scaled = run(samples * np.uint32(factor), decomposer, system)
     np.testing.assert_array_equal(scaled.waveform, plain.waveform)
     # Starts come from logarithms, which do not scale to the last bit.
     reach = 0.05 * np.nan_to_num(plain.time_err, nan=1.0) + 1e-4

@@ -1,6 +1,7 @@
 """Every sentence of docs/reliability.md, "What can be relied on", has its tests: tests/reliability_tests.txt."""
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -42,13 +43,18 @@ def test_every_sentence_of_what_can_be_relied_on_has_its_tests():
     assert all(held.values()), [sentence for sentence, tests in held.items() if not tests]
 
 
+@functools.cache
+def _tree(path):
+    return ast.parse(path.read_text("utf-8"))
+
+
 def test_the_named_tests_exist_and_assert_something():
     for sentence, tests in read_held().items():
         for test in tests:
             if test.startswith("fact: "):
                 continue
             path, _, name = test.partition("::")
-            tree = ast.parse((ROOT / path).read_text("utf-8"))
+            tree = _tree(ROOT / path)
             found = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
             found = [node for node in found if not name or node.name == name]
             assert found, f"{test}, which should hold {sentence!r}, is not there"

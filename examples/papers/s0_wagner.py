@@ -186,7 +186,7 @@ def table_of_cross_sections(number: int, seed: int) -> Table:
     table = Table("equations 2 to 4: cross section over the truth", 4)
     rng, n = np.random.default_rng(seed), max(number // 20, 30)
     recording = fine_recording(1.0, 2.0)
-    beam, system = 1e-3, replace(known_system(recording), divergence=1.0, attenuation=0.22)
+    beam, system = 1e-3, known_system(recording).with_radiometry(divergence=1.0, attenuation=0.22)
     section = {distance: 2.0 * distance / TARGET for distance in RANGES}
     echoes = {}
     for distance, size in section.items():
@@ -203,7 +203,7 @@ def table_of_cross_sections(number: int, seed: int) -> Table:
     chosen = echoes[TARGET][2]
     covered = 0.25 * np.pi * (TARGET * beam) ** 2
     light = TARGET**2 * chosen.amplitude * chosen.sigma * 10 ** (2e-4 * 0.22 * TARGET)
-    system = replace(system, calibration=float(np.median(section[TARGET] / covered / light)))
+    system = system.with_radiometry(constant=float(np.median(section[TARGET] / covered / light)))
     for distance, (block, noise, fitted) in echoes.items():
         found = cross_section(block, noise, system, fitted).attributes["cross_section"]
         spread = 1.2 * np.sqrt(2) * (distance / TARGET) ** 3 / 150 / np.sqrt(n)

@@ -27,7 +27,7 @@ from wavebatch.stages.detect.candidates import signal_above
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.detect.wavelet import wavelet
 from wavebatch.stages.noise import pooled
-from wavebatch.stages.score import score
+from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block
 from wavebatch.tools.compare.goodness import measure_fit
 from wavebatch.tools.simulate import (
@@ -226,8 +226,8 @@ def table_of_the_loop(number: int, seed: int) -> Table:
         noise, system = known_noise(recording, number), known_system(recording)
         candidates = find_wavelet(block, noise, system)
 
-        def complete(found: EchoTable, truth=truth, recording=recording) -> float:
-            return 100 * score(found, truth, number, noise_std=recording.recorded_noise).completeness
+        def complete(found: EchoTable, truth=truth) -> float:
+            return 100 * len(match_echoes(found, truth).truth) / len(truth)
 
         maxima = complete(gaussian(block, noise, system, maximum(block, noise, system)))
         single = complete(gaussian(block, noise, system, candidates))

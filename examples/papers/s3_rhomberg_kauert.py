@@ -178,7 +178,7 @@ def table_of_rays(number: int, seed: int) -> Table:
     plain = known_system(recording)
     widths = chain.run(level, plain).sigma
     # The system pulse is what level ground shows, as a survey has it.
-    system = replace(plain, sigma_ref=float(np.median(widths)), divergence=1e3 * DIVERGENCE)
+    system = replace(plain, sigma_ref=float(np.median(widths))).with_radiometry(divergence=1e3 * DIVERGENCE)
     table.near("width of level ground over the pulse", system.sigma_ref / PULSE_SIGMA, 1.0, within=0.01)
     angles = parse_chain(
         "".join(f'[[chain]]\nstage = "{name}"\n' for name in (*names, "attribute.incidence_angle"))

@@ -17,6 +17,7 @@ from published import PRINTED_SHARES, RETURN_TABLES
 from table import Table, main, scatter
 
 import wavebatch as wb
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse
 from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
@@ -147,7 +148,7 @@ def table_of_synthesis(number: int, seed: int) -> Table:
                 returns = block.returns
                 count = np.bincount(returns.waveform, minlength=len(block))
                 noise = Noise(np.full(len(block), 100.0, np.float32), np.full(len(block), 0.3, np.float32))
-                system = SystemPulse(4.7 / FWHM_PER_SIGMA, baseline=100.0, noise_std=0.3)
+                system = SystemPulse(4.7 / FWHM_PER_SIGMA, noise=ReceiverNoise(baseline=100.0, std=0.3))
                 found = gaussian(block, noise, system, maximum(block, noise, system))
                 echoes = found.count(len(block))
                 for number_of in (1, 2):

@@ -1,12 +1,14 @@
 """What a report says of a strip as a whole: waveforms without echoes, returns that lie elsewhere."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 from batch_tools import run_one
 from click.testing import CliRunner
 from strips import cut_strip
+from writer_tools import data_file
 
 from wavebatch.cli import main
 from wavebatch.files.las.header import read_header
@@ -94,6 +96,31 @@ def test_a_pulse_that_is_a_guess_warns_in_cron_too(tiny_strip, tmp_path):
     assert "the system pulse is a guess" in line and "--system" in line
     assert CliRunner().invoke(main, ["survey", str(tiny_strip), "-o", str(tmp_path / "long.toml")]).exit_code == 0
     assert warn_quietly(short, tmp_path / "again", "--system", str(tmp_path / "long.toml")) == []
+
+
+def test_echoes_in_doubt_warn_in_cron_too(tiny_strip, tmp_path):
+    assert CliRunner().invoke(main, ["survey", str(tiny_strip), "-o", str(tmp_path / "sure.toml")]).exit_code == 0
+    text = (tmp_path / "sure.toml").read_text()
+    for share, said in ((0.1, False), (0.2, True)):
+        path = tmp_path / f"{share}.toml"
+        path.write_text(text.replace("[figures]", f"[figures]\nechoes_in_doubt = {share}"))
+        lines = warn_quietly(tiny_strip, tmp_path / f"out-{share}", "--system", str(path))
+        assert len(lines) == said
+    assert "20 % of the echoes in doubt: the system pulse is a guess" in lines[0] and "give --system" in lines[0]
+
+
+def test_a_known_pulse_is_no_guess_but_its_noise_may_be(tmp_path):
+    neon, known = data_file("neon/neon_harv_a.las"), tmp_path / "known.toml"
+    assert CliRunner().invoke(main, ["survey", str(neon), "-o", str(known)]).exit_code == 0
+    known.write_text(re.sub("echoes_in_doubt = .*", "echoes_in_doubt = 0.08", known.read_text()))
+    (line,) = warn_quietly(neon, tmp_path / "out", "--system", str(known))
+    assert "found 8 % of the echoes in doubt: the noise is a guess" in line and "--system" in line
+
+
+@pytest.mark.parametrize("strip", ["riegl", "leica"])
+def test_a_good_strip_is_no_guess(strip, request, tmp_path):
+    short = cut_strip(request.getfixturevalue(strip), tmp_path / "short.las", 120)
+    assert not [line for line in warn_quietly(short, tmp_path) if "is a guess" in line]
 
 
 def test_a_residual_threshold_below_the_noise_is_said(tiny_strip, tmp_path):

@@ -43,7 +43,7 @@ def strips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("strips")
     (folder / "chain.toml").write_text(CHAIN)
     for scene in ("slope", "urban"):
-        simulate_strip(scene, folder / f"{scene}.las", pulses=24_000, seed=5)
+        simulate_strip(scene, folder / f"{scene}.las", pulses=12_000, seed=5)
     return folder
 
 
@@ -245,7 +245,7 @@ def take_all(second, number):
     second.cut()
     found, units = [], 0
     while second.has_more:
-        function, arguments = second.next_call(b"", None)
+        function, arguments = second.next_call(b"")
         if function is process_tile:
             assert second.take(function(*arguments))[0] is None
         else:

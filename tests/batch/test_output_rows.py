@@ -214,6 +214,33 @@ def test_echoes_of_several_blocks_are_in_the_order_of_their_packets(spoilt):
     prepared.scan.close()
 
 
+def test_points_without_a_location_come_first_of_their_packet(tiny_strip):
+    """The reader calls them broken today; if one got a packet, NaN would put it behind the echoes, or anywhere."""
+    prepared = prepare_strip(make_job(tiny_strip))
+    with StripReader(tiny_strip) as reader:
+        unit = reader.read_unit(0, prepared.scan)
+        blocks = list(reader.read_blocks(unit, 100, owned_only=True))
+    prepared.scan.close()
+    chain, system = prepared.job.chain, prepared.system
+    echoes = gather_echoes(unit, [(block, index, chain.run(block, system)) for block, index in blocks])
+    added = echoes.table.with_attributes(point=np.full(len(echoes.table), -1))  # so that all points have no echo
+    points = np.array(unit.points)
+    points["point_source_id"] = np.arange(len(points))
+    points["return_point_wave_location"] = np.nan
+    unit = dataclasses.replace(unit, points=points)
+    rows = assemble_echoes(unit, dataclasses.replace(echoes, table=added), prepared.layout).rows
+    packet = unit.packet_of_point[rows["point_source_id"]]
+    of_several = 0
+    for number in np.unique(packet[packet >= 0]):
+        members = rows[packet == number]
+        is_point = (members["echo_flags"] & EchoFlag.NO_ECHO) > 0
+        given = np.flatnonzero(unit.packet_of_point == number)
+        assert members["point_source_id"][: len(given)].tolist() == given.tolist()
+        assert is_point[: len(given)].all() and not is_point[len(given) :].any()
+        of_several += len(given) > 1 and len(members) > len(given)
+    assert of_several > 5
+
+
 def test_counts_are_those_of_a_loop(spoilt, tmp_path):
     report = run_one(spoilt, tmp_path).report
     points, echoes, members, flags, _ = _read_packets(spoilt)

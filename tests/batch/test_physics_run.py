@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.system import Radiometry
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile
@@ -250,8 +251,9 @@ def test_calibration_files():
     bare = parse_calibration('schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0.1\n', "cal")
     assert bare.divergence is None and bare.attenuation == 0.22
     system = FOUND.apply(SystemPulse(2.0))
-    assert (system.calibration, system.divergence, system.attenuation) == (2.6e-8, 1.1, 0.3)
-    assert FOUND.apply(SystemPulse(2.0, divergence=0.5)).divergence == 0.5
+    given = system.radiometry
+    assert (given.constant, given.divergence, given.attenuation) == (2.6e-8, 1.1, 0.3)
+    assert FOUND.apply(SystemPulse(2.0, radiometry=Radiometry(divergence=0.5))).radiometry.divergence == 0.5
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.stages.chain_file import load_chain
 from wavebatch.surveying.auto_chain import chain_text, decide
 from wavebatch.surveying.system_file import load_survey
+from wavebatch.surveying.systems.figures import describe_figures
 from wavebatch.tools.simulate import simulate_strip
 
 
@@ -45,7 +46,7 @@ def test_the_text_has_every_measure_and_every_decision(flat_strip, surveyed):
                  "widths", "decisions"):  # fmt: skip
         assert any(line.startswith(name) for line in lines), name
     found = load_survey(folder / "SYSTEM.toml").survey
-    for kind, value in found.system.noise_by_kind.items():
+    for kind, value in found.system.noise.by_kind.items():
         end = f"{value:.3f} DN" if value > 0 else "not known: too few samples"
         assert any(line.startswith(f"  {NOISE_KINDS[kind]} ") and line.endswith(end) for line in lines), kind
     for decision in decide(found):
@@ -91,7 +92,7 @@ def test_json_for_programs(flat_strip, surveyed):
     result = _survey(flat_strip, "--json")
     told, saved = json.loads(result.stdout), load_survey(folder / "SYSTEM.toml")
     assert told["system"]["sigma_ref_ns"] == saved.survey.system.sigma_ref
-    assert told["figures"] == dict(saved.survey.figures) and told["waveforms"] == saved.survey.waveforms
+    assert told["figures"] == describe_figures(saved.survey.figures) and told["waveforms"] == saved.survey.waveforms
     assert told["chain"] == chain_text(saved.survey)
     assert {decision["part"] for decision in told["decisions"]} >= {decision.part for decision in decide(saved.survey)}
     assert told["direction"]["sign"] == "toward"

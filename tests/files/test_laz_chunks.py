@@ -1,4 +1,4 @@
-"""LAZ files whose chunks were compressed apart: the bytes are those of a file that was compressed in one go.
+"""LAZ files that several threads compressed: the bytes are those of a file that one thread compressed.
 
 And what a decoder says past Python.
 """
@@ -36,35 +36,28 @@ def make_rows(point_format, n, seed=0):
     return rows
 
 
-def open_file(target, point_format):
+def open_file(target, point_format, threads=1):
     version = (1, 4) if point_format > 5 else (1, 3)
     header = LasHeader.new(version, point_format, (0.01,) * 3, (0.0,) * 3)
-    return PointFile(target, header, build_dtype(point_format, RECORDS), RECORDS, overwrite=True)
+    return PointFile(target, header, build_dtype(point_format, RECORDS), RECORDS, overwrite=True, threads=threads)
 
 
 @pytest.mark.quick_cases("100017-[16]", "50000-[038]", "1-*", "0-*")
 @pytest.mark.parametrize("point_format", [0, 1, 3, 4, 5, 6, 7, 8])
 @pytest.mark.parametrize("n", [0, 1, CHUNK_POINTS, 2 * CHUNK_POINTS + 17])
-def test_chunks_give_the_bytes_of_the_whole(tmp_path, point_format, n):
+def test_threads_give_the_bytes_of_one(tmp_path, point_format, n):
     rows = make_rows(point_format, n)
     with open_file(tmp_path / "whole.laz", point_format) as file:
         for part in np.array_split(rows, 7):
             file.write(part)
         file.commit()
-    with open_file(tmp_path / "chunks.laz", point_format) as file:
-        maker = file.chunk_maker
-        for at in range(0, n, CHUNK_POINTS):
-            file.write_chunk(*maker.make(rows[at : at + CHUNK_POINTS].copy()))
+    with open_file(tmp_path / "chunks.laz", point_format, threads=2) as file:
+        for part in np.array_split(rows, 11):
+            file.write(part)
         file.commit()
     assert (tmp_path / "chunks.laz").read_bytes() == (tmp_path / "whole.laz").read_bytes()
     for backend in BACKENDS if n else ():
         assert read_raw(tmp_path / "chunks.laz", backend).tobytes() == rows.tobytes()
-
-
-@pytest.mark.parametrize(("name", "point_format"), [("out.las", 6), ("out.laz", 9), ("out.laz", 10)])
-def test_other_files_are_written_by_one_process(tmp_path, name, point_format):
-    with open_file(tmp_path / name, point_format) as file:
-        assert file.chunk_maker is None
 
 
 def test_statistics_do_not_depend_on_how_rows_are_cut():
@@ -78,9 +71,7 @@ def test_statistics_do_not_depend_on_how_rows_are_cut():
     for pieces in 1, 2, 3, 10:
         whole = Statistics(rows.dtype, RECORDS)
         for part in np.array_split(rows, pieces):
-            one = Statistics(rows.dtype, RECORDS)
-            one.add(part)
-            whole.merge(one)
+            whole.add(part)
         header = LasHeader.new((1, 5), 6, (0.01,) * 3, (0.0,) * 3)
         whole.fill(header)
         seen.add((header.point_count, header.by_return, header.mins, header.maxs, str(header.gps_range),
@@ -92,7 +83,7 @@ def test_rows_of_another_layout_are_refused(tmp_path):
     with open_file(tmp_path / "a.laz", 6) as file:
         other = recfunctions.drop_fields(make_rows(6, 3), "X")
         with pytest.raises(InputError, match="another layout"):
-            file.chunk_maker.make(other)
+            file.write(other)
 
 
 def _panic(*_):

@@ -163,7 +163,7 @@ def test_stale_files_go_and_those_being_written_stay(tmp_path):
     alive = write(tmp_path / "a", b"alive")
     code = (
         "import sys, time; from pathlib import Path; from wavebatch.files.disk.publish import Draft\n"
-        "draft = Draft(Path(sys.argv[1]), overwrite=False); print('ready', flush=True); time.sleep(60)"
+        "draft = Draft(Path(sys.argv[1]), overwrite=False); print('ready', flush=True); time.sleep(600)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "b")], stdout=subprocess.PIPE) as other:
         assert other.stdout.readline() == b"ready\n"

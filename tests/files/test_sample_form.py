@@ -93,7 +93,7 @@ def test_inverted_waveforms_give_the_echoes_of_upright_ones(upright, tmp_path):
         assert second.digitizer.inverted and second.digitizer.gain == -first.digitizer.gain
         volts = first.digitizer.offset + first.digitizer.gain * 255 - first.digitizer.gain * 0
         assert second.digitizer.offset == pytest.approx(volts)
-        assert survey_blocks(read_sample(two, b)).figures["inverted"] == 1.0
+        assert survey_blocks(read_sample(two, b)).figures.inverted == 1.0
     reports = []
     for strip in (upright, down):
         assert run_one(strip, tmp_path).status == "written"

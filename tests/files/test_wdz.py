@@ -11,6 +11,23 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader
 
 
+@pytest.fixture(scope="module")
+def packed_once(riegl, tmp_path_factory):
+    """The RIEGL strip with compressed packets: the encoder of the tests is slow."""
+    folder = tmp_path_factory.mktemp("packed")
+    for suffix in (".las", ".wdp"):
+        (folder / f"plain{suffix}").write_bytes(riegl.with_suffix(suffix).read_bytes())
+    return pack_strip(folder / "plain.las", folder / "packed.las")
+
+
+@pytest.fixture
+def packed(packed_once, tmp_path):
+    """A copy of it that may be changed."""
+    for suffix in (".las", ".wdz"):
+        (tmp_path / f"packed{suffix}").write_bytes(packed_once.with_suffix(suffix).read_bytes())
+    return tmp_path / "packed.las"
+
+
 @pytest.fixture
 def plain(riegl, tmp_path):
     """A copy of the RIEGL strip that may be changed."""
@@ -26,16 +43,15 @@ def _read(path):
 
 
 @pytest.mark.parametrize("mixed", [False, True])
-def test_compressed_packets_hold_the_same_samples(plain, tmp_path, mixed):
-    packed = pack_strip(plain, tmp_path / "packed.las", mixed)
+def test_compressed_packets_hold_the_same_samples(plain, packed, tmp_path, mixed):
+    packed = pack_strip(plain, tmp_path / "mixed.las", mixed) if mixed else packed
     expected, _ = _read(plain)
     found, scan = _read(packed)
     assert found == expected and scan.broken == 0 and scan.short == 0
     assert packed.with_suffix(".wdz").stat().st_size < 0.6 * plain.with_suffix(".wdp").stat().st_size or mixed
 
 
-def test_damaged_packets_are_flagged_and_the_others_read(plain, tmp_path, rng):
-    packed = pack_strip(plain, tmp_path / "packed.las")
+def test_damaged_packets_are_flagged_and_the_others_read(packed, rng):
     expected, _ = _read(packed)
     wdz = packed.with_suffix(".wdz")
     data = bytearray(wdz.read_bytes())
@@ -50,16 +66,14 @@ def test_damaged_packets_are_flagged_and_the_others_read(plain, tmp_path, rng):
     assert np.count_nonzero(flags & int(EchoFlag.BROKEN_PACKET)) == scan.broken
 
 
-def test_a_cut_wdz_keeps_what_is_there(plain, tmp_path):
-    packed = pack_strip(plain, tmp_path / "packed.las")
+def test_a_cut_wdz_keeps_what_is_there(packed):
     wdz = packed.with_suffix(".wdz")
     wdz.write_bytes(wdz.read_bytes()[:-2000])
     found, scan = _read(packed)
     assert 0 < scan.broken < 200 and len(found) > 2000
 
 
-def test_a_run_of_both_gives_the_same_points(plain, tmp_path):
-    packed = pack_strip(plain, tmp_path / "packed.las")
+def test_a_run_of_both_gives_the_same_points(plain, packed, tmp_path):
     clouds = []
     for path in (plain, packed):
         words = ["run", str(path), "-o", str(tmp_path / "out"), "--profile", "fast", "--keep-packets"]
@@ -74,8 +88,7 @@ def test_a_run_of_both_gives_the_same_points(plain, tmp_path):
     assert kept and (tmp_path / "out" / "packed.wdz").exists()
 
 
-def test_a_missing_or_contradicting_wdz_is_named(plain, tmp_path):
-    packed = pack_strip(plain, tmp_path / "packed.las")
+def test_a_missing_or_contradicting_wdz_is_named(plain, packed, tmp_path):
     packed.with_suffix(".wdz").rename(tmp_path / "other.wdz")
     with pytest.raises(InputError, match=r"put packed\.wdz next to the strip"):
         StripReader(packed)

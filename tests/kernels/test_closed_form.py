@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import fit_closed_form
 from wavebatch.stages.decompose.fit import closed_form
@@ -39,7 +40,7 @@ def test_steps_lead_to_the_published_least_squares(steps, tolerance):
     noise = Noise(np.zeros(1, np.float32), np.full(1, 0.3, np.float32))
     start = EchoTable.build([0], [14.0], [37.0], [2.0])
     # A wide system pulse makes the window cover all samples.
-    echoes = closed_form(block, noise, SystemPulse(2.4, noise_std=0.3), start, steps=steps)
+    echoes = closed_form(block, noise, SystemPulse(2.4, noise=ReceiverNoise(std=0.3)), start, steps=steps)
     assert echoes.amplitude[0] == pytest.approx(37.62496, abs=5 * tolerance)
     assert echoes.time[0] == pytest.approx(14.294543, abs=tolerance)
     assert echoes.sigma[0] == pytest.approx(1.802284, abs=tolerance)

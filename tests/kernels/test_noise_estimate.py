@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from wavebatch import surveying
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import estimate_noise
@@ -86,7 +87,7 @@ def test_coloured_noise_shows_in_the_covariance(rho, factor):
     pooled = estimate_noise(block.samples.T.astype(np.float32), 6)
     first, second = pooled.correlation[:2]
     assert np.sqrt((6 + 8 * first + 2 * second) / 6) == pytest.approx(factor, rel=0.03)
-    assert surveying.survey_block(block).system.noise_std >= 0.99 * factor * pooled.std
+    assert surveying.survey_block(block).system.noise.std >= 0.99 * factor * pooled.std
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.5, 2.0, 6.0])
@@ -113,9 +114,31 @@ def test_tail_noise_follows_a_drifting_baseline():
     rng = np.random.default_rng(9)
     base = np.linspace(10, 90, n)[:, None]
     block = WaveformBlock.from_samples(np.rint(base + rng.standard_normal((n, 64))).astype(np.uint8))
-    noise = STAGES["noise.tail"].function(block, SystemPulse(2.0, noise_std=0.5), samples=20)
+    noise = STAGES["noise.tail"].function(block, SystemPulse(2.0, noise=ReceiverNoise(std=0.5)), samples=20)
     assert np.abs(noise.baseline - base[:, 0]).max() < 1.5
     assert np.median(noise.std) == pytest.approx(1.04, rel=0.1)
+
+
+@pytest.mark.parametrize(("number", "s"), [(1, 40), (2, 80), (4, 80), (1, 24)])
+@pytest.mark.parametrize("std", [0.9, 2.2])
+def test_weak_echoes_everywhere_are_not_taken_for_noise(number, s, std):
+    """Echoes of 3 to 8 standard deviations, `number` in each waveform: the noise was 1.6 to 4.5 times too large."""
+    rng = np.random.default_rng(number + s)
+    n, x = 4096, np.arange(s)[:, None]
+    y = 12 + std * rng.standard_normal((s, n))
+    for _ in range(number):
+        height = std * rng.uniform(3, 8, n)
+        y += height * np.exp(-0.5 * ((x - rng.uniform(6, s - 6, n)) / 2.0) ** 2)
+    pooled = estimate_noise(np.clip(np.rint(y), 0, 255).astype(np.float32), 6)
+    assert pooled.std == pytest.approx(np.hypot(std, QUANTISATION_STD), rel=0.06)
+
+
+def test_noise_that_is_a_little_lopsided_keeps_its_limit():
+    """As that of a receiver (Leica: 1.3): cut off at a tighter limit it would be too small."""
+    rng = np.random.default_rng(4)
+    noise = rng.gamma(16.0, 0.25, (80, 4000)) - 4.0  # standard deviation 1, skewness 0.5
+    pooled = estimate_noise(np.rint(30 + 2 * noise).astype(np.float32), 6)
+    assert pooled.std == pytest.approx(np.hypot(2.0, QUANTISATION_STD), rel=0.01)
 
 
 @pytest.mark.parametrize(("level", "std"), [(0, 5.0), (4, 5.0), (12, 8.0), (0, 0.4), (3, 40.0)])

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.learn_pulse import fit_gaussians, fit_skewed, stack_pulse
@@ -44,7 +45,7 @@ def list_models(receiver):
     stack = stack_pulse(signal, np.full(400, 500.0), time, 12, 40)
     sums = [fit_gaussians(stack, SIGMA, most)[-1] for most in (2, 3, 4, 5)]
     left, right = lobe_edges(FINE, pulse, 0.5 * pulse.max())
-    system = SystemPulse((right - left) / FWHM_PER_SIGMA, baseline=20.0, noise_std=0.3)
+    system = SystemPulse((right - left) / FWHM_PER_SIGMA, noise=ReceiverNoise(baseline=20.0, std=0.3))
     systems = [replace(system, components=tuple(map(tuple, fit.components))) for fit in sums if fit.rms < 0.006]
     skewed = fit_skewed(stack, SIGMA)
     if skewed.rms < 0.006:
@@ -65,7 +66,7 @@ def test_models_of_one_pulse_give_one_time_at_every_width(receiver, factor):
     assert len(systems) >= 2
     amplitudes = []
     for system in systems:
-        system = replace(system, baseline=2000.0, noise_std=30.0)
+        system = replace(system, noise=replace(system.noise, baseline=2000.0, std=30.0))
         noise = pooled(block, system)
         candidates = maximum(block, noise, system)
         stages = [adaptive(block, noise, system, candidates, max_echoes=1)]

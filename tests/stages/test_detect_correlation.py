@@ -6,6 +6,7 @@ import pytest
 from published import WAGNER
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.signal.square_differences import (
@@ -22,7 +23,7 @@ from wavebatch.stages.reference_pulse import reference_pulse
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.simulate import known_noise, known_system, simulate_block
 
-SYSTEM = SystemPulse(2.0, baseline=500.0, noise_std=100.0)
+SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=500.0, std=100.0))
 UNIT = 100.0
 """Counts per unit of noise, so that rounding does not matter."""
 

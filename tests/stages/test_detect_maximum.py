@@ -4,6 +4,7 @@ import naive
 import numpy as np
 import pytest
 
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.filters import curvature_taps, gaussian_taps
 from wavebatch.stages.chain import STAGES
@@ -31,7 +32,7 @@ def block(rng):
 
 def detect(name, block, **parameters):
     n = len(block)
-    system = SystemPulse(2.0, baseline=1200.0, noise_std=100.0)
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=1200.0, std=100.0))
     noise = Noise(np.full(n, 1200, np.float32), np.full(n, 100, np.float32))
     found = STAGES[f"detect.{name}"].function(block, noise, system, **parameters)
     return sorted(zip(found.waveform.tolist(), np.rint(found.time).astype(int).tolist(), strict=True))
@@ -79,7 +80,8 @@ def test_candidates_have_the_height_and_width_of_their_echo(sigma):
     y = 1200 + 5000 * np.exp(-0.5 * ((np.arange(160) - 80.3) / sigma) ** 2)
     block = WaveformBlock.from_samples(np.rint(y[None]).astype(np.uint16))
     noise = Noise(np.full(1, 1200, np.float32), np.full(1, 100, np.float32))
-    found = STAGES["detect.maximum"].function(block, noise, SystemPulse(sigma, baseline=1200.0, noise_std=100.0))
+    system = SystemPulse(sigma, noise=ReceiverNoise(baseline=1200.0, std=100.0))
+    found = STAGES["detect.maximum"].function(block, noise, system)
     assert len(found) == 1 and found.time[0] == pytest.approx(80.3, abs=0.05)
     assert found.amplitude[0] == pytest.approx(5000, rel=0.1 if sigma < 4 else 0.02)
     assert found.sigma[0] == pytest.approx(sigma, rel=0.1 if sigma < 4 else 0.02)

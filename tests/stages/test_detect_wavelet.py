@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from published import WANG_CASES, simulate_wang
 
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.signal.deconvolve import (
     convolve_pulse,
@@ -161,7 +162,7 @@ def test_wiener_undoes_a_skewed_pulse_where_it_lies():
 
 @pytest.mark.parametrize("snr", [30, 100])
 def test_richardson_lucy_separates_pairs_and_leaves_singles(snr):
-    system = SystemPulse(2.0, baseline=5000.0, noise_std=100.0)
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=5000.0, std=100.0))
     detect = STAGES["detect.richardson_lucy"].function
     block, noise, phase = record([(snr, 0)], 2.0, 1.0, 400)
     single = detect(block, noise, system)
@@ -176,7 +177,7 @@ def test_richardson_lucy_separates_pairs_and_leaves_singles(snr):
 
 def test_times_are_in_ns_at_any_spacing():
     block, noise, _ = record([(100, 0)], 1.0, 0.0, 1, spacing=0.5)
-    system = SystemPulse(1.0, baseline=5000.0, noise_std=30.0)
+    system = SystemPulse(1.0, noise=ReceiverNoise(baseline=5000.0, std=30.0))
     for name in ("wavelet", "richardson_lucy"):
         assert STAGES[f"detect.{name}"].function(block, noise, system).time == pytest.approx([15.0], abs=0.02)
 
@@ -188,7 +189,8 @@ CASES = [("wavelet", {}), ("wavelet", {"wavelet": "mexican_hat"}), ("richardson_
 def test_amplitudes_are_those_of_the_echoes(name, parameters):
     """Of the samples, not of the coefficients, which are a third as high."""
     block, noise, _ = record([(100.0, 0.0)], 2.0, 1.0, 300)
-    found = STAGES[f"detect.{name}"].function(block, noise, SystemPulse(2.0, noise_std=FINE), **parameters)
+    system = SystemPulse(2.0, noise=ReceiverNoise(std=FINE))
+    found = STAGES[f"detect.{name}"].function(block, noise, system, **parameters)
     assert np.median(found.amplitude[found.amplitude > 30 * FINE]) / FINE == pytest.approx(100.0, rel=0.08)
 
 
@@ -207,6 +209,6 @@ def test_thresholds_are_standard_deviations_of_what_is_searched(name, parameters
     for factor, expected in ((0.88, 0), (1.12, 1)):
         block, noise, _ = record([(10.0 * factor * least, 0.0)], 2.0, 0.0, 1)
         noise = replace(noise, std=np.full(1, 10.0 * FINE, np.float32))
-        system = SystemPulse(2.0, noise_std=10.0 * FINE)
+        system = SystemPulse(2.0, noise=ReceiverNoise(std=10.0 * FINE))
         found = STAGES[f"detect.{name}"].function(block, noise, system, threshold=threshold, **parameters)
         assert len(found) == expected, factor

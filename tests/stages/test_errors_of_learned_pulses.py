@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
@@ -52,7 +53,7 @@ def draw(shape, width, n, seed, apart=0.0, rho=0.0, unit=1.0):
 def scatter(block, system, amplitude, time, sigma, number):
     """Scatter of the fits of waveforms with `number` echoes over their errors: amplitude, time, sigma."""
     n = len(block)
-    noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
+    noise = Noise(np.full(n, system.noise.baseline, np.float32), np.full(n, system.noise.std, np.float32))
     echoes = adaptive(block, noise, system, maximum(block, noise, system))
     true = (amplitude > 0).sum(axis=1)
     right = (echoes.count(n) == number) & (true == number)
@@ -75,7 +76,7 @@ def test_errors_of_a_known_pulse_are_the_scatter_of_fits(width, apart, number):
     _, _, sigma = measures("tailed", width)
     first, *others = SHAPES["tailed"]
     components = tuple((w, d * width, s * width) for w, d, s in (first, *others))
-    system = SystemPulse(sigma, baseline=BASELINE, noise_std=NOISE, components=components)
+    system = SystemPulse(sigma, noise=ReceiverNoise(baseline=BASELINE, std=NOISE), components=components)
     block, *truth = draw("tailed", width, 3000, 4, apart)
     assert scatter(block, system, *truth, number) == pytest.approx(np.ones(3), abs=0.1)
 
@@ -87,10 +88,10 @@ def test_the_survey_finds_the_colour_of_the_noise(shape, width, rho):
     """It comes from the calm half of the waveforms, which lacks power: white noise had values of -0.05 to -0.02."""
     block, *truth = draw(shape, width, 4000, 5, rho=rho)
     system = survey_block(block).system
-    correlation = np.array(system.correlation)
+    correlation = np.array(system.noise.correlation)
     assert correlation[0] == pytest.approx(rho / (1 + rho * rho), abs=0.015)
     assert correlation[1:] == pytest.approx(np.zeros(len(correlation) - 1), abs=0.012)
-    assert system.noise_by_kind["quiet"] == pytest.approx(NOISE, rel=0.015)
+    assert system.noise.by_kind["quiet"] == pytest.approx(NOISE, rel=0.015)
     assert scatter(block, system, *truth, 1) == pytest.approx(np.ones(3), abs=0.12)
 
 
@@ -100,6 +101,6 @@ def test_whole_counts_are_no_correlation_no_tail_and_no_less_noise(unit):
     block, *_ = draw("gaussian", 2.0, 4000, 6, unit=unit)
     system = survey_block(block).system
     assert not system.components
-    assert system.noise_std == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)
-    assert system.correlation == pytest.approx(np.zeros(len(system.correlation)), abs=0.02)
-    assert system.noise_by_kind["quiet"] == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)
+    assert system.noise.std == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)
+    assert system.noise.correlation == pytest.approx(np.zeros(len(system.noise.correlation)), abs=0.02)
+    assert system.noise.by_kind["quiet"] == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)

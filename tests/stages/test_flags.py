@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
 from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
@@ -50,7 +51,7 @@ def test_flags_are_those_of_a_loop(table, rng):
     amplitude = np.where(strong, rng.uniform(1400, 1900, len(table)), table.amplitude)
     table = replace(table, amplitude=amplitude.astype(np.float32))
     noise = Noise(np.full(N, 20, np.float32), rng.uniform(0.8, 3, N).astype(np.float32))
-    system = SystemPulse(2.0, baseline=20.0, noise_std=1.0, saturation=255.0, ringing=0.1)
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=20.0, std=1.0), saturation=255.0, ringing=0.1)
     found = flag_echoes(block, noise, system, replace(table, flags=np.zeros(len(table), np.uint16)))
     expected = []
     for i in range(len(table)):

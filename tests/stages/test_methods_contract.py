@@ -6,6 +6,7 @@ from contract_tools import SYSTEMS, assert_same, check_echoes, inputs, make_bloc
 
 from wavebatch import surveying
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.pulse_tables import error_factors
@@ -84,7 +85,7 @@ def test_a_constant_waveform_holds_no_echo(name, s):
     level = np.repeat(np.array([0, 12, 40, 255], np.uint8)[:, None], s, axis=1)
     pulse = 12 + np.rint(80 * np.exp(-0.5 * ((np.arange(s) - 0.6 * s) / 2) ** 2)).astype(np.uint8)
     block = WaveformBlock.from_samples(np.insert(level, [1, 3], pulse, axis=0))
-    system = SystemPulse(2.0, baseline=12, noise_std=1.0)
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=12, std=1.0))
     noise = Noise(np.full(6, 12, np.float32), np.ones(6, np.float32))
     given = (STAGES["detect.maximum"].function(block, noise, system),) if name.startswith("decompose") else ()
     table = STAGES[name].function(block, noise, system, *given)
@@ -96,6 +97,7 @@ def test_a_constant_waveform_holds_no_echo(name, s):
 @pytest.mark.parametrize("spacing", [0.001, 1.0, 4000.0])
 def test_factors_of_coloured_noise_are_bounded_for_any_spacing(spacing, kappa):
     """A pulse on one sample has no derivatives, and one of 10,000 samples no table that fits into memory."""
-    system = SystemPulse(sigma_ref=2.0, baseline=12.0, noise_std=1.0, kappa=kappa, correlation=(0.5, 0.2, -0.1))
+    receiver = ReceiverNoise(baseline=12.0, std=1.0, correlation=(0.5, 0.2, -0.1))
+    system = SystemPulse(sigma_ref=2.0, noise=receiver, kappa=kappa)
     factors = error_factors(system, spacing, np.array([0.7, 1.0, 4.0]) * 2.0 / spacing)
     assert np.isfinite(factors).all() and (factors > 0.05).all() and (factors < 3).all()

@@ -6,10 +6,11 @@ import naive_signal
 import numpy as np
 import pytest
 
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 
-SYSTEM = SystemPulse(2.0, baseline=12.0, baseline_spread=0.5, noise_std=1.1)
+SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.5, std=1.1))
 
 
 def record(rng, n=60, s=80):
@@ -28,7 +29,7 @@ def test_baselines_are_those_of_a_loop(rng, recovery, gaps):
     missing = np.zeros(block.samples.shape, bool)
     missing[:, 70:] = gaps
     block = replace(block, missing=missing) if gaps else block
-    noise = STAGES["noise.pooled"].function(block, replace(SYSTEM, recovery=recovery))
+    noise = STAGES["noise.pooled"].function(block, replace(SYSTEM, noise=replace(SYSTEM.noise, recovery=recovery)))
     width = 3.5 * np.hypot(np.sqrt(6) / 4 * 1.1, 0.5)
     for w, waveform in enumerate(block.samples.astype(float) - 12):
         quiet = naive_signal.find_quiet(waveform[:, None].astype(np.float32), width, 6, int(recovery))[:, 0]

@@ -9,6 +9,7 @@ from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain
+from wavebatch.core.system import LevelWidths, Radiometry, ReceiverNoise
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.column_names import describe
@@ -27,7 +28,12 @@ from wavebatch.tools.simulate.blocks import simulate_pulses
 from wavebatch.tools.simulate.geometry import AIR_SPEED
 from wavebatch.tools.simulate.scenes import find_scene
 
-SYSTEM = SystemPulse(1.2, baseline=12.0, noise_std=1.0, divergence=1.1, calibration=2.6e-8, attenuation=0.22)
+SYSTEM = SystemPulse(
+    1.2,
+    noise=ReceiverNoise(baseline=12.0, std=1.0),
+    radiometry=Radiometry(divergence=1.1, constant=2.6e-8, attenuation=0.22),
+)
+BEAM = 1e-3 * SYSTEM.radiometry.divergence
 NAMES = ("range", "backscatter_coefficient", "cross_section", "level_reflectance", "incidence_angle")
 COLUMNS = [name for stage in NAMES for name in STAGES[f"attribute.{stage}"].makes]
 KNOWN = set(COLUMNS) - {"range_error"}
@@ -50,7 +56,7 @@ def make(degrees, snr=100.0, height=640.0, per_waveform=1, seed=1):
     """Block and fitted echoes on planes that the ray strikes at `degrees` (n,), with errors at the bound."""
     rng = np.random.default_rng(seed)
     n = len(degrees)
-    sigma = np.hypot(SYSTEM.sigma_ref, spread_of_angle(np.radians(degrees), height, 1e-3 * SYSTEM.divergence))
+    sigma = np.hypot(SYSTEM.sigma_ref, spread_of_angle(np.radians(degrees), height, BEAM))
     amplitude = np.full(n, snr) * np.cos(np.radians(degrees)) * SYSTEM.sigma_ref / sigma
     errors = crlb(amplitude, sigma, 1.0, 1.0)
     block = WaveformBlock.from_samples(np.zeros((n // per_waveform, 8), np.uint8))
@@ -81,11 +87,11 @@ def test_backscatter_and_range():
 
 def test_a_wrong_position_is_in_the_error():
     block, echoes, _ = make(np.full(10, 20.0), snr=1e6)
-    system = replace(SYSTEM, sensor_error=6.4, attenuation=0.0)
+    system = SYSTEM.with_radiometry(sensor_error=6.4, attenuation=0.0)
     done = run(block, echoes, system, "backscatter_coefficient", "cross_section").attributes
     assert done["cross_section_err"] / done["cross_section"] == pytest.approx(0.04, rel=0.01)
     assert done["backscatter_coefficient_err"] / done["backscatter_coefficient"] == pytest.approx(0.02, rel=0.02)
-    calibrated = replace(SYSTEM, attenuation=0.0, calibration_err=0.03)
+    calibrated = SYSTEM.with_radiometry(attenuation=0.0, constant_error=0.03)
     done = run(block, echoes, calibrated, "cross_section").attributes
     assert done["cross_section_err"] / done["cross_section"] == pytest.approx(0.03, rel=0.01)
 
@@ -93,9 +99,9 @@ def test_a_wrong_position_is_in_the_error():
 @pytest.mark.parametrize(
     ("system", "gamma", "section"),
     [
-        (replace(SYSTEM, shot_error=0.05), 0.05, 0.05),
-        (replace(SYSTEM, divergence_error=0.1), 0.0, 0.2),
-        (replace(SYSTEM, attenuation_error=0.1), 2e-4 * 640 * 0.1 * np.log(10), 2e-4 * 640 * 0.1 * np.log(10)),
+        (SYSTEM.with_radiometry(shot_error=0.05), 0.05, 0.05),
+        (SYSTEM.with_radiometry(divergence_error=0.1), 0.0, 0.2),
+        (SYSTEM.with_radiometry(attenuation_error=0.1), 2e-4 * 640 * 0.1 * np.log(10), 2e-4 * 640 * 0.1 * np.log(10)),
     ],
     ids=["energy from shot to shot", "divergence", "air"],
 )
@@ -186,9 +192,9 @@ def test_only_echoes_alone_have_a_reflectance_and_an_angle():
 @pytest.mark.parametrize(
     ("system", "known"),
     [
-        (replace(SYSTEM, calibration=None), {"range", "incidence_angle", "incidence_angle_err"}),
+        (SYSTEM.with_radiometry(constant=None), {"range", "incidence_angle", "incidence_angle_err"}),
         (
-            replace(SYSTEM, divergence=None),
+            SYSTEM.with_radiometry(divergence=None),
             {
                 "range",
                 "backscatter_coefficient",
@@ -199,7 +205,7 @@ def test_only_echoes_alone_have_a_reflectance_and_an_angle():
         ),
         (replace(SYSTEM, sigma_ref=0.64), KNOWN - {"incidence_angle", "incidence_angle_err"}),
         (SYSTEM, KNOWN),
-        (replace(SYSTEM, sensor_error=0.1), set(COLUMNS)),
+        (SYSTEM.with_radiometry(sensor_error=0.1), set(COLUMNS)),
     ],
     ids=["no calibration", "no divergence", "pulse too short for the sampling", "no position error", "everything"],
 )
@@ -264,8 +270,9 @@ def test_angles_of_simulated_slopes():
         block = with_sensor(made)
         # On slopes alone the system's width cannot be measured: level ground elsewhere, or SYSTEM.toml, must say it.
         # So must the scatter of widths, which is measured below the system's width: slopes have moved that by 0.015 ns.
-        known = {"sigma_ref": scene.recording.pulse.sigma, "divergence": scene.divergence, "width_scatter": 0.0}
-        system = system or replace(survey_block(block).system, **known)
+        known = {"sigma_ref": scene.recording.pulse.sigma, "widths": LevelWidths()}
+        found = survey_block(block).system.with_radiometry(divergence=scene.divergence)
+        system = system or replace(found, **known)
         echoes = chain.run(block, system)
         true = np.degrees(made.rays.incidence)[echoes.waveform]
         off.append(echoes.attributes["incidence_angle"] - true)
@@ -279,7 +286,7 @@ def test_angles_of_simulated_slopes():
 
 
 def test_an_infrared_beam_has_no_angles():
-    system = replace(SYSTEM, sigma_ref=1.7, divergence=0.4)
+    system = replace(SYSTEM, sigma_ref=1.7, radiometry=replace(SYSTEM.radiometry, divergence=0.4))
     block, echoes, _ = make(np.linspace(0, 40, 500), snr=50.0)
     narrow = replace(echoes, sigma=np.full(500, 1.7, np.float32))
     done = run(block, narrow, system, "incidence_angle").attributes
@@ -331,13 +338,13 @@ def reasons(echoes):
     [
         (SYSTEM, False, "range", NoData.NO_SENSOR),
         (SYSTEM, False, "incidence_angle", NoData.NO_SENSOR),
-        (replace(SYSTEM, calibration=None), True, "level_reflectance", NoData.NOT_CALIBRATED),
-        (replace(SYSTEM, level_error=np.inf), True, "incidence_angle", NoData.NO_LEVEL),
-        (replace(SYSTEM, calibration=None, divergence=None), True, "cross_section", NoData.NOT_CALIBRATED),
-        (replace(SYSTEM, divergence=None), True, "cross_section", NoData.NO_DIVERGENCE),
-        (replace(SYSTEM, divergence=None), True, "incidence_angle", NoData.NO_DIVERGENCE),
+        (SYSTEM.with_radiometry(constant=None), True, "level_reflectance", NoData.NOT_CALIBRATED),
+        (replace(SYSTEM, widths=replace(SYSTEM.widths, error=np.inf)), True, "incidence_angle", NoData.NO_LEVEL),
+        (SYSTEM.with_radiometry(constant=None, divergence=None), True, "cross_section", NoData.NOT_CALIBRATED),
+        (SYSTEM.with_radiometry(divergence=None), True, "cross_section", NoData.NO_DIVERGENCE),
+        (SYSTEM.with_radiometry(divergence=None), True, "incidence_angle", NoData.NO_DIVERGENCE),
         (replace(SYSTEM, sigma_ref=0.6), True, "incidence_angle", NoData.SHORT_PULSE),
-        (replace(SYSTEM, divergence=0.01), True, "incidence_angle", NoData.UNCERTAIN),
+        (SYSTEM.with_radiometry(divergence=0.01), True, "incidence_angle", NoData.UNCERTAIN),
     ],
 )
 def test_every_missing_value_has_a_reason(system, sensor, column, reason):
@@ -386,7 +393,7 @@ def test_echoes_that_are_far_too_narrow_are_flagged():
 
 def test_relative_columns_need_no_calibration_and_become_absolute_with_its_constant():
     block, echoes, _ = make(np.full(200, 30.0), snr=300.0)
-    bare = replace(SYSTEM, calibration=None, divergence=None)
+    bare = SYSTEM.with_radiometry(constant=None, divergence=None)
     names = ("relative_backscatter", "relative_cross_section", "relative_reflectance")
     others = ("backscatter_coefficient", "cross_section", "reflectance")
     angles = run(block, echoes, SYSTEM, "incidence_angle")
@@ -406,7 +413,7 @@ def test_channels_have_constants_of_their_own():
     block, echoes, _ = make(np.full(20, 30.0), snr=300.0)
     one = run(block, echoes, SYSTEM, "backscatter_coefficient").attributes["backscatter_coefficient"]
     channels = {(1, 0): (5.2e-8, 0.0), (1, 2): (7.8e-8, 0.1), (2, 0): (1.0, 0.0)}
-    system = replace(SYSTEM, channels=channels)
+    system = SYSTEM.with_radiometry(channels=channels)
     two = run(block, echoes, system, "backscatter_coefficient").attributes["backscatter_coefficient"]
     assert two == pytest.approx(2 * one, rel=1e-6)
     mixed = replace(block, scanner=np.arange(20, dtype=np.uint8) % 4)
@@ -450,7 +457,7 @@ def test_slopes_keep_the_energy_of_a_learned_pulse(degrees):
 def test_a_normalized_amplitude_is_that_at_the_reference_range(reference):
     """Level targets at 500 and 900 m, by the lidar equation: the same height at the reference, with or without air."""
     for attenuation in (0.0, 0.5):
-        system = replace(SYSTEM, calibration=None, attenuation=attenuation)
+        system = SYSTEM.with_radiometry(constant=None, attenuation=attenuation)
         found = []
         for height in (500.0, 900.0):
             power = receive_power(np.ones(1), np.array([height]), transmitted=1e16, aperture=0.1, divergence=1e-3,
@@ -474,7 +481,7 @@ def test_a_normalized_amplitude_is_that_at_the_reference_range(reference):
 def test_the_error_of_the_air_counts_over_the_way_to_the_reference():
     block, echoes, _ = make(np.zeros(4), snr=1e6)
     for reference, way in ((640.0, 0.0), (1640.0, 1000.0)):
-        system = replace(SYSTEM, attenuation_error=0.1)
+        system = SYSTEM.with_radiometry(attenuation_error=0.1)
         done = run(block, echoes, system, "amplitude_normalized", amplitude_normalized={"reference_range": reference})
         relative = done.attributes["amplitude_normalized_err"] / done.attributes["amplitude_normalized"]
         assert relative == pytest.approx(2e-4 * way * 0.1 * np.log(10), rel=0.01, abs=1e-4)
@@ -494,7 +501,7 @@ def test_the_energy_of_each_pulse_is_divided_out():
     brighter = replace(echoes, amplitude=(echoes.amplitude * np.nan_to_num(energy, nan=1.0)).astype(np.float32))
     names = ("backscatter_coefficient", "amplitude_normalized")
     plain = run(block, echoes, SYSTEM, *names).attributes
-    known = replace(SYSTEM, shot_error=0.2, attenuation_error=1e-6)  # 0 takes the air as known to a half
+    known = SYSTEM.with_radiometry(shot_error=0.2, attenuation_error=1e-6)  # 0 takes the air as known to a half
     done = run(replace(block, pulse_energy=energy), brighter, known, *names)
     for name in names:
         values = done.attributes[name]
@@ -530,7 +537,7 @@ def planes(system, degrees, n=800, height=640.0, seed=3):
     """Waveforms of planes that rays strike at an angle, with the system's own pulse broadened by them; noise 1."""
     rng = np.random.default_rng(seed)
     shape, limits = pulse_shape(system, 1.0), shape_limits(system, 1.0)
-    width = np.hypot(limits.ref, spread_of_angle(np.radians(degrees), height, 1e-3 * system.divergence))
+    width = np.hypot(limits.ref, spread_of_angle(np.radians(degrees), height, 1e-3 * system.radiometry.divergence))
     x, time = np.arange(120.0), 45 + rng.uniform(-0.5, 0.5, n)
     pulse = evaluate_pulse(shape, np.tile(x, (n, 1)), time[:, None], np.full((n, 1), width))[0]
     counts = np.rint(12 + 150 * pulse * limits.ref / width + rng.standard_normal(pulse.shape))

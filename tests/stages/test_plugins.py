@@ -12,6 +12,7 @@ from click.testing import CliRunner
 import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.core.echoes import COLUMNS
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.stages import chain as chain_module
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import effective, parse_chain
@@ -87,7 +88,7 @@ def test_a_chain_may_name_stages_of_a_plugin(installed):
     assert effective(parse_chain(effective(chain), "again")) == effective(chain)
     samples = np.full((3, 40), 12, np.uint8)
     samples[1, 9:12] = (40, 90, 40)
-    table = chain.run(wb.WaveformBlock.from_samples(samples), wb.SystemPulse(1.0, baseline=12.0))
+    table = chain.run(wb.WaveformBlock.from_samples(samples), wb.SystemPulse(1.0, noise=ReceiverNoise(baseline=12.0)))
     assert table.waveform.tolist() == [1] and len(table.attributes["skew_hint"]) == 1
 
 

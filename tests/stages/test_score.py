@@ -8,10 +8,11 @@ import pytest
 from helpers_scenes import make_block, make_scene
 from hypothesis import given
 from hypothesis import strategies as st
+from scoring import score
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.fit.bounds import crlb
-from wavebatch.stages.score import ErrorStats, find_isolated, list_pairs, match_echoes, score
+from wavebatch.stages.score import ErrorStats, find_isolated, list_pairs, match_echoes
 
 
 def match_naively(found, truth, tolerance):

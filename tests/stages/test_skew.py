@@ -10,6 +10,7 @@ import pytest
 import wavebatch as wb
 from wavebatch import surveying
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import parse_chain
@@ -46,7 +47,7 @@ def test_the_survey_keeps_the_skew_beside_a_learned_pulse():
 
 def test_without_a_skew_of_the_survey_a_learned_pulse_is_refused():
     block, _, _ = strip([0.23], n=20)
-    system = SystemPulse(2.4, baseline=12, noise_std=1.0, components=LEARNED)
+    system = SystemPulse(2.4, noise=ReceiverNoise(baseline=12, std=1.0), components=LEARNED)
     with pytest.raises(ConfigError, match="survey again, or give kappa"):
         parse_chain(TEXT, "c").run(block, system)
     assert len(parse_chain(TEXT + "\nkappa = 0.2", "c").run(block, system))
@@ -115,7 +116,7 @@ def test_the_energy_of_a_generalized_gaussian_is_that_of_its_exponent(power):
     y = 5000 * naive.power_pulse(x, time[:, None], 3.0, power)
     counts = np.rint(1000 + y + np.random.default_rng(1).standard_normal(y.shape)).astype(np.uint16)
     text = TEXT.replace("skewed", "generalized_gaussian") + '\n[[chain]]\nstage = "attribute.energy"'
-    system = SystemPulse(2.4, baseline=1000.0, noise_std=1.1)
+    system = SystemPulse(2.4, noise=ReceiverNoise(baseline=1000.0, std=1.1))
     found = parse_chain(text, "c").run(WaveformBlock.from_samples(counts), system)
     energy = np.bincount(found.waveform, found.attributes["energy"])
     assert np.median(energy / y.sum(axis=1)) == pytest.approx(1.0, abs=0.01)

@@ -95,7 +95,7 @@ def test_constant_waveforms_have_no_echo(profile, level, system):
     measured = surveying.survey_block(block).system
     assert np.isfinite(measured.sigma_ref)
     if system == "of another file":
-        measured = replace(measured, baseline=float(level), noise_std=0.3, sigma_ref=3.0)
+        measured = replace(measured, noise=replace(measured.noise, baseline=float(level), std=0.3), sigma_ref=3.0)
     assert len(load_profile(profile).run(block, measured)) == 0
 
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
+from scoring import score
 
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile, parse_chain
-from wavebatch.stages.score import score
 from wavebatch.surveying import Decision, Survey, survey_block
 from wavebatch.surveying.auto_chain import (
     LOST,
@@ -18,9 +18,10 @@ from wavebatch.surveying.auto_chain import (
     widest_chain,
     without_columns,
 )
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.tools.simulate import find_pulse
 
-OPEN_FIGURES = {"empty_share": 0.2, "overlapped_share": 0.0005}
+OPEN_FIGURES = Figures(empty_share=0.2, overlapped_share=0.0005)
 DECISIONS = (
     Decision("learned pulse", False, "a simpler pulse reaches the noise"),
     Decision("growth of fits", False, "says the survey"),
@@ -31,7 +32,7 @@ DECISIONS = (
 
 
 def _survey(decisions=DECISIONS, waveforms=8000, **figures) -> Survey:
-    return Survey(SystemPulse(sigma_ref=2.0), waveforms, {**OPEN_FIGURES, **figures}, decisions)
+    return Survey(SystemPulse(sigma_ref=2.0), waveforms, replace(OPEN_FIGURES, **figures), decisions)
 
 
 def _stages(chain) -> list[str]:
@@ -69,8 +70,8 @@ def test_an_open_scene_gets_one_fit_per_maximum_and_reads_why():
         (_survey(overlapped_share=0.001, waveforms=1000), True),
         (_survey(overlapped_share=0.0, empty_share=1.0), True),
         (_survey(decisions=()), True),
-        (replace(_survey(), figures={}), True),
-        (replace(_survey(), waveforms=0, figures={}, decisions=()), True),
+        (replace(_survey(), figures=Figures()), True),
+        (replace(_survey(), waveforms=0, figures=Figures(), decisions=()), True),
     ],
 )
 def test_fits_stop_growing_only_where_next_to_nothing_overlaps(survey, grows):
@@ -143,8 +144,8 @@ def test_the_choice_depends_on_nothing_but_the_survey():
 
 def test_angles_that_the_widths_allow_are_named_with_what_they_need():
     """The beam's divergence is in no strip, so that no survey alone can add the stage."""
-    survey = Survey(SystemPulse(2.0), 8000, {}, (Decision("incidence angle", True, "60 % are wider"),))
+    survey = Survey(SystemPulse(2.0), 8000, decisions=(Decision("incidence angle", True, "60 % are wider"),))
     text = chain_text(survey)
     assert "# incidence angle: not in this chain: it needs the divergence of the beam" in text
     assert "attribute.incidence_angle" not in [step.stage.name for step in parse_chain(text, "c").steps]
-    assert "incidence angle" not in chain_text(Survey(SystemPulse(2.0), 8000, {}, ()))
+    assert "incidence angle" not in chain_text(Survey(SystemPulse(2.0), 8000))

@@ -37,7 +37,7 @@ def _run(path) -> Found:
         chain = choose_chain(survey)
         for number in range(reader.unit_count()):
             for block, _ in reader.read_blocks(reader.read_unit(number, scan), 8192, owned_only=True):
-                parts.append(_compare(block, chain.run(block, survey.system), survey.system.baseline))
+                parts.append(_compare(block, chain.run(block, survey.system), survey.system.noise.baseline))
     return Found(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 

@@ -20,6 +20,8 @@ from wavebatch.kernels.physics.pulse_energies import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 
+pytestmark = pytest.mark.kept_surveys
+
 LIGHT = 1.2e8
 BASE = {"speed": 30.0, "rate": 10_000.0, "half_angle": 12.0}
 

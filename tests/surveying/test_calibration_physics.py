@@ -15,6 +15,8 @@ from wavebatch.surveying.calibrating.calibration_file import format_calibration,
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibrating.target_file import Target
 
+pytestmark = pytest.mark.kept_surveys
+
 RINGING = ((1.0, 0.0, 2.0), (0.06, 9.0, 2.2), (0.03, 16.0, 2.5))
 TAIL = ((1.0, 0.0, 2.0), (0.3, 3.0, 3.0))
 DENSE = {"speed": 30.0, "line_rate": 50.0, "half_angle": 4.0}

@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import kept_surveys
 import pytest
 from batch_tools import read_cloud
 from click.testing import CliRunner
@@ -14,6 +15,8 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.surveying.choose_chain import COSTS, Request, make_choice, widest
 from wavebatch.tools.simulate import find_pulse, simulate_strip
+
+pytestmark = pytest.mark.kept_surveys
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -94,6 +97,7 @@ def test_a_saved_survey_is_used_as_it_is_and_the_report_says_whose_it_is(strips,
 
 
 def test_no_survey_is_made_where_one_is_given(strips, saved, tmp_path, monkeypatch):
+    monkeypatch.setattr(kept_surveys, "active", False)
     monkeypatch.setattr("wavebatch.surveying.survey.survey_block", lambda *a, **k: pytest.fail("surveyed"))
     assert _run(strips / "flat.las", "-o", tmp_path, "-q", "--system", saved, "--debug").exit_code == 0
 

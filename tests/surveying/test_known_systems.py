@@ -92,11 +92,11 @@ def test_a_small_strip_has_the_echoes_of_the_whole_strip(riegl, tmp_path, points
     path = cut_strip(riegl, tmp_path / "cut.las", points)
     small, whole = _survey(path), _survey(riegl)
     assert _count_echoes(path, small) == pytest.approx(_count_echoes(path, whole), rel=error)
-    if small.figures["isolated_echoes"] < 20:
+    if small.figures.isolated_echoes < 20:
         assert find_source(small.system).name == "riegl-q680i"
         reason = next(one.reason for one in small.decisions if one.part == "learned pulse")
         assert reason.startswith("pulse from the shipped riegl-q680i")
-        assert small.figures["pulse_cost"] < small.figures["isolated_pulse_cost"]
+        assert small.figures.pulse_cost < small.figures.isolated_pulse_cost
 
 
 def test_a_small_strip_of_the_other_known_sensor_looks_like_it(leica, tmp_path):
@@ -139,7 +139,7 @@ def test_after_pulses_of_an_unknown_sensor_are_flagged(share, delay):
 def test_a_gaussian_of_a_small_strip_has_the_width_of_its_echoes():
     """It was 2 samples, a guess, with fewer than 20 isolated echoes."""
     survey = survey_block(make_block(make_scene("flat", pulse=PulseModel(3.4), n_samples=100), 12, seed=1)[0])
-    assert survey.figures["isolated_echoes"] < 20
+    assert survey.figures.isolated_echoes < 20
     assert survey.system.sigma_ref == pytest.approx(3.4, rel=0.05) and survey.system.ringing == 0
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.pulse_shape import PulseShape, measure_pulse
@@ -68,7 +69,7 @@ def judge(block, time):
 def test_flat_tops_are_learned_and_found(seed):
     block, time, _ = record(flat_top, seed)
     system, _, whole, error = judge(block, time)
-    assert system.noise_std == pytest.approx(1.04, rel=0.15)
+    assert system.noise.std == pytest.approx(1.04, rel=0.15)
     assert whole > 0.94 and np.std(error) < 0.12
 
 
@@ -76,7 +77,7 @@ def test_flat_tops_are_learned_and_found(seed):
 def test_counts_that_hardly_scatter_do_not_spoil_the_pulse(noise):
     block, time, height = record(gaussian, 3, noise=noise, wide=0.3)
     system, echoes, whole, _ = judge(block, time)
-    assert system.noise_std < 0.45 and system.sigma_ref == pytest.approx(2.0, rel=0.01)
+    assert system.noise.std < 0.45 and system.sigma_ref == pytest.approx(2.0, rel=0.01)
     assert whole > 0.98
     alone = echoes.count(len(block))[echoes.waveform] == 1
     ratio = echoes.amplitude[alone] / height[echoes.waveform[alone]]
@@ -126,8 +127,8 @@ def drifting(seed, *, drift, noise, n=3000, top=200):
 def test_baselines_that_drift_along_the_strip_hide_no_echo(drift, noise, top):
     block, time, base = drifting(7, drift=drift, noise=noise, top=top)
     system, _, whole, error = judge(block, time)
-    assert system.noise_std == pytest.approx(np.hypot(noise, 0.289), rel=0.05)
-    assert system.baseline_spread == pytest.approx(drift / np.sqrt(12), rel=0.05)
+    assert system.noise.std == pytest.approx(np.hypot(noise, 0.289), rel=0.05)
+    assert system.noise.baseline_spread == pytest.approx(drift / np.sqrt(12), rel=0.05)
     assert whole > 0.985
     found = STAGES["noise.pooled"].function(block, system).baseline - base
     assert np.sqrt(np.mean(found**2)) < 0.3 * np.hypot(noise, 0.289)
@@ -158,16 +159,16 @@ def test_digitizers_that_record_otherwise_get_a_pulse_and_noise_of_their_own():
     assert system.sigma_ref == pytest.approx(2.0, rel=0.02) and system.of(wide) is system
     own = system.of(narrow)
     # Of the noise of 8 DN about a level of 12 DN, counts from 0 on keep 7.6.
-    assert own.sigma_ref == pytest.approx(1.2, rel=0.02) and own.noise_std == pytest.approx(7.6, rel=0.05)
+    assert own.sigma_ref == pytest.approx(1.2, rel=0.02) and own.noise.std == pytest.approx(7.6, rel=0.05)
     # Twelve waveforms are too few for a pulse, but enough for a level.
     few = system.of(low)
-    assert few.sigma_ref == system.sigma_ref and few.baseline == pytest.approx(42, abs=0.3)
-    echoes = choose_chain(survey).run(narrow, replace(system, divergence=0.5))
+    assert few.sigma_ref == system.sigma_ref and few.noise.baseline == pytest.approx(42, abs=0.3)
+    echoes = choose_chain(survey).run(narrow, system.with_radiometry(divergence=0.5))
     single = echoes.count(len(narrow)) == 1
     assert single.mean() > 0.98
     assert np.std((echoes.time - time[echoes.waveform])[single[echoes.waveform]]) < 0.1
-    assert replace(system, divergence=0.5).of(narrow).divergence == 0.5
-    assert survey.waveforms == 2112 and survey.figures["single_share"] > 0.98
+    assert system.with_radiometry(divergence=0.5).of(narrow).radiometry.divergence == 0.5
+    assert survey.waveforms == 2112 and survey.figures.single_share > 0.98
 
 
 def test_digitizers_that_record_alike_share_what_is_learned():
@@ -177,8 +178,9 @@ def test_digitizers_that_record_alike_share_what_is_learned():
 
 
 def test_systems_of_digitizers_are_saved(tmp_path):
-    own = SystemPulse(1.2, baseline=300.0, noise_by_kind={"quiet": 8.0}, components=((1.0, 0.0, 1.2), (0.1, 5.0, 1.0)))
-    survey = Survey(SystemPulse(2.0, digitizers={4: own, 9: SystemPulse(3.0)}), 5, {}, ())
+    noise = ReceiverNoise(baseline=300.0, by_kind={"quiet": 8.0})
+    own = SystemPulse(1.2, noise=noise, components=((1.0, 0.0, 1.2), (0.1, 5.0, 1.0)))
+    survey = Survey(SystemPulse(2.0, digitizers={4: own, 9: SystemPulse(3.0)}), 5)
     path = tmp_path / "system.toml"
     write_text(path, format_survey(SavedSurvey(survey)), overwrite=False)
     assert load_survey(path).survey == survey

@@ -14,6 +14,7 @@ from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
 from wavebatch.surveying import Survey
 from wavebatch.surveying.outgoing import compare_outgoing, learn_shape, save_outgoing
 from wavebatch.surveying.system_file import SavedSurvey, format_survey
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 
@@ -61,8 +62,8 @@ def sent(tmp_path, rng):
 
 
 def _echoes(fwhm, learned=True):
-    figures = {"misfit_1_gaussians": 0.01} if learned else {}
-    return Survey(SystemPulse(fwhm / FWHM_PER_SIGMA, components=((1.0, 0.0, 1.0), (0.1, 3.0, 1.0))), 500, figures, ())
+    figures = Figures(misfit_gaussians={1: 0.01} if learned else {})
+    return Survey(SystemPulse(fwhm / FWHM_PER_SIGMA, components=((1.0, 0.0, 1.0), (0.1, 3.0, 1.0))), 500, figures)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +81,7 @@ def test_the_pulse_that_is_taken_and_why(sent, ratio, learned, same, taken, reas
     width = fwhm if taken else ratio * fwhm
     assert found.system.sigma_ref * FWHM_PER_SIGMA == pytest.approx(width)
     assert (found.system.components == before.system.components) != taken
-    assert found.figures["sent_fwhm_ns"] == pytest.approx(fwhm)
+    assert found.figures.sent_fwhm_ns == pytest.approx(fwhm)
     # A survey that is saved under the same name is not taken for outgoing pulses.
     strip.with_suffix(".system.toml").write_text(format_survey(SavedSurvey(found)))
     assert compare_outgoing(before, strip) is before

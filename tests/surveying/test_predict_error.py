@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
+from scoring import score
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.chain_file import list_profiles, load_profile
-from wavebatch.stages.score import score
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import COSTS
 from wavebatch.surveying.predict_error import Prediction, leave_out_false, predict_errors, simulate_again
@@ -80,16 +80,16 @@ def test_predictions_are_the_same_every_time():
 def test_what_is_simulated_again_holds_the_echoes_noise_and_clipping():
     block = WaveformBlock.from_samples(np.zeros((4000, 60), np.uint8))
     system = known_system(make_scene("flat").recording)
-    system = replace(system, noise_gain=0.05, saturation=200.0)
+    system = replace(system, noise=replace(system.noise, gain=0.05), saturation=200.0)
     waveform = np.arange(4000)
     echoes = EchoTable.build(waveform, np.full(4000, 30.0), np.where(waveform % 2, 100.0, 400.0), np.full(4000, 2.0))
     again, _ = simulate_again(block, system, echoes, np.random.default_rng(1))
     assert again.samples.dtype == np.uint8 and again.samples.max() == 200
     quiet, peak = again.samples[:, :15].astype(float), again.samples[1::2, 30].astype(float)
-    assert quiet.mean() == pytest.approx(system.baseline, abs=0.05)
-    assert (quiet - quiet.mean(axis=1, keepdims=True)).std() == pytest.approx(system.noise_std, rel=0.06)
-    assert peak.mean() == pytest.approx(system.baseline + 100, abs=0.3)
-    expected = np.sqrt(system.noise_std**2 + 0.05 * 100 + system.baseline_spread**2)
+    assert quiet.mean() == pytest.approx(system.noise.baseline, abs=0.05)
+    assert (quiet - quiet.mean(axis=1, keepdims=True)).std() == pytest.approx(system.noise.std, rel=0.06)
+    assert peak.mean() == pytest.approx(system.noise.baseline + 100, abs=0.3)
+    expected = np.sqrt(system.noise.std**2 + 0.05 * 100 + system.noise.baseline_spread**2)
     assert peak.std() == pytest.approx(expected, rel=0.06)
 
 

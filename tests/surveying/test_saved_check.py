@@ -10,6 +10,7 @@ from writer_tools import data_file
 from wavebatch.cli import main
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.system_file import load_survey
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import known_systems
 from wavebatch.surveying.systems.saved_check import find_contradiction
 from wavebatch.tools.api.strip import survey
@@ -50,7 +51,7 @@ def contradiction(strip, saved):
 def test_another_sensor_contradicts_and_another_scene_does_not(folder, name, plain):
     saved = load_survey(folder / "SYSTEM.toml").survey
     if plain:
-        saved = replace(saved, figures={key: saved.figures[key] for key in ("bits", "spacing_ns")})
+        saved = replace(saved, figures=Figures(bits=saved.figures.bits, spacing_ns=saved.figures.spacing_ns))
     found = contradiction(folder / f"{name}.las", saved)
     if plain and name == "noisy":
         return  # less than three times the noise: such files do not give that of quiet samples
@@ -69,14 +70,15 @@ def test_shipped_and_saved_surveys_of_real_strips_fit_their_own_strip_and_no_oth
     }
     for known in known_systems():
         own = survey(paths[known.name])
-        shipped = replace(own, system=replace(known.system, noise_std=own.system.noise_std))  # some have the pulse only
-        plain = replace(shipped, figures={key: shipped.figures[key] for key in ("bits", "spacing_ns")})
+        noise = replace(known.system.noise, std=own.system.noise.std)  # some have the pulse only
+        plain = replace(own, system=replace(known.system, noise=noise))
+        plain = replace(plain, figures=Figures(bits=own.figures.bits, spacing_ns=own.figures.spacing_ns))
         for name, path in paths.items():
             assert (contradiction(path, own) == "") == (name == known.name), (name, known.name)
             # Without figures of a look the limits are wide, and a canopy's echoes may be of any narrower pulse.
             hidden_by_canopy = (known.name, name) == ("riegl-q680i", "neon-gemini")
             assert (contradiction(path, plain) == "") == (name == known.name or hidden_by_canopy), (name, known.name)
-        assert contradiction(paths[known.name], replace(plain, figures={})) == ""
+        assert contradiction(paths[known.name], replace(plain, figures=Figures())) == ""
 
 
 def run(*arguments):

@@ -130,7 +130,7 @@ def test_the_survey_of_another_strip_proves_the_reference(tmp_path):
     system = tmp_path / "s.toml"
     call("survey", tmp_path / "level.las", "--divergence", GREEN.divergence, "-o", system)
     saved = load_survey(system).survey.system
-    assert saved.level_error is not None and 0 < saved.level_error < 0.01
+    assert saved.widths.error is not None and 0 < saved.widths.error < 0.01
     columns, true, _ = fly(tmp_path, [HILLSIDE], GREEN, 600, "--system", system)
     check(columns, "incidence_angle", true["incidence"], np.ones(len(true["plane"]), bool))
 
@@ -166,7 +166,7 @@ def test_the_survey_finds_the_divergence(tmp_path, divergence):
     write_strip(tmp_path / "s.las", [*roofs([10, 30]), Plane()], flight, 16_000, 3)
     call("survey", tmp_path / "s.las", "-o", tmp_path / "s.toml")
     figures = load_survey(tmp_path / "s.toml").survey.figures
-    seen, error = (figures[f"divergence_seen_{name}mrad"] for name in ("", "error_"))
+    seen, error = figures.divergence_seen_mrad, figures.divergence_seen_error_mrad
     assert abs(seen - divergence) < 3 * error < 0.3 * divergence
 
 

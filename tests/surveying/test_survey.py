@@ -22,14 +22,14 @@ def test_the_width_is_found_however_far_from_the_first_guess(sigma):
     system = survey_block(make_block(scene, 3000, seed=3)[0]).system
     # Half a sample is less than a width can be measured with (0.85): there it only has to be found.
     assert system.sigma_ref == pytest.approx(sigma, rel=0.03 if sigma > 0.5 else 0.1)
-    assert system.noise_std == pytest.approx(scene.recording.recorded_noise, rel=0.02)
+    assert system.noise.std == pytest.approx(scene.recording.recorded_noise, rel=0.02)
 
 
 @pytest.mark.parametrize("spacing", [0.5, 2.0])
 def test_widths_are_in_ns_whatever_the_spacing(spacing):
     scene = make_scene("flat", spacing=spacing, n_samples=160)
     survey = survey_block(make_block(scene, 2500, seed=3)[0])
-    assert survey.system.sigma_ref == pytest.approx(2.0, rel=0.02) and survey.figures["spacing_ns"] == spacing
+    assert survey.system.sigma_ref == pytest.approx(2.0, rel=0.02) and survey.figures.spacing_ns == spacing
 
 
 @pytest.mark.quick_cases("gaussian-gaussian", "leica-learned")
@@ -56,9 +56,9 @@ def test_the_simplest_pulse_that_serves_is_chosen(pulse, kind):
 def test_signal_dependent_noise_and_clipping_are_found():
     scene = make_scene("urban", noise_gain=0.1, saturation=150)
     survey = survey_block(make_block(scene, 6000, seed=5)[0])
-    assert survey.system.noise_gain == pytest.approx(0.1, rel=0.25)
-    assert survey.system.saturation == 150 and 0 < survey.figures["saturated_share"] < 0.1
-    assert survey.figures["largest_count"] == 150 and survey.figures["least_count"] >= 0
+    assert survey.system.noise.gain == pytest.approx(0.1, rel=0.25)
+    assert survey.system.saturation == 150 and 0 < survey.figures.saturated_share < 0.1
+    assert survey.figures.largest_count == 150 and survey.figures.least_count >= 0
     needed = {decision.part: decision.needed for decision in survey.decisions}
     assert needed["censored fit"] and needed["signal-dependent weights"]
 
@@ -74,7 +74,7 @@ def test_waveforms_of_several_lengths_are_surveyed_together():
     both, alone = survey_blocks(parts), survey_blocks([flat])
     assert both.waveforms == 2500 and both.system.digitizers == {}
     assert both.system.sigma_ref == pytest.approx(alone.system.sigma_ref, rel=0.01)
-    assert both.system.noise_std == pytest.approx(alone.system.noise_std, rel=0.02)
+    assert both.system.noise.std == pytest.approx(alone.system.noise.std, rel=0.02)
     assert join_digitizers([]) == [] and survey_blocks([]).waveforms == 0
 
 
@@ -83,15 +83,25 @@ def test_waveforms_of_several_lengths_are_surveyed_together():
 @pytest.mark.parametrize("gain", [0.0, 0.03, 0.2])
 def test_the_growth_of_noise_is_not_what_the_fit_leaves_of_it(gain):
     scene = make_scene("flat", noise_gain=gain, pulse=find_pulse("leica"), n_samples=100)
-    found = [survey_block(make_block(scene, 3000, seed=seed)[0]).system.noise_gain for seed in (6, 7, 8)]
-    assert np.mean(found) == pytest.approx(gain, rel=0.2)
+    found = [survey_block(make_block(scene, 3000, seed=seed)[0]).system.noise.gain for seed in (6, 7, 8)]
+    assert np.mean(found) == pytest.approx(gain, rel=0.15)
+
+
+@pytest.mark.parametrize(("width", "least"), [(1.2, 0.15), (2.0, 0.18), (3.5, 0.18)])
+def test_noise_that_grows_most_where_the_fit_takes_most_is_put_back(rng, width, least):
+    """In the middle of narrow echoes; 0.12 to 0.18 was found where 0.2 is true."""
+    n, x = 4096, np.arange(80)
+    light = 2 * rng.uniform(20, 80, (n, 1)) * np.exp(-0.5 * ((x - rng.uniform(15, 65, (n, 1))) / width) ** 2)
+    samples = np.rint(100 + light + rng.standard_normal((n, 80)) * np.sqrt(4 + 0.2 * light))
+    found = survey_block(WaveformBlock.from_samples(samples.astype(np.uint16)))
+    assert least < found.system.noise.gain < 0.21
 
 
 def test_any_waveforms_can_be_surveyed(rng):
     noise = rng.integers(0, 256, (50, 30)).astype(np.uint8)
     for samples in (noise, noise[:1], noise[:, :3], np.full((FIRST_LOOK + 9, 12), 255, np.uint8)):
         survey = survey_block(WaveformBlock.from_samples(samples))
-        assert np.isfinite([survey.system.sigma_ref, survey.system.noise_std]).all()
+        assert np.isfinite([survey.system.sigma_ref, survey.system.noise.std]).all()
         assert choose_chain(survey).steps
 
 
@@ -112,22 +122,22 @@ def test_riegl_is_what_is_known_of_it(riegl):
     after /= sum(w * np.exp(-0.5 * (delay / sigma) ** 2) for w, delay, sigma in system.components)
     assert 9.5 < lag[np.argmax(after)] < 11.5 and 0.02 < after.max() < 0.07
     assert system.ringing == pytest.approx(0.044, abs=0.01)
-    assert system.noise_std == pytest.approx(1.66, abs=0.15) and 1.7 < system.baseline < 2.8
+    assert system.noise.std == pytest.approx(1.66, abs=0.15) and 1.7 < system.noise.baseline < 2.8
     misfits = survey.figures
-    assert misfits["misfit_5_gaussians"] < 0.5 * misfits["misfit_2_gaussians"] < 0.5 * misfits["misfit_1_gaussians"]
-    assert abs(misfits["kappa"]) < 0.19 and misfits["misfit_skewed"] > 0.8 * misfits["misfit_1_gaussians"]
+    assert misfits.misfit_gaussians[5] < 0.5 * misfits.misfit_gaussians[2] < 0.5 * misfits.misfit_gaussians[1]
+    assert abs(misfits.kappa) < 0.19 and misfits.misfit_skewed > 0.8 * misfits.misfit_gaussians[1]
 
 
 def test_leica_is_what_is_known_of_it(leica):
     """A strong skew, which the skewed pulse halves and a learned one brings near the noise."""
     survey = _survey_file(leica)
     system, misfits = survey.system, survey.figures
-    assert len(system.components) >= 2 and 0.2 < misfits["kappa"] < 0.4
+    assert len(system.components) >= 2 and 0.2 < misfits.kappa < 0.4
     assert system.sigma_ref == pytest.approx(3.15, abs=0.1)
-    assert misfits["misfit_3_gaussians"] < 0.5 * misfits["misfit_skewed"] < 0.5 * misfits["misfit_1_gaussians"]
+    assert misfits.misfit_gaussians[3] < 0.5 * misfits.misfit_skewed < 0.5 * misfits.misfit_gaussians[1]
     # Coloured noise (.6, .55, .4 ...): what it does to the amplitude of a pulse is twice the noise of a sample.
-    assert system.noise_std == pytest.approx(1.7, abs=0.15) and misfits["empty_share"] == 0
-    assert system.correlation[:3] == pytest.approx((0.6, 0.54, 0.36), abs=0.08)
+    assert system.noise.std == pytest.approx(1.7, abs=0.15) and misfits.empty_share == 0
+    assert system.noise.correlation[:3] == pytest.approx((0.6, 0.54, 0.36), abs=0.08)
 
 
 def test_a_survey_depends_on_the_samples_only():

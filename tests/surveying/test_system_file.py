@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.system import Defects, LevelWidths, Radiometry, ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.text_file import write_text
 from wavebatch.surveying import Decision, Survey, survey_block
@@ -22,26 +23,26 @@ from wavebatch.surveying.system_file import (
     load_survey,
     parse_survey,
 )
-from wavebatch.surveying.systems.system_table import QUANTITIES
+from wavebatch.surveying.systems.figures import Figures, Kind, Level, Look
+from wavebatch.surveying.systems.system_table import NUMBERS, ROWS
 
 SYSTEM = SystemPulse(
     sigma_ref=1.8581162121217176,
-    baseline=3.6834210432062053,
-    baseline_spread=0.1 + 0.2,
-    noise_std=1.2997285311240736,
-    noise_by_kind={"quiet": 1 / 3, "tail smoothed": 2e-7, "core": 1e22},
-    noise_gain=5e-324,
+    noise=ReceiverNoise(
+        baseline=3.6834210432062053,
+        baseline_spread=0.1 + 0.2,
+        std=1.2997285311240736,
+        by_kind={"quiet": 1 / 3, "tail smoothed": 2e-7, "core": 1e22},
+        gain=5e-324,
+        correlation=(0.63, 1 / 7, -0.1),
+        recovery=42.0,
+    ),
     kappa=-0.1,
     components=((1.0, 0.0, 1.8836713464397783), (-0.03361226544360852, 10.587040699291984, 1.5927024379059929)),
     ringing=0.04428410627806453,
     saturation=255.0,
     acceptance=18.0,
-    correlation=(0.63, 1 / 7, -0.1),
-    pattern=(0.1, -0.1 / 3),
-    slope_spread=1 / 7,
-    spikes=0.08,
-    transient=2.0,
-    recovery=42.0,
+    defects=Defects(pattern=(0.1, -0.1 / 3), slope_spread=1 / 7, spikes=0.08, transient=2.0),
     tail_misfit=((-9.3, 0.0021), (5.574348636365153, 0.1 + 0.2)),
     misfit=0.1 / 3,
     hidden=((0.035, 1 / 7, 0.0), (0.07, 0.1 + 0.2, 1e-9)),
@@ -49,7 +50,7 @@ SYSTEM = SystemPulse(
 SURVEY = Survey(
     SYSTEM,
     2311,
-    {"empty_share": 0.1, "kappa": np.float64(0.05534052830222781), "misfit_1_gaussians": 1e-17},
+    Figures(empty_share=0.1, kappa=np.float64(0.05534052830222781), misfit_gaussians={1: 1e-17}),
     (Decision("growth of fits", True, 'says "11 %",\nin two lines \\ with a \x7f'), Decision("ä", False, "")),
 )
 FINGERPRINT = {"size": 12345678901, "sha256_sampled": "ab" * 32, "packets": {"size": 7, "sha256_sampled": "cd" * 32}}
@@ -82,10 +83,13 @@ positive = st.floats(1e-3, 1e4)
 )
 def test_any_system_comes_back_to_the_last_bit(width, numbers, gain, rows, reason, saturation, correlation, tail):
     system = SystemPulse(
-        sigma_ref=width, baseline=numbers[0], noise_gain=gain, components=tuple(rows), saturation=saturation,
-        correlation=tuple(correlation), tail_misfit=tuple(tail),
-    )  # fmt: skip
-    survey = Survey(system, 1, {"a figure": numbers[1]}, (Decision("part", False, reason),))
+        sigma_ref=width,
+        noise=ReceiverNoise(baseline=numbers[0], gain=gain, correlation=tuple(correlation)),
+        components=tuple(rows),
+        saturation=saturation,
+        tail_misfit=tuple(tail),
+    )
+    survey = Survey(system, 1, Figures(least_count=numbers[1]), (Decision("part", False, reason),))
     assert _same(parse_survey(format_survey(SavedSurvey(survey)), "x"), SavedSurvey(survey))
 
 
@@ -96,19 +100,29 @@ def test_a_real_survey_comes_back():
 
 
 def test_figures_that_are_no_numbers_are_left_out():
-    text = format_survey(SavedSurvey(Survey(SYSTEM, 0, {"good": 1.0, "bad": math.nan}, ())))
-    assert dict(parse_survey(text, "x").survey.figures) == {"good": 1.0}
+    text = format_survey(SavedSurvey(Survey(SYSTEM, 0, Figures(bits=1.0, kappa=math.nan), ())))
+    assert parse_survey(text, "x").survey.figures == Figures(bits=1.0)
+
+
+def test_figures_of_other_versions_are_left_out_and_a_flight_is_whole_or_none():
+    others = "new_figure = 3.0\nflight_width = 2.0\nflight_descriptor_1_bits = 8.0\n"
+    text = TEXT.replace("[figures]\n", f"[figures]\n{others}")
+    assert parse_survey(text, "x").survey.figures == SURVEY.figures
+    look = Look(Level(7, 12.0, 0.5, 1.0, 99, None), 2.0, 0.9, 0.01)
+    figures = replace(SURVEY.figures, look=look, kinds={3: Kind(8.0, 1.0, 0.5, -1.0), 12: Kind(16.0, 2.0, 1.0, 0.0)})
+    assert parse_survey(format_survey(SavedSurvey(Survey(SYSTEM, 5, figures))), "x").survey.figures == figures
 
 
 def test_every_number_of_the_system_has_a_key():
-    fields = {quantity.field for quantity in QUANTITIES.values()} | {"noise_by_kind", "components", "digitizers"}
-    fields |= {"correlation", "tail_misfit", "pattern", "seams", "hidden"}
+    keys = {entry.field for entry in (NUMBERS | ROWS).values()} | {"noise.by_kind", "digitizers"}
     # Of a calibration and of the sensor's position, which come with files of their own.
-    elsewhere = {"calibration", "calibration_err", "channels", "attenuation", "sensor_error", "shot_error"}
+    elsewhere = {"constant", "constant_error", "channels", "attenuation", "sensor_error", "shot_error"}
     elsewhere |= {"attenuation_error", "swath"}
+    parts = {"noise": ReceiverNoise, "defects": Defects, "widths": LevelWidths, "radiometry": Radiometry}
+    fields = set(SystemPulse.__dataclass_fields__) - set(parts)
+    fields |= {f"{name}.{field}" for name, part in parts.items() for field in part.__dataclass_fields__}
     # Set by a chain while it runs.
-    elsewhere |= {"other_pulse"}
-    assert fields | elsewhere == set(SystemPulse.__dataclass_fields__)
+    assert keys | {f"radiometry.{name}" for name in elsewhere} | {"other_pulse"} == fields
 
 
 def test_figures_decisions_and_fingerprint_may_be_missing():
@@ -116,10 +130,10 @@ def test_figures_decisions_and_fingerprint_may_be_missing():
     text = f'schema = "{SYSTEM_SCHEMA}"\n' + TEXT[start : TEXT.index("[figures]")]
     saved = parse_survey(text, "x")
     assert saved.survey.system == SYSTEM
-    assert not saved.survey.figures and saved.survey.decisions == () and not saved.fingerprint
+    assert saved.survey.figures == Figures() and saved.survey.decisions == () and not saved.fingerprint
 
 
-@pytest.mark.parametrize("key", [key for key in QUANTITIES if not QUANTITIES[key].optional])
+@pytest.mark.parametrize("key", [key for key in NUMBERS if not NUMBERS[key].optional])
 def test_a_missing_quantity_is_named(key):
     text = re.sub(rf"^{key} = .*\n", "", TEXT, flags=re.M)
     with pytest.raises(ConfigError, match=rf"x\.toml: \[system\]: key '{key}' is missing"):
@@ -135,7 +149,7 @@ def test_files_of_earlier_versions_are_read():
     text = re.sub(r"^(correlation|tail_misfit|misfit|hidden) = .*\n", "", TEXT, flags=re.M)
     assert text.count("\n") == TEXT.count("\n") - 4
     system = parse_survey(text, "x").survey.system
-    assert system == replace(SYSTEM, correlation=(), tail_misfit=(), misfit=0.0, hidden=())
+    assert system == replace(SYSTEM, noise=replace(SYSTEM.noise, correlation=()), tail_misfit=(), misfit=0.0, hidden=())
 
 
 @pytest.mark.parametrize(
@@ -204,7 +218,7 @@ def test_files_from_before_the_skew_stay_readable():
     system = parse_survey(old, "x").survey.system
     assert system.skew is None and system.skew_spread == 0.0
     known = replace(SYSTEM, skew=0.2345678901234567, skew_spread=0.05)
-    again = parse_survey(format_survey(SavedSurvey(Survey(known, 1, {}, ()))), "x").survey.system
+    again = parse_survey(format_survey(SavedSurvey(Survey(known, 1))), "x").survey.system
     assert (again.skew, again.skew_spread) == (known.skew, known.skew_spread)
 
 

@@ -20,6 +20,8 @@ from wavebatch.tools.simulate import find_scene, simulate_strip, strip
 from wavebatch.tools.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, Flight, trace_rays
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS
 
+pytestmark = pytest.mark.kept_surveys
+
 
 def call(*arguments):
     return CliRunner().invoke(main, list(map(str, arguments)))

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from helpers_scenes import make_scene
 
 from wavebatch.cli import main
+from wavebatch.core.system import Radiometry
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.flat_ground import Slopes, measure_reference
@@ -131,24 +132,24 @@ def test_level_ground_is_told_from_the_swath(half_angle):
     made = simulate_seed_block(replace(SCENE, flight=Flight(640.0, half_angle=half_angle, look_ahead=0.0)), 6, 0)
     back = made.rays.direction / AIR_SPEED * made.rays.distance[:, None]
     block = replace(made.block, sensor=made.rays.ground - back)
-    surveyed = replace(survey_block(block).system, divergence=SCENE.divergence)
+    surveyed = survey_block(block).system.with_radiometry(divergence=SCENE.divergence)
     true = SCENE.recording.pulse.sigma
     assert surveyed.sigma_ref / true > 1.005
     known = Slopes(block, made.rays.incidence, np.full(len(block), np.radians(0.3)))
     seen = measure_reference([known], surveyed, block.spacing).system
-    assert np.sqrt(seen.sigma_ref**2 + seen.level_variance) == pytest.approx(true, rel=0.002)
-    assert seen.width_scatter < 0.01 * true
+    assert np.sqrt(seen.sigma_ref**2 + seen.widths.variance) == pytest.approx(true, rel=0.002)
+    assert seen.widths.scatter < 0.01 * true
 
 
 @pytest.mark.slow
 def test_a_reference_that_no_surface_shows_is_no_reference():
     block = simulate_seed_block(make_scene("empty"), 1, 0).block
-    system = SystemPulse(2.0, divergence=0.5)
+    system = SystemPulse(2.0, radiometry=Radiometry(divergence=0.5))
     unknown = Slopes(replace(block, sensor=block.origin), *np.full((2, len(block)), np.nan))
     for samples in ([], [unknown], [unknown._replace(block=block)]):
         seen = measure_reference(samples, system, 1.0)
-        assert np.isinf(seen.system.level_error) and seen.divergence is None and seen.echoes == 0
-    blind = replace(system, divergence=None)
+        assert np.isinf(seen.system.widths.error) and seen.divergence is None and seen.echoes == 0
+    blind = system.with_radiometry(divergence=None)
     assert measure_reference([unknown], blind, 1.0).system == blind
 
 

@@ -75,7 +75,7 @@ def test_tails_are_no_baseline(share, length):
     signal, rows, time, _ = render(tailed(share, length), 1, amplitude=(60, 200))
     block = digitize(signal, 1)
     system, echoes = decompose(block)
-    assert abs(error_before(block, system, echoes)) < 0.2 and abs(system.baseline - BASE) < 0.2
+    assert abs(error_before(block, system, echoes)) < 0.2 and abs(system.noise.baseline - BASE) < 0.2
     found, true, _ = compare(echoes, rows, time)
     assert found > 0.995 and true > 0.985
 
@@ -92,7 +92,7 @@ def test_samples_before_the_pulse_agree_with_the_baseline(strip, request):
 
 def test_ordinary_strips_keep_all_quiet_samples():
     signal, *_ = render(bell, 2, second=0.5)
-    assert survey_block(digitize(signal, 2)).system.recovery == 0
+    assert survey_block(digitize(signal, 2)).system.noise.recovery == 0
 
 
 def optech(x):
@@ -130,7 +130,7 @@ def test_spikes_of_one_sample_are_no_echoes():
     at, place = np.flatnonzero(rng.random(len(signal)) < 0.08), rng.integers(1, 79, len(signal))
     signal[at, place[at]] += rng.uniform(6, 80, len(at)) * rng.choice([1, -1], len(at), p=[0.8, 0.2])
     system, found, true = scores(digitize(signal, 5), rows, time)
-    assert system.spikes == pytest.approx(0.08, rel=0.25)
+    assert system.defects.spikes == pytest.approx(0.08, rel=0.25)
     assert found > 0.985 and true > 0.985
 
 
@@ -156,8 +156,8 @@ def test_converters_that_take_turns_are_made_alike():
     signal, rows, time, _ = render(bell, 6, amplitude=(4, 40))
     pattern = np.tile([0.6, -0.6], 40)
     system, found, true = scores(digitize(signal + pattern, 6), rows, time)
-    assert system.pattern == pytest.approx([0.6, -0.6, 0.6, -0.6], abs=0.03)
-    assert system.noise_std == pytest.approx(np.hypot(0.7, 0.289), rel=0.06)
+    assert system.defects.pattern == pytest.approx([0.6, -0.6, 0.6, -0.6], abs=0.03)
+    assert system.noise.std == pytest.approx(np.hypot(0.7, 0.289), rel=0.06)
     assert found > 0.9 and true > 0.985
 
 
@@ -169,7 +169,7 @@ def test_jumps_at_the_start_are_no_echoes(everywhere):
     signal[:, 0] += jump
     signal[:, 1] += 0.4 * jump
     system, found, true = scores(digitize(signal, 7), rows, time)
-    assert 2 <= system.transient <= 3
+    assert 2 <= system.defects.transient <= 3
     assert found > 0.99 and true > 0.993
 
 
@@ -177,7 +177,7 @@ def test_sloping_baselines_hide_no_echo():
     signal, rows, time, _ = render(bell, 8, s=120, amplitude=(6, 100))
     slope = 0.08 * np.random.default_rng(8).standard_normal((3000, 1))
     system, found, true = scores(digitize(signal, 8, base=40 + slope * (np.arange(120) - 59.5)), rows, time)
-    assert system.slope_spread == pytest.approx(0.08, rel=0.1)
+    assert system.defects.slope_spread == pytest.approx(0.08, rel=0.1)
     assert found > 0.99 and true > 0.99
 
 
@@ -212,7 +212,7 @@ def test_strips_without_defects_keep_their_counts():
     for pulse, seed in ((bell, 9), (tailed(0.012, 30.0), 10)):
         block = digitize(render(pulse, seed, second=0.3)[0], seed)
         system = survey_block(block).system
-        assert not system.has_defects and clean_block(block, system) is block
+        assert not system.defects and clean_block(block, system) is block
         assert not survey_blocks([block]).system.seams
 
 

@@ -9,6 +9,7 @@ from click.testing import CliRunner
 
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.system import LevelWidths, ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
@@ -17,7 +18,7 @@ from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.angle_limits import REFERENCE_ERROR, SLOPE, predict_angles
 from wavebatch.tools.compare.angle_table import ANGLES, format_angles, tabulate_angles
 
-GAUSSIAN = SystemPulse(sigma_ref=2.0, baseline=12.0, noise_std=1.0, width_scatter=0.01)
+GAUSSIAN = SystemPulse(sigma_ref=2.0, noise=ReceiverNoise(baseline=12.0, std=1.0), widths=LevelWidths(scatter=0.01))
 
 
 def run(*words):
@@ -41,13 +42,13 @@ def test_errors_are_those_that_the_survey_predicts():
 
 
 def test_level_ground_that_is_wider_than_the_pulse_shifts_the_table():
-    wide = replace(GAUSSIAN, level_variance=0.5)
+    wide = replace(GAUSSIAN, widths=replace(GAUSSIAN.widths, variance=0.5))
     found = tabulate_angles(wide, 1.0, 700.0, 0.5, 80.0)
     assert found.width[0] == pytest.approx(FWHM_PER_SIGMA * np.sqrt(4.5), rel=1e-3)
 
 
 def test_angles_that_no_width_means_are_empty():
-    found = tabulate_angles(replace(GAUSSIAN, level_variance=-3.999), 1.0, 700.0, 0.5, 80.0)
+    found = tabulate_angles(replace(GAUSSIAN, widths=replace(GAUSSIAN.widths, variance=-3.999)), 1.0, 700.0, 0.5, 80.0)
     text = format_angles(found).splitlines()
     assert np.isnan(found.width[0]) and text[1].split(",")[2:4] == ["", ""]
 
@@ -87,9 +88,9 @@ def test_errors_are_those_of_many_echoes_through_the_stage_and_do_not_jump(ampli
     block = WaveformBlock.from_samples(np.zeros((1, 2), np.uint8), bits=8, spacing=1.0)
     for angle in (0, 3, 10, 30, 60):
         true = found.width[angle] / FWHM_PER_SIGMA
-        bound = bound_time(amplitude, true, GAUSSIAN.noise_std, 1.0)
+        bound = bound_time(amplitude, true, GAUSSIAN.noise.std, 1.0)
         # The survey's widths scatter, and its reference has an error, as the stage assumes.
-        width = true + rng.normal(0, np.hypot(bound, GAUSSIAN.width_scatter), 4000)
+        width = true + rng.normal(0, np.hypot(bound, GAUSSIAN.widths.scatter), 4000)
         width += rng.normal(0, 2.0 * 2.0 * REFERENCE_ERROR / (2 * true) * 2.0, 4000)
         zero = np.zeros(len(width))
         echoes = EchoTable.build(zero.astype(int), zero, zero + amplitude, width, sigma_err=zero + bound)
@@ -111,9 +112,11 @@ def test_what_is_not_known_of_level_ground_is_in_the_error_of_every_angle(level_
     """The least variance of a facing surface has an error, which no strong echo can undercut."""
     block = WaveformBlock.from_samples(np.zeros((1, 2), np.uint8), bits=8, spacing=1.0)
     echoes = EchoTable.build([0, 0], [5.0, 30.0], [1e4, 50.0], [2.5, 2.5], sigma_err=np.array([1e-4, 0.05]))
-    sharp = replace(GAUSSIAN, width_scatter=0.0)
+    sharp = replace(GAUSSIAN, widths=replace(GAUSSIAN.widths, scatter=0.0))
     alone = added_variance(block, sharp, echoes, "system", 1e-4)[1]
-    found = added_variance(block, replace(sharp, level_error=level_error), echoes, "system", 1e-4)[1]
+    system = replace(sharp, widths=replace(sharp.widths, error=level_error))
+    found = added_variance(block, system, echoes, "system", 1e-4)[1]
     assert found == pytest.approx(np.hypot(alone, level_error), rel=1e-6) and found.min() >= level_error
-    flat, given = (tabulate_angles(one, 1.0, 700.0, 0.5, 1000.0) for one in (sharp, replace(sharp, level_error=0.2)))
+    unsure = replace(sharp, widths=replace(sharp.widths, error=0.2))
+    flat, given = (tabulate_angles(one, 1.0, 700.0, 0.5, 1000.0) for one in (sharp, unsure))
     assert (given.error[10:70] > 2 * flat.error[10:70]).all()

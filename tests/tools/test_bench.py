@@ -18,12 +18,14 @@ from bench.jobs_model import Parts
 from bench.promises import SPEEDS, judge
 from bench.release import SCENES, format_release, measure_cases, read_options
 from bench.stability import FAILURES, count_changes, count_failures
+from bench_tools import time_here
 from click.testing import CliRunner
 
 import wavebatch
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
@@ -46,7 +48,19 @@ SMALL = BenchOptions(
 
 @pytest.fixture(scope="module")
 def document():
-    """A small benchmark with everything in it."""
+    """A small benchmark with everything in it, whose chains are timed in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        time_here(patch)
+        return measure_small()
+
+
+@pytest.fixture(scope="module")
+def timed_document():
+    """The same, timed in processes of their own."""
+    return measure_small()
+
+
+def measure_small():
     found = run_bench(SMALL, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=60))
     cases = measure_cases(SMALL, list_cases(["H10"]), lambda text: None, waveforms=90)
     return {**found, "stability": cases, "promises": judge(found)}
@@ -57,7 +71,8 @@ def find_row(document, name):
 
 
 @pytest.mark.slow
-def test_document_has_a_row_per_chain_and_peer(document):
+def test_document_has_a_row_per_chain_and_peer(timed_document):
+    document = timed_document
     assert document["schema"] == command.SCHEMA
     names = [row["name"] for row in document["scenes"][0]["rows"]]
     assert names[:4] == ["fast", "balanced", "accurate", "auto"] and "scipy leastsq" in names
@@ -201,7 +216,7 @@ def test_groups_differ_and_are_surveyed():
 def known_group(n=300) -> Group:
     scene = find_bench_scene("flat")
     ((block, truth),) = simulate_blocks(scene, n, seed=2, size=n)
-    return make_group(scene, 0, block, truth, Survey(SystemPulse(2.0, noise_std=1.04), n, {}, ()))
+    return make_group(scene, 0, block, truth, Survey(SystemPulse(2.0, noise=ReceiverNoise(std=1.04)), n))
 
 
 def test_tally_of_perfect_echoes_and_of_none():
@@ -296,13 +311,13 @@ def test_worker_answers_raises_and_dies():
             worker.call(os.stat, "/no/such/file")
         memory = worker.call(peak_memory)
         assert memory is None or 5e6 < memory < 1e9
-        worker.submit(time.sleep, 60)
+        worker.submit(time.sleep, 600)
         with pytest.raises(TimeoutError):
             worker.take(0.05)
     with Worker() as worker:
         worker.submit(os._exit, 3)
         with pytest.raises(WorkerDied):
-            worker.take(30)
+            worker.take(300)
 
 
 FAKE = """
@@ -327,10 +342,11 @@ def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()
     samples[7, 40], samples[20, 40] = 950, 850
-    result = peers.run_peer("gdecomp", replace(block, samples=samples), SystemPulse(2.0, baseline=12.0, noise_std=1.04))
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.04))
+    result = peers.run_peer("gdecomp", replace(block, samples=samples), system)
     assert result.failures == 2 and result.waveforms == 38
     assert sorted(set(range(40)) - set(result.found.waveform.tolist())) == [7, 20]
-    group = make_group(scene, 0, block, truth, Survey(SystemPulse(2.0), 40, {}, ()))
+    group = make_group(scene, 0, block, truth, Survey(SystemPulse(2.0), 40))
     tally = Tally()
     tally.add(group, result.found)
     assert tally.figures()["completeness"].value == pytest.approx(38 / 40)

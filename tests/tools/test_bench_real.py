@@ -13,6 +13,7 @@ from strips import make_raw
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import InputError
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
@@ -50,7 +51,7 @@ def make_pool(samples, path="made.las"):
 
 
 def level_solver(**system):
-    survey = Survey(SystemPulse(**system), 0, {}, ())
+    survey = Survey(SystemPulse(**system), 0)
     return Solver(survey, choose_chain(survey))
 
 
@@ -101,7 +102,8 @@ def test_seed_decides_all_and_json_holds_it(strip):
 def test_a_wrong_survey_is_seen(strip, report, monkeypatch):
     def deaf(blocks):
         survey = survey_blocks(blocks)
-        return replace(survey, system=replace(survey.system, noise_std=4 * survey.system.noise_std))
+        noise = replace(survey.system.noise, std=4 * survey.system.noise.std)
+        return replace(survey, system=replace(survey.system, noise=noise))
 
     monkeypatch.setattr(pool, "survey_blocks", deaf)
     found = measure_real(strip, injections=2000)
@@ -125,7 +127,7 @@ def test_values_before_rounding_keep_variance_and_correlation():
 def test_noise_of_short_quiet_stretches_is_not_too_small():
     samples = np.rint(20 + correlated(3000, 8)).astype(np.uint8)
     made = make_pool(samples)
-    found = measure_noise(made, level_solver(sigma_ref=2.0, baseline=20.0), [EchoTable.empty()])
+    found = measure_noise(made, level_solver(sigma_ref=2.0, noise=ReceiverNoise(baseline=20.0)), [EchoTable.empty()])
     assert found.std == pytest.approx(np.hypot(0.9, 12**-0.5), rel=0.12)
     assert found.correlation[0] == pytest.approx(0.6 * 0.81 / (0.81 + 1 / 12), abs=0.1)
 
@@ -192,7 +194,7 @@ def test_surveys_of_parts_agree(strip):
 def test_agreement_sees_a_survey_that_is_off(strip):
     whole = read_pool(strip, 500)
     one = Solver.of_blocks(whole.blocks)
-    wide = replace(one.survey, system=replace(one.system, noise_std=8.0, acceptance=120.0))
+    wide = replace(one.survey, system=replace(one.system, noise=replace(one.system.noise, std=8.0), acceptance=120.0))
     row = compare_solvers("made", one, Solver(wide, one.chain), whole.blocks)
     assert row.differ > 0.01 and row.surveys[1].noise == 8.0
     assert compare_solvers("same", one, one, whole.blocks).differ == 0

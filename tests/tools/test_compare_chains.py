@@ -9,6 +9,7 @@ from click.testing import CliRunner
 
 from wavebatch.cli import main
 from wavebatch.core.errors import InputError
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Step
@@ -103,7 +104,7 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed, monkeypatch):
 def test_tables_of_wagner_et_al(seed):
     """T6: Gaussian decomposition with ASDF: 80 % and more identical, |median| < 0.002 ns, rms 0.10 to 0.16 ns."""
     block = wagner_waveforms(4000, seed)
-    system = SystemPulse(2.0, baseline=20.0, noise_std=1.04)
+    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=20.0, std=1.04))
     chains = make_chain("maximum", "gaussian"), make_chain("asdf", "none", rule="paper", interpolation="parabola")
     runs = {key: ChainRun(chain, system, 1.0) for key, chain in zip("ab", chains, strict=True)}
     found = match_chains(iter([block.rows(slice(0, 2500)), block.rows(slice(2500, None))]), runs, ("GD", "ASDF"), 1.0)

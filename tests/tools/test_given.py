@@ -32,6 +32,6 @@ def test_noise_and_system_are_those_of_the_receiver(rng):
     assert len(truth) == 0
     assert np.std(block.samples) == pytest.approx(noise.std[0], rel=0.01)
     assert np.mean(block.samples) == pytest.approx(noise.baseline[0], abs=0.02)
-    assert (system.sigma_ref, system.baseline) == (2.0, 20.0)
-    assert system.noise_std == pytest.approx(np.hypot(1.5, np.sqrt(1 / 12)))
+    assert (system.sigma_ref, system.noise.baseline) == (2.0, 20.0)
+    assert system.noise.std == pytest.approx(np.hypot(1.5, np.sqrt(1 / 12)))
     assert known_noise(recording, 2, least=9.0).std.tolist() == [9, 9]

@@ -103,7 +103,7 @@ def test_energies_and_pulse_are_those_that_were_sent(tmp_path, rng, fwhm):
         assert error.std() < 1.3 * points[f"{name}_err"].mean() < 0.03, name
     assert found.outgoing["energy_scatter"] == pytest.approx(energies.std(), abs=0.004)
     saved = load_survey(tmp_path / "o.system.toml").survey
-    assert saved.figures["outgoing_fwhm_ns"] == pytest.approx(fwhm, rel=0.02)
+    assert saved.figures.outgoing_fwhm_ns == pytest.approx(fwhm, rel=0.02)
     assert saved.system.sigma_ref * 2.35482 == pytest.approx(fwhm, rel=0.02)
 
 

@@ -16,9 +16,9 @@ from wavebatch.cli import main
 from wavebatch.core.condition import read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud import echo_reader as io_cloud
 from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots import raster, values
 from wavebatch.tools.plots.histogram import count_flags, count_values, place_edges
 from wavebatch.tools.plots.raster import grid_values

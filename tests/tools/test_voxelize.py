@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.las.header import read_header
@@ -33,8 +34,8 @@ from wavebatch.tools.voxels.floor import Floor
 from wavebatch.tools.voxels.profile import Deconvolution, _pulse_taps, deconvolve_block
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
-SYSTEM = SystemPulse(2.0, baseline=12.0, baseline_spread=0.4, noise_std=1.05)
-SAVED = SavedSurvey(Survey(SYSTEM, 1000, {}, ()))
+SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.4, std=1.05))
+SAVED = SavedSurvey(Survey(SYSTEM, 1000))
 DOWN = np.array([0.0, 0.0, -HALF_C])
 
 
@@ -220,7 +221,7 @@ def test_two_surfaces_that_the_waveform_shows_as_one_are_two_layers(tmp_path, it
         block, _ = next(reader.read_blocks(reader.read_unit(0, reader.scan()), 500, True))
     mean = block.samples.mean(axis=0)
     assert np.count_nonzero((mean[1:-1] > mean[:-2]) & (mean[1:-1] >= mean[2:]) & (mean[1:-1] > 20)) == 1
-    saved = SavedSurvey(Survey(pulse, 150, {}, ()))
+    saved = SavedSurvey(Survey(pulse, 150))
     method = Deconvolution(iterations=iterations)
     _, found = voxelize(strip, tmp_path / "v.npz", 0.3, system=saved, deconvolution=method)
     layers = sum_by_layer(found)

@@ -24,7 +24,7 @@ COUNTS: dict[str, str] = {
     "waveforms": "packets that went through the chain, each once however many points share it",
     "echoes": "echoes found in them",
     "matched_returns": "points whose echo was found",
-    "unmatched_returns": "points in a packet with echoes, none of which is theirs; passed through",
+    "unmatched_returns": "points in a packet with echoes, but without an echo of their own; passed through",
     "no_echo_returns": "points in a packet without any echo; passed through",
     "added_echoes": "echoes that the input does not have as a return",
     "points_out": "points written",

@@ -15,11 +15,11 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_names import describe_roundings
-from wavebatch.stages.decompose.rebuild import loop_model
+from wavebatch.stages.decompose.loops import loop_model
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.sensor import SensorSource
-from wavebatch.surveying.systems.known_systems import COMPARED, find_source
+from wavebatch.surveying.systems.known_systems import find_source
 
 _ANGLE = "incidence_angle"
 
@@ -35,6 +35,10 @@ suits a strip; 35 % on a RIEGL and 80 % on a Leica strip of Gaussians in place o
 
 INVERTED = 5.0
 """Signals are inverted where counts reach this many times further below the baseline than above it."""
+
+MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
+"""Share of the echoes in doubt, because another pulse, misfit or noise serves as well, from which a survey's pulse is
+called a guess; of a known pulse, from which its noise is."""
 
 _NEEDS: dict[str, tuple[NoData, ...]] = {
     "range": (),
@@ -148,8 +152,8 @@ def _name_raised(prepared: Prepared) -> Iterator[str]:
     step, survey = prepared.choice.chain.steps[2], prepared.choice.survey
     if step.stage.name != "decompose.residual_loop":
         return
-    given, noise = step.effective(), survey.system.noise_std
-    unit = {"count": 1.0, "amplitude": survey.figures.get("amplitude_50", 0.0)}.get(given["t_unit"], 0.0)
+    given, noise = step.effective(), survey.system.noise.std
+    unit = {"count": 1.0, "amplitude": survey.figures.amplitude_50 or 0.0}.get(given["t_unit"], 0.0)
     if 0 < unit * given["t_diff"] < noise:
         yield (
             f"decompose.residual_loop: t_diff = {given['t_diff']:g} (unit {given['t_unit']}) lies below the noise of "
@@ -186,29 +190,34 @@ def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
     if points and not waveforms:
         yield f"none of {points} points has a waveform: all are written unchanged, without attributes"
     elif waveforms >= LEAST_JUDGED and not echoes:
-        figures, system = prepared.choice.survey.figures, prepared.system
-        down = system.baseline - figures.get("least_count", system.baseline)
-        up = figures.get("largest_count", system.baseline) - system.baseline
+        figures, noise = prepared.choice.survey.figures, prepared.system.noise
+        least, largest = figures.least_count, figures.largest_count
+        down = 0.0 if least is None else noise.baseline - least
+        up = 0.0 if largest is None else largest - noise.baseline
         reason = "nothing rises far enough above the noise"
-        if down > INVERTED * max(up, system.noise_std):
-            reason = f"the signal falls from {system.baseline:.0f} to {system.baseline - down:.0f} DN: it is inverted"
+        if down > INVERTED * max(up, noise.std):
+            reason = f"the signal falls from {noise.baseline:.0f} to {noise.baseline - down:.0f} DN: it is inverted"
         yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` shows what the strip records"
 
 
 def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """A system pulse that is a guess: the survey had too few echoes to measure it, or to tell it from plants."""
-    found, system = prepared.choice.survey, prepared.system
-    alone, drawn = found.figures.get("isolated_echoes"), "pulse_cost" in found.figures
-    if not report.count("echoes") or alone is None or (drawn and find_source(system) is not None):
+    """A pulse or noise that is a guess: too few echoes to learn a pulse from, or echoes that another one does not find.
+    """
+    figures, system = prepared.choice.survey.figures, prepared.system
+    alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
+    if not report.count("echoes") or alone is None:
         return
-    reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed" if alone < FEW else ""
-    if drawn and not reason and found.waveforms < COMPARED:
-        reason = f"only {found.waveforms} waveforms, with close echoes in most of them"
+    known = figures.pulse_cost is not None and find_source(system) is not None
+    most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
+    reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
+    if alone < FEW and not (known or system.components):
+        reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
     if reason:
+        guess = f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
+        guess = f"noise is a guess, of {system.noise.std:.3g} DN" if known else guess
         yield (
-            f"the survey found {reason}: the system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns, "
-            "and widths, errors and the number of echoes depend on it; give --system, a survey of a longer strip of "
-            "this sensor"
+            f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
+            "give --system, a survey of a longer strip of this sensor"
         )
 
 
@@ -299,8 +308,8 @@ def explain_absence(prepared: Prepared) -> dict[str, str]:
     dict of str to str
         The reason by column.
     """
-    chain, system = prepared.job.chain, prepared.system
-    lacks = {NoData.NOT_CALIBRATED: system.calibration is None, NoData.NO_DIVERGENCE: system.divergence is None}
+    chain, known = prepared.job.chain, prepared.system.radiometry
+    lacks = {NoData.NOT_CALIBRATED: known.constant is None, NoData.NO_DIVERGENCE: known.divergence is None}
     reasons = {}
     for column, needs in _NEEDS.items():
         if column not in chain.makes:
@@ -323,10 +332,10 @@ def _explain(prepared: Prepared, report: RunReport, column: str, counts: Mapping
 def _look_out(prepared: Prepared, report: RunReport) -> AngleOutlook | None:
     """How good angles from widths are on the strip; None where distance or divergence is unknown."""
     parameters = angle_parameters(prepared.job.chain) or {}
-    divergence = parameters.get("divergence") or prepared.system.divergence
+    divergence = parameters.get("divergence") or prepared.system.radiometry.divergence
     distance = prepared.sensor.distance
     amplitude = AMPLITUDE_BINS.quantile(report.amplitude, 0.5)
-    spacing = prepared.choice.survey.figures.get("spacing_ns")
+    spacing = prepared.choice.survey.figures.spacing_ns
     if not (divergence and distance and amplitude and spacing):
         return None
     return predict_angles(prepared.system, spacing, distance, divergence, amplitude, parameters["max_error"])

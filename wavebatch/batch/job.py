@@ -49,7 +49,8 @@ class StripJob:
         """Return the chain with the physical stages that trajectory, calibration and divergence allow, and those of the
         columns that are asked for.
         """
-        sources = (self.calibration, self.request.system and self.request.system.survey.system)
+        saved = self.request.system
+        sources = (self.calibration, saved and saved.survey.system.radiometry)
         divergence = any(source is not None and source.divergence is not None for source in sources)
         given = self.sensor != SensorRequest()
         chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
@@ -61,7 +62,7 @@ class StripJob:
         if self.attenuation is None:
             return system
         value, error = self.attenuation
-        return replace(system, attenuation=value, attenuation_error=error)
+        return system.with_radiometry(attenuation=value, attenuation_error=error)
 
     @property
     def energy(self) -> str | None:

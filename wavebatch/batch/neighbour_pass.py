@@ -29,7 +29,6 @@ from wavebatch.batch.unit import Prepared, SolvedBlocks, solve_unit, unpack
 from wavebatch.core.echoes import COLUMNS, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.files.disk.row_file import RowStore
-from wavebatch.files.disk.shared_rows import Rows, discard_rows, read_rows, share_rows
 from wavebatch.files.disk.spool import Spool
 from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, thin_out
 from wavebatch.kernels.geometry.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
@@ -100,17 +99,14 @@ class SecondPass:
         self._tiles_left = self._units_left = 0
         self._sample, self._every = [np.empty((0, 3))], 1
 
-    def add(self, entries: Rows, state: Rows) -> None:
-        """Keep what `begin_unit` gave, in the order of the units."""
-        rows, kept = read_rows(entries), read_rows(state)
+    def add(self, rows: np.ndarray, kept: np.ndarray) -> None:
+        """Keep entries and state of `begin_unit`, in the order of the units."""
         first = -self._rows.count % self._every
         self._sample.append(rows["xyz"][first :: self._every] * np.array(self._scales))
         self._units.append(tuple(slice(store.count, store.count + len(new))
                                  for store, new in ((self._rows, rows), (self._states, kept))))  # fmt: skip
         self._rows.add(rows)
         self._states.add(kept)
-        discard_rows(entries)
-        discard_rows(state)
         while sum(map(len, self._sample)) > SAMPLE:
             self._sample = [np.concatenate(self._sample)[::2].copy()]
             self._every *= 2
@@ -153,15 +149,14 @@ class SecondPass:
         """Whether all units are finished."""
         return self._entries is not None and not self._tiles_left + self._units_left
 
-    def next_call(self, blob: bytes, folder: Path | None) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """Return the next function to call and its arguments; those given are as for `begin_unit`."""
+    def next_call(self, blob: bytes) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """Return the next function to call and its arguments; blob: as for `begin_unit`."""
         if self._parts:
             return process_tile, (self._blob, *self._parts.popleft())
         rows, state = self._units.popleft()
-        kept = share_rows(self._states.read(state.start, state.stop), folder)
-        return end_unit, (blob, kept, self._found.read(rows.start, rows.stop), folder)
+        return end_unit, (blob, self._states.read(state.start, state.stop), self._found.read(rows.start, rows.stop))
 
-    def take(self, result: Found | tuple[Rows, RunReport]) -> tuple[Rows | None, RunReport]:
+    def take(self, result: Found | tuple[np.ndarray, RunReport]) -> tuple[np.ndarray | None, RunReport]:
         """Take the result of the oldest call: rows of the cloud, None for a tile; and its report."""
         if not self._tiles_left:
             self._units_left -= 1
@@ -177,21 +172,17 @@ class SecondPass:
                 store.close()
 
 
-def begin_unit(
-    blob: bytes, number: int, block_size: int | None, folder: Path | None
-) -> tuple[tuple[Rows, Rows], RunReport]:
+def begin_unit(blob: bytes, number: int, block_size: int | None) -> tuple[tuple[np.ndarray, np.ndarray], RunReport]:
     """Run the chain on one unit.
 
     Parameters
     ----------
     blob, number, block_size
         As for `process_unit`.
-    folder : Path or None
-        Of shared memory.
 
     Returns
     -------
-    entries, state : Rows
+    entries, state : array
         ENTRY (m,), without numbers; and what `end_unit` needs, u1 (k,).
     report : RunReport
         The timing.
@@ -203,32 +194,30 @@ def begin_unit(
     chain = prepared.job.chain
     kept = [(index, chain.keep_needed(block)) for index, block in solved] if chain.after_second else []
     state = np.frombuffer(pickle.dumps((made._replace(columns=needed), kept), PROTOCOL), np.uint8)
-    shared = share_rows(_list_entries(echoes, made), folder), share_rows(state, folder)
-    return shared, RunReport(timing=timing)
+    return (_list_entries(echoes, made), state), RunReport(timing=timing)
 
 
-def end_unit(blob: bytes, state: Rows, found: np.ndarray, folder: Path | None) -> tuple[Rows, RunReport]:
+def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, RunReport]:
     """Make the rows of a unit that are written, once the second pass has been over its points.
 
     Parameters
     ----------
-    blob, folder
+    blob
         As for `begin_unit`.
-    state : Rows
+    state : u1 (k,)
         From `begin_unit`.
     found : structured array (m,)
         Of the unit's rows.
 
     Returns
     -------
-    rows : Rows
+    rows : structured array (m,)
     report : RunReport
     """
     _gather.cache_clear()  # tiles are done: their memory is needed for the unit
     prepared: Prepared = unpack(blob)
     timing: dict[str, float] = {}
-    made, solved = pickle.loads(read_rows(state))
-    discard_rows(state)
+    made, solved = pickle.loads(state)
     has_echo = made.echo >= 0
     by_echo = np.zeros(len(made.counted), found.dtype)
     by_echo[made.echo[has_echo]] = found[has_echo]
@@ -242,7 +231,7 @@ def end_unit(blob: bytes, state: Rows, found: np.ndarray, folder: Path | None) -
     rows, left = prepared.selector.select(made.rows, {**made.columns, **columns})
     reasons = count_reasons({name: codes[made.counted] for name, codes in values.items()})
     report = replace(made.report, no_data={**made.report.no_data, **reasons}, timing=timing)
-    return share_rows(rows, folder), report + left
+    return rows, report + left
 
 
 def _solve_again(

@@ -36,7 +36,7 @@ EXCLUSIVE = (
     ("chain", "profile", "tolerance"), ("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"),
     ("scheduler", "memory"), ("attenuation", "visibility"), ("trajectory", "flight_height"),
 )  # fmt: skip
-"""Options of which only one is possible; in wavebatch.toml one takes the place of the others in what counts less."""
+"""Options that exclude each other. One in wavebatch.toml replaces those that come from a weaker source."""
 
 NEEDS = {
     "force": ("system",), "lever_arm": ("trajectory",), "crs": ("trajectory",), "wavelength": ("visibility",),
@@ -50,7 +50,7 @@ ELSEWHERE = ("output", "recursive", "jobs", "scheduler", "memory", "block_size",
 
 
 def check_together(given: Mapping[str, Any], known: Collection[str] | None = None) -> None:
-    """Raise ConfigError for two options of which only one is possible, and for one that another one needs.
+    """Raise ConfigError for two options that exclude each other, and for one without the option that it needs.
 
     Parameters
     ----------

@@ -106,7 +106,8 @@ def _describe_air(prepared: Prepared) -> dict[str, Any]:
     job, system = prepared.job, prepared.system
     given = "the default, for which there is no source" if job.calibration is None else "the calibration"
     source = given if job.attenuation is None else "--attenuation or --visibility"
-    return {"attenuation_db_km": system.attenuation, "error_db_km": system.attenuation_error, "from": source}
+    air = system.radiometry
+    return {"attenuation_db_km": air.attenuation, "error_db_km": air.attenuation_error, "from": source}
 
 
 def describe_chain(prepared: Prepared) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -208,14 +208,14 @@ class _Batch:
         """Work until every strip has an outcome."""
         while self._submit() or self._active:
             interrupts.check()
-            heads = {future: strip for strip in self._active for future in strip.heads}
+            heads = {strip.pending[0]: strip for strip in self._active if strip.pending}
             try:
                 done = self._workers.wait(heads)
             except BrokenExecutor as error:
                 self._give_up(error)
             else:
                 for future in done:
-                    self._take(heads[future], future)
+                    self._take(heads[future])
 
     def close(self) -> None:
         """Remove what unfinished strips have left."""
@@ -225,13 +225,13 @@ class _Batch:
 
     def _submit(self) -> bool:
         """Submit calls up to the workers' limit; return whether any is under way."""
-        while sum(strip.under_way for strip in self._active) < self._workers.limit:
+        while sum(len(strip.pending) for strip in self._active) < self._workers.limit:
             strip = next((strip for strip in self._active if strip.has_more), None) or self._start_next()
             if strip is None:
                 break
             with self._failing(strip):
                 strip.submit(self._workers)
-        return any(strip.under_way for strip in self._active)
+        return any(strip.pending for strip in self._active)
 
     def _start_next(self) -> StripTask | None:
         """Start the next strip that needs work; None where no other strip may start now."""
@@ -253,12 +253,12 @@ class _Batch:
                 self._end(strip, Outcome(strip.job, "skipped", report))
         return None
 
-    def _take(self, strip: StripTask, future: Future) -> None:
+    def _take(self, strip: StripTask) -> None:
         if strip not in self._active:
             return
         with self._failing(strip):
             before = strip.written
-            strip.take(future, self._workers)
+            strip.take(self._workers)
             done, units = strip.written, strip.prepared.units
             if done > before:
                 self._tell({"event": "unit", "strip": str(strip.job.path), "done": done, "of": units})

@@ -21,8 +21,7 @@ from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.neighbour_pass import SecondPass, begin_unit
 from wavebatch.batch.options import RunOptions
-from wavebatch.batch.row_transfer import RowStream, process_unit_shared
-from wavebatch.batch.unit import Prepared, prepare_strip
+from wavebatch.batch.unit import Prepared, prepare_strip, process_unit
 from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
@@ -59,7 +58,6 @@ class StripTask:
         self._blob = b""
         self._claim: Claim | None = None
         self._writer: CloudWriter | None = None
-        self._rows: RowStream | None = None
         self._second: SecondPass | None = None
         self._report = RunReport()
         self._described: dict[str, Any] = {}
@@ -117,23 +115,9 @@ class StripTask:
         return self._second is not None and self._second.has_more
 
     @property
-    def heads(self) -> list[Future]:
-        """The calls of which `take` can use the result next."""
-        return [queue[0] for queue in self._queues if queue]
-
-    @property
-    def under_way(self) -> int:
-        """Number of calls whose results are not used yet."""
-        return sum(map(len, self._queues))
-
-    @property
-    def _queues(self) -> list[deque[Future]]:
-        return [self.pending] if self._rows is None else [self.pending, self._rows.pending]
-
-    @property
     def is_complete(self) -> bool:
-        """Whether all units are done, also by a second pass, and all rows are in the cloud that can be."""
-        if self.prepared is None or self.written < self.prepared.units or self._rows.pending:
+        """Whether all units are done, also by a second pass."""
+        if self.prepared is None or self.written < self.prepared.units:
             return False
         return self._second is None or self._second.is_complete
 
@@ -143,54 +127,45 @@ class StripTask:
             self.pending.append(workers.submit(prepare_strip, self.job.absolute() if workers.is_remote else self.job))
             return
         if self._submitted == self.prepared.units:
-            function, arguments = self._second.next_call(self._blob, self._rows.folder)
+            function, arguments = self._second.next_call(self._blob)
             self.pending.append(workers.submit(function, *arguments))
             return
-        arguments = self._blob, self._submitted, self._options.block_size, self._rows.folder
-        self.pending.append(workers.submit(process_unit_shared if self._second is None else begin_unit, *arguments))
+        arguments = self._blob, self._submitted, self._options.block_size
+        self.pending.append(workers.submit(process_unit if self._second is None else begin_unit, *arguments))
         self._submitted += 1
 
-    def take(self, future: Future, workers: Workers | Cluster) -> None:
-        """Use the result of one of the `heads`: open the output, take rows, or write a chunk of them."""
-        if self._rows is not None and self._rows.pending and future is self._rows.pending[0]:
-            start = time.perf_counter()
-            seconds = self._rows.take()
-            self._report += RunReport(timing={"write": seconds + time.perf_counter() - start})
-            return
+    def take(self, workers: Workers | Cluster) -> None:
+        """Use the oldest result: open the output, or write rows."""
         result = self.pending.popleft().result()
         start = time.perf_counter()
         if self.prepared is None:
             self.prepared = result
             self._report += result.report
-            self._open(workers)
+            self._open(workers.jobs)
         elif self.written == self.prepared.units:
             rows, report = self._second.take(result)
             if rows is not None:
-                self._rows.add(rows)
+                self._writer.write(rows)
             self._report += report
         else:
             rows, report = result
             if self._second is None:
-                self._rows.add(rows)
+                self._writer.write(rows)
             else:
                 self._second.add(*rows)
             self.written += 1
             self._report += report + RunReport(timing={"write": time.perf_counter() - start})
-        if self.written == self.prepared.units:
-            if self._second is not None:
-                self._report += self._second.cut()
-            if self._second is None or self._second.is_complete:
-                self._rows.end()
+        if self.written == self.prepared.units and self._second is not None:
+            self._report += self._second.cut()
 
-    def _open(self, workers: Workers | Cluster) -> None:
+    def _open(self, threads: int) -> None:
         options, prepared = self._options, self.prepared
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
         command = self.job.options.command(self.job.path.name)
         provenance = {**self._described, "command": command, **report_file.describe_chain(prepared)}
         provenance |= report_file.describe_strip(prepared, self._described)
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
-        self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
-        self._rows = RowStream(self._writer, workers.submit if workers.compresses else None, workers.memory)
+        self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite, threads=threads)
         if prepared.second_step is not None:
             self._second = SecondPass(prepared.second_step, prepared.layout.source.header.scales, cloud)
 
@@ -248,8 +223,8 @@ class StripTask:
         self.release()
 
     def _close(self) -> None:
-        """Remove what waited in memory and in temporary files."""
-        for one in (self._rows, self._second, self.prepared and self.prepared.scan):
+        """Remove temporary files."""
+        for one in (self._second, self.prepared and self.prepared.scan):
             if one is not None:
                 one.close()
 

@@ -75,7 +75,7 @@ class Prepared:
     @property
     def system(self) -> SystemPulse:
         """The pulse that the strip is run with, its calibration, and the error of the sensor's position."""
-        return self.job.calibrate(replace(self.choice.survey.system, sensor_error=self.sensor.error))
+        return self.job.calibrate(self.choice.survey.system.with_radiometry(sensor_error=self.sensor.error))
 
     @property
     def second_step(self) -> Step | None:
@@ -181,23 +181,23 @@ def _see_level(
     them; and what is doubtful about the beam."""
     parameters = angle_parameters(job.chain)
     survey = choice.survey
-    saved = job.request.system is not None and not job.request.flight and survey.system.level_error is not None
+    saved = job.request.system is not None and not job.request.flight and survey.system.widths.error is not None
     if parameters is None or sensor is UNKNOWN or saved:
         return choice, ()
     used = job.calibrate(survey.system)
-    used = replace(used, divergence=parameters["divergence"] or used.divergence)
-    seen = sample_reference(reader, scan, sensor, used, survey.figures.get("spacing_ns", 0.0))
+    divergence = parameters["divergence"] or used.radiometry.divergence
+    used = used.with_radiometry(divergence=divergence)
+    seen = sample_reference(reader, scan, sensor, used, survey.figures.spacing_ns or 0.0)
     doubt = seen.doubt()
-    error = abs(seen.divergence / used.divergence - 1.0) if doubt else survey.system.divergence_error
-    system = replace(_take_reference(survey.system, seen.system), divergence_error=error)
+    error = abs(seen.divergence / divergence - 1.0) if doubt else survey.system.radiometry.divergence_error
+    system = _take_reference(survey.system, seen.system).with_radiometry(divergence_error=error)
     return replace(choice, survey=replace(survey, system=system)), (doubt,) if doubt else ()
 
 
 def _take_reference(system: SystemPulse, seen: SystemPulse) -> SystemPulse:
     """The system with the reference of angles, each digitizer with its own."""
     others = {index: _take_reference(other, seen.digitizers[index]) for index, other in system.digitizers.items()}
-    names = ("level_variance", "level_error", "width_scatter")
-    return replace(system, digitizers=others, **{name: getattr(seen, name) for name in names})
+    return replace(system, digitizers=others, widths=seen.widths)
 
 
 def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:

@@ -72,10 +72,10 @@ def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, A
 
     with open_strip(path, direction=direction, headerless=headerless) as strip:
         found = survey(strip)
-    like = find_likeness(found.system, found.figures["spacing_ns"])
+    like = find_likeness(found.system, found.figures.spacing_ns)
     return {
         "full_width_ns": FWHM_PER_SIGMA * found.system.sigma_ref,
-        "noise_dn": found.system.noise_std,
+        "noise_dn": found.system.noise.std,
         "sensor": like and like.known.sensor,
         "difference": like and like.difference,
         "sentence": like.describe() if like else "this strip's pulse looks like that of no known sensor",

@@ -145,7 +145,7 @@ def _slice(
         sigma, floor = options["sigma"], 0.0
         if scan.with_waveform:
             system = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system
-            sigma, floor = system.sigma_ref if sigma is None else sigma, _NOISE_FLOOR * system.noise_std
+            sigma, floor = system.sigma_ref if sigma is None else sigma, _NOISE_FLOOR * system.noise.std
         settings = shared.from_options(SliceOptions, options, sigma=2.0 if sigma is None else sigma, floor=floor)
         counts = _find(reader, scan, settings, output, lines, extras, crs, options["overwrite"])
     if not counts["lines"]:

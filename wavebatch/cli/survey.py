@@ -145,7 +145,7 @@ def _write_angles(target: Path, opened: Any, found: Any, overwrite: bool) -> Non
     from wavebatch.tools.compare.angle_table import write_angles
 
     distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
-    sizes = {"spacing": found.figures["spacing_ns"], "amplitude": found.figures["amplitude_50"]}
+    sizes = {"spacing": found.figures.spacing_ns, "amplitude": found.figures.amplitude_50}
     name = opened.facts.path.name
     write_angles(target, found.system, distance=distance, strip=name, **sizes, overwrite=overwrite)
 
@@ -168,7 +168,7 @@ def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[Sa
     flight = survey_flight(samples)
     saved = flight.saved
     if options["divergence"] is not None:
-        system = replace(saved.survey.system, divergence=options["divergence"])
+        system = saved.survey.system.with_radiometry(divergence=options["divergence"])
         saved = replace(saved, survey=replace(saved.survey, system=system))
     return saved, _describe_flight(flight, paths, failed)
 
@@ -189,6 +189,7 @@ def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Pat
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import SYSTEM_SCHEMA, describe_system
+    from wavebatch.surveying.systems.figures import describe_figures
 
     return {
         "schema": SYSTEM_SCHEMA,
@@ -197,7 +198,7 @@ def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
         "fingerprint": dict(saved.fingerprint),
         "waveforms": saved.survey.waveforms,
         "system": describe_system(saved.survey.system),
-        "figures": {name: float(value) for name, value in saved.survey.figures.items()},
+        "figures": describe_figures(saved.survey.figures),
         "decisions": [
             {"part": one.part, "needed": bool(one.needed), "reason": one.reason} for one in saved.survey.decisions
         ],
@@ -211,10 +212,10 @@ def _find_likeness(saved: SavedSurvey) -> dict[str, Any] | None:
     from wavebatch.surveying.systems.known_systems import find_likeness, find_source
 
     survey = saved.survey
-    found = find_likeness(survey.system, survey.figures.get("spacing_ns", 0.0))
+    found = find_likeness(survey.system, survey.figures.spacing_ns or 0.0)
     if found is None:
         return None
-    taken = "pulse_cost" in survey.figures and find_source(survey.system) is not None
+    taken = survey.figures.pulse_cost is not None and find_source(survey.system) is not None
     return {"sensor": found.known.sensor, "name": found.known.name, "difference": found.difference, "taken": taken,
             "sentence": found.describe()}  # fmt: skip
 
@@ -226,15 +227,15 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     else:
         yield _line("strip", f"{facts['strip']}: {size}")
     yield _line("surveyed", count(saved.survey.waveforms, "waveform"))
-    samples = f"{figures['n_samples']:.0f} of {figures['bits']:.0f} bits, {figures['spacing_ns']:g} ns apart"
+    samples = f"{figures.n_samples:.0f} of {figures.bits:.0f} bits, {figures.spacing_ns:g} ns apart"
     yield _line("samples", samples)
-    yield _line("ADC range", f"counts {round(figures['least_count'])} to {round(figures['largest_count'])}")
+    yield _line("ADC range", f"counts {round(figures.least_count)} to {round(figures.largest_count)}")
     if "direction" in facts:
         yield _line("vectors", f"{facts['direction']['sign']} the sensor: {facts['direction']['evidence']}")
     yield from _noise_lines(saved)
     yield from _pulse_lines(saved)
-    if "divergence_seen_mrad" in figures:
-        seen = format_measure(figures["divergence_seen_mrad"], figures["divergence_seen_error_mrad"])
+    if figures.divergence_seen_mrad is not None:
+        seen = format_measure(figures.divergence_seen_mrad, figures.divergence_seen_error_mrad)
         words = "mrad by the widths of echoes over the slopes of their surfaces, if these are plane"
         yield _line("beam", f"{seen} {words}")
     yield from _digitizer_lines(saved)
@@ -270,16 +271,15 @@ NOISE_KINDS = {
 
 
 def _noise_lines(saved: SavedSurvey) -> Iterator[str]:
-    system, figures = saved.survey.system, saved.survey.figures
-    yield _line("baseline", f"{system.baseline:.3f} DN, +-{system.baseline_spread:.3f} DN between waveforms")
-    yield _line("noise", f"{system.noise_std:.3f} DN for thresholds and errors, chosen from")
-    for kind, value in system.noise_by_kind.items():
+    noise, strong = saved.survey.system.noise, saved.survey.figures.amplitude_99
+    yield _line("baseline", f"{noise.baseline:.3f} DN, +-{noise.baseline_spread:.3f} DN between waveforms")
+    yield _line("noise", f"{noise.std:.3f} DN for thresholds and errors, chosen from")
+    for kind, value in noise.by_kind.items():
         known = f"{value:.3f} DN" if value > 0 else "not known: too few samples"
         yield f"  {NOISE_KINDS.get(kind, kind.replace('_', ' ')):34}{known}"
-    strong = figures["amplitude_99"]
-    grown = f"{system.noise_gain * strong:.2f} DN2 at {strong:.0f} DN"
-    text = f"variance grows by {system.noise_gain:.4f} DN2 per DN, {grown}"
-    yield _line("signal noise", text if system.noise_gain > 0 else "none")
+    grown = f"{noise.gain * strong:.2f} DN2 at {strong:.0f} DN"
+    text = f"variance grows by {noise.gain:.4f} DN2 per DN, {grown}"
+    yield _line("signal noise", text if noise.gain > 0 else "none")
 
 
 def _name_model(system: SystemPulse) -> str:
@@ -299,13 +299,13 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
     if like is not None:
         taken = f"{like['sensor']}: its shipped pulse is used"
         yield _line("sensor", taken if like["taken"] else like["sentence"])
-    yield _line("pulse models", f"from {figures.get('isolated_echoes', 0):.0f} isolated echoes; misfit per amplitude")
-    if "misfit_goal" not in figures:
+    yield _line("pulse models", f"from {figures.isolated_echoes or 0:.0f} isolated echoes; misfit per amplitude")
+    if figures.misfit_goal is None:
         model = "a shipped pulse" if system.components else "a Gaussian of their width"
         yield f"  too few to learn a pulse from: {model} is used"
     else:
         yield from _misfit_lines(saved)
-    yield _line("kappa", f"{figures['kappa']:.4f}" if "kappa" in figures else "not known")
+    yield _line("kappa", f"{figures.kappa:.4f}" if figures.kappa is not None else "not known")
     yield _line("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
     yield _line("acceptance", f"one more echo must lower chi2 by {system.acceptance:g}")
     if system.misfit:
@@ -315,30 +315,29 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
 
 def _digitizer_lines(saved: SavedSurvey) -> Iterator[str]:
     for index, one in saved.survey.system.digitizers.items():
-        noise = f"baseline {one.baseline:.3f} DN, noise {one.noise_std:.3f} DN"
+        noise = f"baseline {one.noise.baseline:.3f} DN, noise {one.noise.std:.3f} DN"
         yield _line(f"digitizer {index}", f"{noise}; {_name_model(one)}; s_ref {one.sigma_ref:.4f} ns")
 
 
 def _misfit_lines(saved: SavedSurvey) -> Iterator[str]:
     figures, system = saved.survey.figures, saved.survey.system
-    chosen = f"misfit_{len(system.components)}_gaussians"
-    if not system.components:
-        chosen = "misfit_skewed" if system.kappa else "misfit_1_gaussians"
-    tried = {name: value for name, value in figures.items() if name.startswith("misfit_") and name != "misfit_goal"}
-    for name in sorted(tried, key=lambda name: (name != "misfit_1_gaussians", name != "misfit_skewed", name)):
-        words = name.removeprefix("misfit_").replace("_", " ").replace("1 gaussians", "1 gaussian")
-        yield f"  {words:18}{tried[name]:.4f}{'  chosen' if name == chosen else ''}"
-    yield f"  {'unseen below':18}{figures['misfit_goal']:.4f}"
+    chosen = len(system.components) or (0 if system.kappa else 1)
+    tried = {1: figures.misfit_gaussians[1], 0: figures.misfit_skewed} | figures.misfit_gaussians
+    for number, misfit in tried.items():
+        words = f"{number} gaussian{'s' * (number > 1)}" if number else "skewed"
+        yield f"  {words:18}{misfit:.4f}{'  chosen' if number == chosen else ''}"
+    yield f"  {'unseen below':18}{figures.misfit_goal:.4f}"
 
 
 def _scene_lines(saved: SavedSurvey) -> Iterator[str]:
     system, figures = saved.survey.system, saved.survey.figures
     clipped = "none found"
     if system.saturation is not None:
-        clipped = f"at {system.saturation:.0f} DN, in {100 * figures['saturated_share']:.2f} % of the waveforms"
+        clipped = f"at {system.saturation:.0f} DN, in {100 * figures.saturated_share:.2f} % of the waveforms"
     yield _line("saturation", clipped)
-    shares = ", ".join(f"{100 * figures[f'{kind}_share']:.2f} % {kind}" for kind in ("empty", "single", "overlapped"))
-    yield _line("waveforms", f"{shares}; {figures['echoes_per_waveform']:.3f} echoes each")
-    yield _line("amplitudes", f"99 % below {figures['amplitude_99']:.1f} DN")
-    share = 100 * figures["system_width_share"]
+    kinds = {"empty": figures.empty_share, "single": figures.single_share, "overlapped": figures.overlapped_share}
+    shares = ", ".join(f"{100 * share:.2f} % {kind}" for kind, share in kinds.items())
+    yield _line("waveforms", f"{shares}; {figures.echoes_per_waveform:.3f} echoes each")
+    yield _line("amplitudes", f"99 % below {figures.amplitude_99:.1f} DN")
+    share = 100 * figures.system_width_share
     yield _line("widths", f"{share:.1f} % of the clear echoes have the width of the system pulse")

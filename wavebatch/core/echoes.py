@@ -251,6 +251,10 @@ class EchoTable:
         """Number of echoes in each of the n waveforms of a block, int64 (n,)."""
         return np.bincount(self.waveform, minlength=n)
 
+    def alone(self, n: int) -> np.ndarray:
+        """Which echoes are the only one of their waveform, of n waveforms; bool (m,)."""
+        return self.count(n)[self.waveform] == 1
+
     def to_numpy(self) -> np.ndarray:
         """The table as one structured array (m,): a field per core column, then one per attribute, with their dtypes.
 

@@ -15,7 +15,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 KEEP = 128 << 20
 """Freed memory that a process may keep [bytes]: the arrays of one block need less."""
 
-ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """Variables that keep libraries to one thread, in processes that start with them: wavebatch's arrays are too small for
 more, and the last bits of a product depend on how it is shared out."""
 

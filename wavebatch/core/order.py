@@ -40,6 +40,11 @@ def find_order(waveform: np.ndarray, time: np.ndarray) -> np.ndarray | None:
     return order
 
 
+def robust_std(values: np.ndarray) -> float:
+    """Standard deviation by the median of the distances from the median, of values (m,), m > 0."""
+    return MAD_TO_STD * float(np.median(np.abs(values - np.median(values))))
+
+
 def group_medians(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median of each group of values, and their standard deviation by the median of their distances from it.
 

@@ -8,11 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import StageError
-from wavebatch.core.units import AIR_ATTENUATION, HALF_C, QUANTISATION_STD
+from wavebatch.core.system import (
+    Defects,
+    LevelWidths,
+    Radiometry,
+    ReceiverNoise,
+    angle_to_vertical,
+    swath_columns,
+)
+from wavebatch.core.units import HALF_C
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,88 +241,38 @@ class SystemPulse:
 
     sigma_ref: float
     """Gaussian standard deviation of the echo of a flat target [ns]."""
-    baseline: float = 0.0
-    """Typical level without signal [count]."""
-    baseline_spread: float = 0.0
-    """Standard deviation of the true baseline between waveforms [count]."""
-    recovery: float = 0.0
-    """Time after a strong signal until the level is back to what it was before it [ns]."""
-    noise_std: float = QUANTISATION_STD
-    """Noise of one sample that thresholds and errors use [count]."""
-    noise_by_kind: Mapping[str, float] = field(default_factory=dict)
-    """The estimates that noise_std was chosen from: quiet, outside of echoes, core ... [count]."""
-    correlation: tuple[float, ...] = ()
-    """Correlation of the noise of two samples 1, 2, ... spacings apart; empty where it is white."""
-    noise_gain: float = 0.0
-    """Signal-dependent noise variance per count of signal [count] (docs/algorithms.md H12)."""
     kappa: float = 0.0
     """Skew of the system pulse; 0 for a Gaussian."""
     components: tuple[tuple[float, float, float], ...] = ()
     """Learned pulse: (weight, delay [ns], sigma [ns]) per component; empty when no pulse was learned."""
+    noise: ReceiverNoise = ReceiverNoise()
+    defects: Defects = Defects()
+    widths: LevelWidths = LevelWidths()
+    radiometry: Radiometry = Radiometry()
     other_pulse: bool = False
     """Whether the echoes of a block were fitted with another pulse than the survey's; set while a chain runs."""
     skew: float | None = None
     """Skew of the best skewed pulse, whichever pulse the survey chose; None where it was not measured."""
     skew_spread: float = 0.0
     """Standard deviation of the skews of single echoes about it: ground and plants differ; 0 where not measured."""
-    pattern: tuple[float, ...] = ()
-    """Offsets that repeat along the samples, of converters that take samples in turn [count]; empty for none."""
-    slope_spread: float = 0.0
-    """Standard deviation of the slopes of baselines [count/ns]; 0 where baselines are level."""
-    spikes: float = 0.0
-    """Spikes of one sample per waveform; 0 where they are not taken off."""
-    transient: float = 0.0
-    """Time at the start of every waveform in which its receiver is not at rest [ns]."""
-    seams: Mapping[int, int] = field(default_factory=dict)
-    """Sample between two recordings of a packet that was interpolated, by the number of samples of such packets."""
     ringing: float = 0.0
     """Largest after-pulse as a share of the amplitude."""
-    saturation: float | None = None
-    """Count from which samples are clipped, as the survey saw; None if only the digitizer's largest count is."""
     acceptance: float = 15.0
     """Smallest fall of chi2 for which an echo is added."""
-    tail_misfit: tuple[tuple[float, float], ...] = ()
-    """(lag after the peak [ns], share of the amplitude): what the pulse leaves unexplained around strong echoes."""
     misfit: float = 0.0
     """How far strong echoes deviate from the pulse, as a share of their amplitude. A fall of chi2 that this explains
     does not add an echo.
     """
-    level_variance: float = 0.0
-    """Variance of echoes of level ground seen from above, minus that of the system pulse [ns2]: zero or negative,
-    because the echoes that the pulse was learned from come from slopes too.
-    """
-    level_error: float | None = None
-    """Standard deviation of `level_variance` [ns2]; None where it was not measured, infinite where surfaces of known
-    slope were sought and not found, so that widths mean no angle.
-    """
+    tail_misfit: tuple[tuple[float, float], ...] = ()
+    """(lag after the peak [ns], share of the amplitude): what the pulse leaves unexplained around strong echoes."""
     hidden: tuple[tuple[float, float, float], ...] = ()
     """What neighbours that were not found do to times: variance of an echo over that of the pulse, less 1; and the
     variance of its time over that excess, of lone echoes and of others (docs/algorithms.md 2.2). Empty for none.
     """
-    width_scatter: float = 0.0
-    """Scatter of the echo widths of one surface beyond their fit errors [ns]: no pulse model is exact."""
-    divergence: float | None = None
-    """Full angle of the beam between the 1/e^2 points [mrad]; None where it is not known."""
-    divergence_error: float = 0.0
-    """Relative standard deviation of the divergence."""
-    calibration: float | None = None
-    """Constant C' of kernels/physics/radiometry [1/(m2 count ns)]; None where the strip is not calibrated."""
-    calibration_err: float = 0.0
-    """Relative standard deviation of the calibration."""
-    shot_error: float = 0.0
-    """Relative standard deviation of the emitted energy from shot to shot, where the block does not hold it."""
-    channels: Mapping[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
-    """Calibration and its relative error of single channels, by (index of the digitizer, scanner channel)."""
-    swath: tuple[float, ...] = ()
-    """How the calibration grows with the angle t of the ray to the vertical: largest angle T [rad], a and b of
-    exp(a u^2 + b u^4), u = min(t / T, 1); empty where it does not.
-    """
-    attenuation: float = AIR_ATTENUATION
-    """Attenuation of the light in the air, one way [dB/km]."""
-    attenuation_error: float = 0.0
-    """Standard deviation of the attenuation [dB/km]."""
-    sensor_error: float = 0.0
-    """Standard deviation of the distance to the sensor's position [m]."""
+    saturation: float | None = None
+    """Count from which samples are clipped, as the survey saw; None if only the digitizer's largest count is."""
+    seams: Mapping[int, int] = field(default_factory=dict)
+    """Sample between two recordings of a packet that was interpolated, by the number of samples of such packets."""
     digitizers: Mapping[int, SystemPulse] = field(default_factory=dict)
     """Pulse and noise of digitizers that record differently from the commonest one of the strip, by their index."""
 
@@ -322,21 +281,14 @@ class SystemPulse:
         if not self.sigma_ref > 0:
             raise ValueError(f"sigma_ref must be positive, got {self.sigma_ref}")
 
-    @property
-    def has_defects(self) -> bool:
-        """Whether waveforms must be cleaned before they are read."""
-        return bool(self.pattern or self.slope_spread or self.spikes or self.transient)
-
     def of(self, block: WaveformBlock) -> SystemPulse:
-        """The system of the block's digitizer: its pulse and noise, and what is known of the whole strip."""
+        """The system of the block's digitizer: its pulse and noise, and the radiometry of the whole strip."""
         other = self.digitizers.get(block.digitizer.index)
-        if other is None:
-            return self
-        whole = (
-            "divergence", "divergence_error", "calibration", "calibration_err", "channels", "swath",
-            "shot_error", "attenuation", "attenuation_error", "sensor_error",
-        )  # fmt: skip
-        return replace(other, **{name: getattr(self, name) for name in whole})
+        return self if other is None else replace(other, radiometry=self.radiometry)
+
+    def with_radiometry(self, **values: Any) -> SystemPulse:
+        """The system with other values of its radiometry, by field."""
+        return replace(self, radiometry=replace(self.radiometry, **values))
 
     def calibrate(self, block: WaveformBlock) -> tuple[np.ndarray, np.ndarray]:
         """Calibration of each waveform's channel.
@@ -348,27 +300,13 @@ class SystemPulse:
         error : float64 (n,)
             Relative standard deviation.
         """
-        n = len(block)
-        constant = np.full(n, np.nan if self.calibration is None else self.calibration)
-        error = np.full(n, self.calibration_err)
-        for (digitizer, scanner), (value, value_err) in self.channels.items():
+        n, given = len(block), self.radiometry
+        constant = np.full(n, np.nan if given.constant is None else given.constant)
+        error = np.full(n, given.constant_error)
+        for (digitizer, scanner), (value, value_err) in given.channels.items():
             if digitizer == block.digitizer.index:
                 same = np.full(n, scanner == 0) if block.scanner is None else block.scanner == scanner
                 constant[same], error[same] = value, value_err
-        if self.swath:
-            constant *= np.exp(swath_columns(angle_to_vertical(block.direction), self.swath[0]) @ self.swath[1:])
+        if given.swath:
+            constant *= np.exp(swath_columns(angle_to_vertical(block.direction), given.swath[0]) @ given.swath[1:])
         return constant, error
-
-
-def angle_to_vertical(direction: np.ndarray) -> np.ndarray:
-    """Angle of rays to the vertical, at which they strike level ground; direction: f8 (n, 3), angle: f8 (n,) [rad]."""
-    x, y, z = direction.T
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        down = -z / np.sqrt(x * x + y * y + z * z)
-    return np.arccos(np.clip(down, -1.0, 1.0))
-
-
-def swath_columns(angle: np.ndarray, most: float) -> np.ndarray:
-    """u^2 and u^4 of angles (n,) [rad], f8 (n, 2), u = min(angle / most, 1): see `SystemPulse.swath`."""
-    square = np.minimum(angle / most, 1.0) ** 2
-    return np.stack([square, square**2], axis=1)

@@ -22,6 +22,7 @@ from wavebatch.core.errors import ConfigError, StageError
 from wavebatch.core.no_data import SUFFIX
 from wavebatch.core.schema import Range, read_hint
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.stages.clean import clean_block
 
 KINDS: dict[str, tuple[tuple[str, ...], type]] = {
@@ -75,6 +76,10 @@ class Stage:
     fits: Callable[[SystemPulse, Mapping[str, Any]], SystemPulse] | None = None
     """Of a decomposer: the strip's system with the pulse that it fits, from system and parameters. Attribute stages get
     it, so that widths and areas are read as what they are. None: the survey's pulse."""
+    shape: Callable[[SystemPulse, float, Mapping[str, Any]], PulseShape | None] | None = None
+    """Of a decomposer: the pulse by which its echoes are drawn, from system, spacing [ns] and parameters; None where
+    nothing is fitted. Without this function it is the pulse of the system that `fits` returns. Echoes with a skew or an
+    exponent of their own carry it as a column."""
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None
     """What is wrong with this stage in a chain and for a strip (None before the strip is known); empty if nothing."""
 
@@ -102,6 +107,7 @@ def stage(
     needs: Needs = (),
     second_pass: Callable[..., Any] | None = None,
     fits: Callable[[SystemPulse, Mapping[str, Any]], SystemPulse] | None = None,
+    shape: Callable[[SystemPulse, float, Mapping[str, Any]], PulseShape | None] | None = None,
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None,
     shares: Any = None,
 ) -> Callable[[Callable], Callable]:
@@ -115,7 +121,7 @@ def stage(
         Attribute columns that the stage adds. A Column declares a new one, so that `run` can write it.
     needs : tuple of str, or function of the parameters
         Attribute columns that earlier stages must have added.
-    second_pass, fits, check : optional
+    second_pass, fits, shape, check : optional
         See `Stage`.
     shares : dataclass instance, optional
         Parameters that stages share: its fields with their annotations, its values as defaults, its docstring for their
@@ -146,7 +152,7 @@ def stage(
             raise StageError(f"stage {name} declares column {min(taken)}, which there is already")
         COLUMNS.update(new)
         names = tuple(column.name if isinstance(column, Column) else column for column in makes)
-        STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass, fits, check)
+        STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass, fits, shape, check)
         return function
 
     return register
@@ -198,6 +204,10 @@ class Step:
     def effective(self) -> dict[str, Any]:
         """Every parameter with the value that will be used."""
         return {**{name: p.default for name, p in self.stage.parameters.items()}, **self.parameters}
+
+    def fit_system(self, system: SystemPulse) -> SystemPulse:
+        """Return the strip's system with the pulse that this decomposer fits."""
+        return system if self.stage.fits is None else self.stage.fits(system, self.effective())
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -364,9 +374,9 @@ class Chain:
 
     def _data(self, solved: Solved, step: Step) -> dict[str, Any]:
         """The data of a step; attribute stages get the system with the pulse that the decomposer fitted."""
-        system, decomposer = solved.system, self.steps[2]
-        if step.stage.kind == "attribute" and decomposer.stage.fits is not None:
-            fitted = decomposer.stage.fits(system, decomposer.effective())
+        system = solved.system
+        if step.stage.kind == "attribute":
+            fitted = self.steps[2].fit_system(system)
             other = (fitted.components, fitted.kappa) != (system.components, system.kappa)
             system = replace(fitted, other_pulse=other)
         return {**solved._asdict(), "system": system}

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from wavebatch.core.system import Defects
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.defects import (
     fill_spikes,
@@ -77,24 +78,25 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
     if block.samples.dtype.kind == "f":
         return block
     block = mark_seam(block, system.seams)
-    if not system.has_defects:
+    defects = system.defects
+    if not defects:
         return block
     raw = transpose_samples(block.samples)
     signal = raw.copy()
-    if system.pattern:
-        offsets = np.array(system.pattern, np.float32)
+    if defects.pattern:
+        offsets = np.array(defects.pattern, np.float32)
         signal -= offsets[np.arange(len(signal)) % len(offsets)][:, None]
     missing = None if block.missing is None else block.missing.T
-    if system.slope_spread > 0:
+    if defects.slope_spread > 0:
         signal -= _slopes(signal, system, block.spacing, missing)
-    if system.spikes > 0:
-        level = np.median(signal, axis=0) if system.slope_spread > 0 else np.float32(system.baseline)
-        fill_spikes(signal, find_spikes(signal - level, sample_noise(system), system.sigma_ref / block.spacing))
+    if defects.spikes > 0:
+        level = np.median(signal, axis=0) if defects.slope_spread > 0 else np.float32(system.noise.baseline)
+        fill_spikes(signal, find_spikes(signal - level, system.noise.quiet, system.sigma_ref / block.spacing))
     clipped = raw >= clip_level(block, system)
     np.copyto(signal, raw, where=clipped)
     samples = np.ascontiguousarray(signal.T)
     samples.flags.writeable = False
-    lost = round(system.transient / block.spacing)
+    lost = round(defects.transient / block.spacing)
     if lost:
         gone = np.zeros(samples.shape, bool) if block.missing is None else block.missing.copy()
         gone[:, :lost] = True
@@ -133,16 +135,11 @@ def find_seams(blocks: Iterable[WaveformBlock]) -> dict[int, int]:
     return {length: at for length, at in found.items() if at}
 
 
-def sample_noise(system: SystemPulse) -> float:
-    """Return the noise of a quiet sample: `noise_std` is larger where noise is coloured."""
-    return min(system.noise_std, system.noise_by_kind.get("quiet") or system.noise_std)
-
-
 def _slopes(signal: np.ndarray, system: SystemPulse, spacing: float, missing: np.ndarray | None) -> np.ndarray:
     """The sloping part of each baseline (s, n), 0 in its middle: own slopes, drawn towards none by their errors."""
     reach = int(np.ceil(GUARD * system.sigma_ref / spacing))
-    slope, error = fit_slopes(signal, sample_noise(system), reach, missing=missing)
-    spread = system.slope_spread * spacing
+    slope, error = fit_slopes(signal, system.noise.quiet, reach, missing=missing)
+    spread = system.defects.slope_spread * spacing
     slope = np.where(np.isfinite(error), slope * spread**2 / (spread**2 + np.minimum(error, 1e6) ** 2), 0.0)
     x = np.arange(len(signal), dtype=np.float32) - np.float32(0.5 * (len(signal) - 1))
     return x[:, None] * slope.astype(np.float32)
@@ -167,31 +164,32 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     block = block.rows(slice(None, None, max(len(block) // MOST_WAVEFORMS, 1)))
     signal = transpose_samples(block.samples)
     missing = None if block.missing is None else block.missing.T
-    std, width = sample_noise(system), system.sigma_ref / block.spacing
+    std, width = system.noise.quiet, system.sigma_ref / block.spacing
     reach = int(np.ceil(3 * width))
-    spread = _slope_spread(signal, std, reach, missing)
+    spread, defects = _slope_spread(signal, std, reach, missing), Defects()
     if spread:
         # Everything else is measured about level baselines.
-        system = replace(system, slope_spread=spread / block.spacing)
-        signal = clean_block(block, system).samples.T
+        defects = Defects(slope_spread=spread / block.spacing)
+        signal = clean_block(block, replace(system, defects=defects)).samples.T
         level = np.median(signal, axis=0)
-    elif system.baseline_spread > DRIFT * std:
+    elif system.noise.baseline_spread > DRIFT * std:
         level = find_levels(signal, std, reach)[0]
     else:
-        level = np.float32(system.baseline)
+        level = np.float32(system.noise.baseline)
     above = signal - level
     if missing is not None:
         above[missing] = 0
-    quiet = find_quiet(above, np.float32(3.5 * np.hypot(SMOOTH_GAIN * std, system.baseline_spread) + 0.25), reach)
+    quiet = find_quiet(above, np.float32(3.5 * np.hypot(SMOOTH_GAIN * std, system.noise.baseline_spread) + 0.25), reach)
     if missing is not None:
         quiet &= ~missing
     offsets, error = find_pattern(signal, quiet)
     if np.abs(offsets).max() > max(PATTERN * max(std, 1.0), CERTAIN * error.max()):
-        system = replace(system, pattern=tuple(offsets.tolist()))
+        defects = replace(defects, pattern=tuple(offsets.tolist()))
     if width >= NARROWEST:
         spikes = np.count_nonzero(find_spikes(above, std, width)) / len(block)
-        system = replace(system, spikes=spikes if spikes > LEAST_SPIKES else 0.0)
-    return replace(system, transient=find_transient(above, std) * block.spacing)
+        defects = replace(defects, spikes=spikes if spikes > LEAST_SPIKES else 0.0)
+    defects = replace(defects, transient=find_transient(above, std) * block.spacing)
+    return replace(system, defects=defects)
 
 
 RARER = 0.1

@@ -54,23 +54,23 @@ def pooled(
     docs/algorithms.md H10.
     """
     n = len(block)
-    std = max(system.noise_std, QUANTISATION_STD)
+    std = max(system.noise.std, QUANTISATION_STD)
     reach = int(np.ceil(guard * system.sigma_ref / block.spacing))
-    recovery = int(np.ceil(min(system.recovery / block.spacing, block.samples.shape[1])))
-    spread = system.baseline_spread
+    recovery = int(np.ceil(min(system.noise.recovery / block.spacing, block.samples.shape[1])))
+    spread = system.noise.baseline_spread
     if spread > DRIFT * std:
         signal = transpose_samples(block.samples)
-        signal -= np.float32(system.baseline)
+        signal -= np.float32(system.noise.baseline)
         mean, quiet, number = find_levels(signal, std, reach, limit, recovery)
         if block.missing is not None:
             quiet &= ~block.missing.T
             mean, number = quiet_mean(signal, quiet)
     else:
-        level = np.full(n, system.baseline, np.float32)
+        level = np.full(n, system.noise.baseline, np.float32)
         samples = Samples(block.samples, level, np.ones(n, np.float32), block.missing)
         mean, number = quiet_levels(samples, limit * np.hypot(SMOOTH_GAIN * std, spread), reach, recovery)
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
-    baseline = system.baseline + trust * mean
+    baseline = system.noise.baseline + trust * mean
     noise = Noise(baseline.astype(np.float32), np.full(n, std, np.float32))
     return noise if block.missing is None else _split_levels(block, noise, system, limit)
 
@@ -95,7 +95,7 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit
     lowest = np.partition(signal, s // 10, axis=0)[s // 10] + np.float32(LOWEST_TENTH * std)
     level = np.where(number >= LEAST_QUIET, level, lowest)
     # The mean of correlated samples scatters more than that of as many independent ones.
-    spread = std * np.sqrt(max(1.0, 1.0 + 2.0 * float(np.sum(system.correlation))))
+    spread = std * np.sqrt(max(1.0, 1.0 + 2.0 * float(np.sum(system.noise.correlation))))
     apart = np.abs(level - noise.baseline[row]) > APART * spread / np.sqrt(np.maximum(number, 1)) + MARGIN * std
     if not apart.any():
         return noise
@@ -128,7 +128,7 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, R
     else:
         baseline, std = _tail_of_recorded(block, samples)
     return Noise(
-        baseline.astype(np.float32), np.maximum(std, max(system.noise_std, QUANTISATION_STD)).astype(np.float32)
+        baseline.astype(np.float32), np.maximum(std, max(system.noise.std, QUANTISATION_STD)).astype(np.float32)
     )
 
 

@@ -219,7 +219,7 @@ FACTOR_WIDTHS = 12
 
 
 def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.ndarray:
-    """Errors of echoes in the noise's colour over those that a fit in white noise of `noise_std` gives.
+    """Errors of echoes in the noise's colour over those that a fit in white noise of `noise.std` gives.
 
     Parameters
     ----------
@@ -238,13 +238,13 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
 
     Notes
     -----
-    `noise_std` is what coloured noise does to amplitudes; times and widths suffer less from noise that changes slowly
+    `noise.std` is what coloured noise does to amplitudes; times and widths suffer less from noise that changes slowly
     (docs/algorithms.md H11).
     """
-    if not system.correlation:
+    if not system.noise.correlation:
         return np.ones((len(width), 4))
     shape = pulse_shape(system, spacing)
-    widths, factors = _factor_table(shape, shape_limits(system, spacing), system.correlation)
+    widths, factors = _factor_table(shape, shape_limits(system, spacing), system.noise.correlation)
     return np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
 
 

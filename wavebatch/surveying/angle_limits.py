@@ -84,8 +84,8 @@ def predict_angles(
     Width errors are the Cramer-Rao bound with the system's noise (docs/algorithms.md 2.1); the angle is that of 1.4.
     """
     width = system.sigma_ref / spacing
-    own = float(np.sqrt(max(system.sigma_ref**2 + system.level_variance, 1e-12)))
-    if np.isinf(system.level_error or 0.0):
+    own = float(np.sqrt(max(system.sigma_ref**2 + system.widths.variance, 1e-12)))
+    if np.isinf(system.widths.error or 0.0):
         return AngleOutlook(np.inf, max_error, REASONS[NoData.NO_LEVEL][0])
     if width < LEAST_PULSE_WIDTH:
         needed = f"{LEAST_PULSE_WIDTH} are needed for widths to mean a slope"
@@ -93,17 +93,17 @@ def predict_angles(
         return AngleOutlook(np.inf, max_error, reason)
     added = float(spread_of_angle(np.radians(SLOPE), distance, 1e-3 * divergence))
     sigma = float(np.hypot(own, added))
-    bound = float(bound_time(max(amplitude, 1e-3), sigma, system.noise_std, spacing))
-    width_err = float(np.hypot(bound, system.width_scatter))
-    variance_err = np.hypot(2.0 * np.hypot(sigma * width_err, own * own * REFERENCE_ERROR), system.level_error or 0.0)
+    bound = float(bound_time(max(amplitude, 1e-3), sigma, system.noise.std, spacing))
+    width_err = float(np.hypot(bound, system.widths.scatter))
+    variance_err = np.hypot(2.0 * np.hypot(sigma * width_err, own * own * REFERENCE_ERROR), system.widths.error or 0.0)
     values = (np.array([value]) for value in (added * added, variance_err, distance))
     error = float(np.degrees(angles_of_variance(*values, 1e-3 * divergence)[1][0]))
-    flat_err = float(np.hypot(bound_time(max(amplitude, 1e-3), own, system.noise_std, spacing), system.width_scatter))
-    least = np.sqrt(np.hypot(2.0 * np.hypot(own * flat_err, own * own * REFERENCE_ERROR), system.level_error or 0.0))
+    flat_err = float(np.hypot(bound_time(max(amplitude, 1e-3), own, system.noise.std, spacing), system.widths.scatter))
+    least = np.sqrt(np.hypot(2.0 * np.hypot(own * flat_err, own * own * REFERENCE_ERROR), system.widths.error or 0.0))
     facing = float(np.degrees(angle_of_spread(least, distance, 1e-3 * divergence)))
     reason = (
         f"at {distance:.0f} m, a beam of {divergence:g} mrad on a slope of {SLOPE:g} degrees widens the pulse from "
-        f"{own:.3g} ns to {sigma:.4g} ns; echoes of {amplitude:.0f} DN with a noise of {system.noise_std:.3g} DN "
+        f"{own:.3g} ns to {sigma:.4g} ns; echoes of {amplitude:.0f} DN with a noise of {system.noise.std:.3g} DN "
         f"give this width to {width_err:.2g} ns, so the angle to {error:.1f} degrees ({facing:.1f} where the surface "
         f"faces the sensor); max_error is {max_error:g}"
     )
@@ -154,20 +154,20 @@ def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergen
     InputError
         Where the coordinates are not in metres.
     """
-    system = replace(survey.system, divergence=divergence)
+    system = survey.system.with_radiometry(divergence=divergence)
     source = find_sensor(reader, scan, SensorRequest())
-    spacing, figures = survey.figures["spacing_ns"], dict(survey.figures)
+    spacing, figures = survey.figures.spacing_ns, survey.figures
     seen = None if source.distance is None else sample_reference(reader, scan, source, system, spacing)
     if seen is not None and seen.divergence is not None:
-        figures["divergence_seen_mrad"] = seen.divergence
-        figures["divergence_seen_error_mrad"] = seen.divergence * seen.divergence_error
+        error = seen.divergence * seen.divergence_error
+        figures = replace(figures, divergence_seen_mrad=seen.divergence, divergence_seen_error_mrad=error)
     if divergence is None:
         return replace(survey, figures=figures)
     if seen is None:
         outlook = AngleOutlook(np.inf, 0.0, "the sensor's position is unknown: give --trajectory to `wavebatch run`")
     else:
         system = seen.system
-        outlook = predict_angles(system, spacing, source.distance, divergence, survey.figures["amplitude_50"])
+        outlook = predict_angles(system, spacing, source.distance, divergence, figures.amplitude_50)
         if seen.doubt():
             outlook = replace(outlook, reason=f"{seen.doubt()}; {outlook.reason}")
     others = (decision for decision in survey.decisions if decision.part != Part.ANGLE)

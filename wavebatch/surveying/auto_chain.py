@@ -65,11 +65,11 @@ def _decide_growth(survey: Survey) -> Decision:
 
 def _overlapped(survey: Survey) -> tuple[float, float]:
     """Share of overlapped ones among the waveforms with echoes, and the number of these in the sample."""
-    figures = survey.figures
-    filled = (1.0 - figures.get("empty_share", 1.0)) * survey.waveforms
-    if "overlapped_share" not in figures or filled < 1:
+    empty, overlapped = survey.figures.empty_share, survey.figures.overlapped_share
+    filled = 0.0 if empty is None else (1.0 - empty) * survey.waveforms
+    if overlapped is None or filled < 1:
         return 1.0, 0.0
-    return min(figures["overlapped_share"] * survey.waveforms / filled, 1.0), filled
+    return min(overlapped * survey.waveforms / filled, 1.0), filled
 
 
 def chain_text(survey: Survey) -> str:
@@ -128,4 +128,4 @@ def without_columns(columns: tuple[str, ...], widest: Chain, chain: Chain) -> tu
 
 def widest_chain() -> Chain:
     """Return the automatic chain with all parts: its columns are those that a user can ask for."""
-    return choose_chain(Survey(SystemPulse(sigma_ref=1.0), 0, {}, ()))
+    return choose_chain(Survey(SystemPulse(sigma_ref=1.0), 0))

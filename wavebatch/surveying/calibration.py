@@ -165,7 +165,7 @@ class Calibration:
     strips: tuple[StripConstant, ...] = ()
     """Constants of single strips, where several were calibrated together."""
     swath: tuple[float, ...] = ()
-    """How the constant grows with the scan angle, as `SystemPulse.swath`; empty where it was not fitted."""
+    """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
     notes: tuple[str, ...] = ()
     """What is doubtful about it, one line each; not kept in the file."""
 
@@ -178,15 +178,14 @@ class Calibration:
 
     def apply(self, system: SystemPulse) -> SystemPulse:
         """Return the system pulse with this calibration; a divergence that the system has already stays."""
-        return replace(
-            system,
-            calibration=self.constant,
-            calibration_err=self.relative_error,
+        return system.with_radiometry(
+            constant=self.constant,
+            constant_error=self.relative_error,
             channels={(row.digitizer, row.scanner): (row.constant, row.relative_error) for row in self.channels},
             shot_error=max((row.shot_energy for row in self.channels), default=0.0),
             swath=self.swath,
             attenuation=self.attenuation,
-            divergence=self.divergence if system.divergence is None else system.divergence,
+            divergence=self.divergence if system.radiometry.divergence is None else system.radiometry.divergence,
         )
 
     def describe(self) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from wavebatch.surveying.auto_chain import choose_chain, decide, widest_chain
 from wavebatch.surveying.outgoing import compare_outgoing
 from wavebatch.surveying.predict_error import WAVEFORMS, Prediction, leave_out_false, predict_errors
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
+from wavebatch.surveying.systems.figures import describe_figures
 
 SAMPLE_SAMPLES = 1 << 21
 """Most samples that a survey reads: 8192 waveforms of 256 samples."""
@@ -231,10 +232,10 @@ def describe_survey(choice: Choice, request: Request, fingerprint: Mapping[str, 
         `system` and `survey`.
     """
     found, saved = choice.survey, request.system
-    figures = {name: float(value) for name, value in found.figures.items() if np.isfinite(value)}
+    figures = describe_figures(found.figures)
     source: dict[str, Any] = {"from": "strip", "waveforms": found.waveforms, "figures": figures}
     if saved is not None and request.flight:
-        source |= {"from": "flight", "strips": int(found.figures.get("flight_strips", 0)), "version": saved.version}
+        source |= {"from": "flight", "strips": int(found.figures.flight_strips or 0), "version": saved.version}
     elif saved is not None:
         same = bool(saved.fingerprint) and dict(saved.fingerprint) == dict(fingerprint)
         source |= {"from": "file", "strip": saved.strip, "version": saved.version, "of_this_strip": same}

@@ -17,13 +17,13 @@ import numpy as np
 import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import UNCLEAN
+from wavebatch.core.system import LevelWidths
 from wavebatch.core.units import SQUARED_NORMAL_MEDIAN, C, format_measure
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.geometry.normals import Surroundings, measure_normals, thin_out
 from wavebatch.kernels.geometry.two_lines import in_two_lines
-from wavebatch.stages.attribute.light import is_alone
 from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
@@ -77,7 +77,7 @@ class Reference:
     """What echoes of surfaces of known slope show."""
 
     system: SystemPulse
-    """With `level_variance`, `level_error` and `width_scatter`."""
+    """With its `widths`."""
     echoes: int
     """Clean single echoes whose surface is known."""
     divergence: float | None = None
@@ -87,7 +87,7 @@ class Reference:
 
     def doubt(self) -> str:
         """Return a sentence where the system's divergence contradicts the widths; empty where it does not."""
-        given = self.system.divergence
+        given = self.system.radiometry.divergence
         if given is None or self.divergence is None:
             return ""
         if abs(given / self.divergence - 1.0) < 3.0 * self.divergence_error:
@@ -235,7 +235,7 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
     Returns
     -------
     Reference
-        `level_error` is infinite where fewer than 50 clean echoes of surfaces of known slope are found: widths then
+        `widths.error` is infinite where fewer than 50 clean echoes of surfaces of known slope are found: widths then
         mean no angle. Without a divergence the system stays as it is.
     """
     parts: dict[int | None, list[np.ndarray]] = {}
@@ -245,24 +245,24 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
             continue
         parts.setdefault(index if index in system.digitizers else None, []).append(_measure(sample, system))
     found = {index: np.concatenate(rows, axis=1) for index, rows in parts.items()}
+    divergence = system.radiometry.divergence
     others = {
-        index: _refer(replace(other, divergence=system.divergence), found.get(index, np.empty((4, 0))))
+        index: _refer(other.with_radiometry(divergence=divergence), found.get(index, np.empty((4, 0))))
         for index, other in system.digitizers.items()
     }
     main = found.get(None, np.empty((4, 0)))
-    divergence, error = _fit_divergence(*main)
-    return Reference(replace(_refer(system, main), digitizers=others), main.shape[1], divergence, error)
+    return Reference(replace(_refer(system, main), digitizers=others), main.shape[1], *_fit_divergence(*main))
 
 
 def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:
     """The system of one digitizer with the reference from echoes (4, n): see `_measure`."""
-    if system.divergence is None:
+    if system.radiometry.divergence is None:
         return system
     variance, error, lever, lever_err = rows
-    square = (1e-3 * system.divergence) ** 2
+    square = (1e-3 * system.radiometry.divergence) ** 2
     variance, error = variance - square * lever, np.hypot(error, square * lever_err)
     if len(variance) < ENOUGH_TO_LEARN:
-        return replace(system, level_error=np.inf)
+        return replace(system, widths=replace(system.widths, error=np.inf))
     # The survey's pulse may include slopes, so the true one can be narrower, but never wider.
     level, level_err = _find_level(variance, error)
     level = min(level, 0.0)
@@ -270,8 +270,8 @@ def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:
     ratio = np.median(((level - variance[below]) / error[below]) ** 2) / SQUARED_NORMAL_MEDIAN if below.any() else 1.0
     excess = np.median(error[below] ** 2) * max(float(ratio) - 1.0, 0.0) if below.any() else 0.0
     scatter = float(np.sqrt(excess) / (2.0 * system.sigma_ref))
-    level_err = float(np.hypot(level_err, 2.0 * square * np.median(lever) * system.divergence_error))
-    return replace(system, level_variance=level, level_error=level_err, width_scatter=scatter)
+    level_err = float(np.hypot(level_err, 2.0 * square * np.median(lever) * system.radiometry.divergence_error))
+    return replace(system, widths=LevelWidths(level, level_err, scatter))
 
 
 def _find_level(variance: np.ndarray, error: np.ndarray) -> tuple[float, float]:
@@ -293,9 +293,9 @@ def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:
     Variance beyond the system's and its error [ns2]; what a beam of 1 rad would add, and its error [ns2].
     """
     block = sample.block
-    system = replace(system.of(block), level_variance=0.0, level_error=None, width_scatter=0.0)
+    system = replace(system.of(block), widths=LevelWidths())
     echoes = decompose_sample(block, system)
-    clean = is_alone(block, echoes) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    clean = echoes.alone(len(block)) & (echoes.amplitude > MIN_SNR * system.noise.std)
     echoes = echoes.take(np.flatnonzero(clean & ((echoes.flags & np.uint16(UNCLEAN)) == 0)))
     variance, error = added_variance(block, system, echoes, "system", 0.0)
     row = echoes.waveform

@@ -19,6 +19,7 @@ import numpy as np
 from wavebatch.core import interrupts
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.fingerprint import take_fingerprint
@@ -33,8 +34,9 @@ from wavebatch.surveying.measuring.noise_and_width import (
     measure_gaussian,
     measure_quiet,
 )
-from wavebatch.surveying.survey import Level, Survey, compare_levels, describe_level, pool_blocks, survey_blocks
+from wavebatch.surveying.survey import Survey, compare_levels, describe_level, pool_blocks, survey_blocks
 from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.systems.figures import Kind, Look
 from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, take_strongest, with_pulse
 
 LEAST_SHARE = 64
@@ -80,11 +82,7 @@ ALIKE_NOISE, ALIKE_LEVEL = 1.15, 0.5
 Spread = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]
 """Calls a function with every item and gives the results in order, like `map`."""
 
-Kind = tuple[float, float, float, float]
-"""Bits, spacing [ns], gain and offset [V] of a descriptor."""
-
 _FORMS = ("{:g} bits", "samples {:g} ns apart", "gain {:g}", "offset {:g}")
-_KIND = ("bits", "spacing_ns", "gain", "offset")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,19 +99,6 @@ class StripSample:
     def waveforms(self) -> int:
         """Return how many were sampled."""
         return sum(map(len, self.blocks))
-
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """What a strip, or all strips of a flight, record; of the main digitizer."""
-
-    level: Level
-    width: float
-    """Gaussian width of the narrowest echoes that repeat [ns]; 0 where there are too few."""
-    steady: float
-    """Share of the clear echoes that have nearly this width."""
-    misfit: float
-    """What the flight's pulse leaves of the better half of strong echoes, beyond noise, as a share of the amplitude."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +238,7 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
             break
         group = fitting
     used = {index: kind for index, kind in kinds.items() if any(block.digitizer.index == index for block in blocks)}
-    figures = {**survey.figures, **describe_look(whole), **_describe_kinds(used), "flight_strips": float(len(group))}
+    figures = replace(survey.figures, look=whole, kinds=used, flight_strips=float(len(group)))
     identity = {"strips": [dict(sample.fingerprint) for sample in group]}
     name = group[0].path.name if len(samples) == 1 else f"{len(group)} strips"
     return Flight(SavedSurvey(replace(survey, figures=figures), name, identity), tuple(held))
@@ -317,7 +302,7 @@ def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None
     block = pool_blocks(max(kinds.values(), key=lambda group: sum(map(len, group))))
     plain, lone, width = _find_width(block, system.sigma_ref)
     level = describe_level(block, plain)
-    quiet = plain.noise_by_kind.get("quiet", 0.0)
+    quiet = plain.noise.by_kind.get("quiet", 0.0)
     if quiet:
         # The mean square of all quiet samples holds weak echoes too: 2.2 DN in a RIEGL strip, 1.6 in a part of it.
         level = level._replace(std=max(quiet, QUANTISATION_STD))
@@ -351,7 +336,7 @@ def compare_looks(own: Look, whole: Look, system: SystemPulse, wider: float = WI
 
     wider: how much wider than the flight's most echoes may be, as a share of the width.
     """
-    level = compare_levels(own.level, [whole.level], system.noise_std, OTHER_NOISE)
+    level = compare_levels(own.level, [whole.level], system.noise.std, OTHER_NOISE)
     level = level.strip().replace("the others", "the flight")
     return "; ".join(filter(None, (_compare_pulses(own, whole, system, wider), level)))
 
@@ -370,7 +355,7 @@ def _compare_pulses(own: Look, whole: Look, system: SystemPulse, wider: float = 
 
 def _kind(block: WaveformBlock) -> Kind:
     digitizer = block.digitizer
-    return (float(digitizer.bits), digitizer.spacing, digitizer.gain, digitizer.offset)
+    return Kind(float(digitizer.bits), digitizer.spacing, digitizer.gain, digitizer.offset)
 
 
 def _agree_on_kinds(samples: Sequence[StripSample]) -> dict[int, Kind]:
@@ -416,7 +401,8 @@ def _find_group(samples: list[StripSample], spread: Spread) -> list[StripSample]
     for candidate in looks[:: max(len(looks) // CANDIDATES, 1)]:
         if candidate is None:
             continue
-        whole, noise = replace(candidate, misfit=np.inf), SystemPulse(sigma_ref=1.0, noise_std=candidate.level.std)
+        whole = replace(candidate, misfit=np.inf)
+        noise = SystemPulse(sigma_ref=1.0, noise=ReceiverNoise(std=candidate.level.std))
         group = [
             sample
             for sample, look in zip(samples, looks, strict=True)
@@ -427,42 +413,17 @@ def _find_group(samples: list[StripSample], spread: Spread) -> list[StripSample]
     return best or samples
 
 
-def describe_look(look: Look) -> dict[str, float]:
-    """Return what strips record as figures of a survey; `read_flight` reads them."""
-    level = {f"flight_level_{name}": float(value) for name, value in look.level._asdict().items() if value is not None}
-    return {**level, "flight_width": look.width, "flight_steady": look.steady, "flight_misfit": look.misfit}
-
-
-def describe_kinds(blocks: Iterable[WaveformBlock]) -> dict[str, float]:
-    """Return what the descriptors of blocks mean as figures of a survey; `read_flight` reads them."""
-    return _describe_kinds({block.digitizer.index: _kind(block) for block in blocks})
-
-
-def _describe_kinds(kinds: Mapping[int, Kind]) -> dict[str, float]:
-    return {
-        f"flight_descriptor_{index}_{name}": float(value)
-        for index, kind in kinds.items()
-        for name, value in zip(_KIND, kind, strict=True)
-    }
+def list_kinds(blocks: Iterable[WaveformBlock]) -> dict[int, Kind]:
+    """Return how the samples of each descriptor of blocks were made, by its index."""
+    return {block.digitizer.index: _kind(block) for block in blocks}
 
 
 def read_flight(survey: Survey) -> tuple[Look, dict[int, Kind]]:
     """Return what a surveyed flight records, and its descriptors; raises ConfigError for a survey of no flight."""
-    figures = survey.figures
-    try:
-        level = {name: figures[f"flight_level_{name}"] for name in Level._fields if name != "clip"}
-        level |= {"waveforms": int(level["waveforms"]), "samples": int(level["samples"])}
-        level["std"] = max(level["std"], QUANTISATION_STD)
-        numbers = (figures[f"flight_{name}"] for name in ("width", "steady", "misfit"))
-        look = Look(Level(**level, clip=figures.get("flight_level_clip")), *numbers)
-        indices = sorted({int(key.split("_")[2]) for key in figures if key.startswith("flight_descriptor_")})
-        kinds = {index: tuple(figures[f"flight_descriptor_{index}_{name}"] for name in _KIND) for index in indices}
-        if not kinds:
-            raise KeyError("flight_descriptor")
-    except (KeyError, ValueError, IndexError, OverflowError) as error:
-        remedy = "`wavebatch run --survey flight --overwrite` makes one"
-        raise ConfigError(f"holds no survey of a flight; {remedy}") from error
-    return look, kinds
+    look, kinds = survey.figures.look, survey.figures.kinds
+    if look is None or not kinds:
+        raise ConfigError("holds no survey of a flight; `wavebatch run --survey flight --overwrite` makes one")
+    return look, dict(sorted(kinds.items()))
 
 
 def surveys_agree(surveys: Sequence[Survey]) -> bool:
@@ -477,20 +438,20 @@ def surveys_agree(surveys: Sequence[Survey]) -> bool:
     bool
         False for fewer than two, and where one has too few echoes for a pulse.
     """
-    if len(surveys) < 2 or any(survey.figures.get("isolated_echoes", 0) < FEW for survey in surveys):
+    if len(surveys) < 2 or any((survey.figures.isolated_echoes or 0) < FEW for survey in surveys):
         return False
     first, *others = surveys
     return all(_agree(first, other) for other in others)
 
 
 def _agree(a: Survey, b: Survey) -> bool:
-    if any(a.figures.get(name) != b.figures.get(name) for name in ("spacing_ns", "bits")):
+    if (a.figures.spacing_ns, a.figures.bits) != (b.figures.spacing_ns, b.figures.bits):
         return False
-    noise = min(a.system.noise_std, b.system.noise_std)
-    echoes = min(a.figures["isolated_echoes"], b.figures["isolated_echoes"])
+    noise = min(a.system.noise.std, b.system.noise.std)
+    echoes = min(a.figures.isolated_echoes, b.figures.isolated_echoes)
     return (
-        max(a.system.noise_std, b.system.noise_std) < ALIKE_NOISE * noise
-        and abs(a.system.baseline - b.system.baseline) < ALIKE_LEVEL * noise
+        max(a.system.noise.std, b.system.noise.std) < ALIKE_NOISE * noise
+        and abs(a.system.noise.baseline - b.system.noise.baseline) < ALIKE_LEVEL * noise
         and a.system.digitizers.keys() == b.system.digitizers.keys()
         and compare_pulses(a.system, b.system) < ALIKE_PULSES + PULSE_ERROR / np.sqrt(echoes)
     )

@@ -86,7 +86,7 @@ def _measure_class(
         # Groups of which one more echo is hidden look smaller: the near pairs in them were not counted.
         groups = len(np.unique(echoes.waveform[source]))
         expected /= 1.0 - min(expected * len(excess) / groups, MOST_LOST)
-    clear = (echoes.amplitude > CLEAR * system.noise_std) & ((number > 1) if company else (number == 1))
+    clear = (echoes.amplitude > CLEAR * system.noise.std) & ((number > 1) if company else (number == 1))
     there = np.histogram(excess_variance(echoes.take(np.flatnonzero(clear)), system), EXCESS)[0]
     hidden = expected * np.histogram(excess, EXCESS)[0]
     moved = expected * np.histogram(excess, EXCESS, weights=shift**2 / np.maximum(excess, EXCESS[0]))[0]
@@ -113,7 +113,7 @@ def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) ->
     time = np.stack([middle - half, middle + half], axis=1)
     pairs = EchoTable.build(np.repeat(np.arange(n), 2), time.ravel(), echoes.amplitude[chosen], echoes.sigma[chosen])
     found = decompose_sample(*simulate_again(block, system, pairs, rng))
-    one = (found.count(n)[found.waveform] == 1) & (found.amplitude > CLEAR * system.noise_std)
+    one = found.alone(n) & (found.amplitude > CLEAR * system.noise.std)
     found = found.take(np.flatnonzero(one))
     shift = np.abs(time[found.waveform] - found.time[:, None]).min(axis=1)
     return excess_variance(found, system), shift / ref

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.elementary import exp
@@ -20,6 +21,7 @@ from wavebatch.kernels.signal.outgoing import Reference, measure_outgoing
 from wavebatch.surveying import Decision, Survey
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
+from wavebatch.surveying.systems.figures import Figures
 
 STACKED = 4096
 """Outgoing pulses that are stacked, at most."""
@@ -31,8 +33,6 @@ GOAL = 1.25
 """Misfit of a pulse, in errors of the stack, that nobody can tell from none."""
 WIDENED = 1.15
 """Ratio of widths up to which slopes and plants may have widened even the narrowest echoes of a strip."""
-FWHM = "outgoing_fwhm_ns"
-"""Figure that says that a system file is of outgoing pulses."""
 PART = "outgoing pulse"
 SYSTEM_SUFFIX = ".system.toml"
 """End of the system file beside an imported strip."""
@@ -161,22 +161,20 @@ def save_outgoing(
     components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in shape.fit.components)
     system = SystemPulse(
         sigma_ref=shape.fwhm / FWHM_PER_SIGMA,
-        baseline=reference.level,
-        baseline_spread=reference.spread,
-        noise_std=reference.noise,
+        noise=ReceiverNoise(baseline=reference.level, baseline_spread=reference.spread, std=reference.noise),
         components=components if len(components) > 1 else (),
         ringing=shape.ringing,
     )
-    figures = {
-        FWHM: shape.fwhm,
-        "outgoing_pulses": float(shape.pulses),
-        "outgoing_misfit": shape.fit.rms,
-        "outgoing_ringing": shape.ringing,
-        "outgoing_same_receiver": float(same_receiver),
-        "spacing_ns": spacing,
-        "bits": float(bits),
+    figures = Figures(
+        outgoing_fwhm_ns=shape.fwhm,
+        outgoing_pulses=float(shape.pulses),
+        outgoing_misfit=shape.fit.rms,
+        outgoing_ringing=shape.ringing,
+        outgoing_same_receiver=float(same_receiver),
+        spacing_ns=spacing,
+        bits=float(bits),
         **{f"outgoing_{key}": value for key, value in scatter.items()},
-    }
+    )
     reason = f"stacked from {shape.pulses} outgoing pulses: full width at half maximum {shape.fwhm:.3f} ns"
     survey = Survey(system, shape.pulses, figures, (Decision(PART, True, reason),))
     return SavedSurvey(survey, name, fingerprint)
@@ -211,10 +209,10 @@ def compare_outgoing(found: Survey, strip: Path) -> Survey:
     """
     path = strip.with_suffix(SYSTEM_SUFFIX)
     sent = load_survey(path).survey if path.is_file() else None
-    if sent is None or FWHM not in sent.figures or not found.waveforms:
+    if sent is None or sent.figures.outgoing_fwhm_ns is None or not found.waveforms:
         return found
-    ours, theirs = found.system.sigma_ref * FWHM_PER_SIGMA, sent.figures[FWHM]
-    learned = "misfit_1_gaussians" in found.figures
+    ours, theirs = found.system.sigma_ref * FWHM_PER_SIGMA, sent.figures.outgoing_fwhm_ns
+    learned = bool(found.figures.misfit_gaussians)
     ratio = ours / theirs
     if not learned:
         take, why = ratio > 1 - SAME, "too few echoes show the pulse"
@@ -223,12 +221,12 @@ def compare_outgoing(found: Survey, strip: Path) -> Survey:
     elif ratio < 1:
         take, why = False, "echoes are narrower, so another receiver recorded the outgoing pulses"
     else:
-        take = bool(sent.figures.get("outgoing_same_receiver")) or ratio < WIDENED
+        take = bool(sent.figures.outgoing_same_receiver) or ratio < WIDENED
         why = "targets widened the echoes" if take else "their receiver is slower than that of the outgoing pulses"
     rings = f"after-pulses {100 * found.system.ringing:.1f} and {100 * sent.system.ringing:.1f} %"
     text = f"echoes {ours:.3f} ns wide at half maximum, outgoing pulses {theirs:.3f} ns, {rings}: {why}"
     # Not the name of the figure itself: a survey that is saved beside the strip is no file of outgoing pulses.
-    figures = {**found.figures, "sent_fwhm_ns": theirs}
+    figures = replace(found.figures, sent_fwhm_ns=theirs)
     shape = ("sigma_ref", "components", "kappa", "ringing")
     pulse = {name: getattr(sent.system, name) for name in shape} if take else {}
     system = replace(found.system, **pulse)

@@ -13,6 +13,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import without_nan
+from wavebatch.core.system import Defects
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
@@ -93,7 +94,7 @@ def predict_errors(block: WaveformBlock, system: SystemPulse, chains: Mapping[st
     sure = truth.amplitude >= LEAST_SNR * noise.std[truth.waveform]
     truth = truth.take(np.flatnonzero(sure & ((truth.flags & int(_DOUBTFUL)) == 0)))
     trial, system = simulate_again(block, system, truth, np.random.default_rng(SEED))
-    bounds = bound_time(truth.amplitude, truth.sigma.astype(np.float64), system.noise_std, block.spacing) * HALF_C
+    bounds = bound_time(truth.amplitude, truth.sigma.astype(np.float64), system.noise.std, block.spacing) * HALF_C
     bound = _rms(bounds)
     predictions = []
     for name, chain in chains.items():
@@ -152,14 +153,14 @@ def simulate_again(
     amplitude, time, width = model_parameters(shape, limits, np.stack(start, axis=1).astype(np.float64)).T
     signal = render_echoes(shape, n, s, echoes.waveform, time, amplitude, width)
     # Rounding to whole counts, below, adds this part of the noise again.
-    white = max(system.noise_std**2 - QUANTISATION_STD**2, 0.0)
-    variance = white + system.noise_gain * np.maximum(signal, 0)
+    white = max(system.noise.std**2 - QUANTISATION_STD**2, 0.0)
+    variance = white + system.noise.gain * np.maximum(signal, 0)
     signal += np.sqrt(variance).astype(np.float32) * rng.standard_normal((n, s), dtype=np.float32)
-    signal += system.baseline + system.baseline_spread * rng.standard_normal((n, 1))
+    signal += system.noise.baseline + system.noise.baseline_spread * rng.standard_normal((n, 1))
     top = block.digitizer.max_count if system.saturation is None else min(system.saturation, block.digitizer.max_count)
     counts = np.clip(np.rint(signal), 0, top).astype(np.min_scalar_type(block.digitizer.max_count))
     trial = WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
-    plain = replace(system, pattern=(), slope_spread=0.0, spikes=0.0, transient=0.0)
+    plain = replace(system, defects=Defects())
     return replace(trial, digitizer=block.digitizer), plain
 
 

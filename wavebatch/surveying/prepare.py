@@ -55,7 +55,7 @@ class Setup:
     @property
     def system(self) -> SystemPulse:
         """The pulse with its calibration and the error of the sensor's position."""
-        system = replace(self.choice.survey.system, sensor_error=self.sensor.error)
+        system = self.choice.survey.system.with_radiometry(sensor_error=self.sensor.error)
         return system if self.calibration is None else self.calibration.apply(system)
 
 
@@ -110,8 +110,8 @@ def prepare(
         source = _find_sensor(reader, scan, sensor or SensorRequest(), positions)
     if calibration is None:
         return Setup(choice, source, stranger=stranger, forced=forced)
-    fitted = match_strip(calibration, reader, scan, choice.survey.system, source, choice.chain, air)
-    return Setup(choice, source, fitted.calibration, fitted.warnings, stranger, forced)
+    fitted, doubts = match_strip(calibration, reader, scan, choice.survey.system, source, choice.chain, air)
+    return Setup(choice, source, fitted, doubts, stranger, forced)
 
 
 def _hold(reader: StripReader, scan: StripScan, request: Request) -> tuple[str, str]:

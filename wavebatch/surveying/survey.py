@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.system import Defects, LevelWidths
 from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
-from wavebatch.kernels.signal.noise import find_levels
+from wavebatch.kernels.signal.noise import estimate_noise, find_levels, keep_longest
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
@@ -33,11 +33,13 @@ from wavebatch.surveying.measuring.noise_and_width import (
     FIRST_WIDTH,
     RESIDUAL_LOOK,
     SETTLED,
+    SMALL,
     find_saturation,
     measure_gaussian,
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
+from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import choose_pulse, find_source, guess_pulse
 from wavebatch.surveying.systems.skew import measure_skew
 
@@ -61,6 +63,10 @@ STRANGE, STRANGE_NOISE = 6.0, 1.3
 
 COUNTED = 256
 """Samples of a waveform that count where the main digitizer is chosen."""
+
+
+PULSE_SAMPLES = 2.5
+"""Quiet samples, in widths of the pulse, that say as much of the noise of a pulse as one value."""
 
 
 class Part(StrEnum):
@@ -94,9 +100,8 @@ class Survey:
 
     system: SystemPulse
     waveforms: int
-    figures: Mapping[str, float]
-    """Shares of the scene, isolated echoes, amplitudes, and the misfit of every pulse model tried."""
-    decisions: tuple[Decision, ...]
+    figures: Figures = field(default_factory=Figures)
+    decisions: tuple[Decision, ...] = ()
 
 
 def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
@@ -121,7 +126,7 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
     """
     joined = join_digitizers(blocks)
     if not joined:
-        return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
+        return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0)
     seams = find_seams(joined)
     found = _survey_joined([mark_seam(block, seams) for block in joined], learn=learn)
     others = {index: replace(own, seams=seams) for index, own in found.system.digitizers.items()}
@@ -142,7 +147,7 @@ def _survey_joined(joined: list[WaveformBlock], *, learn: bool) -> Survey:
         plain = measure_gaussian(main)
     main, plain = clean_sample(main, plain)
     found = _survey(main, plain, learn=learn)
-    found.figures["descriptors_pooled"] = float(len(members))
+    found.figures.descriptors_pooled = float(len(members))
     if not others:
         return found
     return _add_digitizers(found, plain, main, others, strangers, learn=learn)
@@ -223,28 +228,17 @@ def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int
     for index in list(facts)[:0:-1]:
         own = facts[index]
         rest = [fact for other, fact in facts.items() if other != index and other not in strangers]
-        reason = compare_levels(own, rest, plain.noise_std)
+        reason = compare_levels(own, rest, plain.noise.std)
         if reason:
             strangers[index] = reason
     return strangers
-
-
-class Level(NamedTuple):
-    """Level and noise of a descriptor's quiet samples, with what is needed for their errors."""
-
-    waveforms: int
-    mean: float
-    spread: float
-    std: float
-    samples: int
-    clip: float | None
 
 
 def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
     """Level and noise of one descriptor, from each waveform's own quiet samples."""
     signal = transpose_samples(block.samples)
     reach = int(np.ceil(3 * plain.sigma_ref / block.spacing))
-    _, quiet, _ = find_levels(signal, plain.noise_std, reach)
+    _, quiet, _ = find_levels(signal, plain.noise.std, reach)
     if block.missing is not None:
         quiet &= ~block.missing.T
     # Only what comes before the first signal: long packets have more echoes, and what lies between them is no level.
@@ -255,7 +249,7 @@ def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
     pairs = quiet[1:] & quiet[:-1]
     step = np.where(pairs, signal[1:] - signal[:-1], np.float32(0))
     freedom = max(int(np.count_nonzero(pairs)), 1)
-    unlike = 2 * max(1 - (plain.correlation[0] if plain.correlation else 0.0), 0.1)
+    unlike = 2 * max(1 - (plain.noise.correlation[0] if plain.noise.correlation else 0.0), 0.1)
     std = float(np.sqrt(np.sum(step * step, dtype=np.float64) / (unlike * freedom)))
     mean, spread = (float(np.mean(level[used])), float(np.std(level[used]))) if used.any() else (0.0, 0.0)
     clip = find_saturation(block.samples, block.digitizer.max_count)
@@ -307,10 +301,10 @@ def _add_digitizers(
             reason = strange or "its bits, spacing, gain, offset, level, noise or pulse differ from the main one's"
             decisions.append(Decision(f"digitizer {block.digitizer.index}", True, reason))
         counts.append(len(block))
-        scenes.append(_describe(block, own, decompose_sample(block, own)))
-    figures = dict(found.figures)
-    for name in ("empty_share", "single_share", "overlapped_share", "echoes_per_waveform", "saturated_share"):
-        figures[name] = float(np.average([scene[name] for scene in scenes], weights=counts))
+        scenes.append(_describe(block, own, decompose_sample(block, own), Figures()))
+    names = ("empty_share", "single_share", "overlapped_share", "echoes_per_waveform", "saturated_share")
+    whole = {name: float(np.average([getattr(scene, name) for scene in scenes], weights=counts)) for name in names}
+    figures = replace(found.figures, **whole)
     system = replace(found.system, digitizers=systems)
     return Survey(system, sum(counts), figures, (*_decide(system, main.spacing, figures), *decisions))
 
@@ -323,10 +317,9 @@ def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock
     if block.digitizer.bits != main.digitizer.bits:
         return False
     other = measure_gaussian(block, plain.sigma_ref / block.spacing)
-    slack = 0.25 * plain.noise_std + 3 * plain.baseline_spread / np.sqrt(len(block))
-    alike = abs(other.baseline - plain.baseline) < slack
-    for quantity, most in (("noise_std", 1.2), ("sigma_ref", 1.04)):
-        ratio = getattr(other, quantity) / getattr(plain, quantity)
+    slack = 0.25 * plain.noise.std + 3 * plain.noise.baseline_spread / np.sqrt(len(block))
+    alike = abs(other.noise.baseline - plain.noise.baseline) < slack
+    for ratio, most in ((other.noise.std / plain.noise.std, 1.2), (other.sigma_ref / plain.sigma_ref, 1.04)):
         alike &= 1 / most < ratio < most
     return bool(alike and (other.saturation or main.digitizer.max_count) == clip_level(main, plain))
 
@@ -334,37 +327,36 @@ def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock
 def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> SystemPulse:
     """The system of another digitizer; where its echoes are too few for a pulse, the main one's with its noise."""
     own = survey_block(block, learn=learn)
-    if own.figures.get("isolated_echoes", 0) >= FEW or not learn:
+    if not learn or own.figures.isolated_echoes >= FEW:
         return own.system
-    noise = measure_gaussian(block, system.sigma_ref / block.spacing)
-    kept = ("baseline", "baseline_spread", "recovery", "noise_std", "noise_by_kind", "correlation", "saturation")
-    return replace(system, noise_gain=0.0, **{name: getattr(noise, name) for name in kept})
+    measured = measure_gaussian(block, system.sigma_ref / block.spacing)
+    return replace(system, noise=measured.noise, saturation=measured.saturation)
 
 
 def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
     """Survey of one block: noise and width of isolated echoes, the pulse's shape, noise again, the threshold."""
     if not len(block):
-        return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
+        return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0)
     return _survey(*clean_sample(block, measure_gaussian(block)), learn=learn)
 
 
 def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlock, SystemPulse]:
     """The block without the defects of its waveforms, and the system with them, once more from what is left."""
     found = measure_defects(block, system)
-    if not found.has_defects:
+    if not found.defects:
         return block, system
     block = clean_block(block, found)
-    kept = {name: getattr(found, name) for name in ("pattern", "slope_spread", "spikes", "transient")}
-    return block, replace(measure_gaussian(block, system.sigma_ref / block.spacing, known=True), **kept)
+    cleaned = measure_gaussian(block, system.sigma_ref / block.spacing, known=True)
+    return block, replace(cleaned, defects=found.defects)
 
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
     """As survey_block, from noise and width as `measure_gaussian` finds them."""
-    figures: dict[str, float] = {}
+    figures = Figures()
     if learn:
         clear = find_clear(block, system)
         main = find_isolated(block, system, clear)
-        figures["isolated_echoes"] = len(main)
+        figures.isolated_echoes = len(main)
         learned = len(main) >= ENOUGH_TO_LEARN
         if learned:
             system = learn_pulse(block, system, main, figures)
@@ -377,27 +369,50 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             if len(chosen) < ENOUGH_TO_LEARN or abs(system.sigma_ref / last - 1) < SETTLED:
                 break
         learned |= len(chosen) >= ENOUGH_TO_LEARN
-        system = choose_pulse(part, system, learned=learned, figures=figures)
+        strong = find_strong(clear)
+        system = choose_pulse(block, system, strong, learned=learned, figures=figures)
         before, echoes = system, decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
-        # The strongest echoes are the same, and clear, whatever pulse is learned from them.
-        system = measure_misfit(block, system, find_strong(clear))
+        # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its
+        # misfit; a few echoes of a small strip, full of neighbours, do not know better.
+        strong = strong if find_source(system) is None else find_strong(clear, 0)
+        unsure, system = system, measure_misfit(block, system, strong)
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
+        if len(block) < SMALL:
+            doubt = 1 - len(_find_sure(block, unsure, strong)) / max(len(echoes), 1)
+            figures.echoes_in_doubt = max(doubt, figures.echoes_in_doubt or 0.0)
     else:
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
-    system = replace(measure_hidden(part, system, echoes), width_scatter=_measure_scatter(part, system, echoes))
+    widths = LevelWidths(scatter=_measure_scatter(part, system, echoes))
+    system = replace(measure_hidden(part, system, echoes), widths=widths)
     system = measure_skew(part, system, echoes) if learn else system
-    figures.update(_describe(part, system, echoes))
-    decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system))
+    figures = _describe(part, system, echoes, figures)
+    decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system.defects))
     return Survey(system, len(block), figures, decisions)
+
+
+def _find_sure(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> EchoTable:
+    """The echoes of a small strip that noise and misfit leave no doubt of.
+
+    The noise is two standard errors larger, by its quiet samples. What few strong echoes miss a pulse of the strip's
+    own by is all misfit: it may change from shot to shot, and have nothing in common.
+    """
+    width = system.sigma_ref / block.spacing
+    missing = None if block.missing is None else keep_longest(block.missing.T)
+    quiet = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing).share
+    error = np.sqrt(PULSE_SAMPLES * width / (2 * max(quiet * block.samples.size, 1)))
+    if find_source(system) is None:
+        system = measure_misfit(block, system, strong, bounded=False)
+    noise = replace(system.noise, std=float(system.noise.std * (1 + 2 * error)))
+    return decompose_sample(block, replace(system, noise=noise))
 
 
 def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
     """Whether two surveys with one pulse find the same echoes, near enough for the shares of a scene."""
-    ratio = other.noise_std / one.noise_std
-    alike = one.noise_gain == other.noise_gain and one.misfit == other.misfit
+    ratio = other.noise.std / one.noise.std
+    alike = one.noise.gain == other.noise.gain and one.misfit == other.misfit
     return alike and max(ratio, 1 / ratio) < SAME_THRESHOLD
 
 
@@ -406,7 +421,7 @@ def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
 
     From those narrower than the system pulse: slopes and plants only widen. 0 with too few of them.
     """
-    clear = (echoes.count(len(block))[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    clear = echoes.alone(len(block)) & (echoes.amplitude > MIN_SNR * system.noise.std)
     clear &= (echoes.flags & np.uint16(UNCLEAN)) == 0
     below = clear & (echoes.sigma < system.sigma_ref)
     if np.count_nonzero(below) < ENOUGH_TO_LEARN:
@@ -416,8 +431,8 @@ def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     return float(np.sqrt(max(excess, 0.0)))
 
 
-def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> dict[str, float]:
-    """Shares and amplitudes of the scene."""
+def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figures: Figures) -> Figures:
+    """The figures with samples, shares and amplitudes of the scene."""
     n = len(block)
     number = echoes.count(n)
     overlapped = np.zeros(n, bool)
@@ -425,49 +440,50 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> d
     saturated = 0.0
     if system.saturation is not None:
         saturated = float((block.samples >= system.saturation).any(axis=1).mean())
-    narrow = (number[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    narrow = (number[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise.std)
     deviation = (echoes.sigma - system.sigma_ref) / np.maximum(echoes.sigma_err, 1e-6)
-    return {
-        "spacing_ns": block.spacing,
-        "n_samples": float(block.samples.shape[1]),
-        "bits": float(block.digitizer.bits),
-        "inverted": float(block.digitizer.inverted),
-        "least_count": float(block.samples.min(initial=block.digitizer.max_count)),
-        "largest_count": float(block.samples.max(initial=0)),
-        "empty_share": float((number == 0).mean()),
-        "single_share": float((number == 1).mean()),
-        "overlapped_share": float(overlapped.mean()),
-        "echoes_per_waveform": float(number.mean()),
-        "amplitude_50": float(np.median(echoes.amplitude)) if len(echoes) else 0.0,
-        "amplitude_99": float(np.quantile(echoes.amplitude, 0.99)) if len(echoes) else 0.0,
-        "saturated_share": saturated,
-        "system_width_share": float((np.abs(deviation[narrow]) < 3).mean()) if narrow.any() else 0.0,
-    }
+    return replace(
+        figures,
+        spacing_ns=block.spacing,
+        n_samples=float(block.samples.shape[1]),
+        bits=float(block.digitizer.bits),
+        inverted=float(block.digitizer.inverted),
+        least_count=float(block.samples.min(initial=block.digitizer.max_count)),
+        largest_count=float(block.samples.max(initial=0)),
+        empty_share=float((number == 0).mean()),
+        single_share=float((number == 1).mean()),
+        overlapped_share=float(overlapped.mean()),
+        echoes_per_waveform=float(number.mean()),
+        amplitude_50=float(np.median(echoes.amplitude)) if len(echoes) else 0.0,
+        amplitude_99=float(np.quantile(echoes.amplitude, 0.99)) if len(echoes) else 0.0,
+        saturated_share=saturated,
+        system_width_share=float((np.abs(deviation[narrow]) < 3).mean()) if narrow.any() else 0.0,
+    )
 
 
-def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -> tuple[Decision, ...]:
+def _decide(system: SystemPulse, spacing: float, figures: Figures) -> tuple[Decision, ...]:
     """The table of docs/algorithms.md 4.4: what this scene needs, and the reason for each part left out."""
     width = system.sigma_ref / spacing
-    share = figures["overlapped_share"]
-    strongest = figures["amplitude_99"]
+    share = figures.overlapped_share
+    strongest = figures.amplitude_99
     learned = len(system.components)
     inverted = "the signal goes down from its baseline: counts are mirrored when they are read"
     return (
-        *((Decision(Part.INVERTED, True, inverted),) if figures.get("inverted") else ()),
+        *((Decision(Part.INVERTED, True, inverted),) if figures.inverted else ()),
         Decision(Part.PULSE, learned > 1, _explain_pulse(system, figures)),
         Decision(Part.SKEW, system.kappa != 0, _explain_skew(system, figures)),
         Decision(Part.GROWTH, share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
         Decision(Part.PRIOR, share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (40 %)"),
         Decision(
             Part.CENSORED,
-            system.saturation is not None and figures["saturated_share"] > 0,
-            f"{100 * figures['saturated_share']:.2f} % of the waveforms are saturated",
+            system.saturation is not None and figures.saturated_share > 0,
+            f"{100 * figures.saturated_share:.2f} % of the waveforms are saturated",
         ),
         Decision(
             Part.WEIGHTS,
-            system.noise_gain > 0,
-            f"variance grows by {system.noise_gain * strongest:.2f} DN2 up to {strongest:.0f} DN, "
-            f"against {system.noise_std**2:.2f} DN2 without signal",
+            system.noise.gain > 0,
+            f"variance grows by {system.noise.gain * strongest:.2f} DN2 up to {strongest:.0f} DN, "
+            f"against {system.noise.std**2:.2f} DN2 without signal",
         ),
         Decision(
             Part.WIDTH,
@@ -476,24 +492,24 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
         ),
         Decision(
             Part.ANGLE,
-            width >= LEAST_PULSE_WIDTH and figures["system_width_share"] < 0.95,
-            f"{100 * figures['system_width_share']:.0f} % of the clear echoes have the width of the system pulse; a "
+            width >= LEAST_PULSE_WIDTH and figures.system_width_share < 0.95,
+            f"{100 * figures.system_width_share:.0f} % of the clear echoes have the width of the system pulse; a "
             "chain has angles only where the beam's divergence is given",
         ),
     )
 
 
-def _decide_defects(system: SystemPulse) -> Iterator[Decision]:
+def _decide_defects(defects: Defects) -> Iterator[Decision]:
     """What is taken off the waveforms before anything else, of those that have it."""
-    if system.pattern:
-        offsets = ", ".join(f"{offset:+.2f}" for offset in system.pattern)
+    if defects.pattern:
+        offsets = ", ".join(f"{offset:+.2f}" for offset in defects.pattern)
         yield Decision("pattern taken off", True, f"samples differ in turn by {offsets} DN: several converters")
-    if system.slope_spread:
-        yield Decision("slopes taken off", True, f"baselines rise or fall, by {system.slope_spread:.3g} DN/ns (std)")
-    if system.spikes:
-        yield Decision("spikes taken off", True, f"{system.spikes:.3g} spikes of one sample per waveform")
-    if system.transient:
-        yield Decision("start left out", True, f"the first {system.transient:g} ns of the waveforms jump")
+    if defects.slope_spread:
+        yield Decision("slopes taken off", True, f"baselines rise or fall, by {defects.slope_spread:.3g} DN/ns (std)")
+    if defects.spikes:
+        yield Decision("spikes taken off", True, f"{defects.spikes:.3g} spikes of one sample per waveform")
+    if defects.transient:
+        yield Decision("start left out", True, f"the first {defects.transient:g} ns of the waveforms jump")
 
 
 def _decide_seams(seams: Mapping[int, int]) -> Iterator[Decision]:
@@ -503,28 +519,27 @@ def _decide_seams(seams: Mapping[int, int]) -> Iterator[Decision]:
         yield Decision("seam left out", True, reason)
 
 
-def _explain_pulse(system: SystemPulse, figures: Mapping[str, float]) -> str:
+def _explain_pulse(system: SystemPulse, figures: Figures) -> str:
     """Why the pulse is, or is not, a sum of Gaussians."""
-    source = find_source(system) if "pulse_cost" in figures else None
-    if "pulse_cost" in figures:
-        cost, isolated = figures["pulse_cost"], figures["isolated_pulse_cost"]
+    if figures.pulse_cost is not None:
+        source, cost, isolated = find_source(system), figures.pulse_cost, figures.isolated_pulse_cost
         name = f"the shipped {source.name}" if source else "the isolated echoes, drawn together"
         return f"pulse from {name}: echoes and misfit of a waveform cost {cost:.0f} with it, {isolated:.0f} without"
-    if "misfit_1_gaussians" not in figures:
-        few = f"{int(figures.get('isolated_echoes', 0))} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
+    if not figures.misfit_gaussians:
+        few = f"{int(figures.isolated_echoes or 0)} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
         ringing = f"after-pulses of {100 * system.ringing:.1f} % that strong echoes show are flagged"
         return f"{few}; {ringing}" if system.ringing else few
-    one = figures["misfit_1_gaussians"]
+    one = figures.misfit_gaussians[1]
     number = len(system.components)
     if number > 1:
-        best = figures.get(f"misfit_{number}_gaussians", 0.0)
+        best = figures.misfit_gaussians.get(number, 0.0)
         return f"{number} Gaussians miss the stacked echoes by {best:.4f} of the amplitude, one by {one:.4f}"
     return f"one Gaussian misses the stacked echoes by {one:.4f} of the amplitude; a simple pulse is enough"
 
 
-def _explain_skew(system: SystemPulse, figures: Mapping[str, float]) -> str:
+def _explain_skew(system: SystemPulse, figures: Figures) -> str:
     """Why the pulse is, or is not, skewed."""
-    if "misfit_skewed" not in figures:
+    if figures.misfit_skewed is None:
         return "no pulse was learned"
-    misfit, kappa = figures["misfit_skewed"], figures["kappa"]
+    misfit, kappa = figures.misfit_skewed, figures.kappa
     return f"with kappa {kappa:.3f} it misses the stacked echoes by {misfit:.4f} of the amplitude"

@@ -6,7 +6,6 @@ Before you change it: every number must come back to the last bit, and old files
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,7 +15,8 @@ from wavebatch import __version__
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml
 from wavebatch.surveying import Decision, Survey
-from wavebatch.surveying.systems.system_table import REMEDY, comment_system, describe_system, read_figures, read_system
+from wavebatch.surveying.systems.figures import describe_figures, read_figures
+from wavebatch.surveying.systems.system_table import REMEDY, comment_system, describe_system, read_system
 
 SYSTEM_SCHEMA = "wavebatch.system/1"
 
@@ -48,7 +48,7 @@ def format_survey(saved: SavedSurvey) -> str:
         "sensor": saved.sensor or None,
         "waveforms": int(survey.waveforms),
         "system": describe_system(survey.system),
-        "figures": {key: float(value) for key, value in survey.figures.items() if math.isfinite(value)},
+        "figures": describe_figures(survey.figures),
         "decision": [{**asdict(decision), "needed": bool(decision.needed)} for decision in survey.decisions] or None,
         "fingerprint": saved.fingerprint or None,
     }

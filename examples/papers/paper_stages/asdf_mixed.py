@@ -8,12 +8,10 @@ from typing import Annotated, Literal
 import numpy as np
 
 from wavebatch import EchoTable, Noise, SystemPulse, WaveformBlock, stage
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.loops import asdf_only, need_asdf
 from wavebatch.stages.decompose.merge import join_tables
-from wavebatch.stages.decompose.rebuild import MODELS
 from wavebatch.stages.decompose.solve import fit_gaussian
 from wavebatch.stages.detect.maximum import maximum
 
@@ -56,6 +54,3 @@ def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> 
     a, b = (table.take(np.flatnonzero(~differ[table.waveform])) for table in (first, second))
     differ[a.waveform[np.abs(a.time - b.time) > tolerance]] = True
     return differ
-
-
-MODELS["decompose.asdf_mixed"] = lambda *_: GAUSSIAN

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 from wavebatch import EchoTable, Noise, SystemPulse, WaveformBlock, stage
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
-from wavebatch.stages.decompose.rebuild import MODELS
 from wavebatch.stages.decompose.solve import FitOptions, fit_candidates, fit_gaussian, make_settings
 
 _FIT = FitOptions(max_iterations=20, tolerance=0.01)
@@ -31,6 +30,3 @@ def gauss_newton(
     fit = replace(_FIT, **options)
     settings = make_settings(block, system, GAUSSIAN, fit, grow=False, undamped=True)._replace(noise_gain=0.0)
     return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
-
-
-MODELS["decompose.gauss_newton"] = lambda *_: GAUSSIAN

@@ -7,8 +7,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from wavebatch import EchoTable, Noise, SystemPulse, WaveformBlock, stage
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
-from wavebatch.stages.decompose.rebuild import MODELS
+from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.stages.decompose.skew import fit_each
 from wavebatch.stages.decompose.solve import FitOptions, make_settings
 
@@ -16,6 +15,7 @@ _FIT = FitOptions(max_iterations=60)
 
 
 def _fit_log_normal(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
+    """Echoes carry their skews, with which they are drawn."""
     return replace(system, components=(), kappa=0.0)
 
 
@@ -44,7 +44,3 @@ def log_normal(
     fit = replace(_FIT, **options)
     settings = make_settings(block, system, PulseShape(origin=origin), fit, grow=False)
     return fit_each(block, noise, system, echoes, settings, fit.significance)
-
-
-# Echoes carry their skews, with which they are drawn.
-MODELS["decompose.log_normal"] = lambda *_: GAUSSIAN

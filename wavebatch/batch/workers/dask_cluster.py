@@ -25,7 +25,7 @@ from wavebatch.batch.workers.worker_check import (
     describe_worker,
     list_sizes,
     travelling_call,
-    travelling_versions,
+    travelling_kind,
 )
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
@@ -39,8 +39,6 @@ _WORKERS = 10.0
 """Seconds to wait for the first worker."""
 _POLL = 5.0
 """Seconds between two questions to the scheduler."""
-_SAME = ("wavebatch", "numpy", "scipy")
-"""Packages that must have one version everywhere, because results depend on them."""
 _MISFIT = "misfit"
 """Answer of a worker that joined later and does not fit."""
 _ADVICE = "check that it runs, and run again with --resume: finished clouds are complete"
@@ -67,10 +65,8 @@ class Cluster:
     """
 
     is_remote = True
-    compresses = False
-    """Whether workers compress chunks: here rows would travel back to them."""
-    memory = None
-    """Folder of memory that processes share: those of other machines do not."""
+    jobs = 1
+    """Threads of this machine that compress."""
 
     def __init__(
         self,
@@ -160,26 +156,17 @@ class Cluster:
         return sum(self._client.nthreads().values())
 
     def _check_versions(self) -> None:
-        """Raise ConfigError where a worker has another version of Python or of a package that results depend on."""
-        version = platform.python_version
-        self._compare("python", version(), self._ask(version), lambda text: text.split(".")[:2])
-        find_versions = travelling_versions()
-        here, there = find_versions(_SAME), self._ask(find_versions, _SAME)
-        for name in _SAME:
-            self._compare(name, here[name], {worker: found.get(name) for worker, found in there.items()})
+        """Raise ConfigError where a worker is not of the kind of this process."""
         self._kind = describe_worker()
-        for worker, kind in sorted(self._ask(describe_worker).items()):
+        # First of all Python: code does not travel between its versions.
+        found = self._ask(platform.python_version_tuple)
+        self._refuse({worker: {**self._kind, "python": ".".join(version[:2])} for worker, version in found.items()})
+        self._refuse(self._ask(travelling_kind()))
+
+    def _refuse(self, kinds: dict[str, dict[str, str | None]]) -> None:
+        for worker, kind in sorted(kinds.items()):
             if why := compare_workers(self._kind, kind):
                 raise ConfigError(f"--scheduler {self.address}: worker {worker} {why}")
-
-    def _compare(self, name: str, mine: str, theirs: dict[str, Any], part: Callable = str) -> None:
-        for worker, found in sorted(theirs.items()):
-            if found is None or part(found) != part(mine):
-                has = f"has no {name}" if found is None else f"has {name} {found}"
-                raise ConfigError(
-                    f"--scheduler {self.address}: worker {worker} {has}, this machine {mine}; install the same there, "
-                    "so that the result is the same"
-                )
 
     def _check_files(self) -> None:
         """Raise ConfigError where a worker does not see a strip, or sees another folder of the same name."""

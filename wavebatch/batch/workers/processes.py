@@ -27,11 +27,11 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.batch.workers.futures import end_future, settle, wait_uninterrupted
-from wavebatch.batch.workers.serve import END, PATIENCE, serve_calls
+from wavebatch.batch.workers.serve import PATIENCE, serve_calls
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.core.memory import ONE_THREAD, keep_freed_memory
-from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, use_scratch
+from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
@@ -72,14 +72,8 @@ class Workers:
         self._scratch: Path | None = None
         self._needs_main = False
         """Whether calls use functions of the user's script, which the processes then import."""
-        self.compresses = jobs > 1
-        """Whether the processes compress chunks for this one."""
-        self.memory: Path | None = None
-        """Folder of memory that the processes share."""
 
     def __enter__(self) -> Workers:
-        if self.jobs > 1:
-            self.memory = self._stack.enter_context(owning_memory())
         self._scratch = self._stack.enter_context(owning_scratch())
         return self
 
@@ -266,7 +260,6 @@ class _Worker:
                 result, error = self._ask(call.pickled)
                 self.call = None
                 end_future(call.future, result, error)
-            self._pipe.send_bytes(END)
         except (EOFError, OSError):  # the process is dead
             self.serves = False
             if self.call is not None:

@@ -1,7 +1,7 @@
-"""What a worker process runs: calls from its pipe, until the parent process says that there are no more, or dies.
+"""What a worker process runs: calls from its pipe, until the parent process closes it, or dies.
 
-`processes` starts it. Before you change it: it must end with its parent, however that ends, and remove what the parent
-shared in memory; it should import little before it waits for its first call.
+`processes` starts it. Before you change it: it must end with its parent, however that ends; it should import little
+before it waits for its first call.
 """
 
 from __future__ import annotations
@@ -19,41 +19,34 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from wavebatch.core.memory import keep_freed_memory
-from wavebatch.files.disk.temp_folders import remove_memory_of
 
-_FIRST_MODULE = "wavebatch.batch.row_transfer"
+_FIRST_MODULE = "wavebatch.batch.neighbour_pass"
 """What a new process imports while it waits: with it comes nearly all that calls need."""
-
-END = b""
-"""Sent to a process in place of a call: it ends. A pipe that closes without it means that this process was killed."""
 
 _SET_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of linux/prctl.h."""
 
 PATIENCE = 3.0
-"""Seconds that processes have to end by themselves, and the memory of a dead one to be free."""
+"""Seconds that processes have to end by themselves."""
 
 
 def serve_calls(pipe: Connection) -> None:
-    """Make calls until the parent process says that there are no more."""
+    """Make calls until the parent process closes the pipe."""
     _wake_when_parent_dies()  # before all else: until then nothing wakes this process if it is stopped
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     keep_freed_memory()
-    end = threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True)
-    end.start()
+    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     with contextlib.suppress(Exception):  # the call that needs it reports the error
         importlib.import_module(_FIRST_MODULE)
     with contextlib.suppress(EOFError, OSError):
-        while (call := pipe.recv_bytes()) != END:
-            pipe.send_bytes(_answer(call))
-        return
-    end.join()  # else this process would be gone before it has cleaned up
+        while True:
+            pipe.send_bytes(_answer(pipe.recv_bytes()))
 
 
 def _wake_when_parent_dies() -> None:
-    """Let Linux continue this process, if it is stopped, when its parent dies: `_end_with` then cleans up and ends it.
+    """Let Linux continue this process, if it is stopped, when its parent dies: `_end_with` then ends it.
 
-    A signal that kills would leave what the parent shared in memory.
+    A signal that kills would come too early: when the thread ends that has started this process.
     """
     if sys.platform == "linux":
         import ctypes
@@ -80,7 +73,6 @@ def _pickle_error(error: Exception) -> bytes:
 
 
 def _end_with(parent: Any) -> None:
-    """End this process when its parent has died, without what the parent shared in memory until the next run."""
+    """End this process when its parent has died, also in the middle of a call."""
     parent.join()
-    remove_memory_of(parent.pid, PATIENCE)
     os._exit(1)

@@ -33,7 +33,7 @@ def describe_worker() -> dict[str, str]:
     }
 
 
-def compare_workers(here: dict[str, str], there: dict[str, str]) -> str:
+def compare_workers(here: dict[str, str], there: dict[str, str | None]) -> str:
     """Return in what a worker differs from this machine; empty where it does not.
 
     Parameters
@@ -48,7 +48,8 @@ def compare_workers(here: dict[str, str], there: dict[str, str]) -> str:
     """
     for name in ("python", "wavebatch", "numpy", "scipy"):
         if there.get(name) != here[name]:
-            return f"has {name} {there.get(name)}, this machine {here[name]}; install the same there"
+            has = f"has {name} {there[name]}" if there.get(name) else f"has no {name}"
+            return f"{has}, this machine {here[name]}; install the same there, so that the result is the same"
     if there.get("probe") != here["probe"]:
         return (
             f"has another kind of processor ({there.get('name')}), which rounds in another way than this machine "
@@ -79,22 +80,36 @@ def _size(file: str) -> int:
         return -1
 
 
+def travelling_kind() -> Callable[[], dict[str, str | None]]:
+    """Return `describe_worker` as code: a worker may have another wavebatch, or none."""
+
+    def find() -> dict[str, str | None]:
+        try:
+            from wavebatch.batch.workers.worker_check import describe_worker
+
+            return describe_worker()
+        except Exception:
+            import platform
+            import sys
+
+            version = getattr(sys.modules.get("wavebatch"), "__version__", None)
+            return {"python": ".".join(platform.python_version_tuple()[:2]), "wavebatch": version}
+
+    return find
+
+
 def travelling_call() -> Callable[[bytes, dict[str, str]], bytes]:
     """Return a function that makes a pickled call and pickles (result, error), if the worker is of the client's kind.
 
     It is sent as code, calls and results as bytes: the scheduler unpickles all else, and may lack wavebatch.
     """
+    find = travelling_kind()
 
     def call(pickled: bytes, kind: dict[str, str]) -> bytes:
         import pickle
         import traceback
 
-        try:
-            from wavebatch.batch.workers.worker_check import describe_worker
-
-            found = describe_worker()
-        except Exception as error:  # an older wavebatch, or none
-            found = {"python": f"(without this wavebatch: {error})"}
+        found = find()
         if found != kind:
             from distributed import get_worker
 
@@ -107,29 +122,3 @@ def travelling_call() -> Callable[[bytes, dict[str, str]], bytes]:
             return pickle.dumps((None, error))
 
     return call
-
-
-def travelling_versions() -> Callable[[tuple[str, ...]], dict[str, str]]:
-    """Return a function that finds the versions of installed packages, and for wavebatch a checksum of its files.
-
-    It is sent as code: a worker may lack wavebatch.
-    """
-
-    def find_versions(names: tuple[str, ...]) -> dict[str, str]:
-        import importlib
-        import pathlib
-        import zlib
-
-        found = {}
-        for name in names:
-            try:
-                package = importlib.import_module(name)
-            except ImportError:
-                continue
-            found[name] = package.__version__
-            if name == "wavebatch":
-                files = sorted(pathlib.Path(package.__file__).parent.rglob("*.py"))
-                found[name] += f" (files {zlib.crc32(b''.join(file.read_bytes() for file in files)):08x})"
-        return found
-
-    return find_versions

@@ -6,7 +6,6 @@ else has succeeded: matplotlib takes long to import and may be missing.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +140,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
         run, fill = choice.chain, None
         if ranges:
             run, fill, error = add_ranges(choice.chain, reader, scan)
-            system = replace(system, sensor_error=error)
+            system = system.with_radiometry(sensor_error=error)
         views = read_views(reader, scan, places, run, system, options["show"], fill)
         return views, describe_chain(choice.chain)
 

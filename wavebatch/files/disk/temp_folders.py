@@ -14,16 +14,12 @@ import re
 import shutil
 import socket
 import tempfile
-import time
 from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk import locks
-
-MEMORY_PLACE = Path("/dev/shm")
-"""Files here are in memory; Linux has it."""
 
 _LOCK = "lock"
 _place: ContextVar[Path | None] = ContextVar("wavebatch_scratch", default=None)
@@ -85,36 +81,6 @@ def owning_scratch(parent: Path | None = None) -> Iterator[Path | None]:
     finally:
         _place.reset(token)
         owned.close()
-
-
-@contextlib.contextmanager
-def owning_memory() -> Iterator[Path | None]:
-    """Make a folder for files in memory, and remove it at the end; None where the system has no place for them.
-
-    If this process is killed, its workers remove it (`remove_memory_of`), or else the next run.
-    """
-    try:
-        owned = _Owned(MEMORY_PLACE, "") if MEMORY_PLACE.is_dir() else None
-    except OSError:
-        owned = None
-    try:
-        yield None if owned is None else owned.folder
-    finally:
-        if owned is not None:
-            owned.close()
-
-
-def remove_memory_of(process: int, patience: float) -> None:
-    """Remove the folders in memory of a process of this machine that was killed.
-
-    A dying process lets go of its locks one after the other, and other processes may make files meanwhile: this tries
-    again until the folders are gone, for `patience` seconds.
-    """
-    deadline = time.monotonic() + patience
-    while any(MEMORY_PLACE.glob(f"{_prefix()}{process}-*")) and time.monotonic() < deadline:
-        with contextlib.suppress(OSError):
-            remove_orphans(MEMORY_PLACE)
-        time.sleep(0.01)
 
 
 def remove_orphans(parent: Path) -> list[Path]:

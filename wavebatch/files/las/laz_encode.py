@@ -7,8 +7,7 @@ classes); test changes by reading the output with both libraries.
 from __future__ import annotations
 
 import contextlib
-import io
-import struct
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -32,8 +31,6 @@ _ERRORS: tuple[type[Exception], ...] = (lazrs.LazrsError, *([laszip.LaszipError]
 _WAVE_ITEM, _BROKEN_VERSION, _READABLE_VERSION = 9, 2, 1
 CHUNK_POINTS = 50_000
 """Points of a LAZ chunk: what LASzip and lazrs write."""
-_TABLE_PLACE = struct.Struct("<q")
-"""Before the first chunk: where the table of the chunks' sizes begins."""
 _ITEMS_AT = 34
 """Offset of the list of items in the "laszip encoded" record."""
 
@@ -48,42 +45,21 @@ class PointEncoder:
     def write(self, rows: np.ndarray) -> None:
         self._file.write(rows.view(np.uint8).data)
 
-    @property
-    def coding(self) -> bytes | None:
-        """What `compress_chunk` needs to make chunks for `write_chunk`; None where only `write` makes this file."""
-        return None
-
-    def write_chunk(self, points: int, chunk: bytes) -> None:
-        """Append a chunk of `compress_chunk`; all but the last hold CHUNK_POINTS, and `write` may not be called too."""
-        raise NotImplementedError
-
     def finish(self) -> None:
         """Write what is left to be written."""
 
 
-def compress_chunk(coding: bytes, rows: np.ndarray) -> bytes:
-    """Compress rows (m,) as one chunk of a LAZ file; its bytes depend on nothing else.
-
-    coding: of the encoder that will write it. Raises InputError if it fails.
-    """
-    try:
-        with uninterrupted():
-            found = lazrs.compress_points(lazrs.LazVlr(coding), rows.view(np.uint8), False)
-    except _ERRORS as error:
-        raise InputError(f"the points cannot be compressed: {error}") from error
-    return bytes(memoryview(found)[_TABLE_PLACE.size : _TABLE_PLACE.unpack_from(found)[0]])
-
-
-def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
+def open_encoder(file: BinaryIO, header: LasHeader, threads: int = 1) -> PointEncoder:
     """Write header and VLRs at the start of `file` and return the encoder for the points after them.
 
-    For a compressed file the "laszip encoded" record is added to `header.vlrs`.
+    For a compressed file the "laszip encoded" record is added to `header.vlrs`, and `threads` compress; the bytes do
+    not depend on their number.
     """
     if not header.compressed:
         return PointEncoder(file, header)
     if header.point_format in (9, 10) and laszip is not None:
         return _LaszipEncoder(file, header)
-    return _LazrsEncoder(file, header)
+    return _LazrsEncoder(file, header, threads)
 
 
 class _WatchedFile:
@@ -118,7 +94,7 @@ class _WatchedFile:
 class _LazrsEncoder(PointEncoder):
     """lazrs 0.8 writes wrong packet fields in formats 9 and 10 after a change of scanner channel; refused here."""
 
-    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
+    def __init__(self, file: BinaryIO, header: LasHeader, threads: int) -> None:
         extra = header.point_length - STANDARD_DTYPES[header.point_format].itemsize
         vlr = lazrs.LazVlr.new_for_compression(header.point_format, extra)
         payload = _patch_wave_item(bytes(vlr.record_data()))
@@ -127,27 +103,29 @@ class _LazrsEncoder(PointEncoder):
         self._guarded = header.point_format in (9, 10)
         self._channel: int | None = None
         self._watched = _WatchedFile(file)
-        self._compressor = lazrs.LasZipCompressor(self._watched, lazrs.LazVlr(payload))
-        self._payload = payload
-        self._chunks: list[tuple[int, int]] = []
-        """Points and bytes of the chunks of `write_chunk`."""
-
-    @property
-    def coding(self) -> bytes | None:
-        return None if self._guarded else self._payload
-
-    def write_chunk(self, points: int, chunk: bytes) -> None:
-        if not self._chunks:
-            self._start = self._file.tell()
-            self._file.write(_TABLE_PLACE.pack(0))  # until `finish` knows it
-        self._file.write(chunk)
-        self._chunks.append((points, len(chunk)))
+        self._coding, self._threads = lazrs.LazVlr(payload), threads
+        self._compressor: Any = None
+        self._held: list[np.ndarray] = []
 
     def write(self, rows: np.ndarray) -> None:
         if self._guarded:
             self._check_channel(rows)
+        self._held.append(rows.view(np.uint8))
+        least = self._threads * CHUNK_POINTS if self._threads > 1 else 1  # each thread takes a chunk
+        if sum(map(len, self._held)) >= least * rows.itemsize:
+            self._compress()
+
+    def _compress(self) -> None:
+        if self._compressor is None:
+            os.environ.setdefault("RAYON_NUM_THREADS", str(self._threads))  # lazrs reads it when its threads start
+            # Several threads would write a chunk into a file without points.
+            several = self._threads > 1 and self._held
+            make = lazrs.ParLasZipCompressor if several else lazrs.LasZipCompressor
+            self._compressor = make(self._watched, self._coding)
         with self._watched.explaining():
-            self._compressor.compress_many(rows.view(np.uint8))
+            for held in [np.concatenate(self._held)] if len(self._held) > 1 else self._held:
+                self._compressor.compress_many(held)
+        self._held = []
 
     def _check_channel(self, rows: np.ndarray) -> None:
         channels = (rows["classification_flags"] >> 4) & 0b11
@@ -160,20 +138,9 @@ class _LazrsEncoder(PointEncoder):
             )
 
     def finish(self) -> None:
-        if self._chunks:
-            self._finish_chunks()
-            return
+        self._compress()
         with self._watched.explaining():
             self._compressor.done()
-
-    def _finish_chunks(self) -> None:
-        """Write what lazrs writes after its last chunk: the table of the chunks, and its place before the first."""
-        place, table = self._file.tell(), io.BytesIO()
-        lazrs.write_chunk_table(table, self._chunks, lazrs.LazVlr(self._payload))
-        self._file.write(table.getvalue())
-        self._file.seek(self._start)
-        self._file.write(_TABLE_PLACE.pack(place))
-        self._file.seek(0, 2)
 
 
 class _LaszipEncoder(PointEncoder):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,7 +19,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord
 from wavebatch.files.las.header import WAVEFORM_RECORD_ID, LasHeader, Vlr, encode_evlr_header, has_record
-from wavebatch.files.las.laz_encode import compress_chunk, open_encoder
+from wavebatch.files.las.laz_encode import open_encoder
 
 _COPY_SIZE = 1 << 22
 _EXTRA_BYTES = ("LASF_Spec", EXTRA_BYTES_RECORD_ID)
@@ -30,12 +30,20 @@ class PointFile(contextlib.AbstractContextManager):
 
     header: of the output; counts, bounds and offsets are filled in here.
     records: one per extra dimension of dtype; their VLR replaces that in `header.vlrs`, or is appended.
+    threads: that compress; above 1 `write` keeps the rows that it is given for a while.
     As a context manager it aborts unless committed.
     Raises InputError if the target exists (without overwrite) or cannot be written, ConfigError for another suffix.
     """
 
     def __init__(
-        self, target: Path, header: LasHeader, dtype: np.dtype, records: Sequence[ExtraRecord], *, overwrite: bool
+        self,
+        target: Path,
+        header: LasHeader,
+        dtype: np.dtype,
+        records: Sequence[ExtraRecord],
+        *,
+        overwrite: bool,
+        threads: int = 1,
     ) -> None:
         self.target = Path(target)
         self.dtype = dtype
@@ -52,7 +60,7 @@ class PointFile(contextlib.AbstractContextManager):
         """All files that are published together, the point file last."""
         try:
             with self._guarded():
-                self._encoder = open_encoder(self.draft.file, header)
+                self._encoder = open_encoder(self.draft.file, header, threads)
         except BaseException:
             self.draft.discard()
             raise
@@ -69,30 +77,12 @@ class PointFile(contextlib.AbstractContextManager):
             return
         rows = np.ascontiguousarray(rows)
         self._statistics.add(rows)
-        self._check_count()
-        with self._guarded():
-            self._encoder.write(rows)
-            self.draft.file.flush()  # else a worker forked now would inherit the buffer and write it again
-
-    @property
-    def chunk_maker(self) -> ChunkMaker | None:
-        """What makes the arguments of `write_chunk`, also in another process; None where only `write` can be used."""
-        coding = self._encoder.coding
-        return None if coding is None else ChunkMaker(coding, self.dtype, tuple(self._records))
-
-    def write_chunk(self, chunk: bytes, statistics: Statistics) -> None:
-        """Append a chunk of `chunk_maker`: CHUNK_POINTS records, or fewer in the last; excludes `write`."""
-        interrupts.check()
-        self._statistics.merge(statistics)
-        self._check_count()
-        with self._guarded():
-            self._encoder.write_chunk(statistics.count, chunk)
-            self.draft.file.flush()
-
-    def _check_count(self) -> None:
         if self._statistics.count >= 2**32 and self._header.version < (1, 4):
             version = "{}.{}".format(*self._header.version)
             raise InputError(f"{self.target}: LAS {version} holds at most 4294967295 points; use --las-version 1.4")
+        with self._guarded():
+            self._encoder.write(rows)
+            self.draft.file.flush()  # else a worker forked now would inherit the buffer and write it again
 
     def finish_points(self) -> None:
         """End the points; extended records may follow."""
@@ -173,23 +163,6 @@ class PointFile(contextlib.AbstractContextManager):
             raise InputError(f"{self.target}: {error}") from error
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkMaker:
-    """Compresses records for `PointFile.write_chunk`; picklable."""
-
-    coding: bytes
-    dtype: np.dtype
-    records: tuple[ExtraRecord, ...]
-
-    def make(self, rows: np.ndarray) -> tuple[bytes, Statistics]:
-        """Return the chunk of records (m,) and their statistics; raises InputError if they cannot be compressed."""
-        if rows.dtype != self.dtype:
-            raise InputError("rows of another layout than the file's; this is a bug, please report it")
-        statistics = Statistics(self.dtype, self.records)
-        statistics.add(rows)
-        return compress_chunk(self.coding, rows), statistics
-
-
 class Statistics:
     """Counts, bounds and extremes of all rows written, for the header and the extra-bytes records."""
 
@@ -212,17 +185,6 @@ class Statistics:
             if record.code:
                 self._widen(field, rows[field], record.no_data)
 
-    def merge(self, other: Statistics) -> None:
-        """Add the statistics of further rows of the same file."""
-        self.count += other.count
-        self._bits += other._bits
-        for key, found in other._extremes.items():
-            self._extend(key, *found)
-
-    def _extend(self, key: tuple[str, int], low: np.generic, high: np.generic) -> None:
-        least, largest = self._extremes.get(key, (low, high))
-        self._extremes[key] = min(low, least), max(high, largest)
-
     def _widen(self, name: str, values: np.ndarray, no_data: np.ndarray | None = None) -> None:
         for element, column in enumerate(np.atleast_2d(values.T)):
             column = np.ascontiguousarray(column)
@@ -233,7 +195,9 @@ class Statistics:
             if len(column):
                 # Plus 0: which of 0.0 and -0.0 is the least depends on the order of the rows.
                 plus = column.dtype.type(0)
-                self._extend((name, element), column.min() + plus, column.max() + plus)
+                low, high = column.min() + plus, column.max() + plus
+                least, largest = self._extremes.get((name, element), (low, high))
+                self._extremes[name, element] = min(low, least), max(high, largest)
 
     def fill(self, header: LasHeader) -> None:
         """Set counts and bounds of the header; an empty file gets zeros."""

@@ -114,7 +114,7 @@ def start_errors(amplitude: np.ndarray, width: np.ndarray, std: np.ndarray) -> t
 
     Notes
     -----
-    To first order in the noise, for peaks that lie on a sample. Broad echoes, of which five samples cover only the top,
+    To first order in the noise, for peaks that lie on a sample. Broad echoes, where five samples cover only the top,
     have errors many times the Cramer-Rao bound.
     """
     spread = width * width + 0.5

@@ -112,7 +112,7 @@ def number_returns(
     number, count : int64 (m,)
         Return number and number of returns.
     ordered : bool (m,)
-        False for pulses of which no point has a ray: their numbers mean nothing.
+        False for pulses without a ray: their numbers mean nothing.
     """
     m = len(pulse)
     has_ray = np.any(direction != 0, axis=1)

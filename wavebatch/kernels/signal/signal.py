@@ -144,7 +144,7 @@ class _Edges(NamedTuple):
 def _look_at_edges(
     samples: np.ndarray, marks: np.ndarray, row: np.ndarray, first: np.ndarray, side: np.ndarray
 ) -> _Edges:
-    """Edges of runs, all of which `marks` (n, s) holds; first: sample next to the run, side: away from it, 1 or -1."""
+    """Edges of runs; `marks` (n, s) holds all runs. first: sample next to the run, side: away from it, 1 or -1."""
     s = samples.shape[1]
     at = first[:, None] + side[:, None] * np.arange(LEAST_RECORDED)
     place = row[:, None], np.clip(at, 0, s - 1)
@@ -198,15 +198,15 @@ def transpose_samples(samples: np.ndarray) -> np.ndarray:
     return samples.T.astype(np.float32, order="C")
 
 
-def smooth_121(signal: np.ndarray) -> np.ndarray:
-    """Signal (s, n) filtered with [1 2 1]/4 along the samples; the end samples are repeated outwards."""
+def smooth_121(signal: np.ndarray, step: int = 1) -> np.ndarray:
+    """Signal (s, n) filtered with [1 2 1]/4, taps `step` samples apart; the end samples are repeated outwards."""
     smoothed = np.empty_like(signal)
-    if len(signal) == 1:
+    if len(signal) < 2 * step:
         smoothed[:] = signal
         return smoothed
-    np.add(signal[:-2], signal[2:], out=smoothed[1:-1])
-    np.add(signal[0], signal[1], out=smoothed[0])
-    np.add(signal[-1], signal[-2], out=smoothed[-1])
+    np.add(signal[: -2 * step], signal[2 * step :], out=smoothed[step:-step])
+    np.add(signal[0], signal[step : 2 * step], out=smoothed[:step])
+    np.add(signal[-1], signal[-2 * step : len(signal) - step], out=smoothed[-step:])
     smoothed += signal
     smoothed += signal
     smoothed *= np.float32(0.25)

@@ -118,7 +118,7 @@ def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, ech
     model = model_parameters(shape, limits, whole)
     std = noise.std[echoes.waveform].astype(np.float64)
     h3, h4 = np.empty(len(echoes)), np.empty(len(echoes))
-    alone = echoes.count(len(block))[echoes.waveform] == 1
+    alone = echoes.alone(len(block))
     for kind, rows in ((_read_single, np.flatnonzero(alone)), (_read_several, np.flatnonzero(~alone))):
         read = kind(block, noise, shape, echoes.waveform[rows], model[rows])
         h3[rows], h4[rows] = residual_moments(read, s, time[rows], sigma[rows], std[rows])

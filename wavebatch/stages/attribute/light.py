@@ -7,7 +7,6 @@ Source: docs/algorithms.md 5.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -51,24 +50,6 @@ def sensor_distance(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
             off = echoes.attributes[name] - sensor[:, axis]
             squares += off * off
     return radiometry.known_distance(np.sqrt(squares))
-
-
-def is_alone(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
-    """Find echoes that are the only one of their waveform.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-        n waveforms.
-    echoes : EchoTable
-        m echoes.
-
-    Returns
-    -------
-    bool array, shape (m,)
-        True for single echoes.
-    """
-    return echoes.count(len(block))[echoes.waveform] == 1
 
 
 def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
@@ -187,6 +168,7 @@ def measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, 
     -------
     Light
     """
+    given = system.radiometry
     distance = sensor_distance(block, echoes)
     constant, constant_err = (values[echoes.waveform] for values in system.calibrate(block))
     guess = (echoes.flags & np.uint16(EchoFlag.AMPLITUDE_UNRELIABLE)) != 0
@@ -194,11 +176,11 @@ def measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, 
     energy, shot_error = (values[echoes.waveform] for values in _emitted(block, system))
     light = np.where(guess, np.nan, echo_light(block, system, echoes))
     with np.errstate(over="ignore", invalid="ignore"):
-        gamma = radiometry.backscatter(constant, distance, light, 1.0, system.attenuation) / energy
-    away = np.hypot(system.sensor_error, fit_range_error(echoes))
+        gamma = radiometry.backscatter(constant, distance, light, 1.0, given.attenuation) / energy
+    away = np.hypot(given.sensor_error, fit_range_error(echoes))
     relative = radiometry.backscatter_error(
-        np.hypot(light_error(echoes), shot_error), distance, away, constant_err, system.attenuation,
-        power=power, attenuation_err=system.attenuation_error,
+        np.hypot(light_error(echoes), shot_error), distance, away, constant_err, given.attenuation,
+        power=power, attenuation_err=given.attenuation_error,
     )  # fmt: skip
     relative = np.where(bound, np.hypot(relative, BOUND_ERROR), relative)
     cases = (
@@ -229,19 +211,20 @@ def normalize_amplitude(
     cases : Cases
         Why values may be missing.
     """
+    given = system.radiometry
     distance = sensor_distance(block, echoes)
     energy, shot_error = (values[echoes.waveform] for values in _emitted(block, system))
     guess = (echoes.flags & np.uint16(EchoFlag.AMPLITUDE_UNRELIABLE)) != 0
     bound = (echoes.flags & np.uint16(EchoFlag.AT_BOUND)) != 0
     amplitude = np.where(guess | bound, np.nan, echoes.amplitude.astype(np.float64))
-    air = radiometry.transmit(np.asarray(reference), system.attenuation)
+    air = radiometry.transmit(np.asarray(reference), given.attenuation)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        value = radiometry.backscatter(air / reference**2, distance, amplitude, 1.0, system.attenuation) / energy
+        value = radiometry.backscatter(air / reference**2, distance, amplitude, 1.0, given.attenuation) / energy
         fit = echoes.amplitude_err.astype(np.float64) / amplitude
-    away = np.hypot(system.sensor_error, fit_range_error(echoes))
-    relative = radiometry.backscatter_error(np.hypot(fit, shot_error), distance, away, 0.0, system.attenuation)
+    away = np.hypot(given.sensor_error, fit_range_error(echoes))
+    relative = radiometry.backscatter_error(np.hypot(fit, shot_error), distance, away, 0.0, given.attenuation)
     # An error of the attenuation counts over the way by which the range differs from the reference.
-    air_error = system.attenuation_error or AIR_DOUBT * system.attenuation
+    air_error = given.attenuation_error or AIR_DOUBT * given.attenuation
     beyond = 2.0e-4 * log(10.0) * air_error * np.abs(distance - reference)
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
@@ -261,14 +244,14 @@ def _emitted(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.
     """Energy of each emitted pulse over the strip's mean, NaN where unknown, and its relative error: f8 (n,)."""
     n = len(block)
     if block.pulse_energy is None:
-        return np.ones(n), np.full(n, system.shot_error)
+        return np.ones(n), np.full(n, system.radiometry.shot_error)
     error = np.zeros(n) if block.pulse_energy_err is None else block.pulse_energy_err / block.pulse_energy
     return block.pulse_energy, error
 
 
 def without_calibration(system: SystemPulse) -> SystemPulse:
     """Replace the calibration by a constant of exactly 1, for quantities in units of the strip."""
-    return replace(system, calibration=1.0, calibration_err=0.0, channels={}, swath=())
+    return system.with_radiometry(constant=1.0, constant_error=0.0, channels={}, swath=())
 
 
 def add_column(

@@ -37,8 +37,8 @@ def range(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoT
     returns (2 cm). It is no-data where nothing shows how well the sensor's position is known.
     """
     distance = sensor_distance(block, echoes)
-    error = np.hypot(np.hypot(fit_range_error(echoes), system.sensor_error), RETURNS)
-    error[np.isnan(distance) | (system.sensor_error <= 0)] = np.nan
+    error = np.hypot(np.hypot(fit_range_error(echoes), system.radiometry.sensor_error), RETURNS)
+    error[np.isnan(distance) | (system.radiometry.sensor_error <= 0)] = np.nan
     columns = {"range": distance.astype(np.float32), "range_error": error.astype(np.float32)}
     return add_reason(echoes.with_attributes(**columns), "range", (NoData.NO_SENSOR, np.isnan(distance)))
 
@@ -72,10 +72,10 @@ def cross_section(block: WaveformBlock, noise: Noise, system: SystemPulse, echoe
     docs/algorithms.md 5.
     """
     light = measure_light(block, system, echoes, 4)
-    divergence = np.nan if system.divergence is None else 1e-3 * system.divergence
+    divergence = np.nan if system.radiometry.divergence is None else 1e-3 * system.radiometry.divergence
     section = radiometry.cross_section(light.gamma, light.distance, divergence)
-    unknown = (NoData.NO_DIVERGENCE, system.divergence is None)
-    relative = np.hypot(light.relative_error, 2.0 * system.divergence_error)
+    unknown = (NoData.NO_DIVERGENCE, system.radiometry.divergence is None)
+    relative = np.hypot(light.relative_error, 2.0 * system.radiometry.divergence_error)
     return add_column(echoes, "cross_section", section, relative, *light.cases[:2], unknown, *light.cases[2:])
 
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.no_data import NoData
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock, angle_to_vertical
+from wavebatch.core.system import angle_to_vertical
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.physics import radiometry
 from wavebatch.stages.attribute.light import (
     POSITION,
     Light,
     add_column,
-    is_alone,
     measure_light,
     without_calibration,
 )
@@ -116,7 +116,7 @@ def _divide(
     block: WaveformBlock, echoes: EchoTable, name: str, light: Light, angle: np.ndarray, relative: np.ndarray
 ) -> EchoTable:
     """The column gamma / (4 cos(angle)) of echoes that are alone, with relative errors (m,)."""
-    alone = is_alone(block, echoes)
+    alone = echoes.alone(len(block))
     rho = np.where(alone & ~light.bound, radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
     steep = angle >= radiometry.STEEPEST
     more = (

@@ -18,7 +18,7 @@ from wavebatch.kernels.physics.incidence import (
     pulse_table,
     spread_variance,
 )
-from wavebatch.stages.attribute.light import is_alone, sensor_distance
+from wavebatch.stages.attribute.light import sensor_distance
 from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 
@@ -107,7 +107,7 @@ def incidence_angle(
     ----------
     Rhomberg-Kauert et al. (2024), as corrected by docs/algorithms.md 1.4.
     """
-    beam = divergence or system.divergence
+    beam = divergence or system.radiometry.divergence
     short = system.sigma_ref < LEAST_PULSE_WIDTH * block.spacing
     variance, variance_err = added_variance(block, system, echoes, mode, reference_error)
     distance = sensor_distance(block, echoes)
@@ -121,8 +121,8 @@ def incidence_angle(
     if clear.any():
         known = variance[clear], variance_err[clear], distance[clear]
         angle[clear], error[clear] = angles_above(*known, 1e-3 * beam if beam else np.nan, CLEAR_ERRORS)
-    error = np.hypot(error, 0.5 * np.sin(2.0 * angle) * system.divergence_error)
-    unproven = np.isinf(system.level_error or 0.0)
+    error = np.hypot(error, 0.5 * np.sin(2.0 * angle) * system.radiometry.divergence_error)
+    unproven = np.isinf(system.widths.error or 0.0)
     with np.errstate(invalid="ignore"):
         narrow = variance < -NARROW_ERRORS * variance_err
     cases = (
@@ -131,7 +131,7 @@ def incidence_angle(
         (NoData.OTHER_PULSE, _other_pulse(system, mode)),
         (NoData.NO_LEVEL, unproven),
         (NoData.SHORT_PULSE, short),
-        (NoData.SHARED_PULSE, ~is_alone(block, echoes) & alone),
+        (NoData.SHARED_PULSE, ~echoes.alone(len(block)) & alone),
         *((reason, (echoes.flags & np.uint16(flags)) != 0) for reason, flags in _UNCLEAN.items()),
         (NoData.TOO_STEEP, steep),
         (NoData.OTHER, np.isnan(error)),
@@ -166,7 +166,7 @@ def added_variance(
         Variance and its standard deviation [ns2].
     """
     width = echoes.sigma.astype(np.float64)
-    error = np.hypot(echoes.sigma_err.astype(np.float64), system.width_scatter)
+    error = np.hypot(echoes.sigma_err.astype(np.float64), system.widths.scatter)
     reference = system.sigma_ref
     if mode == "pulse":
         variance = spread_variance(pulse_table(system.sigma_ref, block.spacing), width)
@@ -174,9 +174,9 @@ def added_variance(
         variance = spread_variance(paper_table(system.sigma_ref), width)
     else:
         width, error, reference = _model_width(block.spacing, system, width, error)
-        variance = width * width - reference * reference - system.level_variance
+        variance = width * width - reference * reference - system.widths.variance
     fit_err = 2.0 * np.hypot(width * error, reference * reference * reference_error)
-    return variance, np.hypot(fit_err, system.level_error or 0.0)
+    return variance, np.hypot(fit_err, system.widths.error or 0.0)
 
 
 def _facing_error(system: SystemPulse, echoes: EchoTable, reference_error: float) -> np.ndarray:
@@ -186,8 +186,8 @@ def _facing_error(system: SystemPulse, echoes: EchoTable, reference_error: float
     width (docs/algorithms.md 2.1): what is decided by it selects no echoes by their width.
     """
     square = system.sigma_ref**2
-    relative = np.hypot(echoes.sigma_err / echoes.sigma, system.width_scatter / system.sigma_ref)
-    return np.hypot(2.0 * square * np.hypot(relative, reference_error), system.level_error or 0.0)
+    relative = np.hypot(echoes.sigma_err / echoes.sigma, system.widths.scatter / system.sigma_ref)
+    return np.hypot(2.0 * square * np.hypot(relative, reference_error), system.widths.error or 0.0)
 
 
 def _model_width(

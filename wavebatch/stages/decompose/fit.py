@@ -29,7 +29,7 @@ SINGLE_PRECISION = 2.0**-23
 amplitudes of 4e9 counts rounding is 200 times a noise of one count."""
 
 
-@stage("decompose")
+@stage("decompose", shape=lambda *_: None)
 def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Echoes of the detector as they are, without a fit and without errors."""
     return flag_echoes(block, noise, system, echoes)

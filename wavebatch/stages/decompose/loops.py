@@ -18,20 +18,40 @@ from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference
-from wavebatch.stages.decompose.rebuild import loop_model, loop_shape, render_table
-from wavebatch.stages.decompose.skew import skewed, system_skew
+from wavebatch.stages.decompose.rebuild import render_table
+from wavebatch.stages.decompose.skew import fit_skewed, skewed
 from wavebatch.stages.decompose.solve import EchoLimits, fit_gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
 from wavebatch.stages.flags import flag_echoes
-from wavebatch.stages.pulse_tables import LEAST_WIDTH
+from wavebatch.stages.pulse_tables import LEAST_WIDTH, pulse_shape
+
+
+def loop_model(system: SystemPulse, model: str) -> str:
+    """Return the model that a residual loop fits.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    model : {"auto", "gaussian", "skewed", "generalized", "learned"}
+        As for `decompose.residual_loop`.
+
+    Returns
+    -------
+    str
+        The model; for `auto` the pulse that the survey chose.
+    """
+    if model != "auto":
+        return model
+    return "learned" if system.components else "skewed" if system.kappa else "gaussian"
 
 
 def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
-    """The system with the pulse that `residual_loop` fits."""
+    """The system with the pulse that `residual_loop` fits; of the generalized model echoes carry their exponents."""
     model = loop_model(system, parameters["model"])
     if model == "learned":
         return system
-    return replace(system, components=(), kappa=system_skew(system)) if model == "skewed" else fit_gaussian(system, {})
+    return fit_skewed(system, {"kappa": 0.0}) if model == "skewed" else fit_gaussian(system, {})
 
 
 @stage("decompose", fits=_fit_loop, shares=EchoLimits())
@@ -71,7 +91,7 @@ def residual_loop(
     Wang, Wang and Tseng; docs/algorithms.md 1.2.
     """
     model = loop_model(system, model)
-    shape = loop_shape(system, block.spacing, model)
+    shape = pulse_shape(_fit_loop(system, {"model": model}), block.spacing)
     options = {"max_iterations": max_iterations, "tolerance": 0.1, **limits}
     limit = _residual_limit(block, noise, t_diff, t_unit)
     rows = np.arange(len(block))

@@ -101,7 +101,7 @@ def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
         return table
     excess, lone, others = np.array(system.hidden).T
     wider = np.maximum(excess_variance(table, system), 0.0)
-    alone = table.count(n)[table.waveform] == 1
+    alone = table.alone(n)
     share = np.where(alone, np.interp(wider, excess, lone), np.interp(wider, excess, others))
     error = np.sqrt(table.time_err**2 + share * wider * system.sigma_ref**2)
     return replace(table, time_err=error.astype(np.float32))

@@ -31,7 +31,17 @@ def _fit_reference(system: SystemPulse, parameters: Mapping[str, Any]) -> System
     return system if parameters["model"] == "broadened" else replace(system, components=(), kappa=0.0)
 
 
-@stage("decompose", fits=_fit_reference, shares=FIT)
+def _shape_reference(system: SystemPulse, spacing: float, parameters: Mapping[str, Any]) -> PulseShape:
+    """The pulse that `reference` fits."""
+    if parameters["model"] == "stretched":
+        return _tabulate_system(system, pulse_shape(system, spacing), spacing)
+    if parameters["model"] == "given":
+        taps, _ = reference_pulse(system, spacing, "given", pulse=parameters["pulse"])
+        return PulseShape(table=tabulate_pulse(np.arange(len(taps), dtype=np.float64), taps))
+    return pulse_shape(system, spacing)
+
+
+@stage("decompose", fits=_fit_reference, shape=_shape_reference, shares=FIT)
 def reference(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     model: Literal["broadened", "stretched", "given"] = "broadened",
@@ -55,38 +65,12 @@ def reference(
     ----------
     docs/algorithms.md R1; Mallet and Bretar (2009).
     """
-    shape = reference_shape(system, block.spacing, model, pulse)
+    shape = _shape_reference(system, block.spacing, {"model": model, "pulse": pulse})
     fit = replace(FIT, **options)
     settings = make_settings(block, system, shape, fit, grow=False)
     if model != "broadened":
         system = replace(system, components=())
     return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
-
-
-def reference_shape(system: SystemPulse, spacing: float, model: str, pulse: str) -> PulseShape:
-    """Return the pulse that `reference` fits.
-
-    Parameters
-    ----------
-    system : SystemPulse
-        Result of the survey.
-    spacing : float
-        Time between two samples [ns].
-    model, pulse : str
-        As for `reference`.
-
-    Returns
-    -------
-    PulseShape
-        Pulse for the kernels.
-    """
-    shape = pulse_shape(system, spacing)
-    if model == "stretched":
-        return _tabulate_system(system, shape, spacing)
-    if model == "given":
-        taps, _ = reference_pulse(system, spacing, "given", pulse=pulse)
-        return PulseShape(table=tabulate_pulse(np.arange(len(taps), dtype=np.float64), taps))
-    return shape
 
 
 def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> PulseShape:

@@ -2,84 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes, render_skewed, skewed_pulse
 from wavebatch.stages.chain import Step
-from wavebatch.stages.decompose.models import POWERS, half_width_factor, reference_shape
-from wavebatch.stages.decompose.skew import skewed_shape
+from wavebatch.stages.decompose.models import POWERS, half_width_factor
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
-
-
-def loop_model(system: SystemPulse, model: str) -> str:
-    """Return the model that a residual loop fits.
-
-    Parameters
-    ----------
-    system : SystemPulse
-        Result of the survey.
-    model : {"auto", "gaussian", "skewed", "generalized", "learned"}
-        As for `decompose.residual_loop`.
-
-    Returns
-    -------
-    str
-        The model; for `auto` the pulse that the survey chose.
-    """
-    if model != "auto":
-        return model
-    return "learned" if system.components else "skewed" if system.kappa else "gaussian"
-
-
-def loop_shape(system: SystemPulse, spacing: float, model: str) -> PulseShape:
-    """Return the pulse that a residual loop fits.
-
-    Parameters
-    ----------
-    system : SystemPulse
-        Result of the survey.
-    spacing : float
-        Time between two samples [ns].
-    model : {"auto", "gaussian", "skewed", "generalized", "learned"}
-        As for `decompose.residual_loop`.
-
-    Returns
-    -------
-    PulseShape
-        Pulse in samples; of the generalized model echoes carry their exponents.
-    """
-    model = loop_model(system, model)
-    if model == "learned":
-        return pulse_shape(system, spacing)
-    return skewed_shape(system, 0.0) if model == "skewed" else GAUSSIAN
-
-
-MODELS: dict[str, Callable[[SystemPulse, float, Mapping[str, Any]], PulseShape] | None] = {
-    "decompose.adaptive": lambda system, spacing, _: pulse_shape(system, spacing),
-    "decompose.reference": lambda system, spacing, given: reference_shape(
-        system, spacing, given["model"], given["pulse"]
-    ),
-    "decompose.skewed": lambda system, _, given: (
-        GAUSSIAN if given["kappa"] == "free" else skewed_shape(system, given["kappa"])
-    ),
-    "decompose.residual_loop": lambda system, spacing, given: loop_shape(system, spacing, given["model"]),
-    **dict.fromkeys(
-        [
-            f"decompose.{name}"
-            for name in ("asdf_only", "closed_form", "gaussian", "generalized_gaussian")
-        ],
-        lambda *_: GAUSSIAN,
-    ),
-    "decompose.none": None,
-}
-"""The pulse that a decomposer fits, from system, spacing and parameters; None where nothing is fitted. Echoes with a
-skew or an exponent of their own carry it as a column. A plug-in adds its decomposers."""
 
 
 def fitted_pulse(decomposer: Step, system: SystemPulse, spacing: float) -> PulseShape | None:
@@ -97,10 +30,11 @@ def fitted_pulse(decomposer: Step, system: SystemPulse, spacing: float) -> Pulse
     Returns
     -------
     PulseShape or None
-        Pulse in samples; None where nothing is fitted, or a plugin does not say.
+        Pulse in samples; None where nothing is fitted.
     """
-    shape_of = MODELS.get(decomposer.stage.name)
-    return None if shape_of is None else shape_of(system, spacing, decomposer.effective())
+    if decomposer.stage.shape is not None:
+        return decomposer.stage.shape(system, spacing, decomposer.effective())
+    return pulse_shape(decomposer.fit_system(system), spacing)
 
 
 def rebuild_waveforms(

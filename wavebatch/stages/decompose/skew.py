@@ -13,7 +13,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Settings
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import find_clusters
 from wavebatch.stages.decompose.solve import FIT, describe_solution, fit_candidates, make_settings
@@ -52,31 +52,26 @@ def system_skew(system: SystemPulse) -> float:
     return system.skew
 
 
-def skewed_shape(system: SystemPulse, kappa: float) -> PulseShape:
-    """Return the pulse that `skewed` fits.
+def fit_skewed(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
+    """Return the system with the pulse that `skewed` fits.
 
     Parameters
     ----------
     system : SystemPulse
         Result of the survey.
-    kappa : float
-        Skew; 0 takes the value of the survey.
+    parameters : mapping
+        Of the stage: kappa.
 
     Returns
     -------
-    PulseShape
-        Skewed, or Gaussian where the skew is negligible.
+    SystemPulse
+        Skewed; without a skew where echoes have skews of their own, which they carry.
     """
-    return pulse_shape(replace(system, components=(), kappa=kappa or system_skew(system)), 1.0)
-
-
-def _fit_skewed(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
-    """The system with the pulse that `skewed` fits; echoes with skews of their own carry them."""
     kappa = parameters["kappa"]
     return replace(system, components=(), kappa=0.0 if kappa == "free" else kappa or system_skew(system))
 
 
-@stage("decompose", fits=_fit_skewed, shares=FIT)
+@stage("decompose", fits=fit_skewed, shares=FIT)
 def skewed(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     kappa: Annotated[float, Range(-0.9, 0.9)] | Literal["free"] = 0.0,
@@ -97,7 +92,7 @@ def skewed(
     ----------
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 0, 1.2.
     """
-    shape = skewed_shape(system, 0.0 if kappa == "free" else kappa)
+    shape = pulse_shape(fit_skewed(system, {"kappa": 0.0 if kappa == "free" else kappa}), block.spacing)
     fit = replace(FIT, **options)
     settings = make_settings(block, system, shape, fit, grow=False)
     if kappa != "free":

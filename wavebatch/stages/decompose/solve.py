@@ -123,7 +123,7 @@ def make_settings(
     pulse = system if shape.components else replace(system, components=())
     limits = shape_limits(pulse, block.spacing, fit.least_width, fit.most_width)
     return Settings(
-        *limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, tolerance=fit.tolerance,
+        *limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise.gain, tolerance=fit.tolerance,
         max_iterations=fit.max_iterations, **options,
     )  # fmt: skip
 
@@ -226,7 +226,7 @@ def describe_solution(
     )  # fmt: skip
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components:
-        table = drop_unproven(table, system, clip_level(block, system) - system.baseline)
+        table = drop_unproven(table, system, clip_level(block, system) - system.noise.baseline)
     if settings.grow:
         table = cover_hidden(table, system, len(block))
     return flag_echoes(block, noise, system, clear_lone(table))

@@ -95,21 +95,21 @@ def adjust_constants(
     use = reached[ties.source]
     cell, source, value, error = ties.cell[use], ties.source[use], ties.value[use], ties.error[use]
     one = csr_array((np.ones(len(cell)), (np.arange(len(cell)), source)), (len(cell), n))
-    design = hstack([one, csr_array(columns[use])], format="csr")
+    equations = _Equations(hstack([one, csr_array(columns[use])], format="csr"), cell, value, anchors, reached)
     weight = error**-2.0
     found = np.append(np.where(reached, anchors.value, np.nan), np.zeros(columns.shape[1]))
     rest = np.zeros(len(cell))
     for _ in range(_ROUNDS if len(cell) else 0):
-        found = _solve(design, cell, value, weight, anchors, reached)
-        rest = _residuals(design, cell, value, weight, found)
+        found = equations.solve(weight)
+        rest = equations.residuals(weight, found)
         scatter = max(MAD_TO_STD * float(np.median(np.abs(rest))), _LEAST_SCATTER)
         # Errors of fits are in the residuals already: the larger of the two is what a row is known to.
         spread = np.maximum(error, scatter)
         weight = spread**-2.0 * np.minimum(1.0, HUBER * scatter / np.maximum(np.abs(rest), 1e-12))
-    again = _resample(ties.centre[use], design, cell, value, weight, anchors, reached, trials)
+    again = equations.resample(weight, ties.centre[use], trials)
     residual = np.full(len(ties.cell), np.nan)
     residual[use] = rest
-    errors = _errors(design, source, again, n) if trials else np.full(n, np.nan)
+    errors = _errors(equations.design, source, again, n) if trials else np.full(n, np.nan)
     number = np.bincount(source, minlength=n)
     return Adjustment(
         found[:n], errors, again[:, :n], number, residual, _excess(rest, cell, error), found[n:], again[:, n:]
@@ -147,52 +147,57 @@ def _reach(ties: Ties, known: np.ndarray, n: int) -> np.ndarray:
     return np.isin(group, group[known])
 
 
-def _solve(
-    design: csr_array, cell: np.ndarray, value: np.ndarray, weight: np.ndarray, anchors: Anchors, reached: np.ndarray
-) -> np.ndarray:
-    """Constants and coefficients f8 (n + m,) for these weights; NaN for sources that are not reached."""
-    n, known = len(reached), np.flatnonzero(np.isfinite(anchors.value))
-    more = np.zeros((n, design.shape[1] - n)) if anchors.columns is None else anchors.columns
-    fixed = np.concatenate([np.eye(n)[known], more[known]], axis=1)
-    firm = anchors.error[known] ** -2.0
-    normal, right = fixed.T @ (firm[:, None] * fixed), fixed.T @ (firm * anchors.value[known])
-    if len(cell):
-        # The brightness of each cell is eliminated: only what differs within cells counts.
-        cells = int(cell.max()) + 1
-        whole = np.maximum(np.bincount(cell, weight, cells), 1e-300)
-        gather = csr_array((weight, (cell, np.arange(len(cell)))), (cells, len(cell)))
-        table = gather @ design
-        normal += (design.T @ (design.multiply(weight[:, None]))).toarray()
-        normal -= (table.T @ (table.multiply(1.0 / whole[:, None]))).toarray()
-        right -= design.T @ (weight * value) - table.T @ (gather @ value / whole)
-    found = np.full(design.shape[1], np.nan)
-    some = np.flatnonzero(np.append(reached, np.ones(design.shape[1] - n, bool)))
-    found[some] = np.linalg.lstsq(normal[np.ix_(some, some)], right[some], rcond=1e-12)[0]
-    return found
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """Those of k rows of ties for the constants of n sources and the coefficients of m columns."""
 
+    design: csr_array
+    """(k, n + m)."""
+    cell: np.ndarray
+    value: np.ndarray
+    anchors: Anchors
+    reached: np.ndarray
+    """Sources that are tied to a target, bool (n,)."""
 
-def _residuals(
-    design: csr_array, cell: np.ndarray, value: np.ndarray, weight: np.ndarray, found: np.ndarray
-) -> np.ndarray:
-    bright = value + design @ np.nan_to_num(found)
-    cells = int(cell.max(initial=-1)) + 1
-    mean = np.bincount(cell, weight * bright, cells) / np.maximum(np.bincount(cell, weight, cells), 1e-300)
-    return bright - mean[cell]
+    def solve(self, weight: np.ndarray) -> np.ndarray:
+        """Constants and coefficients f8 (n + m,) for weights (k,); NaN for sources that are not reached."""
+        design, cell, anchors = self.design, self.cell, self.anchors
+        n, known = len(self.reached), np.flatnonzero(np.isfinite(anchors.value))
+        more = np.zeros((n, design.shape[1] - n)) if anchors.columns is None else anchors.columns
+        fixed = np.concatenate([np.eye(n)[known], more[known]], axis=1)
+        firm = anchors.error[known] ** -2.0
+        normal, right = fixed.T @ (firm[:, None] * fixed), fixed.T @ (firm * anchors.value[known])
+        if len(cell):
+            # The brightness of each cell is eliminated: only what differs within cells counts.
+            cells = int(cell.max()) + 1
+            whole = np.maximum(np.bincount(cell, weight, cells), 1e-300)
+            gather = csr_array((weight, (cell, np.arange(len(cell)))), (cells, len(cell)))
+            table = gather @ design
+            normal += (design.T @ (design.multiply(weight[:, None]))).toarray()
+            normal -= (table.T @ (table.multiply(1.0 / whole[:, None]))).toarray()
+            right -= design.T @ (weight * self.value) - table.T @ (gather @ self.value / whole)
+        found = np.full(design.shape[1], np.nan)
+        some = np.flatnonzero(np.append(self.reached, np.ones(design.shape[1] - n, bool)))
+        found[some] = np.linalg.lstsq(normal[np.ix_(some, some)], right[some], rcond=1e-12)[0]
+        return found
 
+    def residuals(self, weight: np.ndarray, found: np.ndarray) -> np.ndarray:
+        """Brightness of each row beyond the mean of its cell, f8 (k,)."""
+        bright = self.value + self.design @ np.nan_to_num(found)
+        mean = np.bincount(self.cell, weight * bright) / np.maximum(np.bincount(self.cell, weight), 1e-300)
+        return bright - mean[self.cell]
 
-def _resample(
-    centre: np.ndarray, design: csr_array, cell: np.ndarray, value: np.ndarray, weight: np.ndarray,
-    anchors: Anchors, reached: np.ndarray, trials: int,
-) -> np.ndarray:  # fmt: skip
-    """Solutions with blocks of cells drawn again, and targets changed by their errors; f8 (trials, n + m)."""
-    rng = np.random.default_rng(0)
-    _, block = np.unique(np.floor(centre / BLOCK), axis=0, return_inverse=True)
-    blocks = int(block.max(initial=-1)) + 1
-    found = np.empty((trials, design.shape[1]))
-    for row in found:
-        drawn = np.bincount(rng.integers(0, max(blocks, 1), blocks), minlength=blocks).astype(float)
-        # A little of every block stays: without it a source that few blocks tie could be lost.
-        part = weight * np.maximum(drawn[block.ravel()], 1e-3) if blocks else weight
-        moved = replace(anchors, value=anchors.value + anchors.error * rng.standard_normal(len(anchors.value)))
-        row[:] = _solve(design, cell, value, part, moved, reached)
-    return found
+    def resample(self, weight: np.ndarray, centre: np.ndarray, trials: int) -> np.ndarray:
+        """Solutions with blocks of cells drawn again, and targets changed by their errors; f8 (trials, n + m)."""
+        rng = np.random.default_rng(0)
+        _, block = np.unique(np.floor(centre / BLOCK), axis=0, return_inverse=True)
+        blocks = int(block.max(initial=-1)) + 1
+        found = np.empty((trials, self.design.shape[1]))
+        value, error = self.anchors.value, self.anchors.error
+        for row in found:
+            drawn = np.bincount(rng.integers(0, max(blocks, 1), blocks), minlength=blocks).astype(float)
+            # A little of every block stays: without it a source that few blocks tie could be lost.
+            part = weight * np.maximum(drawn[block.ravel()], 1e-3) if blocks else weight
+            moved = replace(self.anchors, value=value + error * rng.standard_normal(len(value)))
+            row[:] = replace(self, anchors=moved).solve(part)
+        return found

@@ -14,11 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.waveforms import swath_columns
+from wavebatch.core.system import swath_columns
 from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
-from wavebatch.surveying.calibrating.flight_strips import FlightStrip, find_box, read_strip
-from wavebatch.surveying.calibrating.setting import SCANNERS
+from wavebatch.surveying.calibrating.flight_strips import FlightStrip, Source, find_box, read_strip
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, measure_ties
@@ -71,16 +70,15 @@ def calibrate_flight(
     options = options or CalibrationOptions()
     check_attenuation(options.attenuation)
     boxes = [find_box(path) for path in paths]
-    origin = boxes[0][0]
     strips = [read_strip(path, i, boxes, targets, options) for i, path in enumerate(paths)]
     good = [strip for strip in strips if strip.found is not None]
     if not good:
         raise InputError(strips[0].refused if len(strips) == 1 else "; ".join(strip.refused for strip in strips))
-    sources = [(i, channel) for i, strip in enumerate(strips) for channel in strip.channels]
+    sources = [Source(strip, row) for strip in strips for row in strip.channels]
     if len(sources) == 1 and not options.scan_angle:
         return FlightCalibration(good[0].found)
-    ties = _tie(strips, sources, origin)
-    anchors, seen = _list_given(strips, sources, options)
+    ties = _tie(sources)
+    anchors, seen = _list_given(sources, options)
     swath: tuple[float, ...] = ()
     if options.scan_angle:
         adjusted, swath = fit_swath(ties, anchors, seen)
@@ -89,7 +87,7 @@ def calibrate_flight(
     else:
         adjusted = adjust_constants(ties, anchors)
     calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath)
-    names = [_name(strips, source) for source in sources]
+    names = [source.name for source in sources]
     pairs = tuple(compare_pairs(ties, adjusted, names))
     notes = [*calibration.notes, *find_doubts(names, adjusted, calibration.strips, pairs)]
     calibration, more = _widen(calibration, adjusted, find_trend(ties, anchors, seen, adjusted))
@@ -114,31 +112,27 @@ def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) 
     return replace(calibration, relative_error=whole, channels=channels, strips=strips), notes
 
 
-def _tie(strips: Sequence[FlightStrip], sources: Sequence[tuple[int, int]], origin: np.ndarray) -> Ties:
+def _tie(sources: Sequence[Source]) -> Ties:
     """The tie cells of all sources."""
     parts = [np.empty(0, TIE)]
-    for number, (i, channel) in enumerate(sources):
-        rows = strips[i].ties[strips[i].ties["source"] == channel]
+    for number, source in enumerate(sources):
+        rows = source.strip.ties[source.strip.ties["source"] == source.channel]
         rows["source"] = number
         parts.append(rows)
     rows = np.concatenate(parts)
     return measure_ties(rows, choose_size(rows))
 
 
-def _list_given(
-    strips: Sequence[FlightStrip], sources: Sequence[tuple[int, int]], options: CalibrationOptions
-) -> tuple[Anchors, np.ndarray]:
+def _list_given(sources: Sequence[Source], options: CalibrationOptions) -> tuple[Anchors, np.ndarray]:
     """Constants by targets with their errors without that of the reflectance, which strips that see the same targets
     share; and how each source saw its targets, array of VIEW (n,), NaN without."""
     value, error = np.full((2, len(sources)), np.nan)
     seen = np.full(len(sources), np.nan, VIEW)
-    for number, (i, channel) in enumerate(sources):
-        found = strips[i].found
-        for row in found.channels if found else ():
-            if SCANNERS * row.digitizer + row.scanner == channel:
-                rest = row.relative_error**2 - _reflectance_error([found], options) ** 2
-                value[number], error[number] = math.log(row.constant), math.sqrt(max(rest, 1e-6))
-                seen[number] = strips[i].seen[channel]
+    for number, source in enumerate(sources):
+        if (given := source.given) is not None:
+            rest = given.relative_error**2 - _reflectance_error([source.strip.found], options) ** 2
+            value[number], error[number] = math.log(given.constant), math.sqrt(max(rest, 1e-6))
+            seen[number] = source.strip.seen[source.channel]
     return Anchors(value, error), seen
 
 
@@ -150,23 +144,24 @@ def _reflectance_error(found: Sequence[Calibration], options: CalibrationOptions
 
 
 def _assemble(
-    strips: Sequence[FlightStrip], sources: Sequence[tuple[int, int]], adjusted: Adjustment, options: CalibrationOptions
+    strips: Sequence[FlightStrip], sources: Sequence[Source], adjusted: Adjustment, options: CalibrationOptions
 ) -> Calibration:
     """The calibration of the flight: a constant per channel, and one per channel and strip."""
     good = [strip.found for strip in strips if strip.found is not None]
     shared = _reflectance_error(good, options)
-    channels, rows, scatter = [], [], _drift_scatter(sources, adjusted)
-    for channel in sorted({channel for _, channel in sources}):
-        mine = [k for k, (_, other) in enumerate(sources) if other == channel and np.isfinite(adjusted.value[k])]
-        if not mine:
-            continue
+    of = np.array([source.channel for source in sources])
+    known = np.isfinite(adjusted.value)
+    channels, rows, scatter = [], [], _drift_scatter(of[known], adjusted.value[known])
+    for channel in np.unique(of[known]):
+        mine = np.flatnonzero(known & (of == channel))
+        some = [sources[k] for k in mine]
         mean, trials = float(adjusted.value[mine].mean()), adjusted.trials[:, mine]
         # A channel of one strip says nothing of its drift: it is credited with that of the others.
         apart = float(np.std(adjusted.value[mine], ddof=1)) if len(mine) > 1 else scatter
-        ranging = float(np.mean([strips[sources[k][0]].ranging for k in mine]))
+        ranging = float(np.mean([source.strip.ranging for source in some]))
         error = float(np.sqrt(np.std(trials.mean(axis=1), ddof=1) ** 2 + shared**2 + apart**2 + ranging**2))
-        channels.append(_describe_row(strips, sources, mine, math.exp(mean), error))
-        rows += _list_strips(strips, sources, mine, adjusted, shared)
+        channels.append(_describe_row(some, math.exp(mean), error))
+        rows += _list_strips(some, mine, adjusted, shared)
     constants = np.array([row.constant for row in channels])
     error = float(np.hypot(np.std(constants) / constants.mean(), max(row.relative_error for row in channels)))
     return replace(
@@ -188,38 +183,30 @@ def _assemble(
 
 
 def _list_strips(
-    strips: Sequence[FlightStrip],
-    sources: Sequence[tuple[int, int]],
-    mine: Sequence[int],
-    adjusted: Adjustment,
-    shared: float,
+    some: Sequence[Source], mine: np.ndarray, adjusted: Adjustment, shared: float
 ) -> Iterator[StripConstant]:
-    """The constants of one channel on each strip; mine: its sources, shared: error of the targets' reflectance."""
+    """The constants of one channel on each strip; mine: numbers of its sources, shared: error of the reflectance."""
     values, trials = adjusted.value[mine], adjusted.trials[:, mine]
     errors = np.std(trials - trials.mean(axis=1)[:, None], axis=0, ddof=1)
-    for k, drift, error in zip(mine, np.expm1(values - values.mean()), errors, strict=True):
-        strip, channel = strips[sources[k][0]], sources[k][1]
+    for source, k, drift, error in zip(some, mine, np.expm1(values - values.mean()), errors, strict=True):
         yield StripConstant(
-            strip=strip.path.name,
-            sha256=strip.sha256,
-            digitizer=channel // SCANNERS,
-            scanner=channel % SCANNERS,
+            strip=source.strip.path.name,
+            sha256=source.strip.sha256,
+            digitizer=source.row.digitizer,
+            scanner=source.row.scanner,
             constant=math.exp(adjusted.value[k]),
-            relative_error=float(np.sqrt(adjusted.error[k] ** 2 + shared**2 + strip.ranging**2)),
+            relative_error=float(np.sqrt(adjusted.error[k] ** 2 + shared**2 + source.strip.ranging**2)),
             drift=float(drift),
             drift_error=float(error),
             ties=int(adjusted.ties[k]),
         )
 
 
-def _drift_scatter(sources: Sequence[tuple[int, int]], adjusted: Adjustment) -> float:
+def _drift_scatter(channel: np.ndarray, value: np.ndarray) -> float:
     """Standard deviation of the logarithms of a channel's constants between strips; 0 where no channel has two."""
-    channel = np.array([other for _, other in sources])
-    squares, freedom = 0.0, 0
-    for one in np.unique(channel):
-        values = adjusted.value[(channel == one) & np.isfinite(adjusted.value)]
-        squares += float(np.sum((values - values.mean()) ** 2)) if len(values) else 0.0
-        freedom += max(len(values) - 1, 0)
+    parts = [value[channel == one] for one in np.unique(channel)]
+    freedom = sum(len(part) - 1 for part in parts)
+    squares = sum(float(np.sum((part - part.mean()) ** 2)) for part in parts)
     return math.sqrt(squares / freedom) if freedom else 0.0
 
 
@@ -233,30 +220,16 @@ def _list_targets(strips: Sequence[FlightStrip]) -> Iterator[TargetResult]:
                 yield replace(row, name=f"{row.name} on {strip.path.name}")
 
 
-def _describe_row(
-    strips: Sequence[FlightStrip],
-    sources: Sequence[tuple[int, int]],
-    mine: Sequence[int],
-    constant: float,
-    error: float,
-) -> ChannelConstant:
+def _describe_row(some: Sequence[Source], constant: float, error: float) -> ChannelConstant:
     """The row of a channel with how it records, and what targets say of its scatter; InputError for two recordings."""
-    i, channel = sources[mine[0]]
-    kinds = [strips[sources[k][0]].described[strips[sources[k][0]].channels.index(channel)] for k in mine]
-    first = kinds[0]
-    for k, kind in zip(mine, kinds, strict=True):
-        if (kind.bits, kind.spacing_ns, kind.gain) != (first.bits, first.spacing_ns, first.gain):
+    first = some[0].row
+    for path, row in ((source.strip.path, source.row) for source in some):
+        if (row.bits, row.spacing_ns, row.gain) != (first.bits, first.spacing_ns, first.gain):
             raise InputError(
-                f"{strips[sources[k][0]].path}: digitizer {kind.digitizer} records in another way than that of "
-                f"{strips[i].path.name}: another sensor or other settings; calibrate these strips separately"
+                f"{path}: digitizer {row.digitizer} records in another way than that of "
+                f"{some[0].strip.path.name}: another sensor or other settings; calibrate these strips separately"
             )
-    seen = [
-        row
-        for k in mine
-        if strips[sources[k][0]].found
-        for row in strips[sources[k][0]].found.channels
-        if SCANNERS * row.digitizer + row.scanner == channel
-    ]
+    seen = [source.given for source in some if source.given is not None]
     return replace(
         first,
         constant=constant,
@@ -264,12 +237,5 @@ def _describe_row(
         spread=max((row.spread for row in seen), default=0.0),
         echoes=sum(row.echoes for row in seen),
         shot_energy=max((row.shot_energy for row in seen), default=0.0),
-        pulse_ns=float(np.median([kind.pulse_ns for kind in kinds])),
+        pulse_ns=float(np.median([source.row.pulse_ns for source in some])),
     )
-
-
-def _name(strips: Sequence[FlightStrip], source: tuple[int, int]) -> str:
-    i, channel = source
-    if len(strips[i].channels) == 1:
-        return strips[i].path.name
-    return f"{strips[i].path.name} digitizer {channel // SCANNERS} scanner channel {channel % SCANNERS}"

@@ -13,33 +13,64 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.text_file import read_text
-from wavebatch.files.toml_file import REQUIRED, TomlTable, format_toml, parse_toml, shorten
+from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml, shorten
+from wavebatch.files.toml_schema import Key, describe_keys, read_keys
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
 
-_NUMBERS: dict[str, tuple[str, float, float, Any, str]] = {
-    "constant": (
-        "constant", 1e-30, 1e30, REQUIRED, "C' [1/(m2 count ns)]: gamma = C' R^2 amplitude sigma / transmission"
+_NUMBERS: dict[str, Key] = {
+    "constant": Key(
+        "constant", 1e-30, 1e30, "C' [1/(m2 count ns)]: gamma = C' R^2 amplitude sigma / transmission"
     ),
-    "relative_error": ("relative_error", 0.0, 10.0, REQUIRED, "standard deviation of the constant, relative"),
-    "attenuation_db_km": ("attenuation", 0.0, 100.0, 0.22, "of the air, one way, as it was used for the constant"),
-    "divergence_mrad": (
-        "divergence", 1e-3, 100.0, None, "full angle of the beam between the 1/e^2 points; needed for m2"
+    "relative_error": Key("relative_error", 0.0, 10.0, "standard deviation of the constant, relative"),
+    "attenuation_db_km": Key("attenuation", 0.0, 100.0, "of the air, one way, as it was used for the constant", True),
+    "divergence_mrad": Key(
+        "divergence", 1e-3, 100.0, "full angle of the beam between the 1/e^2 points; needed for m2", optional=True
     ),
-    "height_m": ("height", 0.0, 1e7, None, "of the sensor above the targets, median"),
-    "distance_m": ("distance", 0.0, 1e7, None, "from the sensor to the targets, median: runs at others are less sure"),
-    "pulse_rate_hz": ("rate", 1e-3, 1e12, None, "by GPS times: a laser has another energy at another rate"),
-    "section_constant": (
-        "section_constant", 0.0, 1e30, None, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission"
+    "height_m": Key("height", 0.0, 1e7, "of the sensor above the targets, median", optional=True),
+    "distance_m": Key(
+        "distance", 0.0, 1e7, "from the sensor to the targets, median: runs at others are less sure", optional=True
+    ),
+    "pulse_rate_hz": Key("rate", 1e-3, 1e12, "by GPS times: a laser has another energy at another rate", optional=True),
+    "section_constant": Key(
+        "section_constant", 0.0, 1e30, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission", optional=True
     ),
 }  # fmt: skip
-"""Numbers of the file by key: field of Calibration, least and largest value, default, meaning."""
+"""Numbers of the file by key."""
+
+_CONSTANT: dict[str, Key] = {
+    "digitizer": Key("digitizer", 1, 255, kind=int),
+    "scanner": Key("scanner", 0, 3, optional=True, kind=int),
+    "constant": _NUMBERS["constant"],
+    "relative_error": _NUMBERS["relative_error"],
+}
+"""Keys of any constant of a channel."""
+
+_CHANNEL: dict[str, Key] = _CONSTANT | {
+    "spread": Key("spread", 0.0, 1e6, optional=True),
+    "echoes": Key("echoes", 0, 10**12, optional=True, kind=int),
+    "shot_energy": Key("shot_energy", 0.0, 1e6, optional=True),
+    "bits": Key("bits", 1, 32, optional=True, kind=int),
+    "samples": Key("samples", 1, 1 << 32, optional=True, kind=int),
+    "spacing_ns": Key("spacing_ns", 1e-6, 1e9, optional=True),
+    "gain": Key("gain", -math.inf, math.inf, optional=True),
+    "pulse_ns": Key("pulse_ns", 1e-6, 1e9, optional=True),
+    "noise_dn": Key("noise_dn", 0.0, 1e12, optional=True),
+    "brightest": Key("brightest", 0.0, 1e30, optional=True),
+}
+"""Keys of a [[channel]]."""
+
+_STRIP: dict[str, Key] = _CONSTANT | {
+    "drift": Key("drift", -1.0, 1e6, optional=True),
+    "drift_error": Key("drift_error", 0.0, 1e6, optional=True),
+    "ties": Key("ties", 0, 10**12, optional=True, kind=int),
+}
+"""Keys of a [[flight_strip]] that are numbers."""
 
 _DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
@@ -51,12 +82,11 @@ _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of 
 
 def format_calibration(found: Calibration) -> str:
     """Return the TOML text of a calibration; `parse_calibration` gives the same constants again."""
-    numbers = {key: getattr(found, name) for key, (name, *_) in _NUMBERS.items()}
     document = {
         "schema": CALIBRATION_SCHEMA,
         "version": __version__,
         **{key: getattr(found, key) for key in _TEXTS},
-        **{key: None if value is None else float(value) for key, value in numbers.items()},
+        **describe_keys(found, _NUMBERS),
         "scan_angle": dict(zip(_SWATH, (math.degrees(found.swath[0]), *found.swath[1:]), strict=True))
         if found.swath
         else None,
@@ -65,7 +95,7 @@ def format_calibration(found: Calibration) -> str:
         "target": [asdict(row) for row in found.targets] or None,
         "fingerprint": {key: item for key, item in found.fingerprint.items() if not isinstance(item, Mapping)} or None,
     }
-    return format_toml(document, heading=_HEADING, comments={key: row[-1] for key, row in _NUMBERS.items()})
+    return format_toml(document, heading=_HEADING, comments={key: entry.meaning for key, entry in _NUMBERS.items()})
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -97,8 +127,8 @@ def parse_calibration(text: str, name: str) -> Calibration:
     tables = ("scan_angle", "channel", "flight_strip", "target", "fingerprint")
     table.check_keys(("schema", "version", *_TEXTS, *_NUMBERS, *tables))
     table.check_schema(CALIBRATION_SCHEMA)
-    values = {field: table.number(key, *limits) for key, (field, *limits) in _NUMBERS.items()}
-    section = values.pop("section_constant")
+    values = read_keys(table, _NUMBERS)
+    section = values.pop("section_constant", None)
     texts = {key: str(table.values.get(key, "")) for key in _TEXTS}
     if texts["flight"]:
         with contextlib.suppress(ValueError):
@@ -136,33 +166,11 @@ def _check_section(section: float, found: Calibration, name: str) -> None:
 
 
 def _read_channel(table: TomlTable) -> ChannelConstant:
-    table.check_keys(ChannelConstant.__dataclass_fields__)
-    return ChannelConstant(
-        table.integer("digitizer", 1, 255),
-        table.integer("scanner", 0, 3, 0),
-        *(table.number(key, *_NUMBERS[key][1:]) for key in ("constant", "relative_error")),
-        spread=table.number("spread", 0.0, 1e6, 0.0),
-        echoes=table.integer("echoes", 0, 10**12, 0),
-        shot_energy=table.number("shot_energy", 0.0, 1e6, 0.0),
-        bits=table.integer("bits", 1, 32, None),
-        samples=table.integer("samples", 1, 1 << 32, None),
-        spacing_ns=table.number("spacing_ns", 1e-6, 1e9, None),
-        gain=table.number("gain", default=None),
-        pulse_ns=table.number("pulse_ns", 1e-6, 1e9, None),
-        noise_dn=table.number("noise_dn", 0.0, 1e12, None),
-        brightest=table.number("brightest", 0.0, 1e30, None),
-    )
+    table.check_keys(_CHANNEL)
+    return ChannelConstant(**{"scanner": 0, **read_keys(table, _CHANNEL)})
 
 
 def _read_strip(table: TomlTable) -> StripConstant:
-    table.check_keys(StripConstant.__dataclass_fields__)
-    return StripConstant(
-        table.get("strip", str, ""),
-        table.get("sha256", str),
-        table.integer("digitizer", 1, 255),
-        table.integer("scanner", 0, 3, 0),
-        *(table.number(key, *_NUMBERS[key][1:]) for key in ("constant", "relative_error")),
-        drift=table.number("drift", -1.0, 1e6, 0.0),
-        drift_error=table.number("drift_error", 0.0, 1e6, 0.0),
-        ties=table.integer("ties", 0, 10**12, 0),
-    )
+    table.check_keys(("strip", "sha256", *_STRIP))
+    names = {"strip": table.get("strip", str, ""), "sha256": table.get("sha256", str)}
+    return StripConstant(**{**names, "scanner": 0, **read_keys(table, _STRIP)})

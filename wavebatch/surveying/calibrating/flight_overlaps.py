@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.core.units import MAD_TO_STD
+from wavebatch.core.order import robust_std
 from wavebatch.surveying.calibrating.adjust_flight import LEAST_TIES, Adjustment
 from wavebatch.surveying.calibrating.tie_cells import Ties
 from wavebatch.surveying.calibration import StripConstant
@@ -64,16 +64,16 @@ def compare_pairs(ties: Ties, adjusted: Adjustment, names: Sequence[str]) -> Ite
                 continue
             i, j = rows[a][left], rows[b][right]
             value, height = ties.value[i] - ties.value[j], ties.height[i] - ties.height[j]
-            middle, level = float(np.median(value)), float(np.median(height))
+            middle = float(np.median(value))
             yield PairOverlap(
                 names[a],
                 names[b],
                 len(i),
                 math.exp(middle),
                 math.exp(middle + adjusted.value[a] - adjusted.value[b]),
-                MAD_TO_STD * float(np.median(np.abs(value - middle))),
-                level,
-                MAD_TO_STD * float(np.median(np.abs(height - level))),
+                robust_std(value),
+                float(np.median(height)),
+                robust_std(height),
             )
 
 

@@ -9,11 +9,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.waveforms import angle_to_vertical
+from wavebatch.core.system import angle_to_vertical
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.calibrating.setting import SCANNERS, see_channels
@@ -47,15 +48,39 @@ class FlightStrip:
     found: Calibration | None
     """The calibration by targets on this strip."""
     refused: str
-    channels: tuple[int, ...]
-    described: tuple[ChannelConstant, ...]
-    """How each of the channels records."""
+    channels: tuple[ChannelConstant, ...]
+    """How each of its channels records."""
     ranging: float
     """Relative error of a constant from the error of the sensor's position."""
     ties: np.ndarray
     """Array of TIE, with channels as sources."""
     seen: Mapping[int, np.void]
     """How the targets were seen by each channel, as VIEW."""
+
+
+class Source(NamedTuple):
+    """A channel of a strip: what has a constant."""
+
+    strip: FlightStrip
+    row: ChannelConstant
+    """How it records."""
+
+    @property
+    def channel(self) -> int:
+        """Its number; the same in all strips."""
+        return SCANNERS * self.row.digitizer + self.row.scanner
+
+    @property
+    def given(self) -> ChannelConstant | None:
+        """Its constant by the targets on the strip; None without."""
+        found = self.strip.found.channels if self.strip.found else ()
+        return next((row for row in found if Source(self.strip, row).channel == self.channel), None)
+
+    @property
+    def name(self) -> str:
+        """Of the strip, and of the channel where the strip has several."""
+        of = f" digitizer {self.row.digitizer} scanner channel {self.row.scanner}"
+        return self.strip.path.name + (of if len(self.strip.channels) > 1 else "")
 
 
 def find_box(path: Path) -> _Box:
@@ -78,7 +103,7 @@ def read_strip(
         targets = [target.place(path, header) for target in targets]
         seen = see_channels(source.reader, source.scan)
         known = source.reader.facts.digitizers  # points may name others: they have no waveform
-        channels = tuple(SCANNERS * digitizer + scanner for digitizer, scanner in seen if digitizer in known)
+        channels = [ChannelConstant(*channel, 1.0, 0.0) for channel in seen if channel[0] in known]
         others = [box for i, box in enumerate(boxes) if i != number]
         area = _TieArea(
             boxes[number], boxes[0][0], [boxes[number]] if len(channels) > 1 else others, source.scan.packets
@@ -89,15 +114,13 @@ def read_strip(
             found = build_calibration(source, targets, on_targets, options)
         except InputError as error:
             refused = str(error)
-        blank = [ChannelConstant(channel // SCANNERS, channel % SCANNERS, 1.0, 0.0) for channel in channels]
         distance = np.array([source.sensor.distance or math.inf])
         return FlightStrip(
             path=path,
             sha256=take_fingerprint(path, source.reader.facts.packets.file)["sha256_sampled"],
             found=found,
             refused=refused,
-            channels=channels,
-            described=tuple(describe_channel(row, source) for row in blank),
+            channels=tuple(describe_channel(row, source) for row in channels),
             ranging=measure_ranging(source.sensor, distance, options.attenuation),
             ties=ties,
             seen=_see_targets(on_targets),

@@ -109,7 +109,7 @@ def compare_setting(
 
     compare(found.rate, calibration.rate, SAME_RATE, 1.0, "another rate of pulses [1/s], so another energy:")
     for row in calibration.channels:
-        noise, which = system.digitizers.get(row.digitizer, system).noise_std, f"of digitizer {row.digitizer}"
+        noise, which = system.digitizers.get(row.digitizer, system).noise.std, f"of digitizer {row.digitizer}"
         compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
         # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
         light = found.brightest.get(row.digitizer)
@@ -137,7 +137,7 @@ def compare_air(
 
 def compare_divergence(calibration: Calibration, system: SystemPulse) -> Iterator[str]:
     """Yield the sentence about a divergence that is not that of the calibration."""
-    own, other = system.divergence, calibration.divergence
+    own, other = system.radiometry.divergence, calibration.divergence
     if own is not None and other is not None and abs(own / other - 1.0) > SAME_DIVERGENCE:
         yield (
             f"calibration: measured with a divergence of {other:g} mrad, the survey has {own:g} mrad, which is used: "

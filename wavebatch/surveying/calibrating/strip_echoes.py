@@ -123,7 +123,7 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
         chain = options.chain or widest_chain()
         setup = prepare(reader, scan, chain, options.request, sensor=options.sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
-        system = replace(setup.system, attenuation=options.attenuation, sensor_error=0.0)
+        system = setup.system.with_radiometry(attenuation=options.attenuation, sensor_error=0.0)
         setting = measure_setting(reader, scan, setup.sensor, options.attenuation)
         sent = find_pulse_energy(reader, scan, options.energy)
         if options.energy is not None and sent is not None:
@@ -151,7 +151,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None
 
     given: values of a column for each waveform, f8 (n,).
     """
-    alone = echoes.count(len(block))[echoes.waveform] == 1
+    alone = echoes.alone(len(block))
     echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.UNANCHORED)) == 0)))
     rows = np.zeros(len(echoes), ECHO)
     rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -46,16 +46,6 @@ _LEAST_SHARED = 50
 """Echoes that both chains must have for a comparison."""
 
 
-@dataclass(frozen=True, slots=True)
-class StripMatch:
-    """A calibration as it holds for one strip."""
-
-    calibration: Calibration
-    """With the constants of the strip's channels; its common constant is NaN where the channels are known."""
-    warnings: tuple[str, ...] = ()
-    """One line each."""
-
-
 def match_strip(
     calibration: Calibration,
     reader: StripReader,
@@ -64,7 +54,7 @@ def match_strip(
     sensor: SensorSource,
     chain: Chain | None = None,
     attenuation: float | None = None,
-) -> StripMatch:
+) -> tuple[Calibration, tuple[str, ...]]:
     """Fit a calibration to a strip.
 
     Parameters
@@ -82,7 +72,10 @@ def match_strip(
 
     Returns
     -------
-    StripMatch
+    fitted : Calibration
+        With the constants of the strip's channels; its common constant is NaN where the channels are known.
+    warnings : tuple of str
+        One line each.
 
     Raises
     ------
@@ -95,7 +88,7 @@ def match_strip(
     """
     warnings = list(doubt_calibration(calibration))
     if not any(row.is_described for row in calibration.channels):
-        return StripMatch(calibration, tuple(warnings))
+        return calibration, tuple(warnings)
     growth, reasons = find_growth(calibration, reader, sensor, attenuation)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
     if all(row.sha256 != own_strip for row in calibration.strips):
@@ -130,7 +123,7 @@ def match_strip(
     air = compare_air(calibration, reader, sensor, attenuation, warnings)
     rows = [replace(row, relative_error=math.hypot(row.relative_error, air)) for row in rows]
     fitted = replace(calibration, constant=math.nan, channels=tuple(rows), strips=())
-    return StripMatch(fitted, tuple(dict.fromkeys(warnings)))
+    return fitted, tuple(dict.fromkeys(warnings))
 
 
 def _find_pulses(
@@ -143,15 +136,15 @@ def _find_pulses(
     """
     systems = {0: system, **system.digitizers}
     known = [row.pulse_ns for row in calibration.channels if row.pulse_ns]
-    divergence = system.divergence or calibration.divergence
+    divergence = system.radiometry.divergence or calibration.divergence
     widest = max(one.sigma_ref for one in systems.values()) * FWHM_PER_SIGMA
     if known and divergence and widest > NEAR_PULSE * min(known):
         main = max(scan.by_descriptor, key=lambda index: (index not in system.digitizers, scan.by_descriptor[index]))
         spacing = reader.facts.digitizers[main].spacing
-        seen = sample_reference(reader, scan, sensor, replace(system, divergence=divergence), spacing).system
+        seen = sample_reference(reader, scan, sensor, system.with_radiometry(divergence=divergence), spacing).system
         systems = {0: seen, **seen.digitizers}
     return {
-        index: FWHM_PER_SIGMA * math.sqrt(max(one.sigma_ref**2 + one.level_variance, 0.0))
+        index: FWHM_PER_SIGMA * math.sqrt(max(one.sigma_ref**2 + one.widths.variance, 0.0))
         for index, one in systems.items()
     }
 
@@ -256,7 +249,7 @@ def _compare_energies(block: WaveformBlock, system: SystemPulse, pair: tuple[Cha
     found = []
     for chain in pair:
         echoes = chain.run(block, system)
-        clean = (echoes.count(len(block))[echoes.waveform] == 1) & ((echoes.flags & np.uint16(UNCLEAN)) == 0)
+        clean = echoes.alone(len(block)) & ((echoes.flags & np.uint16(UNCLEAN)) == 0)
         energy = np.full(len(block), np.nan)
         energy[echoes.waveform[clean]] = echoes.attributes["energy"][clean]
         found.append(energy)

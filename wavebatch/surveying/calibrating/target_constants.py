@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from wavebatch.core.order import group_medians, robust_std
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.geometry.facets import fit_facet
 from wavebatch.surveying.calibrating.setting import SCANNERS
@@ -174,14 +175,13 @@ def measure_column(
 def summarise(blank: TargetResult, constant: np.ndarray) -> TargetResult:
     """Return the result with number, median and relative robust spread of constants (n,), n > 0."""
     middle = float(np.median(constant))
-    spread = MAD_TO_STD * float(np.median(np.abs(constant - middle))) / middle
-    return replace(blank, echoes=len(constant), constant=middle, spread=spread)
+    return replace(blank, echoes=len(constant), constant=middle, spread=robust_std(constant) / middle)
 
 
 def _by_channel(constant: np.ndarray, channel: np.ndarray) -> np.ndarray:
     """Constants over the median of their channel."""
     _, group = np.unique(channel, return_inverse=True)
-    return constant / np.array([np.median(constant[group == k]) for k in range(int(group.max()) + 1)])[group]
+    return constant / group_medians(constant, group)[0][group]
 
 
 def _share_strange(constant: np.ndarray) -> float:

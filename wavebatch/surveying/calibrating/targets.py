@@ -66,7 +66,7 @@ def build_calibration(
     -----
     docs/algorithms.md 5.
     """
-    divergence = options.divergence or source.system.divergence
+    divergence = options.divergence or source.system.radiometry.divergence
     measured = [
         measure_target(target, rows, divergence, options.reflectance_error)
         for target, rows in zip(targets, found, strict=not options.column)
@@ -145,7 +145,7 @@ def describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstan
     system = source.system.digitizers.get(row.digitizer, source.system)
     return replace(
         row,
-        noise_dn=system.noise_std,
+        noise_dn=system.noise.std,
         brightest=source.setting.brightest.get(row.digitizer),
         bits=digitizer.bits,
         samples=digitizer.n_samples,

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.core.order import group_medians
+from wavebatch.core.system import angle_to_vertical
 from wavebatch.core.units import MEDIAN_ERROR
-from wavebatch.core.waveforms import angle_to_vertical
 from wavebatch.kernels.geometry.planes import fit_planes
 
 TIE = np.dtype([

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.waveforms import swath_columns
+from wavebatch.core.system import swath_columns
 from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
 from wavebatch.surveying.calibrating.tie_cells import Ties
 
@@ -57,7 +57,7 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
     adjusted : Adjustment
         With the constants straight below the sensor.
     swath : (float, float, float)
-        As `SystemPulse.swath`.
+        As `Radiometry.swath`.
 
     Raises
     ------

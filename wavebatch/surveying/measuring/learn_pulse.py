@@ -16,8 +16,9 @@ from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import model_parameters, pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import ALONE, MIN_SNR, fit_lone
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, find_edge
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, SMALL, find_edge
 from wavebatch.surveying.measuring.residuals import subtract_echoes
+from wavebatch.surveying.systems.figures import Figures
 
 MOST_STACKED = 3000
 """Isolated echoes that a stack takes; more do not make it better."""
@@ -88,7 +89,7 @@ def _nearest_to_edge(echoes: EchoTable) -> EchoTable:
 
 
 def refine_pulse(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figures: dict[str, float]
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figures: Figures
 ) -> tuple[SystemPulse, EchoTable]:
     """The pulse learned once more from all echoes that stand clear, also of waveforms with several, and these echoes.
 
@@ -99,7 +100,7 @@ def refine_pulse(
         With the pulse learned so far.
     echoes : EchoTable
         The block decomposed with it.
-    figures : dict
+    figures : Figures
         Gets the misfits of the models.
 
     Notes
@@ -145,7 +146,7 @@ def _reach(block: WaveformBlock, system: SystemPulse) -> tuple[float, float]:
 def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
     """Rows of clear echoes whose neighbours are at least SEPARATE widths away, or a tenth as high."""
     top = system.saturation or float(block.samples.max())
-    good = (echoes.amplitude > MIN_SNR * system.noise_std) & (echoes.amplitude > 0.08 * top)
+    good = (echoes.amplitude > MIN_SNR * system.noise.std) & (echoes.amplitude > 0.08 * top)
     good &= echoes.amplitude <= _highest(block, system, echoes.amplitude[good])
     good &= (echoes.flags & np.uint16(UNCLEAN & ~int(EchoFlag.OVERLAPPED))) == 0
     gap = np.diff(echoes.time) / system.sigma_ref
@@ -155,12 +156,13 @@ def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     return np.flatnonzero(good)
 
 
-def find_strong(echoes: EchoTable) -> EchoTable:
-    """The strongest fifth of the clear echoes that their target has not widened."""
+def find_strong(echoes: EchoTable, least: int = FEW) -> EchoTable:
+    """The strongest fifth of the clear echoes that their target has not widened, `least` where there are so many."""
     if len(echoes) < FEW:
         return echoes
     narrow = echoes.sigma < WIDENED * find_edge(echoes.sigma)
-    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], 0.8)))
+    share = max(1 - least / np.count_nonzero(narrow), 0.0)
+    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], min(share, 0.8))))
     return echoes.take(strong[:: max(len(strong) // MOST_STRONG, 1)])
 
 
@@ -171,7 +173,7 @@ def find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     return echoes.take(np.flatnonzero((echoes.amplitude > 0.08 * top) & (echoes.amplitude < top)))
 
 
-def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: dict[str, float]) -> SystemPulse:
+def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: Figures) -> SystemPulse:
     """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2)."""
     noise = pooled_noise(block, system)
     signal = block.samples[main.waveform] - noise.level[main.waveform]
@@ -185,7 +187,7 @@ def _learn(
     system: SystemPulse,
     main: EchoTable,
     signal: np.ndarray,
-    figures: dict[str, float],
+    figures: Figures,
     most: int = MOST_COMPONENTS,
     first: np.ndarray | int = 0,
 ) -> SystemPulse:
@@ -194,16 +196,13 @@ def _learn(
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
     stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
     strongest = float(np.quantile(main.amplitude, 0.99))
-    goal = max(REACHED * system.noise_std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
-    sums = fit_gaussians(stack, width, most, goal)
+    goal = max(REACHED * system.noise.std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
+    small = len(block) < SMALL
+    sums = fit_gaussians(stack, width, most, 0.0 if small else goal)
     skewed = fit_skewed(stack, width)
-    figures["misfit_goal"] = goal
-    figures["misfit_skewed"], figures["kappa"] = skewed.rms, skewed.kappa
-    for number in range(1, MOST_COMPONENTS + 1):
-        figures.pop(f"misfit_{number}_gaussians", None)
-    for fit in sums:
-        figures[f"misfit_{len(fit.components)}_gaussians"] = fit.rms
-    best = _simplest([sums[0], skewed, *sums[1:]], goal)
+    figures.misfit_goal, figures.misfit_skewed, figures.kappa = goal, skewed.rms, skewed.kappa
+    figures.misfit_gaussians = {len(fit.components): fit.rms for fit in sums}
+    best = sums[-1] if small else _simplest([sums[0], skewed, *sums[1:]], goal)
     if len(best.components) > 1:
         # All components that were worth fitting: fewer would save nothing, and tiles would disagree on their number.
         best = sums[-1]

@@ -52,7 +52,7 @@ def fit_lone(block: WaveformBlock, noise: Noise, system: SystemPulse, least: flo
     EchoTable
         At most one echo per waveform.
     """
-    n, floor = len(block), least * system.noise_std
+    n, floor = len(block), least * system.noise.std
     candidates = maximum(block, noise, system)
     strongest, second = find_strongest(candidates, n)
     amplitude = candidates.amplitude[strongest]

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import SQRT_PI
+from wavebatch.core.units import MEDIAN_ERROR, SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import promise_echoes
@@ -53,7 +53,9 @@ LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says."""
 
 
-def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
+def measure_misfit(
+    block: WaveformBlock, system: SystemPulse, strong: EchoTable, *, bounded: bool = True, reach: float = CORE_REACH
+) -> SystemPulse:
     """The system with what its pulse leaves unexplained of strong single echoes, as shares of their amplitude.
 
     Parameters
@@ -63,6 +65,10 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
         Its misfit is the least: 0, or that of a known sensor.
     strong : EchoTable
         The strongest single echoes that no target has widened, one per waveform.
+    bounded : bool
+        The misfit is at most what the echoes have in common.
+    reach : float
+        How far from an echo its misfit is looked for [widths of the pulse].
 
     Returns
     -------
@@ -87,46 +93,53 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
     fitted = fitted.take(find_strongest(fitted, len(part))[0])
     misfit = 0.0
     if len(fitted) >= FEW:
-        ratio = fitted.amplitude.astype(np.float64) / system.noise_std
+        ratio = fitted.amplitude.astype(np.float64) / system.noise.std
         energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
-        every = (_promise(part, samples_of(part, noise), system, fitted) - NOISE_PROMISE) / energy
+        every = (_promise(part, samples_of(part, noise), system, fitted, reach) - NOISE_PROMISE) / energy
         share = np.quantile(every, MISFIT_QUANTILE)
-        if np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) < CLIPPED:
-            share = min(share, np.quantile(_common_promise(part, noise, system, fitted) / energy, COMMON_QUANTILE))
+        if bounded and np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) < CLIPPED:
+            common = _common_promise(part, noise, system, fitted, reach) / energy
+            share = min(share, np.quantile(common, COMMON_QUANTILE))
         misfit = SCATTERED * float(np.sqrt(max(share, 0.0)))
     # A known sensor's pulse changes from shot to shot: of that echoes of a strip have nothing in common.
     return replace(system, misfit=max(misfit, system.misfit), tail_misfit=_measure_tail(part, system, fitted))
 
 
-def _promise(part: WaveformBlock, samples: Samples, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+def _promise(
+    part: WaveformBlock, samples: Samples, system: SystemPulse, echoes: EchoTable, reach: float
+) -> np.ndarray:
     """Fall of chi2 (m,) that one more echo promises near each echo, the only one of its waveform."""
     spacing = part.spacing
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
     whole = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1).astype(np.float64)
     main = model_parameters(shape, limits, whole)
     s = part.samples.shape[1]
-    reach = int(np.ceil(CORE_REACH * system.sigma_ref / spacing))
+    far = int(np.ceil(reach * system.sigma_ref / spacing))
     middle = np.rint(whole[:, 1]).astype(np.int64)
-    low, high = np.clip(middle - reach, 0, s - 1), np.clip(middle + reach + 1, 1, s)
+    low, high = np.clip(middle - far, 0, s - 1), np.clip(middle + far + 1, 1, s)
     echo = np.arange(len(echoes))
     windows = Clusters(echoes.waveform.astype(np.int64), low, high, echo, np.ones_like(echo))
     amplitude, time, width = main.T
-    settings = Settings(*limits, shape, clip_level(part, system), system.noise_gain)
+    settings = Settings(*limits, shape, clip_level(part, system), system.noise.gain)
     fitted = Candidates(windows.waveform, time, amplitude, width)
     return promise_echoes(samples, fitted, windows, settings)
 
 
-def _common_promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+def _common_promise(
+    part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, reach: float
+) -> np.ndarray:
     """The same for waveforms of the pulse and of what all echoes of about one height leave of it beyond chance."""
     residual = subtract_echoes(part, system, echoes)[echoes.waveform] / echoes.amplitude[:, None]
     lag = np.arange(residual.shape[1]) - (echoes.time / part.spacing)[:, None]
     lag /= (echoes.sigma / part.spacing)[:, None]
-    near = (np.abs(lag) < CORE_REACH) & np.isfinite(residual)
+    near = (np.abs(lag) < reach) & np.isfinite(residual)
     height = np.broadcast_to(echoes.amplitude[:, None], lag.shape)[near]
-    common, _, error = find_common(residual[near].astype(np.float64), lag[near], height, CORE_REACH)
+    common, number, spread = find_common(residual[near].astype(np.float64), lag[near], height, reach)
+    chance = system.noise.quiet / height
+    error = MEDIAN_ERROR * spread / np.sqrt(number) + 2 * np.maximum(spread - chance, 0.0)
     drawn, (row, place) = render_own(part, system, echoes, echoes.waveform, len(part)), np.nonzero(near)
     drawn[echoes.waveform[row], place] += np.sign(common) * np.maximum(np.abs(common) - error, 0.0) * height
-    return _promise(part, Samples(drawn, np.zeros(len(part), np.float32), noise.std), system, echoes)
+    return _promise(part, Samples(drawn, np.zeros(len(part), np.float32), noise.std), system, echoes, reach)
 
 
 def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[tuple[float, float], ...]:
@@ -138,7 +151,7 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     left = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
     left /= echoes.amplitude[:, None]
     lag = (np.arange(residual.shape[1]) - (echoes.time / part.spacing)[:, None]) / ref
-    expected = system.noise_std / np.median(echoes.amplitude) / np.sqrt(energy)
+    expected = system.noise.std / np.median(echoes.amplitude) / np.sqrt(energy)
     profile = []
     for place in range(-TAIL_BEFORE, TAIL_AFTER):
         here = left[(lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)]

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
@@ -38,6 +39,10 @@ RESIDUAL_LOOK = 4096
 
 FEW = 20
 """Isolated echoes below which the width of the system pulse is a guess."""
+
+SMALL = 256
+"""Waveforms below which a stack of echoes cannot show that a pulse is simple: a tail of 6 % drowns in its errors, and
+adds a fifth to the echoes. What pulse such a strip has is decided by all of its waveforms."""
 
 ENOUGH_TO_LEARN = 20
 """Isolated echoes from which a pulse can be learned (R2): at SNR 20 their stack is known to a hundredth of its peak, a
@@ -101,12 +106,14 @@ def _gaussian_system(block: WaveformBlock, width: float, saturation: float | Non
     hidden = DITHERED if noise.std < UNDITHERED else QUANTISATION_STD
     return SystemPulse(
         sigma_ref=width * block.spacing,
-        baseline=noise.level,
-        baseline_spread=noise.spread,
-        recovery=float(noise.recovery * block.spacing),
-        noise_std=max(seen, noise.std, hidden),
-        noise_by_kind={"quiet": known, "quiet_pulse": seen},
-        correlation=correlation,
+        noise=ReceiverNoise(
+            baseline=noise.level,
+            baseline_spread=noise.spread,
+            recovery=float(noise.recovery * block.spacing),
+            std=max(seen, noise.std, hidden),
+            by_kind={"quiet": known, "quiet_pulse": seen},
+            correlation=correlation,
+        ),
         saturation=saturation,
     )
 
@@ -118,8 +125,8 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
     go beyond it; with too few of them the system's width stays.
     """
     n = len(block)
-    noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
-    if system.baseline_spread > system.noise_std:
+    noise = Noise(np.full(n, system.noise.baseline, np.float32), np.full(n, system.noise.std, np.float32))
+    if system.noise.baseline_spread > system.noise.std:
         noise = pooled_noise(block, system)
     echoes = fit_lone(block, noise, system, MIN_SNR)
     free = (echoes.flags & int(EchoFlag.AT_BOUND)) == 0

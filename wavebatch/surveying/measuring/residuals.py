@@ -12,7 +12,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.order import group_medians
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
+from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.render import render_echoes
@@ -43,6 +43,10 @@ SAME_NOISE = 1.1
 GROWTH_REACH, GROWTH_STEP, GROWTH_CLASS = 1.5, 0.25, 60
 """Widths of an echo around it in which the growth of noise is looked for, steps of the lag there, and the echoes of a
 class of heights: misfit of the pulse is taken off by lag and class."""
+
+BROUGHT, BROUGHT_CROSS = np.sqrt(2 / 3) * np.array([1, 2 / 3, 1 / 2]), -np.sqrt(2 / 3) / 3
+"""Integrals of the squares of the first three Hermite functions times exp(-z^2 / 2); and of the product of the first
+and the third one, times 2 / sqrt(2) as it enters the sum."""
 
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
@@ -109,10 +113,10 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     (docs/algorithms.md R3, H10, H12).
     """
     n, s = block.samples.shape
-    if not system.noise_by_kind["quiet"]:
+    if not system.noise.by_kind["quiet"]:
         system = _measure_outside(block, system, echoes)
     alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
-    alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise_std))
+    alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise.std))
     if len(alone) < ENOUGH_TO_LEARN:
         return system
     time, width = alone.time / block.spacing, alone.sigma / block.spacing
@@ -122,16 +126,16 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     residual = subtract_echoes(part, system, replace(alone, waveform=rows.astype(np.int32)))
     lag = (np.arange(s) - time[:, None]) / width[:, None]
     lag[~np.isfinite(residual)] = np.inf
-    kinds = dict(system.noise_by_kind)
+    kinds = dict(system.noise.by_kind)
     kinds["core"] = _robust_std(residual[np.abs(lag) < 2.5])
-    std = system.noise_std
+    std = system.noise.std
     weak = alone.amplitude < WEAK * DITHERED
     if kinds.get("outside", kinds["quiet"]) < UNDITHERED and np.count_nonzero(weak) >= ENOUGH_TO_LEARN:
         kinds["weak_echoes"] = _robust_std(residual[weak][np.abs(lag[weak]) < 2.5])
         std = max(std, kinds["weak_echoes"])
     sample = kinds.get("outside") or kinds["quiet"] or std
     gain = _noise_gain(residual, model, lag, width, std, std > COLOURED * sample)
-    return replace(system, noise_std=std, noise_by_kind=kinds, noise_gain=gain)
+    return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, gain=gain))
 
 
 def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
@@ -142,7 +146,7 @@ def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     """
     strongest = np.zeros(len(block))
     np.maximum.at(strongest, echoes.waveform, echoes.amplitude)
-    clear = (echoes.amplitude > 8 * system.noise_std) & (echoes.amplitude > 0.05 * strongest[echoes.waveform])
+    clear = (echoes.amplitude > 8 * system.noise.std) & (echoes.amplitude > 0.05 * strongest[echoes.waveform])
     clear = echoes.take(np.flatnonzero(clear))
     residual = subtract_echoes(block, system, clear)
     used = np.isfinite(residual)
@@ -154,11 +158,12 @@ def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
         return system
     std, correlation = found[0], tuple(found[1].tolist())
     hidden = DITHERED if std < UNDITHERED else QUANTISATION_STD
-    kinds = {**system.noise_by_kind, "outside": std, "outside_pulse": seen}
+    kinds = {**system.noise.by_kind, "outside": std, "outside_pulse": seen}
     # The residual is a few percent too small, because the baseline comes from the same samples. The estimate from quiet
     # samples is corrected for that: it is the floor, unless they hold tails of echoes, which the residual does not.
     floor = kinds["quiet_pulse"] if 0 < kinds["quiet"] < SAME_NOISE * std else 0.0
-    return replace(system, noise_std=float(max(seen, std, hidden, floor)), noise_by_kind=kinds, correlation=correlation)
+    std = float(max(seen, std, hidden, floor))
+    return replace(system, noise=replace(system.noise, std=std, by_kind=kinds, correlation=correlation))
 
 
 def _cover(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
@@ -210,15 +215,19 @@ def _robust_std(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean((kept.astype(np.float64) - np.mean(kept, dtype=np.float64)) ** 2)))
 
 
-def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Share of a sample's variance that the fit of amplitude, time and width takes away.
+def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Share h of a sample's variance that the fit of amplitude, time and width takes away, and what it brings there of
+    a variance that is the pulse itself, of height 1: the sum of h_ij^2 S_j over the samples j.
 
     lag: after the echo's centre, in widths. width: of the echo [samples]. The three derivatives of a Gaussian span the
-    first three Hermite functions, whose squares add up to the leverage of a sample.
+    first three Hermite functions: their products add up to h_ij, times the width.
     """
     z = lag.astype(np.float64) ** 2
-    leverage = exp(-z) / np.sqrt(np.pi) * (1 + 2 * z + 0.5 * (2 * z - 1) ** 2) / width
-    return np.minimum(leverage, 0.9)
+    # Squares of the three, and the product of the first and the last one, over exp(-z^2) / sqrt(pi).
+    squares = np.ones_like(z), 2 * z, 0.5 * (2 * z - 1) ** 2
+    bell = exp(-z) / np.sqrt(np.pi) / width
+    brought = sum(part * share for part, share in zip(squares, BROUGHT, strict=True)) + (2 * z - 1) * BROUGHT_CROSS
+    return np.minimum(bell * sum(squares), 0.9), bell * brought
 
 
 def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: float) -> tuple[np.ndarray, ...]:
@@ -242,8 +251,8 @@ def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: 
         Median of the values at this lag and height.
     number : int64 (k,)
         Values that it comes from.
-    error : float64 (k,)
-        Its standard error, from their scatter.
+    spread : float64 (k,)
+        Their standard deviation, from the median of their distances from it.
     """
     classes = min(max(len(np.unique(height)) // GROWTH_CLASS, 1), 8)
     bins = int(2 * reach / GROWTH_STEP)
@@ -251,8 +260,7 @@ def find_common(values: np.ndarray, lag: np.ndarray, height: np.ndarray, reach: 
     place += bins * np.searchsorted(np.quantile(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
     number = np.bincount(place)
     middle, spread = group_medians(values, place)
-    error = MEDIAN_ERROR * spread / np.sqrt(np.maximum(number, 1))
-    return middle[place], number[place], error[place]
+    return middle[place], number[place], spread[place]
 
 
 def _chance_part(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, core: np.ndarray) -> np.ndarray:
@@ -294,8 +302,11 @@ def _noise_gain(
 ) -> float:
     """Growth of the variance per count of signal, 0 where it cannot be told from none (H12)."""
     core = np.abs(lag) < GROWTH_REACH
-    signal, squared = model[core].astype(np.float64), _chance_part(residual, model, lag, core) ** 2
-    squared /= 1 - _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
+    taken, brought = _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
+    squared = _chance_part(residual, model, lag, core) ** 2 / (1 - taken)
+    height = np.broadcast_to(model.max(axis=1)[:, None], lag.shape)[core]
+    # Noise without signal counts once, as if nothing were taken. That of the signal is largest where most is taken.
+    signal = (model[core].astype(np.float64) * (1 - 2 * taken) + height * brought) / (1 - taken)
     if len(signal) < 2000:
         return 0.0
     edges = np.quantile(signal, np.linspace(0, 1, 13))

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.order import robust_std
+from wavebatch.core.units import MEDIAN_ERROR, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
@@ -26,7 +27,10 @@ from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
+from wavebatch.surveying.measuring.misfit import measure_misfit
+from wavebatch.surveying.measuring.noise_and_width import FEW, SMALL
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.system_table import read_system
 
 LEAST_ECHOES = 8
@@ -50,10 +54,8 @@ tail serves better than a guess."""
 SHRUNK = 0.85, 0.7
 """Widths, over that of the isolated echoes, at which a strip's pulse is tried where isolated echoes are canopies."""
 
-WORTH, HOPELESS = 1.04, 1.2
-"""Cost of a Gaussian, over that of a learned pulse with tail or skew, up to which it is taken. In simulated canopies it
-is .9 to 1.03 where the pulse is one, and from 1.06 where it has a tail of 6 %; in strips of real sensors 1.28.
-From HOPELESS on other widths do not make up for it."""
+CROWDED = 1.5
+"""Echoes per waveform from which a learned pulse may have taken neighbours for a tail, however well it fits."""
 
 BEYOND = 3.0
 """Standard errors by which waveforms must cost more with one pulse than with another for it to be worse."""
@@ -198,7 +200,9 @@ def guess_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Sy
     return replace(system, ringing=_find_ringing(block, system, lone))
 
 
-def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, figures: dict[str, float]) -> SystemPulse:
+def choose_pulse(
+    block: WaveformBlock, system: SystemPulse, strong: EchoTable, *, learned: bool, figures: Figures
+) -> SystemPulse:
     """Compare the strip's pulse with those of known sensors, and with itself drawn together.
 
     Parameters
@@ -206,10 +210,13 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
     block : WaveformBlock
     system : SystemPulse
         With the pulse of the isolated echoes.
+    strong : EchoTable
+        The strongest single echoes of the block.
     learned : bool
         Whether it was learned; a Gaussian that is a guess is never drawn together.
-    figures : dict
-        Gets the costs of the two pulses, where one was taken for another.
+    figures : Figures
+        Gets the costs of the two pulses, where one was taken for another, and the share of the echoes that is in doubt
+        because the two cost about the same.
 
     Returns
     -------
@@ -219,60 +226,83 @@ def choose_pulse(block: WaveformBlock, system: SystemPulse, *, learned: bool, fi
     -----
     A pulse is right if it explains all waveforms, not only isolated echoes, with the fewest echoes and the least misfit
     (`measure_cost`): in a canopy isolated echoes are several, and a pulse learned from them is too wide. Nothing is
-    tried where a learned pulse leaves less than SHORT per echo. Else the simplest and widest is taken of those that
-    cost no more (`_simplify`). A known pulse of the strip's spacing is taken if it costs less than the strip's, and
-    less than it does when it is stretched or drawn together (SURE); if it is narrower and costs hardly more (NEARLY);
-    or where the strip's must be drawn together and costs hardly less then (ALMOST).
+    tried where a learned pulse leaves less than SHORT per echo; but where echoes are CROWDED or waveforms few it may be
+    a Gaussian all the same. Else the simplest and widest is taken of those that cost no more (`_drop_tail`,
+    `_draw_together`). A known pulse of the strip's spacing is taken if it costs less than the strip's, and less than it
+    does when it is stretched or drawn together (SURE); if it is narrower and costs hardly more (NEARLY); or where the
+    strip's must be drawn together and costs hardly less then (ALMOST).
     """
-    part = block.rows(np.unique(np.linspace(0, len(block) - 1, COMPARED).astype(np.int64)))
-    own = measure_cost(part, system)
-    if own.echoes < LEAST_ECHOES or (learned and own.misfit < SHORT * own.echoes):
+    part = _spread(block, COMPARED)
+    own = cost = measure_cost(part, system)
+    clear = learned and own.misfit < SHORT * own.echoes
+    if own.echoes < LEAST_ECHOES or (clear and own.echoes < CROWDED * len(part) and len(block) >= SMALL):
         return system
-    pulse, cost = _simplify(part, system, own) if learned else (system, own)
-    drawn = pulse.sigma_ref < system.sigma_ref
-    certain = learned and len(block) >= COMPARED  # one learned from few echoes has their noise, and loses to any other
-    tried = []
-    for known in known_systems():
-        ratio = known.system.sigma_ref / system.sigma_ref
-        if abs(block.spacing / known.spacing - 1) < SAME_SPACING and WIDTHS[0] < ratio < WIDTHS[1]:
-            taken = with_pulse(system, known.system)
-            found = measure_cost(part, taken)
-            if found.typical < NEARLY * own.typical and (
-                (drawn and found.typical < ALMOST * cost.typical)
-                or _is_sure(part, taken, found.typical, own.typical, learned=certain, narrower=ratio < 1)
-            ):
-                tried.append((found.typical, known.name, taken, found))
-    if tried:
-        _, _, pulse, cost = min(tried, key=lambda one: one[:2])
+    pulse = _drop_tail(block, system, strong) if learned else system
     if pulse is not system:
-        figures |= {"pulse_cost": cost.typical, "isolated_pulse_cost": own.typical}
+        cost = measure_cost(part, pulse)
+    if not clear:
+        pulse, cost = _draw_together(part, pulse, cost) if learned else (pulse, cost)
+        # One learned from few echoes has their noise, and loses to any other.
+        certain = learned and len(block) >= SMALL
+        pulse, cost = _compare_known(part, (system, own), (pulse, cost), certain=certain)
+    if pulse is not system:
+        figures.pulse_cost, figures.isolated_pulse_cost = cost.typical, own.typical
+        if own.exceeds(cost) < BEYOND and find_source(pulse) is None:
+            figures.echoes_in_doubt = abs(own.echoes / max(cost.echoes, 1) - 1)
     return pulse
 
 
-def _simplify(part: WaveformBlock, system: SystemPulse, own: Cost) -> tuple[SystemPulse, Cost]:
-    """The simplest and widest pulse that explains waveforms as well as the learned one, and its cost.
+def _compare_known(
+    part: WaveformBlock, own: tuple[SystemPulse, Cost], best: tuple[SystemPulse, Cost], *, certain: bool
+) -> tuple[SystemPulse, Cost]:
+    """The known pulse that serves better than the strip's and its cost, or the best of the strip's and its cost.
 
-    In a canopy the neighbours of echoes become a tail of the learned pulse, and their sums widen it.
+    own: the pulse of the isolated echoes and its cost; certain: it was learned from many.
     """
-    tried = [(own, system), *_draw_together(part, system)]
-    if system.components or system.kappa:
-        plain = replace(system, components=(), kappa=0.0, ringing=0.0)
-        bare = [(measure_cost(part, plain), plain)]
-        if bare[0][0].typical < HOPELESS * own.typical:
-            bare += _draw_together(part, plain)
-        if _least(bare).typical < WORTH * _least(tried).typical:
-            tried = bare
-    least = _least(tried)
-    return next((pulse, cost) for cost, pulse in tried if cost.exceeds(least) < BEYOND)
+    (system, own_cost), (pulse, cost) = own, best
+    drawn = pulse.sigma_ref < system.sigma_ref
+    tried = []
+    for known in known_systems():
+        ratio = known.system.sigma_ref / system.sigma_ref
+        if abs(part.spacing / known.spacing - 1) < SAME_SPACING and WIDTHS[0] < ratio < WIDTHS[1]:
+            taken = with_pulse(system, known.system)
+            found = measure_cost(part, taken)
+            if found.typical < NEARLY * own_cost.typical and (
+                (drawn and found.typical < ALMOST * cost.typical)
+                or _is_sure(part, taken, found.typical, own_cost.typical, learned=certain, narrower=ratio < 1)
+            ):
+                tried.append((found.typical, known.name, taken, found))
+    return min(tried, key=lambda one: one[:2])[2:] if tried else best
 
 
-def _draw_together(part: WaveformBlock, system: SystemPulse) -> list[tuple[Cost, SystemPulse]]:
+def _spread(block: WaveformBlock, number: int) -> WaveformBlock:
+    """At most so many waveforms, spread over the block."""
+    return block.rows(np.unique(np.linspace(0, len(block) - 1, number).astype(np.int64)))
+
+
+def _drop_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
+    """The learned pulse as a plain Gaussian where strong echoes have no tail in common, else the system itself.
+
+    In a canopy the neighbours of echoes become a tail of the learned pulse. They are at another lag in every waveform.
+    """
+    if len(strong) < FEW or not (system.components or system.kappa):
+        return system
+    plain = replace(system, components=(), kappa=0.0, ringing=0.0)
+    missed = measure_misfit(block, plain, strong, reach=RINGING_REACH).misfit
+    ratio = float(np.median(strong.amplitude)) / system.noise.std
+    energy = SQRT_PI * ratio**2 * system.sigma_ref / block.spacing
+    return plain if missed**2 * energy < system.acceptance else system
+
+
+def _draw_together(part: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
+    """The widest of the learned pulse and narrower ones that explains waveforms as well, and its cost.
+
+    In a canopy sums of close echoes widen the learned pulse.
+    """
     narrower = (scale_pulse(system, scale) for scale in SHRUNK)
-    return [(measure_cost(part, pulse), pulse) for pulse in narrower]
-
-
-def _least(tried: list[tuple[Cost, SystemPulse]]) -> Cost:
-    return min((cost for cost, _ in tried), key=lambda cost: cost.typical)
+    tried = [(cost, system), *((measure_cost(part, pulse), pulse) for pulse in narrower)]
+    least = min((cost for cost, _ in tried), key=lambda cost: cost.typical)
+    return next((pulse, cost) for cost, pulse in tried if cost.exceeds(least) < BEYOND)
 
 
 def _is_sure(
@@ -308,9 +338,9 @@ def measure_cost(block: WaveformBlock, system: SystemPulse) -> Cost:
     """Measure how well a pulse explains waveforms, all echoes fitted together."""
     echoes = decompose_sample(block, system)
     left = np.nan_to_num(subtract_echoes(block, system, echoes)).astype(np.float64)
-    noise = min(system.noise_by_kind.get("quiet") or system.noise_std, system.noise_std)
+    noise = system.noise.quiet
     samples = left.shape[1] if block.missing is None else (~block.missing).sum(axis=1)
-    misfit = (np.einsum("ns,ns->n", left, left) - samples * noise**2) / system.noise_std**2
+    misfit = (np.einsum("ns,ns->n", left, left) - samples * noise**2) / system.noise.std**2
     cost = np.maximum(misfit, 0.0) + system.acceptance * (1 + echoes.count(len(block)))
     return Cost(max(float(np.sum(misfit)), 0.0), len(echoes), log(cost))
 
@@ -323,8 +353,9 @@ def scale_pulse(system: SystemPulse, ratio: float) -> SystemPulse:
 
 def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
     """Return a strip's system with the pulse of another one, and with how far strong echoes deviate from it."""
-    names = ("sigma_ref", "kappa", "components", "ringing", "acceptance", "misfit", "tail_misfit", "width_scatter")
-    return replace(system, **{name: getattr(known, name) for name in names})
+    names = ("sigma_ref", "kappa", "components", "ringing", "acceptance", "misfit", "tail_misfit")
+    widths = replace(system.widths, scatter=known.widths.scatter)
+    return replace(system, widths=widths, **{name: getattr(known, name) for name in names})
 
 
 def find_source(system: SystemPulse) -> KnownSystem | None:
@@ -352,7 +383,7 @@ def _find_ringing(block: WaveformBlock, system: SystemPulse, lone: EchoTable) ->
             continue
         value = np.nanmean(here[rows], axis=1)
         middle = float(np.median(value))
-        error = MEDIAN_ERROR * MAD_TO_STD * float(np.median(np.abs(value - middle))) / np.sqrt(len(value))
+        error = MEDIAN_ERROR * robust_std(value) / np.sqrt(len(value))
         if middle > max(LEAST_RINGING, RINGING_ERRORS * error):
             largest = max(largest, float(np.quantile(value, 0.9)))
     return min(largest, LARGEST_RINGING)

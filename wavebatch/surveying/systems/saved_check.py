@@ -19,8 +19,7 @@ from wavebatch.surveying.flight import (
     STEADY,
     Look,
     compare_looks,
-    describe_kinds,
-    describe_look,
+    list_kinds,
     look_at,
     read_flight,
 )
@@ -58,7 +57,7 @@ def with_look(survey: Survey, blocks: Iterable[WaveformBlock]) -> Survey:
     look = look_at(blocks, survey.system)
     if look is None:
         return survey
-    return replace(survey, figures={**survey.figures, **describe_look(look), **describe_kinds(blocks)})
+    return replace(survey, figures=replace(survey.figures, look=look, kinds=list_kinds(blocks)))
 
 
 def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, force: bool = False) -> str:
@@ -129,17 +128,17 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
         return "", False
     figures = survey.figures
     forms = {(float(block.digitizer.bits), float(block.spacing)) for block in blocks}
-    if "flight_width" in figures:
+    if figures.look is not None:
         whole, kinds = read_flight(survey)
         known = {kind[:2] for kind in kinds.values()}
     else:
-        known = {(figures["bits"], figures["spacing_ns"])} if {"bits", "spacing_ns"} <= figures.keys() else forms
+        known = {(figures.bits, figures.spacing_ns)} if figures.bits and figures.spacing_ns else forms
     if not forms & known:
         return f"its samples have {_in_words(forms)}, those of the survey {_in_words(known)}", True
     look = look_at(blocks, survey.system)
     if look is None:
         return "", False
-    if "flight_width" not in figures:
+    if figures.look is None:
         reason = _compare_system(look, survey)
         return reason, bool(reason)
     look = replace(look, level=look.level._replace(mean=whole.level.mean))
@@ -155,9 +154,9 @@ def _in_words(forms: set[Form]) -> str:
 def _compare_system(look: Look, survey: Survey) -> str:
     """Why echoes and noise are not of the saved pulse, with wide limits."""
     system = survey.system
-    noises = [system.noise_std, *(value for value in system.noise_by_kind.values() if value > 0)]
+    noises = [system.noise.std, *(value for value in system.noise.by_kind.values() if value > 0)]
     if not min(noises) / LARGEST_NOISE < look.level.std < max(noises) * LARGEST_NOISE:
-        return f"its noise is {look.level.std:.2f} DN, that of the survey {system.noise_std:.2f}"
+        return f"its noise is {look.level.std:.2f} DN, that of the survey {system.noise.std:.2f}"
     if not look.width:
         return ""
     ratio = look.width / system.sigma_ref

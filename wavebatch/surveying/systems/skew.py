@@ -62,7 +62,7 @@ def measure_skew(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     ----------
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 1.2.
     """
-    clear = (echoes.count(len(block))[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    clear = echoes.alone(len(block)) & (echoes.amplitude > MIN_SNR * system.noise.std)
     rows = np.flatnonzero(clear & ((echoes.flags & np.uint16(UNCLEAN)) == 0))
     if len(rows) < ENOUGH_TO_LEARN:
         return system

@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -148,12 +149,12 @@ def _mark_front(rows: Rows) -> None:
 
 def _describe(groups: list[Group]) -> dict[str, Any]:
     """Range of the results of the groups' surveys."""
+    fields = {"noise_std": "noise.std", "noise_gain": "noise.gain"}
+    names = ("sigma_ref", "noise_std", "kappa", "noise_gain", "ringing", "acceptance")
+    values = {name: map(attrgetter(fields.get(name, name)), (group.system for group in groups)) for name in names}
     return {
         "groups": len(groups),
         "waveforms_of_a_group": len(groups[0].block),
-        **{
-            name: median_range([float(getattr(group.system, name)) for group in groups])
-            for name in ("sigma_ref", "noise_std", "kappa", "noise_gain", "ringing", "acceptance")
-        },
+        **{name: median_range([float(value) for value in found]) for name, found in values.items()},
         "components": sorted({len(group.system.components) for group in groups}),
     }

@@ -121,25 +121,25 @@ def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
         n_samples=block.samples.shape[1],
         spacing=block.spacing,
         bits=block.digitizer.bits,
-        baseline=system.baseline,
-        baseline_spread=system.baseline_spread,
+        baseline=system.noise.baseline,
+        baseline_spread=system.noise.baseline_spread,
         noise_std=float(np.sqrt(max(_sample_noise(system) ** 2 - QUANTISATION_STD**2, 0.0))) / float(gain),
         rho=color / (color + 1),
-        noise_gain=system.noise_gain,
+        noise_gain=system.noise.gain,
         saturation=clip,
         pulse=pulse,
     )
 
 
 def _sample_noise(system: SystemPulse) -> float:
-    """Noise of one sample [count]; `noise_std` is what coloured noise does to the amplitude of a pulse."""
-    kinds = system.noise_by_kind
-    return kinds.get("outside") or kinds.get("quiet") or system.noise_std
+    """Noise of one sample [count]; `noise.std` is what coloured noise does to the amplitude of a pulse."""
+    kinds = system.noise.by_kind
+    return kinds.get("outside") or kinds.get("quiet") or system.noise.std
 
 
 def _find_color(system: SystemPulse) -> int:
     """Order of the binomial filter whose noise changes by smoothing as the noise of the strip does."""
-    kinds = system.noise_by_kind
+    kinds = system.noise.by_kind
     pairs = [(kinds.get(f"{kind}_smoothed", 0.0), kinds.get(kind, 0.0)) for kind in ("tail", "quiet")]
     ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
     return int(np.argmin(np.abs(np.sqrt(smoothed_power(np.arange(5)) / 6) - ratio)))
@@ -165,7 +165,7 @@ def _take_sample(found: EchoTable, n: int, system: SystemPulse, recording: Recor
 def _free_widths(found: EchoTable, system: SystemPulse) -> np.ndarray:
     """Widths [ns] moved towards the typical one by the share of their spread that their error explains."""
     sigma = found.sigma.astype(np.float64)
-    strong = sigma[found.amplitude > STRONG * system.noise_std]
+    strong = sigma[found.amplitude > STRONG * system.noise.std]
     if len(strong) < 2:
         return np.full(len(sigma), system.sigma_ref)
     typical, spread = float(np.median(strong)), float(strong.var())

@@ -72,7 +72,7 @@ def tabulate_angles(
     tried = np.linspace(0.3, _WIDEST, _FINE) * system.sigma_ref
     variance, _ = _add_variance(system, spacing, tried, np.zeros(_FINE))
     sigma = np.interp(spread**2, variance, tried, left=np.nan, right=np.nan)
-    bound = np.array([bound_time(max(amplitude, 1e-3), max(one, 1e-6), system.noise_std, spacing)
+    bound = np.array([bound_time(max(amplitude, 1e-3), max(one, 1e-6), system.noise.std, spacing)
                       for one in np.nan_to_num(sigma, nan=1.0)])  # fmt: skip
     variance, variance_err = _add_variance(system, spacing, sigma, bound)
     error = _expect_error(variance, variance_err, distance, beam)
@@ -125,13 +125,14 @@ def write_angles(
     Raises ConfigError where the beam is not known, InputError where the sensor's position is not known or no width of
     this system means an angle.
     """
-    if not system.divergence:
+    if not system.radiometry.divergence:
         raise ConfigError(f"--angles {target}: the beam is not known; give --divergence")
     if distance is None:
         raise InputError(f"--angles {target}: the distance of the sensor is not known, so no width means an angle")
-    if math.isinf(system.level_error or 0.0):
+    if math.isinf(system.widths.error or 0.0):
         raise InputError(f"--angles {target}: the strip does not show which width a surface has that faces the sensor")
-    tables = [tabulate_angles(system, spacing, distance, system.divergence, part * amplitude) for part in DRAWN]
+    beam = system.radiometry.divergence
+    tables = [tabulate_angles(system, spacing, distance, beam, part * amplitude) for part in DRAWN]
     if target.suffix.lower() == ".csv":
         write_text(target, format_angles(tables[0]), overwrite=overwrite)
     else:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.even_sample import EvenSample
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.stages.score import ErrorStats
+from wavebatch.tools.even_sample import EvenSample
 
 SPEED = 0.9997 * HALF_C
 """Metres along the ray per ns; the factor is the refractive index of air, n = 1.0003."""

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.even_sample import EvenSample
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import Step
-from wavebatch.stages.clean import sample_noise
 from wavebatch.stages.decompose.rebuild import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.tools.even_sample import EvenSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,7 @@ def measure_fit(
     residual = np.where(used, block.samples - noise.level.astype(np.float64) - model, 0.0)
     energy = np.square(model).sum(axis=1)
     energy[energy <= 0] = np.nan
-    std = noise.std.astype(np.float64) * (sample_noise(system) / system.noise_std)
+    std = noise.std.astype(np.float64) * (system.noise.quiet / system.noise.std)
     floor = np.count_nonzero(used, axis=1) * np.square(std)
     return np.square(residual).sum(axis=1) / energy, floor / energy
 

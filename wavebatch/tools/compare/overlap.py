@@ -16,7 +16,8 @@ import numpy as np
 
 from wavebatch.core.echoes import PASSED_THROUGH, UNCLEAN
 from wavebatch.core.errors import InputError
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.order import group_medians, robust_std
+from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, choose_size, hash_squares, measure_ties
 
@@ -174,12 +175,12 @@ def _summarise(ties: Ties, difference: np.ndarray, stated: float = math.nan) -> 
     if not len(difference):
         return OverlapFigure(0, math.nan, math.nan, math.nan, stated)
     middle = float(np.median(difference))
-    spread = MAD_TO_STD * float(np.median(np.abs(difference - middle)))
+    spread = robust_std(difference)
     centre = ties.centre[ties.source == 0]
     _, block = np.unique(np.floor(centre / BLOCK), axis=0, return_inverse=True)
     block = block.ravel()
-    means = np.array([np.median(difference[block == k]) for k in range(int(block.max()) + 1)])
-    apart = MEDIAN_ERROR * MAD_TO_STD * float(np.median(np.abs(means - np.median(means)))) / math.sqrt(len(means))
+    means = group_medians(difference, block)[0]
+    apart = MEDIAN_ERROR * robust_std(means) / math.sqrt(len(means))
     return OverlapFigure(
         len(difference), middle, max(apart, MEDIAN_ERROR * spread / math.sqrt(len(difference))), spread, stated
     )

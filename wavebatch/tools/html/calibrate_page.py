@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch import __version__
+from wavebatch.core.system import swath_columns
 from wavebatch.core.units import format_relative
-from wavebatch.core.waveforms import swath_columns
 from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
 from wavebatch.surveying.calibrating.calibration_file import format_calibration
 from wavebatch.surveying.calibration import Calibration

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader
 from wavebatch.files.las.crs import describe_crs
+from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.html.charts import draw_histogram, draw_map
 from wavebatch.tools.plots.raster import Raster, choose_grid, find_shown
 from wavebatch.tools.plots.values import Tally, robust_limits

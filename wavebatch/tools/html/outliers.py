@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.units import FWHM_PER_SIGMA, MAD_TO_STD
+from wavebatch.core.order import robust_std
+from wavebatch.core.units import FWHM_PER_SIGMA
 
 FIGURES: dict[str, tuple[str, str, float]] = {
     "echoes": ("echoes per waveform", ".3f", 0.02),
@@ -83,8 +84,7 @@ def _mark(strips: Sequence[Mapping[str, float]], places: Sequence[int], found: l
         if len(known) < FEWEST:
             continue
         median = float(np.median(known))
-        spread = MAD_TO_STD * float(np.median(np.abs(known - median)))
-        limit = max(FARTHEST * spread, LEAST_SHARE * abs(median), least)
+        limit = max(FARTHEST * robust_std(known), LEAST_SHARE * abs(median), least)
         for place, value in zip(places, values, strict=True):
             if abs(value - median) > limit:
                 found[place][key] = f"{value:{form}}; usual is {median:{form}} \u00b1 {limit:{form}}"

@@ -19,7 +19,7 @@ from wavebatch.tools.html import markup
 from wavebatch.tools.html.charts import figures, figures_of
 from wavebatch.tools.html.cloud_pictures import picture_cloud
 from wavebatch.tools.html.strip_views import draw_waveforms
-from wavebatch.tools.html.survey_part import draw_survey, list_decisions, read_system
+from wavebatch.tools.html.survey_part import draw_survey, list_decisions, read_survey
 
 PICTURED = ("amplitude", "echo_width", "range_err", "range", "reflectance", "cross_section", "incidence_angle")
 """Columns with a histogram and a map, where the cloud has them."""
@@ -28,18 +28,18 @@ PICTURED = ("amplitude", "echo_width", "range_err", "range", "reflectance", "cro
 def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
     """The sections of a strip, from its report; pictures that cannot be made say why."""
     found, survey = report["strip"], report["strip"]["survey"]
-    system = read_system(found["system"], survey["figures"])
+    read = read_survey(found)
     warnings = markup.bullets([*report["warnings"], *report["remarks"]], "warning")
     choice = report["choice"]
     parts = [
         warnings,
         markup.section("Counts", count_tables(report["counts"], report["options"]["points"]), level=3),
         markup.section("Survey", markup.paragraph(_name_source(survey["from"])),
-                       draw_survey(system, survey["figures"], survey["waveforms"]), level=3),
+                       draw_survey(read), level=3),
         markup.section("Decisions", markup.paragraph(f"Chain: {choice['chain']}, chosen by: {choice['by']}."),
                        list_decisions(choice["decisions"]), level=3),
         markup.section("Echoes", figures(figures_of(report["quality"])), level=3),
-        markup.or_reason(partial(_draw_waveforms, strip, report, system), "waveforms"),
+        markup.or_reason(partial(_draw_waveforms, strip, report, read.system), "waveforms"),
         markup.or_reason(partial(_draw_cloud, cloud), "maps"),
         markup.section("Flags", flag_table(report["counts"]), level=3),
         markup.section("Columns and no-data", _list_columns(report), level=3),

@@ -89,7 +89,7 @@ def measure_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -
     if block.missing is not None:
         used &= ~block.missing
     level = np.stack([np.broadcast_to(noise.level[row], samples.shape[1:]) for row in range(len(block))])
-    variance = noise.std[:, None].astype(np.float64) ** 2 + system.noise_gain * np.maximum(fit, 0)
+    variance = noise.std[:, None].astype(np.float64) ** 2 + system.noise.gain * np.maximum(fit, 0)
     square = np.where(used, (samples - level - fit) ** 2 / variance, 0.0)
     number = used.sum(axis=1)
     return np.sqrt(square.sum(axis=1) / np.maximum(number, 1))

@@ -41,8 +41,7 @@ def _parts(
     yield markup.section("Summary", markup.facts(rows))
     if "strips" in document:
         yield _list_strips(document)
-    figures = {name: float(value) for name, value in survey.figures.items()}
-    yield markup.section("Survey", draw_survey(survey.system, figures, survey.waveforms), mark="survey")
+    yield markup.section("Survey", draw_survey(survey), mark="survey")
     yield markup.section("Decisions", list_decisions(document["decisions"]), mark="decisions")
     chain = choose_chain(survey)
     for strip in strips[:MOST_DRAWN]:

@@ -6,47 +6,52 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.toml_file import format_toml
+from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SYSTEM_SCHEMA, parse_survey
 from wavebatch.tools.html.charts import draw_counts, draw_pulse, figures
 from wavebatch.tools.html.markup import facts, paragraph, significant, table
 
 
-def read_system(described: Mapping[str, Any], figures: Mapping[str, float]) -> SystemPulse:
-    """The pulse of a report's `system`, each number to the last bit."""
-    document = {"schema": SYSTEM_SCHEMA, "version": "", "waveforms": 0, "system": dict(described)}
-    return parse_survey(format_toml({**document, "figures": dict(figures)}), "report").survey.system
+def read_survey(strip: Mapping[str, Any]) -> Survey:
+    """The survey of a report's `strip`, each number to the last bit."""
+    system, survey = strip["system"], strip["survey"]
+    found = {"waveforms": survey["waveforms"], "figures": survey["figures"]}
+    return parse_survey(format_toml({"schema": SYSTEM_SCHEMA, "system": system, **found}), "report").survey
 
 
-def draw_survey(system: SystemPulse, found: Mapping[str, float], waveforms: int) -> str:
+def draw_survey(survey: Survey) -> str:
     """Figures, pulses and shares of a survey."""
-    spacing = found.get("spacing_ns", 1.0)
+    system, found, waveforms = survey.system, survey.figures, survey.waveforms
+    spacing = found.spacing_ns or 1.0
     pulses = [draw_pulse(system, spacing)]
     pulses += [draw_pulse(one, spacing, f"Pulse of digitizer {index}") for index, one in system.digitizers.items()]
-    shares = [(name, found.get(f"{name}_share")) for name in ("empty", "single", "overlapped")]
-    if all(value is not None for _, value in shares):
-        counts = {name: round(float(value or 0) * waveforms) for name, value in shares}
+    shares = {"empty": found.empty_share, "single": found.single_share, "overlapped": found.overlapped_share}
+    if None not in shares.values():
+        counts = {name: round(value * waveforms) for name, value in shares.items()}
         counts["several apart"] = waveforms - sum(counts.values())
         pulses.append(draw_counts(counts, title="Waveforms of the survey", label="echoes in them"))
     components = [list(map(significant, component)) for component in system.components]
     learned = table(["weight", "delay ns", "sigma ns"], components, caption="Gaussians of the learned pulse")
-    misfits = [(_name_model(name.removeprefix("misfit_")), significant(value, 3))
-               for name, value in sorted(found.items()) if name.startswith("misfit_")]  # fmt: skip
+    misfits = [(f"{number} Gaussian{'s' * (number > 1)}", significant(misfit, 3))
+               for number, misfit in sorted(found.misfit_gaussians.items())]  # fmt: skip
+    others = {"goal": found.misfit_goal, "skewed": found.misfit_skewed}
+    misfits += [(name, significant(misfit, 3)) for name, misfit in others.items() if misfit is not None]
     tried = table(["pulse model", "misfit, share of the amplitude"], misfits, caption="Models that were tried")
     return "\n".join(
-        [facts(_list_figures(system, found, waveforms)), figures(pulses), learned if components else "",
+        [facts(_list_figures(survey)), figures(pulses), learned if components else "",
          tried if misfits else ""]
     )  # fmt: skip
 
 
-def _list_figures(system: SystemPulse, found: Mapping[str, float], waveforms: int) -> Iterable[tuple[str, str]]:
-    yield "surveyed", f"{waveforms:,} waveforms" if waveforms else "not known"
-    if {"n_samples", "bits", "spacing_ns"} <= found.keys():
-        yield "samples", f"{found['n_samples']:.0f} of {found['bits']:.0f} bits, {found['spacing_ns']:g} ns apart"
-    yield "baseline", f"{system.baseline:.3f} \u00b1 {system.baseline_spread:.3f} DN between waveforms"
-    yield "noise", f"{system.noise_std:.3f} DN"
-    gain = system.noise_gain
+def _list_figures(survey: Survey) -> Iterable[tuple[str, str]]:
+    system, found = survey.system, survey.figures
+    yield "surveyed", f"{survey.waveforms:,} waveforms" if survey.waveforms else "not known"
+    if None not in (found.n_samples, found.bits, found.spacing_ns):
+        yield "samples", f"{found.n_samples:.0f} of {found.bits:.0f} bits, {found.spacing_ns:g} ns apart"
+    yield "baseline", f"{system.noise.baseline:.3f} \u00b1 {system.noise.baseline_spread:.3f} DN between waveforms"
+    yield "noise", f"{system.noise.std:.3f} DN"
+    gain = system.noise.gain
     yield "signal noise", f"variance grows by {gain:.4f} DN2 per DN" if gain > 0 else "none"
     width = system.sigma_ref * FWHM_PER_SIGMA
     model = f"learned, {len(system.components)} Gaussians" if system.components else "Gaussian"
@@ -57,10 +62,10 @@ def _list_figures(system: SystemPulse, found: Mapping[str, float], waveforms: in
     yield "acceptance", f"one more echo must lower chi2 by {system.acceptance:g}"
     level = system.saturation
     yield "saturation", "none found" if level is None else f"at {level:.0f} DN"
-    if "echoes_per_waveform" in found:
-        yield "echoes per waveform", f"{found['echoes_per_waveform']:.3f}"
-    if "amplitude_99" in found:
-        yield "amplitudes", f"99 % below {found['amplitude_99']:.1f} DN"
+    if found.echoes_per_waveform is not None:
+        yield "echoes per waveform", f"{found.echoes_per_waveform:.3f}"
+    if found.amplitude_99 is not None:
+        yield "amplitudes", f"99 % below {found.amplitude_99:.1f} DN"
 
 
 def list_decisions(decisions: Iterable[Mapping[str, Any]]) -> str:
@@ -69,9 +74,3 @@ def list_decisions(decisions: Iterable[Mapping[str, Any]]) -> str:
     if not rows:
         return paragraph("The survey did not choose the chain: the user gave it.")
     return table(["", "part of the chain", "reason"], rows)
-
-
-def _name_model(key: str) -> str:
-    """A pulse model in words, from its key in the figures of a survey."""
-    words = key.replace("_", " ").replace("gaussian", "Gaussian")
-    return "1 Gaussian" if words == "1 Gaussians" else words

@@ -15,9 +15,9 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.las.point_formats import CLASS_NAMES
+from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, shown_limits
 
 FEWEST, MOST_CHOSEN = 20, 120

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.files.las.crs import CrsWords, describe_crs
+from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots.values import (
     Clouds,
     Selection,

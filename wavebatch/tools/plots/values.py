@@ -14,9 +14,9 @@ import numpy as np
 
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike, select_points
 from wavebatch.files.las.crs import describe_crs
+from wavebatch.tools.even_sample import EvenSample
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""

@@ -179,7 +179,7 @@ def build_views(
         if shape is not None:
             pulses = echo_pulses(shape, system, block.spacing, table)
             curves = pulses(fine)
-            residual = _residual(samples - noise.level[row], pulses(time).sum(axis=0), clipped, std, system.noise_gain)
+            residual = _residual(samples - noise.level[row], pulses(time).sum(axis=0), clipped, std, system.noise.gain)
         returns = np.empty(0) if block.returns is None else block.returns.time[block.returns.waveform == row]
         views.append(
             WaveformView(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.tools.simulate.blocks import flag_truth
 from wavebatch.tools.simulate.draws import tabulate_echoes
@@ -55,9 +56,11 @@ def known_system(recording: Recording) -> SystemPulse:
     """The result of a survey without error; lobes of the pulse are left out."""
     return SystemPulse(
         sigma_ref=recording.pulse.sigma,
-        baseline=recording.baseline,
-        baseline_spread=recording.baseline_spread,
-        noise_std=recording.recorded_noise,
-        noise_gain=recording.noise_gain,
+        noise=ReceiverNoise(
+            baseline=recording.baseline,
+            baseline_spread=recording.baseline_spread,
+            std=recording.recorded_noise,
+            gain=recording.noise_gain,
+        ),
         kappa=recording.pulse.kappa,
     )

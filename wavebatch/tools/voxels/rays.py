@@ -137,9 +137,9 @@ def _measure_sections(
     distance = radiometry.known_distance(measure_lengths(off))
     with np.errstate(over="ignore", invalid="ignore"):
         gamma = radiometry.backscatter(
-            constant[row], distance, profiles.value[row, sample], system.sigma_ref, system.attenuation
+            constant[row], distance, profiles.value[row, sample], system.sigma_ref, system.radiometry.attenuation
         )
-        value = radiometry.cross_section(gamma, distance, 1e-3 * system.divergence)
+        value = radiometry.cross_section(gamma, distance, 1e-3 * system.radiometry.divergence)
     # A sample without range makes the sum of its ray NaN, which the comparison counts as unknown.
     with np.errstate(invalid="ignore", over="ignore"):
         unknown = ~(np.bincount(row, value, minlength=len(section)) <= MOST_SECTION)

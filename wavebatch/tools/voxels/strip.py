@@ -168,10 +168,10 @@ def voxelize_strip(
         positions = Positions.IF_KNOWN if calibration is None else Positions.REQUIRED
         setup = prepare(reader, scan, widest_chain(), Request(auto=True, system=system, force=force), sensor=sensor,
                         positions=positions, calibration=calibration)  # fmt: skip
-        source, pulse, doubts = setup.sensor, replace(setup.system, sensor_error=0.0), setup.doubts
+        source, pulse, doubts = setup.sensor, setup.system.with_radiometry(sensor_error=0.0), setup.doubts
         if calibration is not None:
             doubts += tuple(filter(None, [source.doubt()]))
-            if pulse.divergence is None:
+            if pulse.radiometry.divergence is None:
                 raise ConfigError(
                     "--calibration: cross sections need the beam's divergence: add divergence_mrad to the calibration "
                     "or give a --system file that has it"
@@ -208,7 +208,7 @@ def voxelize_strip(
                 profile_samples=0 if writer is None else writer.samples,
                 method=deconvolution.method,
                 pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA,
-                noise=pulse.noise_std,
+                noise=pulse.noise.std,
                 sensor=None if calibration is None else source.kind,
                 warnings=doubts,
                 **_list_figures(grid, ratio),
@@ -328,7 +328,7 @@ def _add_block(
         profiles,
         rule,
         headroom=headroom,
-        system=pulse if pulse.calibration is not None else None,
+        system=pulse if pulse.radiometry.constant is not None else None,
     )
     grid.add(rays, block.spacing)
     if writer is not None:

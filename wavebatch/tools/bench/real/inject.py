@@ -196,7 +196,7 @@ def _inject(
     limit = clip_level(block, solver.system.of(block))
     height, which = _draw_pulses(templates, noise.std, len(places.row), rng)
     if (block.samples >= limit).any(axis=1).mean() > CLIPPED:
-        _raise_some(height, which, templates, limit - solver.system.of(block).baseline, rng)
+        _raise_some(height, which, templates, limit - solver.system.of(block).noise.baseline, rng)
     lag = np.arange(block.samples.shape[1]) * block.spacing - places.time[:, None]
     signal = np.empty(lag.shape)
     for number in np.unique(which):

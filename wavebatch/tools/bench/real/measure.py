@@ -110,7 +110,7 @@ class Pulse:
         if len(system.components) > 1:
             model = f"{len(system.components)} Gaussians"
         return cls(
-            solver.survey.waveforms, solver.fwhm, system.noise_std, model, system.acceptance, len(system.digitizers)
+            solver.survey.waveforms, solver.fwhm, system.noise.std, model, system.acceptance, len(system.digitizers)
         )
 
 

@@ -90,7 +90,7 @@ def measure_noise(pool: Pool, solver: Solver, echoes: Sequence[EchoTable]) -> Qu
             pairs[lag] += both.sum()
         lengths.append(np.repeat(number, number))
     if not lengths or pairs[0] < 100:
-        return QuietNoise(solver.system.noise_std, (), int(pairs[0]))
+        return QuietNoise(solver.system.noise.std, (), int(pairs[0]))
     covariance = _add_mean(products / np.maximum(pairs, 1), np.concatenate(lengths))
     std = float(np.sqrt(max(covariance[0], QUANTISATION_STD**2)))
     return QuietNoise(std, tuple(map(float, covariance[1:] / std**2)), int(pairs[0]))

@@ -226,7 +226,7 @@ def _fit_alone(
     time = middle + rng.uniform(-0.5, 0.5, ALONE) * block.spacing
     signal = template.amplitude * template.evaluate(np.arange(s) * block.spacing - time[:, None])
     # Some noise, because chains expect it; the mean of many fits has little of it.
-    samples = np.rint(system.baseline + signal + rng.normal(0.0, noise, signal.shape))
+    samples = np.rint(system.noise.baseline + signal + rng.normal(0.0, noise, signal.shape))
     top = min(clip_level(block, system) - 1, np.iinfo(block.samples.dtype).max)
     found = solver.run(bare_block(block, np.clip(samples, 0, top).astype(block.samples.dtype)))
     best = find_strongest(found, ALONE)

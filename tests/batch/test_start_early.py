@@ -1,0 +1,52 @@
+"""Worker processes that were started for nothing end with the process that started them."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+EARLY = """
+import os, sys, time
+from wavebatch.batch.workers.processes import start_early
+if __name__ == "__main__":
+    start_early(2)
+    with open(f"/proc/{os.getpid()}/task/{os.getpid()}/children") as file:
+        print(file.read(), flush=True)
+    if sys.argv[1] == "stopped":
+        import signal
+        from wavebatch.batch.workers.processes import _early
+        for one in _early:
+            os.kill(one.process.pid, signal.SIGSTOP)
+"""
+
+
+def _is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
+@pytest.mark.parametrize("state", ["running", "stopped"])
+def test_processes_that_were_started_for_nothing_end_with_their_parent(tmp_path, state):
+    """A run that finds its options wrong has started them already; also one that stands still does not keep it."""
+    script = tmp_path / "early.py"
+    script.write_text(EARLY)
+    done = subprocess.run([sys.executable, script, state], capture_output=True, text=True, timeout=300, check=True)
+    assert not done.stderr
+    children = [int(word) for word in done.stdout.split()]
+    assert len(children) >= 2
+    deadline = time.monotonic() + 300
+    while any(_is_alive(child) for child in children):  # one of them is multiprocessing's own, which ends by itself
+        assert time.monotonic() < deadline, "a process stays"
+        time.sleep(0.01)
+
+
+def test_wrong_options_end_a_run_of_several_jobs_as_usual(tmp_path):
+    command = [sys.executable, "-m", "wavebatch", "run", "a.las", "-o", str(tmp_path), "--columns", "none"]
+    done = subprocess.run([*command, "--jobs", "3"], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr

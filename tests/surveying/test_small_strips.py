@@ -1,0 +1,72 @@
+"""Fifty packets: they have the echoes of the whole strip's survey, or the survey says that they are in doubt."""
+
+import pytest
+from helpers_scenes import make_block, make_scene
+from strips import cut_strip
+from writer_tools import data_file
+
+from wavebatch.batch.explain import MOST_DOUBTED, MOST_DOUBTED_KNOWN
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying import survey_block, survey_blocks
+from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.systems import known_systems as module
+from wavebatch.surveying.systems.known_systems import find_source
+from wavebatch.tools.simulate import PulseModel, find_pulse
+
+TAIL = PulseModel(2.2, 0.0, ((0.06, 5.0, 4.0),))
+
+
+def _survey(path):
+    with StripReader(path) as reader, reader.scan() as scan:
+        return survey_blocks(read_sample(reader, scan))
+
+
+def _leave_out(monkeypatch, name):
+    """No shipped pulse of this name: its sensor is a stranger."""
+    rest = tuple(one for one in module.known_systems() if one.name != name)
+    monkeypatch.setattr(module, "known_systems", lambda: rest)
+
+
+@pytest.mark.parametrize(
+    ("scene", "pulse", "first"),
+    [("urban", TAIL, 0), ("flat", find_pulse("riegl"), 100), ("forest", TAIL, 0)],
+    ids=["roofs, tail", "flat, after-pulse", "forest, tail"],
+)
+def test_fifty_packets_of_a_stranger_have_the_echoes_of_its_whole_strip(scene, pulse, first):
+    """They had 1.27, 1.40 and 1.20 times as many, in silence: a Gaussian was as good as their stack could tell."""
+    block = make_block(make_scene(scene, pulse=pulse, n_samples=100), 3000, seed=11)[0]
+    part = block.rows(slice(first, first + 50))
+    small, whole = (survey_block(one) for one in (part, block))
+    found, right = (len(choose_chain(one).run(part, one.system)) for one in (small, whole))
+    assert small.system.components and found == pytest.approx(right, rel=0.1)
+    assert small.figures.echoes_in_doubt < MOST_DOUBTED and whole.figures.echoes_in_doubt is None
+
+
+@pytest.mark.parametrize("scene", ["flat", "urban"])
+def test_a_gaussian_stays_one_in_fifty_packets(scene):
+    scene = make_scene(scene, pulse=PulseModel(2.6), n_samples=100)
+    survey = survey_block(make_block(scene, 50, seed=11)[0])
+    assert not survey.system.components and not survey.system.kappa
+    assert survey.figures.echoes_in_doubt < MOST_DOUBTED
+
+
+def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path, monkeypatch):
+    """50 packets of LVIS as those of a stranger: 1.17 to 2.2 times the echoes, in silence."""
+    path = cut_strip(data_file("lvis/lvis1.las"), tmp_path / "cut.las", 50)
+    assert _survey(path).figures.echoes_in_doubt < 0.05
+    _leave_out(monkeypatch, "nasa-lvis")
+    assert _survey(path).figures.echoes_in_doubt > MOST_DOUBTED
+
+
+@pytest.mark.parametrize("strip", ["riegl", "leica"])
+def test_fifty_packets_of_level_ground_are_sure(strip, request, tmp_path):
+    survey = _survey(cut_strip(request.getfixturevalue(strip), tmp_path / "cut.las", 120))
+    assert survey.figures.echoes_in_doubt < MOST_DOUBTED
+
+
+def test_a_known_pulse_keeps_its_misfit_in_a_small_strip():
+    """Packets of a dense forest with eight quiet samples each."""
+    survey = _survey(data_file("neon/neon_harv_a.las"))
+    assert find_source(survey.system).name == "neon-gemini" and survey.system.misfit == 0
+    assert 0.01 < survey.figures.echoes_in_doubt < MOST_DOUBTED_KNOWN

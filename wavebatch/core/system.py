@@ -1,0 +1,114 @@
+"""The parts of a SystemPulse beside the pulse: the receiver's noise and defects, the widths of level ground, the light.
+
+The survey measures the first three, `surveying.calibration` and options of a run give the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from wavebatch.core.units import AIR_ATTENUATION, QUANTISATION_STD
+
+
+@dataclass(frozen=True, slots=True)
+class ReceiverNoise:
+    """What a receiver records without signal."""
+
+    baseline: float = 0.0
+    """Typical level without signal [count]."""
+    baseline_spread: float = 0.0
+    """Standard deviation of the true baseline between waveforms [count]."""
+    recovery: float = 0.0
+    """Time after a strong signal until the level is back to what it was before it [ns]."""
+    std: float = QUANTISATION_STD
+    """Noise of one sample that thresholds and errors use [count]."""
+    by_kind: Mapping[str, float] = field(default_factory=dict)
+    """The estimates that `std` was chosen from: quiet, outside of echoes, core ... [count]."""
+    correlation: tuple[float, ...] = ()
+    """Correlation of the noise of two samples 1, 2, ... spacings apart; empty where it is white."""
+    gain: float = 0.0
+    """Signal-dependent noise variance per count of signal [count] (docs/algorithms.md H12)."""
+
+    @property
+    def quiet(self) -> float:
+        """Noise of a quiet sample [count]: `std` is larger where noise is coloured."""
+        return min(self.std, self.by_kind.get("quiet") or self.std)
+
+
+@dataclass(frozen=True, slots=True)
+class Defects:
+    """What waveforms have before any signal, and what is taken off them before they are read."""
+
+    pattern: tuple[float, ...] = ()
+    """Offsets that repeat along the samples, of converters that take samples in turn [count]; empty for none."""
+    slope_spread: float = 0.0
+    """Standard deviation of the slopes of baselines [count/ns]; 0 where baselines are level."""
+    spikes: float = 0.0
+    """Spikes of one sample per waveform; 0 where they are not taken off."""
+    transient: float = 0.0
+    """Time at the start of every waveform in which its receiver is not at rest [ns]."""
+
+    def __bool__(self) -> bool:
+        """Whether waveforms must be cleaned before they are read."""
+        return bool(self.pattern or self.slope_spread or self.spikes or self.transient)
+
+
+@dataclass(frozen=True, slots=True)
+class LevelWidths:
+    """How wide the echoes of level ground are, seen from above."""
+
+    variance: float = 0.0
+    """Their variance minus that of the system pulse [ns2]: zero or negative, because the echoes that the pulse was
+    learned from come from slopes too.
+    """
+    error: float | None = None
+    """Standard deviation of `variance` [ns2]; None where it was not measured, infinite where surfaces of known slope
+    were sought and not found, so that widths mean no angle.
+    """
+    scatter: float = 0.0
+    """Scatter of the echo widths of one surface beyond their fit errors [ns]: no pulse model is exact."""
+
+
+@dataclass(frozen=True, slots=True)
+class Radiometry:
+    """What turns amplitudes and times into light: beam, calibration, air, and the errors of each."""
+
+    divergence: float | None = None
+    """Full angle of the beam between the 1/e^2 points [mrad]; None where it is not known."""
+    divergence_error: float = 0.0
+    """Relative standard deviation of the divergence."""
+    constant: float | None = None
+    """Constant C' of kernels/physics/radiometry [1/(m2 count ns)]; None where the strip is not calibrated."""
+    constant_error: float = 0.0
+    """Relative standard deviation of the constant."""
+    shot_error: float = 0.0
+    """Relative standard deviation of the emitted energy from shot to shot, where the block does not hold it."""
+    channels: Mapping[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
+    """Constant and its relative error of single channels, by (index of the digitizer, scanner channel)."""
+    swath: tuple[float, ...] = ()
+    """How the constant grows with the angle t of the ray to the vertical: largest angle T [rad], a and b of
+    exp(a u^2 + b u^4), u = min(t / T, 1); empty where it does not.
+    """
+    attenuation: float = AIR_ATTENUATION
+    """Attenuation of the light in the air, one way [dB/km]."""
+    attenuation_error: float = 0.0
+    """Standard deviation of the attenuation [dB/km]."""
+    sensor_error: float = 0.0
+    """Standard deviation of the distance to the sensor's position [m]."""
+
+
+def angle_to_vertical(direction: np.ndarray) -> np.ndarray:
+    """Angle of rays to the vertical, at which they strike level ground; direction: f8 (n, 3), angle: f8 (n,) [rad]."""
+    x, y, z = direction.T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        down = -z / np.sqrt(x * x + y * y + z * z)
+    return np.arccos(np.clip(down, -1.0, 1.0))
+
+
+def swath_columns(angle: np.ndarray, most: float) -> np.ndarray:
+    """u^2 and u^4 of angles (n,) [rad], f8 (n, 2), u = min(angle / most, 1): see `Radiometry.swath`."""
+    square = np.minimum(angle / most, 1.0) ** 2
+    return np.stack([square, square**2], axis=1)
