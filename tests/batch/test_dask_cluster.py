@@ -218,12 +218,27 @@ def _pretend(package, version, kept=False):
     worker_check.describe_worker.cache_clear()
 
 
+def _hold(go_on):
+    """Let a worker wait at the units of strip b until the file `go_on` is there."""
+    from wavebatch.batch import unit
+
+    def wait(prepared, *arguments, solve=unit.solve_unit):
+        while prepared.job.path.stem == "b" and not os.path.exists(go_on):
+            time.sleep(0.05)
+        return solve(prepared, *arguments)
+
+    unit.solve_unit = wait
+
+
 @pytest.mark.slow
 def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, strips):
     cluster = Dask(tmp_path)
     out = tmp_path / "out"
     try:
         cluster.start_worker()
+        with distributed.Client(cluster.address, set_as_default=False) as client:
+            client.wait_for_workers(1)
+            client.run(_hold, str(tmp_path / "never"))
         command = [sys.executable, "-W", "error", "-m", "wavebatch", "run", "--profile", "fast", "-q"]
         process = subprocess.Popen(
             [*command, str(strips), "-o", str(out), "--scheduler", cluster.address], stderr=subprocess.PIPE, text=True
@@ -242,7 +257,11 @@ def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, s
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
-def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path):
+def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path, tmp_path_factory):
+    go_on = tmp_path_factory.mktemp("go") / "on"
+    with distributed.Client(dask.address, set_as_default=False) as client:
+        client.wait_for_workers(2)
+        client.run(_hold, str(go_on))
     command = [sys.executable, "-W", "error", "-m", "wavebatch", "run", str(strips), "--profile", "fast", "-q"]
     process = subprocess.Popen(
         [*command, "-o", str(tmp_path), "--scheduler", dask.address], stderr=subprocess.PIPE, text=True
@@ -250,6 +269,7 @@ def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path):
     dask.wait_until(lambda: list(tmp_path.glob(".wavebatch-*.tmp")))
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=300)
+    go_on.touch()
     assert process.returncode == 130
     assert said.startswith("interrupted") and said.count("\n") == 1
     assert {path.name for path in tmp_path.iterdir()} <= {"a.laz", "a.report.json", "b.laz", "b.report.json"}

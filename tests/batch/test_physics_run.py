@@ -74,6 +74,16 @@ def test_a_calibration_adds_columns_and_the_strips_own_vectors_serve(plain):
     assert told["request"]["calibration"]["constant"] == 2.6e-8
 
 
+@pytest.mark.parametrize(("measured", "used"), [(33.33, 33.3), (85.0, 80.0)])
+def test_errors_of_level_reflectances_take_the_slopes_of_the_strip(
+    tmp_path, tiny_strip, calibration, monkeypatch, measured, used
+):
+    monkeypatch.setattr("wavebatch.batch.unit.measure_slope", lambda reader, scan: measured)
+    done = run(tiny_strip, "-o", tmp_path, "--profile", "fast", "--calibration", calibration)
+    assert done.exit_code == 0, done.output
+    assert f"slope = {used}\n" in report(tmp_path)["chain"]
+
+
 @pytest.mark.slow
 def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, plain, wide_strip, calibration):
     done = run(wide_strip, "-o", tmp_path, "--profile", "fast", "--calibration", calibration,

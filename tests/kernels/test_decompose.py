@@ -33,6 +33,36 @@ def test_candidates_where_nothing_is_do_not_keep_others_out():
     assert np.count_nonzero(both & (found.number >= 2)) > 170
 
 
+@pytest.mark.parametrize("apart", [1.5, 2.0])
+def test_echoes_that_their_errors_do_not_tell_apart_are_not_kept(apart):
+    """chi2 falls by more than the acceptance, but the pair is closer than its errors allow."""
+    noise = np.random.default_rng(3).standard_normal((300, LENGTH))
+    y = np.rint(bell(20, 100) + bell(20 + apart, 70) + noise)
+    start = np.stack([y.max(axis=1), y.argmax(axis=1), np.full(300, 2.0)], axis=1)[:, :, None]
+    found = decompose(y, start, grow=True, prior_spread=0.2, acceptance=4.0)
+    for last, number in zip(np.cumsum(found.number), found.number, strict=True):
+        rows = slice(last - number, last)
+        assert naive_fit.is_resolved(found.parameters[rows, :3].T, found.errors[rows, :3].T)
+    assert np.count_nonzero(found.number > 1) > 10
+
+
+@pytest.mark.parametrize(("misfit", "number"), [(0.0, 2), (0.2, 1)])
+def test_what_a_misfit_of_the_pulse_may_explain_is_no_echo(misfit, number):
+    noise = np.random.default_rng(3).standard_normal((100, LENGTH))
+    start = np.tile(np.array([150.0, 20.0, 2.0])[:, None], (100, 1, 1))
+    found = decompose(np.rint(bell(20, 150) + bell(27, 12) + noise), start, misfit=misfit, **GROWING)
+    assert (found.number == number).all()
+
+
+@pytest.mark.parametrize("second", [100.0, 80.0])
+def test_a_flat_top_is_split_into_two(second):
+    """A candidate in the middle: no new echo beside it can flatten its top."""
+    found = repeat(bell(20.5, 100) + bell(23.5, second), [22.0], [150.0])
+    assert (found.number == 2).all()
+    times = np.sort(found.parameters[:, 1].reshape(-1, 2), axis=1)
+    np.testing.assert_allclose(np.median(times, axis=0), [20.5, 23.5], atol=0.2)
+
+
 def test_candidates_of_nothing_are_left_out():
     found = repeat(bell(20, 100) - bell(30, 8, 3.0), [20.0, 30.0], [100.0, 4.0])
     assert np.count_nonzero(found.number == 1) > 160

@@ -1,6 +1,7 @@
 """The compiled fit against scipy on the same windows: free, at bounds, clipped, with gaps and with a prior."""
 
 import naive
+import naive_fit
 import numpy as np
 import pytest
 from fits import TIGHT, decompose, fit
@@ -141,6 +142,18 @@ def test_the_width_prior_costs_narrow_echoes_only(rng):
     assert (held.cost > free.cost).all()
     wide = fit(y, start, width_ref=0.5, prior_spread=0.15, **TIGHT)
     np.testing.assert_array_equal(wide.parameters, free.parameters)
+
+
+def test_errors_count_what_the_prior_knows_of_widths(rng):
+    truth = draw(rng, 12, 2, apart=3.5)
+    truth[:, 2] = [1.7, 2.6]
+    y, prior = record(rng, truth), (2.2, 0.15)
+    held = fit(y, near(rng, truth), width_ref=prior[0], prior_spread=prior[1], **TIGHT)
+    same = 0
+    for p, errors in zip(held.parameters[:, :3], held.errors[:, :3], strict=True):
+        expected = naive_fit.errors_of(p, np.arange(float(LENGTH)), 1.0, prior, slice(None), {})
+        same += np.allclose(errors, expected, rtol=5e-3)
+    assert same >= 10  # echoes that overlap much have errors of their own
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32])
