@@ -480,7 +480,7 @@ def test_names_from_files_are_text_and_no_formulas(tmp_path):
         (["histogram", "--column", "z", "-o", "p.png", "--range", "5:1"], "does not go up"),
         (["histogram", "--column", "z", "-o", "p.png", "--range", "nan:1"], "does not go up"),
         (["histogram", "--column", "echo_flags", "-o", "p.png", "--bins", "3"], "--bins"),
-        (["map", "--column", "echo_flags", "-o", "p.png"], "--statistic count --flags"),
+        (["map", "--column", "echo_flags", "-o", "p.png"], "cloud.laz: echo_flags are bits, which have no mean; count"),
         (["map", "-o", "p.png"], "needs a --column"),
         (["map", "--column", "z", "-o", "p.png", "--bbox", "1,2,3"], "WEST,SOUTH,EAST,NORTH"),
         (["histgram"], "did you mean 'histogram'?"),

@@ -104,7 +104,7 @@ def grid_values(
     check_cells(statistic, bounds)
     check_statistic(selection.column, statistic)
     clouds = Clouds(paths, selection)
-    check_statistic(selection.column, statistic, clouds.facts)
+    check_statistic(selection.column, statistic, clouds.facts, paths[0])
     crs = check_crs(paths)
     total, sample, box = _survey(clouds, bounds)
     if not sample.seen:

@@ -214,7 +214,7 @@ def measure_profile(
     """
     clouds = open_heights(paths, selection)
     crs = _find_crs(clouds)
-    check_statistic(selection.column, statistic, clouds.facts)
+    check_statistic(selection.column, statistic, clouds.facts, paths[0])
 
     def pick(_: int, rows: np.ndarray) -> np.ndarray:
         height = rows["values"][:, 1:]

@@ -166,14 +166,16 @@ def round_up(size: float) -> float:
     return next(float(f"{factor * power:.3g}") for factor in (1, 2, 5, 10) if factor * power >= size * (1 - 1e-9))
 
 
-def check_statistic(column: str | None, statistic: str, facts: ColumnFacts | None = None) -> None:
-    """Raises ConfigError where a statistic of a cell or a bin needs a column, or its column holds bits."""
+def check_statistic(
+    column: str | None, statistic: str, facts: ColumnFacts | None = None, path: Path | None = None
+) -> None:
+    """Raises ConfigError where a statistic of a cell or a bin needs a column, or its column, in a file, holds bits."""
     if statistic in ("count", "density"):
         return
     if column is None:
         raise ConfigError(f"--statistic {statistic} needs a --column; only count and density need none")
     if facts is not None and facts.is_flags:
-        raise ConfigError(f"{facts.name} are bits, which have no {statistic}; count the points with a flag: "
+        raise ConfigError(f"{path}: {facts.name} are bits, which have no {statistic}; count the points with a flag: "
                           "--statistic count --flags NAME")  # fmt: skip
 
 

@@ -66,7 +66,7 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     clouds = Clouds(paths, options.selection)
     facts = (clouds.facts, *clouds.other_facts)
     for one in facts:
-        check_statistic(one.name, options.statistic, one)
+        check_statistic(one.name, options.statistic, one, paths[0])
     box, points, largest = _find_extent(clouds, options)
     if unit == "degree" and options.size > max(box[2] - box[0], box[3] - box[1]):
         raise ConfigError(f"{paths[0]}: coordinates are degrees, and cells of {options.size:g} degrees are larger than "
