@@ -143,7 +143,7 @@ def zero_the_heights_of_a_strip(monkeypatch, load):
 
 def forget_where_windows_open(monkeypatch, load):
     """Times count from the first sample of each packet: the relief is lost."""
-    monkeypatch.setattr(segments, "align_times", lambda line: np.zeros(len(line)))
+    monkeypatch.setattr(segments, "align_times", lambda origin, direction: np.zeros(len(origin)))
     return load("s2_jutzi").table_of_a_strip(3000, 0)
 
 
@@ -167,7 +167,7 @@ def keep_the_peaks_of_wide_echoes(monkeypatch, load):
 
     def wrong(self, *others):
         light = measured(self, *others)
-        return replace(light, strength=light.strength * light.sigma / self.sigma)
+        return replace(light, strength=light.strength * light.sigma / self.options.sigma)
 
     monkeypatch.setattr(return_light.LightModel, "measure", wrong)
     return load("s4_ussyshkin").table_of_widths(3000, 0)

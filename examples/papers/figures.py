@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from given_echoes import FINE, fine_recording, known_noise, known_system
 from published import WANG_CASES, simulate_wang
 from s3_rhomberg_kauert import DIVERGENCE, HEIGHT, LENGTH, PULSE_SIGMA, strike_planes
 from s4_ussyshkin import fly_cloud
@@ -20,8 +21,8 @@ from wavebatch.kernels.physics.incidence import paper_table, pulse_table, spread
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.detect.wavelet import transform, wavelet
-from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system
-from wavebatch.tools.simulate.from_returns import SynthesisOptions, synthesize_strip
+from wavebatch.tools.simulate.from_returns import synthesize_strip
+from wavebatch.tools.simulate.return_light import SynthesisOptions
 
 SCALES = (1.0, 2.0, 3.0)
 DEGREES = np.arange(0.0, 76.0, 1.0)

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from given_echoes import FINE, fine_recording, simulate_echoes
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.tools.simulate.draws import FoldedWidth, LogNormal, WithinDepth
-from wavebatch.tools.simulate.given_echoes import FINE, fine_recording, simulate_echoes
 from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording
 from wavebatch.tools.simulate.scenes import Scene

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from published import WAGNER
 from s1_wang import find_raw_maxima
 from table import Table, main, scatter
@@ -27,7 +28,7 @@ from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.correlation import asdf
 from wavebatch.stages.detect.maximum import TWICE_SMOOTHED_GAIN, maximum
 from wavebatch.stages.score import match_echoes
-from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_block, simulate_echoes
+from wavebatch.tools.simulate import simulate_block
 from wavebatch.tools.simulate.draws import LogNormal
 
 PAPER_RULE = {"rule": "paper", "interpolation": "parabola"}

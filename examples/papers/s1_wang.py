@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from published import PULSE_SIGMA, WANG_CASES, simulate_wang
 from table import Table, main, scatter
 
@@ -30,15 +31,7 @@ from wavebatch.stages.noise import pooled
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block
 from wavebatch.tools.compare.goodness import measure_fit
-from wavebatch.tools.simulate import (
-    FINE,
-    find_scene,
-    fine_recording,
-    known_noise,
-    known_system,
-    simulate_block,
-    simulate_echoes,
-)
+from wavebatch.tools.simulate import find_scene, simulate_block
 
 PAPER_COUNTS = {"a": 1, "b": 2, "c": 1, "d": 2, "e": 3}
 LOCAL_MAXIMA = {"a": 1, "b": 2, "c": 1, "d": 1, "e": 2}

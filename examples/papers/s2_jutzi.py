@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from paper_stages.classic import sustained_threshold
 from paper_stages.gauss_newton import gauss_newton
 from published import PULSE_SIGMA, paint_slice
@@ -26,7 +27,7 @@ from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
 from wavebatch.kernels.fit.problem import Settings
 from wavebatch.stages.detect.maximum import matched_filter
-from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes, simulate_strip
+from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import GROUND
 from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
 from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from table import Table, main, scatter
 
 from wavebatch.core.units import FWHM_PER_SIGMA, C
@@ -28,7 +29,6 @@ from wavebatch.kernels.physics.incidence import (
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
-from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.tools.simulate.render import record_counts
 
 HEIGHT, DIVERGENCE, LENGTH = 640.0, 1.1e-3, 1.5

@@ -26,9 +26,9 @@ from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, simulate_returns
-from wavebatch.tools.simulate.from_returns import SynthesisOptions, synthesize_strip
+from wavebatch.tools.simulate.from_returns import synthesize_strip
 from wavebatch.tools.simulate.render import paint_echoes
-from wavebatch.tools.simulate.return_light import Radar
+from wavebatch.tools.simulate.return_light import Radar, SynthesisOptions
 
 FULL = 20_000
 """Pulses that the bands hold for."""

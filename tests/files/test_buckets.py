@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.buckets import MOST_BUCKETS, Buckets, count_buckets, sort_by_time, spread_keys, time_keys
+from wavebatch.files.disk.buckets import MOST_BUCKETS, count_buckets, spread_keys, spread_times, time_keys
+from wavebatch.files.disk.spool import Spool
 
 ROW = np.dtype([("gps_time", "<f8"), ("number", "<i4")])
 
@@ -14,9 +15,9 @@ def test_buckets_give_every_row_back_in_order_and_pulses_whole(rng, number):
     rows = np.zeros(1000, ROW)
     rows["gps_time"], rows["number"] = rng.integers(0, 200, 1000) * 0.25, np.arange(1000)
     seen = []
-    with Buckets(ROW, number) as buckets:
+    with Spool(number, ROW) as buckets:
         for part in np.array_split(rows, 9):
-            buckets.add(part, lambda some: sort_by_time(some["gps_time"], number))
+            buckets.append(spread_times(part["gps_time"], number), part)
         for bucket in range(number):
             got = buckets.read(bucket)
             assert (np.diff(got["number"]) > 0).all()
@@ -49,5 +50,5 @@ def test_no_room_for_buckets_is_one_line(monkeypatch):
 
     monkeypatch.setattr("wavebatch.files.disk.spool.make_folder", full)
     monkeypatch.setattr("wavebatch.files.disk.spool.MEMORY", 1)
-    with pytest.raises(InputError, match="No space left on device.*TMPDIR"), Buckets(ROW, 2) as buckets:
-        buckets.add(np.zeros(3, ROW), lambda rows: sort_by_time(rows["gps_time"], 2))
+    with pytest.raises(InputError, match="No space left on device.*TMPDIR"), Spool(2, ROW) as buckets:
+        buckets.append(spread_times(np.zeros(3), 2), np.zeros(3, ROW))

@@ -14,7 +14,7 @@ from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.files.las.crs import CrsUnits, looks_geocentric, parse_wkt
+from wavebatch.files.las.crs import CrsUnits, looks_geocentric, parse_wkt, read_crs_definition
 from wavebatch.files.las.epsg_units import find_unit
 from wavebatch.files.las.geo_keys import METRES, GeoKeys
 from wavebatch.files.strip.ray_sample import measure_scale
@@ -64,6 +64,7 @@ def parse_geotiff(*records):
         (f'GEOCCS["WGS 84",{GEOG},UNIT["metre",1]]', CrsUnits("geocentric")),
         ('LOCAL_CS["site",UNIT["m",1.0]]', CrsUnits("projected", 1.0)),
         (FEET.replace("[", "(").replace("]", ")"), CrsUnits("projected", 0.3048006096012192)),
+        (UTM.replace("[", " [\n"), CrsUnits("projected", 1.0)),
         ("", CrsUnits()),
         ("EPSG:25832", CrsUnits()),
         (UTM[:-1], CrsUnits()),
@@ -146,20 +147,24 @@ def test_heights_have_codes_of_their_own():
 
 
 @pytest.mark.parametrize(
-    ("directory", "citation", "crs"),
+    ("directory", "citation", "crs", "definition"),
     [
-        (keys(short(1024, 1), short(3072, 2263), short(4096, 6360)), b"x|", "EPSG:2263+6360"),
-        (keys(short(1024, 1), short(3072, 25832)), b"", "EPSG:25832"),
-        (keys(short(1024, 2), short(2048, 4326)), b"", "EPSG:4326"),
-        (keys(short(1024, 1), short(3072, 32767)), b"mine|", "GeoTIFF: mine"),
-        (keys(short(1024, 1)), b"", "GeoTIFF keys"),
+        (keys(short(1024, 1), short(3072, 2263), short(4096, 6360)), b"x|", "EPSG:2263+6360", "EPSG:2263"),
+        (keys(short(1024, 1), short(3072, 25832)), b"", "EPSG:25832", "EPSG:25832"),
+        (keys(short(1024, 2), short(2048, 4326)), b"", "EPSG:4326", "EPSG:4326"),
+        (keys(short(1024, 1), short(3072, 32767)), b"mine|", "GeoTIFF: mine", None),
+        (keys(short(1024, 1)), b"", "GeoTIFF keys", None),
+        # Leica's ALSPP: the code of the CRS stands where that of the unit belongs.
+        (keys(short(1024, 1), short(3076, 32632)), b"", "GeoTIFF keys", "EPSG:32632"),
     ],
 )
-def test_the_code_of_geotiff_keys_is_the_name_of_the_crs(tmp_path, directory, citation, crs):
+def test_the_code_of_geotiff_keys_is_the_name_of_the_crs(tmp_path, directory, citation, crs, definition):
     raw = make_raw(60)
     raw.vlrs = [descriptor(1), projection(34735, directory), projection(34737, citation)]
     with StripReader(raw.write(tmp_path / "s.las")) as reader:
         assert reader.facts.crs == crs
+        found = [read_crs_definition(reader.facts.path, reader.facts.header, heights=both) for both in (False, True)]
+        assert found == [definition, crs if crs.startswith("EPSG") else definition]
 
 
 def test_more_keys_than_bytes_are_cut():

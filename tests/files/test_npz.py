@@ -8,13 +8,10 @@ from wavebatch.files.disk.npz import NpzWriter
 
 
 def write(target, parts, **options):
-    writer = NpzWriter(target, {"place": np.dtype(("<i4", (3,))), "value": "<f4"}, **options)
-    try:
+    with NpzWriter(target, {"place": np.dtype(("<i4", (3,))), "value": "<f4"}, **options) as writer:
         for place, value in parts:
             writer.add({"place": place, "value": value})
         writer.publish({"size": 0.5, "text": "päper"})
-    finally:
-        writer.discard()
 
 
 def test_numpy_reads_what_was_added(tmp_path, rng):
@@ -40,8 +37,8 @@ def test_nothing_is_left_of_what_fails(tmp_path):
         NpzWriter(tmp_path / "a.npz", {"value": "f4"})
     writer = NpzWriter(tmp_path / "b.npz", {"value": "f4"})
     writer.add({"value": np.zeros(3)})
-    writer.discard()
-    writer.discard()
+    writer.close()
+    writer.close()
     assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
     write(tmp_path / "a.npz", [], overwrite=True)
     assert (tmp_path / "a.npz").read_bytes()[:2] == b"PK"

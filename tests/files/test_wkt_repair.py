@@ -80,6 +80,7 @@ def test_a_right_wkt_stays(name):
 def test_only_a_unit_inside_of_the_geographic_crs_changes(name):
     """The other units stay what they are, wherever they stand."""
     right = RIGHT[name]
+    assert repair_wkt(right.replace("GEOGCS[", "GEOGCS [")) == right.replace("GEOGCS[", "GEOGCS [")
     for unit in (METRE, PLAIN, 'UNIT["metre",1]', 'UNIT ( "Meter" , 1.0 )', 'UNIT["meters",1e0,AUTHORITY["EPSG","1"]]'):
         wrong = right.replace('UNIT["degree",0.01745329251994328,AUTHORITY["EPSG","9122"]]', unit)
         assert wrong != right

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import naive
 import numpy as np
 import pytest
+from given_echoes import known_noise, known_system, simulate_echoes
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
@@ -15,7 +16,7 @@ from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import parse_chain
-from wavebatch.tools.simulate import Recording, known_noise, known_system, simulate_echoes
+from wavebatch.tools.simulate import Recording
 
 RECORDING = Recording(n_samples=64, bits=16, baseline=20.0, baseline_spread=0.0)
 SYSTEM = known_system(RECORDING)

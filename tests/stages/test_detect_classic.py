@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from published import PULSE_SIGMA as SIGMA
 
 from wavebatch.stages.chain import STAGES
-from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 
 SYSTEM = known_system(fine_recording(1.0, SIGMA))
 

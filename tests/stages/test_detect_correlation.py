@@ -3,6 +3,7 @@
 import naive
 import numpy as np
 import pytest
+from given_echoes import known_noise, known_system
 from published import WAGNER
 
 from wavebatch.core.errors import ConfigError
@@ -21,7 +22,7 @@ from wavebatch.stages.chain import STAGES
 from wavebatch.stages.detect.correlation import parabola_shift
 from wavebatch.stages.reference_pulse import reference_pulse
 from wavebatch.stages.score import match_echoes
-from wavebatch.tools.simulate import known_noise, known_system, simulate_block
+from wavebatch.tools.simulate import simulate_block
 
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=500.0, std=100.0))
 UNIT = 100.0

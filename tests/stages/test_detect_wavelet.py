@@ -5,6 +5,7 @@ from dataclasses import replace
 import naive
 import numpy as np
 import pytest
+from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from published import WANG_CASES, simulate_wang
 
 from wavebatch.core.system import ReceiverNoise
@@ -19,7 +20,6 @@ from wavebatch.kernels.signal.deconvolve import (
 from wavebatch.kernels.signal.wavelet import b3_detail, b3_gain, b3_level
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.detect.wavelet import transform
-from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 
 GAUSS = np.exp(-0.5 * (np.arange(-6, 7) / 2) ** 2)
 SKEWED = np.exp(-0.5 * (np.log1p(0.12 * np.arange(-6, 7)) / 0.24) ** 2)

@@ -9,6 +9,7 @@ import naive
 import numpy as np
 import pytest
 from contract_tools import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
+from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from published import PULSE_SIGMA as SIGMA
 
 from wavebatch import surveying
@@ -21,7 +22,6 @@ from wavebatch.kernels.signal.runs import find_runs
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.stages.decompose.rebuild import rebuild_waveforms
-from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 
 PAPERS = Path(__file__).resolve().parent.parent.parent / "examples" / "papers"
 SYSTEM = known_system(fine_recording(1.0, SIGMA))

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from given_echoes import known_system
 from helpers_scenes import make_block, make_scene
 from scoring import score
 
@@ -14,7 +15,7 @@ from wavebatch.stages.chain_file import list_profiles, load_profile
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import COSTS
 from wavebatch.surveying.predict_error import Prediction, leave_out_false, predict_errors, simulate_again
-from wavebatch.tools.simulate import find_pulse, known_system
+from wavebatch.tools.simulate import find_pulse
 
 CHAINS = {name: load_profile(name) for name in COSTS}
 

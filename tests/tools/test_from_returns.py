@@ -17,7 +17,8 @@ from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.compare.clouds import compare_clouds
 from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, return_light, simulate_returns
-from wavebatch.tools.simulate.from_returns import Radar, SynthesisOptions, synthesize_strip
+from wavebatch.tools.simulate.from_returns import synthesize_strip
+from wavebatch.tools.simulate.return_light import Radar, SynthesisOptions
 
 
 @pytest.fixture(scope="module")

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.tools.simulate import FINE, Recording, fine_recording, known_noise, known_system, simulate_echoes
+from wavebatch.tools.simulate import Recording
 
 
 def test_waveforms_hold_the_echoes_that_are_given(rng):

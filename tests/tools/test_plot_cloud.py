@@ -309,7 +309,7 @@ def test_flags_select_and_are_counted(cloud):
         count_values([cloud], Selection("echo_flags"))
 
 
-@pytest.mark.parametrize("statistic", raster.STATISTICS)
+@pytest.mark.parametrize("statistic", ["mean", "median", "min", "max", "count", "density"])
 def test_map_is_that_of_a_loop_over_cells(cloud, monkeypatch, statistic):
     monkeypatch.setattr(tiles, "HELD", 700)
     found = grid_values([cloud], Selection("amplitude"), statistic, size=2.5)

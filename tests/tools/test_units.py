@@ -143,6 +143,17 @@ def test_pictures_name_the_unit_of_heights(clouds):
         cut_section([clouds["deg"]], Selection("z"))
 
 
+def test_bands_of_rasters_name_the_unit_of_heights(clouds, tmp_path):
+    """A raster of heights in feet said that they are metres; a column of bits can be counted, as in a map."""
+    rasterio = pytest.importorskip("rasterio")
+    _print("grid", clouds["ft"], "--column", "z", "--size", 50, "-o", tmp_path / "z.tif")
+    _print("grid", clouds["ft"], "--column", "echo_flags", "--statistic", "count", "--size", 50, "-o",
+           tmp_path / "n.tif")  # fmt: skip
+    for name, unit in (("z", "us-ft"), ("n", None)):
+        with rasterio.open(tmp_path / f"{name}.tif") as found:
+            assert found.units == (unit,)
+
+
 def test_geocentric_coordinates_have_no_height(clouds, tmp_path):
     cloud = tmp_path / "g.las"
     cloud.write_bytes(clouds["m"].read_bytes())

@@ -24,7 +24,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.area_crs import describe_miss
 from wavebatch.files.cloud.column_names import resolve
-from wavebatch.files.cloud.echo_reader import describe_dimension, name_standard, read_dimension, read_field
+from wavebatch.files.cloud.echo_reader import name_standard, read_field
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.files.las.checked_header import CheckedHeader
@@ -193,7 +193,7 @@ class RowSelector:
             return columns[found].astype(COLUMNS[found].dtype, copy=False)
         if kind == "carried":
             at = self.layout.extra_fields.index(found)
-            return read_dimension(rows, describe_dimension(found, self.layout.carried[at].record))
+            return self.layout.carried[at].record.read(rows[found])
         return read_field(rows, self.layout.point_format, found, self.layout.source.header)
 
 

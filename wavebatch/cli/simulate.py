@@ -28,17 +28,18 @@ from wavebatch.tools.simulate import (
     simulate_returns,
     simulate_strip,
 )
-from wavebatch.tools.simulate.from_returns import (
+from wavebatch.tools.simulate.from_returns import SynthesisSummary, synthesize_strip
+from wavebatch.tools.simulate.render import LEAST_SPACING, MOST_NOISE, MOST_NOISE_GAIN, MOST_SPACING
+from wavebatch.tools.simulate.return_light import (
+    EQUAL,
     INTENSITIES,
     MOST_GAIN,
+    MOST_HEIGHT,
     MOST_WIDTH,
+    RADAR_LIMITS,
     Radar,
     SynthesisOptions,
-    SynthesisSummary,
-    synthesize_strip,
 )
-from wavebatch.tools.simulate.render import LEAST_SPACING, MOST_NOISE, MOST_NOISE_GAIN, MOST_SPACING
-from wavebatch.tools.simulate.return_light import EQUAL, MOST_HEIGHT, RADAR_LIMITS
 
 _RECORDING = ("n_samples", "spacing", "noise_std", "baseline", "rho", "noise_gain", "saturation")
 """Options that change the recording of the scene."""

@@ -20,8 +20,9 @@ from wavebatch.cli.messages import answer, count, talk
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.figure_file import check_picture
-from wavebatch.files.geojson_crs import GEOJSON_CRS, GeoJsonCrs, find_crs, plan_crs
+from wavebatch.files.geojson_crs import GEOJSON_CRS, GeoJsonCrs, plan_crs
 from wavebatch.files.inputs import find_files
+from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import survey_blocks
 from wavebatch.tools.slices.cube import CubeBuilder
@@ -140,7 +141,7 @@ def _slice(
     with StripReader(strip, direction=options["direction"]) as reader, reader.scan() as scan:
         crs = None
         if output is not None and output.suffix.lower() == ".geojson":
-            known = find_crs(reader.facts.crs, reader.facts.header.vlrs)
+            known = read_crs_definition(strip, reader.facts.header)
             crs = plan_crs(strip, known, options["geojson_crs"])
         sigma, floor = options["sigma"], 0.0
         if scan.with_waveform:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
 from wavebatch.files.las.crs import find_epsg
-from wavebatch.files.las.geo_keys import find_code
-from wavebatch.files.las.header import Vlr
-from wavebatch.files.wkt_repair import drop_empty_codes, repair_wkt
+from wavebatch.files.wkt_repair import drop_empty_codes
 
 GEOJSON_CRS = ("wgs84", "keep")
 """Values of --geojson-crs."""
@@ -45,23 +43,10 @@ class GeoJsonCrs:
         return [[round(x, decimals), round(y, decimals), round(z, _METRES)] for x, y, z in points.tolist()]
 
 
-def find_crs(text: str | None, vlrs: Iterable[Vlr]) -> str | None:
-    """Return the CRS of a file as GIS understand it: its WKT, or `EPSG:code` by its GeoTIFF keys; None without either.
-
-    text: as `read_crs` gives it.
-    """
-    if text is not None and text.startswith("EPSG:"):
-        return text
-    if text is not None and text.rstrip().endswith("]"):
-        return repair_wkt(text)
-    code = find_code(vlrs)
-    return None if code is None else f"EPSG:{code}"
-
-
 def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
     """Return how points of a strip are written as GeoJSON.
 
-    path: of the strip, for messages. crs: from `find_crs`. mode: one of GEOJSON_CRS.
+    path: of the strip, for messages. crs: from `read_crs_definition`. mode: one of GEOJSON_CRS.
     Raises InputError for a strip whose CRS is missing or unknown, ConfigError without pyproj.
     """
     if mode not in GEOJSON_CRS:

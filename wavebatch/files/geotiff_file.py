@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import importlib.util
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.publish import Draft, check_target
+from wavebatch.files.wkt import read_wkt
 
 TILE = 256
 """Cells along a side of a tile: usual for web viewers and cloud storage."""
@@ -102,17 +102,12 @@ def _flatten(crs: Any) -> Any:
     from rasterio.crs import CRS
 
     text = crs.to_wkt(version="WKT2_2019")
-    third = text.find("ORDER[3]")
-    if not text.startswith("PROJCRS[") or third < 0:
+    axes = [node for node in read_wkt(text) if node.word == "AXIS"] if text.startswith("PROJCRS[") else []
+    third = next((axis for axis in axes if (order := axis.find("ORDER")) and order.values == ["3"]), None)
+    if third is None:
         return crs
-    start = text.rindex(",AXIS[", 0, third)
-    depth, end = 0, start
-    for token in re.finditer(r'"[^"]*"|[][]', text[start:]):
-        depth += {"[": 1, "]": -1}.get(token[0], 0)
-        if not depth and token[0] == "]":
-            end = start + token.end()
-            break
-    return CRS.from_wkt((text[:start] + text[end:]).replace("CS[Cartesian,3]", "CS[Cartesian,2]"))
+    start = text.rindex(",", 0, third.start)
+    return CRS.from_wkt((text[:start] + text[third.end :]).replace("CS[Cartesian,3]", "CS[Cartesian,2]"))
 
 
 def _writing() -> Any:

@@ -16,6 +16,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.files.text_file import read_text
 
@@ -46,10 +47,8 @@ class PulseEnergy:
     """Name of the extra byte, or of the text file."""
     field: str | None = None
     """Field of the point records; None for a text file."""
-    scaling: tuple[float, float] = (1.0, 0.0)
-    """Scale and offset of stored values."""
-    empty: float | None = None
-    """Stored value that means none."""
+    record: ExtraRecord | None = None
+    """Of the extra byte."""
     time: np.ndarray | None = None
     """Times of a text file, ascending, f8 (k,) [s]."""
     energy: np.ndarray | None = None
@@ -67,17 +66,10 @@ class PulseEnergy:
     fills: bool = False
     """A pulse of unknown energy counts as one of mean energy, as it would without energies; else it has no data."""
 
-    def values(self, points: np.ndarray) -> np.ndarray:
-        """Return the values of the extra byte of point records (n,), f8, NaN where unknown."""
-        stored = points[self.field]
-        values = stored.astype(np.float64) * self.scaling[0] + self.scaling[1]
-        known = (np.abs(values) < LARGEST) & (True if self.empty is None else stored != self.empty)
-        return np.where(known, values, np.nan)
-
     def read(self, points: np.ndarray) -> np.ndarray:
         """Return the energies of the pulses of point records (n,), f8, NaN where unknown, in the unit of the source."""
         if self.field is not None:
-            values = self.values(points)
+            values = self.record.read(points[self.field])
             return np.where(values > 0, values, np.nan)
         time = points["gps_time"].astype(np.float64)
         after = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
@@ -172,16 +164,13 @@ def _once(found: PulseEnergy, unit: Unit) -> np.ndarray:
 
 def find_column(reader: StripReader, request: str) -> PulseEnergy | None:
     """Find the extra byte of this name; None where there is none."""
-    facts = reader.facts
-    fields = facts.dtype.names[len(facts.dtype.names) - len(facts.records) :] if facts.records else ()
-    known = {record.name: (field, record) for field, record in zip(fields, facts.records, strict=True)}
+    known = {record.name: (field, record) for field, record in reader.facts.extra.items()}
     field, record = known.get(request, (None, None))
     if record is None or not 1 <= record.code <= 10:
         return None
-    empty = None if record.no_data is None else float(record.no_data[0])
     error, described = known.get(f"{request}_err", (None, None))
     plain = described is not None and 1 <= described.code <= 10 and described.scaling is None
-    return PulseEnergy(request, field, record.scaling or (1.0, 0.0), empty, error_field=error if plain else None)
+    return PulseEnergy(request, field, record, error_field=error if plain else None)
 
 
 def name_columns(reader: StripReader, request: str) -> str:

@@ -13,11 +13,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from wavebatch.files.las.header import EVLR_HEADER_SIZE, WKT_ID, Evlr, Vlr, build_wkt, is_projection
+from wavebatch.files.wkt import read_wkt
 
 LONGEST_WKT = 1 << 20
 """Longest record that is read as a WKT: those of real files have a few kilobytes."""
 
-_TOKEN = re.compile(r'"(?:[^"]|"")*"|([A-Za-z_][A-Za-z_0-9]*)\s*([\[(])?|([\])])')
 _METRE = re.compile(r'UNIT\s*[\[(]\s*"(?:met(?:er|re)s?|m)"\s*,\s*([-+0-9.eE]+)\s*[,\])]', re.IGNORECASE)
 _DEGREE = 'UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]]'
 
@@ -36,7 +36,11 @@ def repair_wkt(wkt: str) -> str:
         The same text where nothing is wrong, and where it is not well formed.
     """
     repaired = wkt
-    for start, end in sorted(_list_units(wkt), reverse=True):
+    for node in reversed(read_wkt(wkt)):
+        units = [one for one in node.nodes if one.word == "UNIT"] if node.word == "GEOGCS" else []
+        if len(units) != 1:
+            continue
+        start, end = units[0].start, units[0].end
         found = _METRE.match(wkt, start, end)
         if found and _is_one(found[1]):
             repaired = repaired[:start] + _DEGREE + repaired[end:]
@@ -46,25 +50,6 @@ def repair_wkt(wkt: str) -> str:
 def drop_empty_codes(wkt: str) -> str:
     """Return a WKT without the code 0 of RiPROCESS: GDAL looks it up in vain, and a GeoTIFF then has no projection."""
     return re.sub(r',\s*AUTHORITY\["EPSG","0"\]', "", wkt)
-
-
-def _list_units(wkt: str) -> list[tuple[int, int]]:
-    """Start and end of the UNIT of each GEOGCS, which must be its only one and a direct member of it."""
-    found: list[tuple[int, int]] = []
-    nested: list[tuple[str, int, list[tuple[int, int]]]] = []
-    for token in _TOKEN.finditer(wkt):
-        word, opens, closes = token.groups()
-        if opens:
-            nested.append((word.upper(), token.start(), []))
-        elif closes and not nested:
-            return []
-        elif closes:
-            word, start, units = nested.pop()
-            if word == "UNIT" and nested:
-                nested[-1][2].append((start, token.end()))
-            elif word == "GEOGCS" and len(units) == 1:
-                found += units
-    return [] if nested else found
 
 
 def _is_one(number: str) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.geojson_crs import find_crs
+from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.ray_sample import Rays, measure_scale, sample_rays
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.trajectory_file import read_trajectory
@@ -259,7 +259,7 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
 
 
 def _from_file(reader: StripReader, rays: Rays, request: SensorRequest, several: bool) -> SensorSource:
-    crs = request.crs or find_crs(reader.facts.crs, reader.facts.header.vlrs)
+    crs = request.crs or read_crs_definition(reader.facts.path, reader.facts.header, heights=True)
     known = read_trajectory(request.trajectory, crs=crs, lever_arm=request.lever_arm)
     times = rays.time[np.isfinite(rays.time) & (rays.time != 0)]
     if several and (not len(times) or times.min() == times.max()):

@@ -6,6 +6,7 @@ Only reads options and prints; the work is in `wavebatch.tools.archives.import_f
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from wavebatch.cli.options import (
 )
 from wavebatch.cli.program.completion import complete_files
 from wavebatch.files.inputs import find_files
-from wavebatch.tools.archives.import_file import SUFFIXES, ImportOptions, ImportSummary, describe, import_file
+from wavebatch.tools.archives.import_file import SUFFIXES, ImportOptions, ImportSummary, import_file
 
 EXIT_SOME, EXIT_NONE = 3, 4
 """Exit codes of `wavebatch run`: some files failed; no file was written."""
@@ -56,7 +57,7 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
     results, failed = for_each(
         paths, lambda path: _import(path, targets[path], chosen, options), debug=options["debug"], alone=True
     )
-    answer({"files": [describe(one) for one in results], "failed": failed})
+    answer({"files": [asdict(one) for one in results], "failed": failed})
     sys.exit(0 if not failed else EXIT_SOME if results else EXIT_NONE)
 
 

@@ -13,8 +13,8 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, count, talk, tell
+from wavebatch.cli.plot.clouds import find_clouds, select
 from wavebatch.cli.program.completion import complete_columns
-from wavebatch.files.inputs import find_files
 
 if TYPE_CHECKING:
     from wavebatch.tools.rasters.grid import GridResult
@@ -47,16 +47,14 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
 
     Exit code: 0 done, 1 a cloud cannot be read or the raster cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.core.condition import read_flags
     from wavebatch.files.geotiff_file import check_raster
     from wavebatch.tools.rasters.grid import GridOptions, write_grid
 
-    paths = find_files(map(str, clouds), recursive=options["recursive"])
+    paths = find_clouds(clouds, options)
     check_raster(output, overwrite=options["overwrite"])
-    flags = {"flags_with": read_flags(options["flags"]), "flags_without": read_flags(options["drop_flags"])}
-    given = {name: options[name] for name in ("statistic", "size", "where", "crs", "no_data")}
-    given["bounds"] = options["bbox"]
-    found = write_grid(paths, output, GridOptions(columns, **given, **flags), overwrite=options["overwrite"])
+    selection = select(next(iter(columns), None), options, *columns[1:])
+    how = shared.from_options(GridOptions, options, selection=selection)
+    found = write_grid(paths, output, how, overwrite=options["overwrite"])
     layout = found.layout
     if layout.crs is None:
         talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")

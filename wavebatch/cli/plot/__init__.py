@@ -1,4 +1,4 @@
-"""`wavebatch plot`: pictures of waveforms, histograms and maps; sections and profiles are in `sections`.
+"""`wavebatch plot`: pictures of waveforms; those of clouds are in `clouds` and `sections`.
 
 Reads options, calls `wavebatch.tools.plots` and prints one line. The modules that draw are imported only after all
 else has succeeded: matplotlib takes long to import and may be missing.
@@ -6,36 +6,26 @@ else has succeeded: matplotlib takes long to import and may be missing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import NearestGroup, answer, count, print_json, tell
-from wavebatch.cli.plot.sections import cube, describe_picture, describe_tally, list_tally, profile, section, select
-from wavebatch.cli.program.completion import complete_columns, complete_flags
+from wavebatch.cli.messages import NearestGroup, answer, count, tell
+from wavebatch.cli.plot.clouds import histogram, map_, output_option, read_range
+from wavebatch.cli.plot.sections import cube, profile, section
+from wavebatch.cli.program.completion import complete_flags
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
-from wavebatch.files.inputs import find_files
 from wavebatch.files.text_file import write_text
 
 _SHOWN = ("detector", "asdf", "wavelet", "correlation", "deconvolved", "derivative")
-_output = shared.output_option("Picture to write: .png, .svg or .pdf.")
-
-def _read_range(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
-    if text is None:
-        return None
-    low, high = shared.parse_floats(text, "LOW:HIGH")
-    if not low < high or high - low == float("inf"):
-        raise click.BadParameter(f"{text!r} does not go up from one finite number to another")
-    return low, high
 
 
-def _read_times(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | str | None:
-    return "all" if text == "all" else _read_range(context, parameter, text)
+def _read_times(text: str) -> tuple[float, ...] | str:
+    return "all" if text == "all" else read_range(text)
 
 
 @click.group(cls=NearestGroup)
@@ -48,7 +38,7 @@ def plot() -> None:
 
 @plot.command()
 @shared.strip_argument
-@_output
+@output_option
 @click.option("--packet", "packets", multiple=True, metavar="N|FIRST:END",
               callback=lambda context, parameter, texts: tuple(map(shared.parse_span, texts)),
               help="Draw these packets, counted from 0; END is not included; may be repeated.  [default: six, spread "
@@ -65,7 +55,7 @@ def plot() -> None:
 @click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
 @shared.seed_option("Seed of the random packets.")
 @click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
-@click.option("--times", "shown", callback=_read_times, metavar="LOW:HIGH|all",
+@click.option("--times", "shown", type=shared.Text("LOW:HIGH|all", _read_times), metavar="LOW:HIGH|all",
               help="Part of the waveforms to show [ns].  [default: the part with signal, of each waveform]")
 @click.option("--show", metavar="|".join(_SHOWN), help="Also draw the signal in which the detector searches, with its "
               "threshold; detector: that of the chain's own detector.")
@@ -155,142 +145,5 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
         return views, describe_chain(choice.chain)
 
 
-@plot.command()
-@shared.clouds_argument
-@shared.declared("recursive")
-@_output
-@click.option("--column", "columns", required=True, multiple=True, shell_complete=complete_columns,
-              help="Extra dimension or standard field; echo_flags counts flags. May be repeated: columns of one unit "
-              "share an axis, others get one of their own.")
-@click.option("--by", metavar="COLUMN", shell_complete=complete_columns,
-              help="Draw one line per value of this column, e.g. number_of_returns or classification.")
-@click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
-@click.option("--range", "limits", callback=_read_range, metavar="LOW:HIGH",
-              help="Values to show.  [default: 5 to 95 % of each line, and 1.5 times that range on both sides; what "
-              "lies outside is counted]")
-@click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
-@click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
-@click.option("--counts", is_flag=True, help="Draw numbers also for several lines, not shares of each line's values.")
-@shared.selection_options
-@shared.common_options("overwrite", "json")
-def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
-    """Draw histograms of columns of CLOUDs of any size.
-
-    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. Points without data are left
-    out and counted. For a column with discrete values, each bin holds the same number of possible values.
-
-    Several lines (of --column, --by or --each) are drawn as shares of their values, so that they can be compared.
-
-    Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
-    """  # fmt: skip
-    from wavebatch.tools.plots.histogram import is_flags
-
-    clouds = find_files(map(str, clouds), recursive=options["recursive"])
-    check_picture(output, overwrite=options["overwrite"])
-    columns = tuple(dict.fromkeys(columns))
-    if any(is_flags(clouds[0], column) for column in columns):
-        text, tallies = _draw_flags(clouds, columns, output, options)
-    else:
-        text, tallies = _draw_histograms(clouds, columns, output, options)
-    tell(f"{output}: {text}")
-    if options["as_json"]:
-        drawn = [{"columns": list(names), **list_tally(tally)} for names, tally in tallies.items()]
-        print_json({**describe_picture(output, clouds), "drawn": drawn})
-
-
-def _draw_flags(
-    clouds: Sequence[Path], columns: tuple[str, ...], output: Path, options: dict[str, Any]
-) -> tuple[str, dict[tuple[str, ...], Any]]:
-    """Draws the counts of flags; returns a summary, and the counts by columns."""
-    from wavebatch.tools.plots.histogram import count_flags
-
-    if len(columns) > 1:
-        raise ConfigError(f"flags are counted by name, not by value: draw {', '.join(columns)} one by one")
-    _refuse_for_flags(options)
-    counted = count_flags(clouds, select(columns[0], options))
-    from wavebatch.tools.plots.draw_cloud import draw_flags
-
-    names = tuple(path.name for path in clouds)
-    draw_flags(counted, output, names=names, log=options["log"], overwrite=options["overwrite"])
-    text = f"{count(counted.total.values, 'point')}, {counted.clean} without a flag"
-    text += f", {counted.total.left_out} left out" * bool(counted.total.left_out)
-    return text, {columns: counted.total}
-
-
-def _draw_histograms(
-    clouds: Sequence[Path], columns: tuple[str, ...], output: Path, options: dict[str, Any]
-) -> tuple[str, dict[tuple[str, ...], Any]]:
-    """Draws histograms, those of one unit in one axis; returns a summary, and the counts by columns."""
-    from wavebatch.tools.plots.histogram import count_values
-    from wavebatch.tools.plots.values import Clouds
-
-    panels: dict[str, list[Any]] = {}
-    for column in columns:
-        selection = select(column, options)
-        panels.setdefault(Clouds(clouds, selection).facts.unit, []).append(selection)
-    how = {name: options[name] for name in ("bins", "limits", "each", "by")}
-    if len(panels) > 1 and options["limits"]:
-        raise ConfigError(f"--range is for one unit; {', '.join(columns)} are in {', '.join(panels)}")
-    every = [count_values(clouds, selections, **how) for selections in panels.values()]
-    from wavebatch.tools.plots.draw_cloud import draw_histograms
-
-    how = {name: options[name] for name in ("log", "counts", "overwrite")}
-    draw_histograms(every, output, **how)
-    texts = [describe_tally(found.total, int(found.below.sum() + found.above.sum())) for found in every]
-    names = [tuple(one.column for one in selections) for selections in panels.values()]
-    return "; ".join(texts), {columns: found.total for columns, found in zip(names, every, strict=True)}
-
-
-def _refuse_for_flags(options: dict[str, Any]) -> None:
-    for name, option in (
-        ("bins", "--bins"), ("limits", "--range"), ("each", "--each"), ("by", "--by"), ("counts", "--counts"),
-    ):  # fmt: skip
-        if options[name]:
-            raise ConfigError(f"{option} is of no use for flags, which are counted by name")
-
-
-@plot.command(name="map")
-@shared.clouds_argument
-@shared.declared("recursive")
-@_output
-@click.option("--column", shell_complete=complete_columns,
-              help="Extra dimension or standard field; not needed for count and density.")
-@click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
-              show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
-@click.option("--size", type=float, metavar="M",
-              help="Side of a cell, in the unit of the coordinates.  [default: gives a few points per cell]")
-@shared.bbox_option("Show")
-@shared.selection_options
-@shared.common_options("overwrite", "json")
-def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
-    """Draw a map of a column of CLOUDs of any size, over x and y.
-
-    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. Colours range from the 2nd to
-    the 98th percentile of the cells.
-
-    Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
-    """  # fmt: skip
-    from wavebatch.tools.plots.raster import grid_values
-
-    clouds = find_files(map(str, clouds), recursive=options["recursive"])
-    check_picture(output, overwrite=options["overwrite"])
-    statistic = options["statistic"]
-    if column is None and statistic not in ("count", "density"):
-        raise ConfigError(f"--statistic {statistic} needs a --column; only count and density need none")
-    selection = select(column, options)
-    found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bbox"])
-    from wavebatch.tools.plots.draw_cloud import draw_map
-
-    draw_map(found, output, names=tuple(path.name for path in clouds), overwrite=options["overwrite"])
-    grid = found.grid
-    cells = f"{grid.columns} x {grid.rows} cells of {grid.size:g} {found.crs.unit}"
-    tell(f"{output}: {describe_tally(found.total, found.outside)}; {cells}")
-    if options["as_json"]:
-        more = {"statistic": statistic, "outside": found.outside, "columns": grid.columns, "rows": grid.rows,
-                "size": grid.size, "unit": found.crs.unit}  # fmt: skip
-        print_json({**describe_picture(output, clouds), "column": column, **list_tally(found.total), **more})
-
-
-plot.add_command(section)
-plot.add_command(profile)
-plot.add_command(cube)
+for command in (histogram, map_, section, profile, cube):
+    plot.add_command(command)

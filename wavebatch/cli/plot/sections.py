@@ -5,6 +5,7 @@ Reads options, calls `wavebatch.tools.plots` and `wavebatch.tools.slices`, and p
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,44 +13,16 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, print_json, tell
+from wavebatch.cli.messages import answer, tell
+from wavebatch.cli.plot.clouds import describe_tally, draws_clouds, list_tally, output_option, select
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import SUFFIXES, find_files
 
-_output = shared.output_option("Picture to write: .png, .svg or .pdf.")
 
-def select(column: str | None, options: dict[str, Any]) -> Any:
-    """The selection of a column and of the flags in the options."""
-    from wavebatch.core.condition import read_flags
-    from wavebatch.tools.plots.values import Selection
-
-    flags = read_flags(options["flags"]), read_flags(options["drop_flags"])
-    return Selection(column, *flags, where=options["where"])
-
-
-def describe_picture(output: Path, clouds: Sequence[Path]) -> dict[str, Any]:
-    """The first keys of every document of `plot ... --json`."""
-    return {"output": str(output), "clouds": [str(path) for path in clouds]}
-
-
-def list_tally(tally: Any) -> dict[str, int]:
-    """How many points were drawn, and how many were not, for --json."""
-    return {name: getattr(tally, name) for name in ("points", "left_out", "no_data", "values")}
-
-
-def describe_tally(tally: Any, outside: int, kind: str = "value") -> str:
-    """How many points were drawn, and how many were not, for people."""
-    left_out = f", {tally.left_out} left out" * bool(tally.left_out)
-    return f"{count(tally.values, kind)}, {tally.no_data} without data{left_out}, {outside} outside the picture"
-
-
-def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> tuple[list[Path], bool]:
-    """Clouds, files of segments, or one file of voxels; and whether they are of segments.
-
-    A folder or pattern gives segments where it has no clouds.
-    """
+def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> list[Path]:
+    """Clouds, one file of voxels, or files of segments: these from a folder or pattern where it has no clouds."""
     from wavebatch.tools.slices.output import SEGMENT_SUFFIXES
     from wavebatch.tools.slices.read_segments import check_alone, is_segments
 
@@ -61,28 +34,23 @@ def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool 
         check_alone(paths, options)
     elif segments:
         raise ConfigError(f"{segments[0]}: segments have no side view; use `plot profile`, or `slice --overview`")
-    if voxels and len(paths) > 1:
-        raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
     if voxels and options["where"] is not None:
         raise ConfigError(f"{voxels[0]}: --where is for points; give it to `wavebatch voxelize`")
-    return paths, bool(segments)
+    return paths
 
 
-@click.command()
-@shared.clouds_argument
-@shared.declared("recursive")
-@_output
-@shared.floats_option("--line", "X0,Y0,X1,Y1",
-                      "Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]")
-@click.option("--width", type=float, metavar="W",
-              help="Show what lies within half of W from the line.  [default: a fiftieth of its length]")
-@click.option("--column", shell_complete=complete_columns,
-              help="Column for the colours.  [default: z; energy for voxels]")
-@click.option("--aspect", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, metavar="F",
-              help="Exaggerate heights F times.")
-@shared.selection_options
-@shared.common_options("overwrite", "json")
-def section(clouds: Sequence[Path], output: Path, column: str | None, **options: Any) -> None:
+@draws_clouds(
+    shared.floats_option("--line", "X0,Y0,X1,Y1", "Ends of the section, in the coordinates of the clouds.  [default: "
+                         "along the longer extent]"),
+    click.option("--width", type=float, metavar="W",
+                 help="Show what lies within half of W from the line.  [default: a fiftieth of its length]"),
+    click.option("--column", shell_complete=complete_columns,
+                 help="Column for the colours.  [default: z; energy for voxels]"),
+    click.option("--aspect", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, metavar="F",
+                 help="Exaggerate heights F times."),
+    find=_find,
+)  # fmt: skip
+def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Draw a side view of CLOUDs or voxels along a line.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
@@ -93,35 +61,28 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
     """  # fmt: skip
     from wavebatch.tools.plots.section_data import cut_section
 
-    paths, _ = _find(clouds, options)
-    check_picture(output, overwrite=options["overwrite"])
-    column = column or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
+    column = options["column"] or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
     found = cut_section(paths, select(column, options), line=options["line"], width=options["width"])
     from wavebatch.tools.plots.draw_section import draw_section
 
     draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
     kind = "voxel" if found.voxel else "point"
-    tell(f"{output}: {found.inside} of {describe_tally(found.total, found.outside, kind)}")
-    if options["as_json"]:
-        place = {"line": list(found.line), "width": found.width, "unit": found.crs.unit, "crs": found.crs.name or None}
-        place |= {"outside": found.outside}
-        more = {"inside": found.inside, "drawn": len(found.value), "voxel": found.voxel or None, **place}
-        print_json({**describe_picture(output, paths), "column": column, **list_tally(found.total), **more})
+    place = {"line": list(found.line), "width": found.width, "unit": found.crs.unit, "crs": found.crs.name or None}
+    more = {"inside": found.inside, "drawn": len(found.value), "voxel": found.voxel or None, **place}
+    text = f"{found.inside} of {describe_tally(found.total, found.outside, kind)}"
+    return text, {"column": column, **list_tally(found.total), **more, "outside": found.outside}
 
 
-@click.command()
-@shared.clouds_argument
-@shared.declared("recursive")
-@_output
-@click.option("--column", shell_complete=complete_columns, help="Column for --statistic sum and mean, e.g. energy.")
-@click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,
-              help="Of the points or voxels of a height.  [default: sum with --column, else count]")
-@click.option("--size", type=float, metavar="M", help="Height of a bin.  [default: about a sixtieth of all]")
-@click.option("--each", is_flag=True, help="Draw one line per cloud instead of one of all.")
-@click.option("--log", is_flag=True, help="Use a logarithmic axis of values.")
-@shared.selection_options
-@shared.common_options("overwrite", "json")
-def profile(clouds: Sequence[Path], output: Path, column: str | None, **options: Any) -> None:
+@draws_clouds(
+    click.option("--column", shell_complete=complete_columns, help="Column for --statistic sum and mean, e.g. energy."),
+    click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,
+                 help="Of the points or voxels of a height.  [default: sum with --column, else count]"),
+    click.option("--size", type=float, metavar="M", help="Height of a bin.  [default: about a sixtieth of all]"),
+    click.option("--each", is_flag=True, help="Draw one line per cloud instead of one of all."),
+    click.option("--log", is_flag=True, help="Use a logarithmic axis of values."),
+    find=functools.partial(_find, or_segments=True),
+)  # fmt: skip
+def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Draw how many points, or how much of a column, of CLOUDs, voxels or segments lie at each height.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
@@ -132,30 +93,27 @@ def profile(clouds: Sequence[Path], output: Path, column: str | None, **options:
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.tools.plots.section_data import measure_profile
-    from wavebatch.tools.slices.read_segments import profile_segments
+    from wavebatch.tools.slices.read_segments import is_segments, profile_segments
 
+    column = options["column"]
     statistic = options["statistic"] or ("count" if column is None else "sum")
     how = {"size": options["size"], "each": options["each"]}
-    paths, segments = _find(clouds, options, or_segments=True)
-    check_picture(output, overwrite=options["overwrite"])
-    if segments:
+    if segments := is_segments(paths[0]):
         found = profile_segments(paths, column, statistic, **how)
     else:
         found = measure_profile(paths, select(column, options), statistic, **how)
     from wavebatch.tools.plots.draw_section import draw_profile
 
     draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
-    tell(f"{output}: {describe_tally(found.total, found.outside, 'segment' if segments else 'value')}")
-    if options["as_json"]:
-        series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]
-        more = {"statistic": statistic, "outside": found.outside, "edges": found.edges.tolist(), "series": series}
-        print_json({**describe_picture(output, paths), "column": column, **list_tally(found.total), **more,
-                    "unit": found.unit})  # fmt: skip
+    series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]
+    more = {"statistic": statistic, "outside": found.outside, "edges": found.edges.tolist(), "series": series}
+    text = describe_tally(found.total, found.outside, "segment" if segments else "value")
+    return text, {"column": column, **list_tally(found.total), **more, "unit": found.unit}
 
 
 @click.command()
 @click.argument("cube_file", type=click.Path(path_type=Path), metavar="CUBE.npz")
-@_output
+@output_option
 @click.option("--x", type=click.IntRange(0), metavar="N", help="Slice across the lines at pulse N of each.")
 @click.option("--y", type=click.IntRange(0), metavar="N", help="Slice along scan line N.")
 @click.option("--t", type=float, metavar="NS", help="Slice of all pulses at one time [ns].")
@@ -175,7 +133,6 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
 
     draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
     tell(f"{output}: {', '.join(one.title for one in slices)}")
-    if options["as_json"]:
-        drawn = [{"title": one.title, "rows": one.image.shape[0], "columns": one.image.shape[1],
-                  "extent": list(one.extent), "across": one.across, "up": one.up} for one in slices]  # fmt: skip
-        print_json({"output": str(output), "cube": str(cube_file), "slices": drawn})
+    drawn = [{"title": one.title, "rows": one.image.shape[0], "columns": one.image.shape[1],
+              "extent": list(one.extent), "across": one.across, "up": one.up} for one in slices]  # fmt: skip
+    answer({"output": str(output), "cube": str(cube_file), "slices": drawn})

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from laspy.point.dims import DimensionInfo
 
 from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_names import resolve
-from wavebatch.files.cloud.echo_reader import CloudReader, name_standard, read_dimension, read_field
+from wavebatch.files.cloud.echo_reader import CloudReader, name_standard, read_field
 from wavebatch.files.las.point_formats import ANGLE_UNIT
+from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
 
 _PLACE = np.dtype([("x", "<f8"), ("y", "<f8")])
 
@@ -84,10 +84,8 @@ class ColumnReader(CloudReader):
 
     def list_columns(self) -> list[str]:
         """Return the names of all columns of the file."""
-        dimensions = self._format.dimensions
-        extra = [one.name for one in dimensions if not one.is_standard and one.num_elements == 1]
-        standard = [one.name for one in dimensions if one.is_standard and one.name not in ("X", "Y", "Z")]
-        return [*extra, "x", "y", "z", *standard]
+        standard = [name for name in list_dimensions(self.point_format) if name not in ("X", "Y", "Z")]
+        return [*self.extra, "x", "y", "z", *standard]
 
     def find_value(self, column: str) -> Callable[[np.ndarray], np.ndarray]:
         """Return the function from raw records (n,) to the values of a column (n,), NaN for no data.
@@ -103,15 +101,12 @@ class ColumnReader(CloudReader):
         if column is None:
             return ColumnFacts("points", "-", "", 1.0), lambda raw: np.ones(len(raw))
         known = self.list_columns()
-        extra = {one.name: one for one in self._format.extra_dimensions if one.num_elements == 1}
-        ours = {} if stored else self._find_ours(list(extra.values()), COLUMNS, decibel=True)
-        ours = {name: one.name for name, one in ours.items()}
+        ours = {} if stored else self._find_ours(COLUMNS, decibel=True)
         written = {name: found for name, found in ours.items() if name in self.written}
-        standard = name_standard(self._format.id)
-        wanted, column = column, resolve(column, written, {name: name for name in extra} | standard, ours)
-        if column in extra:
-            dimension = extra[column]
-            return self._describe_extra(dimension), lambda raw: read_dimension(raw, dimension)
+        standard = name_standard(self.point_format)
+        wanted, column = column, resolve(column, written, {name: name for name in self.extra} | standard, ours)
+        if column in self.extra:
+            return self._describe_extra(column), lambda raw: self.read_extra(raw, column)
         if column in known:
             return self._describe_standard(column), lambda raw: read_field(raw, self.point_format, column, self)
         missing = resolve(wanted, {name: name for name in COLUMNS})
@@ -124,23 +119,22 @@ class ColumnReader(CloudReader):
         has = "" if hint.startswith("known") else f" Columns of the file: {', '.join(known)}"
         raise ConfigError(f"{self.path}: has no column {wanted!r}; {hint}{has}")
 
-    def _describe_extra(self, dimension: DimensionInfo) -> ColumnFacts:
+    def _describe_extra(self, field: str) -> ColumnFacts:
         """Facts from the description in the file; for a wavebatch column from its declaration."""
-        text = dimension.description or ""
+        record = self.extra[field]
+        text = record.description
         found = re.search(r"\[([^\[\]]+)\]\s*$", text)
         unit, meaning = (found[1], text[: found.start()].strip()) if found else ("-", text.strip())
         stored = {stored: column for column, stored in self.written.items()}
-        name = stored.get(dimension.name) or re.sub(r"^wb\d*[ _]", "", dimension.name)
+        name = stored.get(field) or re.sub(r"^wb\d*[ _]", "", field)
         if name in COLUMNS and found and unit == COLUMNS[name].unit:
             meaning = COLUMNS[name].meaning
-        is_integer = np.dtype(dimension.dtype).kind in "ui"
-        scale = 1.0 if dimension.scales is None else abs(float(dimension.scales[0]))
-        is_flags = self.has_flags and self._sources["echo_flags"].name == dimension.name
-        return ColumnFacts(dimension.name, unit, meaning, scale if is_integer else 0.0, is_flags)
+        step = 0.0 if record.dtype.kind == "f" else abs((record.scaling or (1.0,))[0])
+        return ColumnFacts(field, unit, meaning, step, self._sources.get("echo_flags") == field)
 
     def _describe_standard(self, name: str) -> ColumnFacts:
-        kind = self._format.dimension_by_name(name.upper() if name in "xyz" else name).kind.name
-        step = 0.0 if kind == "FloatingPoint" else 1.0
+        fields = STANDARD_DTYPES[self.point_format]
+        step = 0.0 if name in fields.names and fields[name].kind == "f" else 1.0
         if name in "xyz":
             step = abs(float(self.scales["xyz".index(name)]))
         elif name == "scan_angle":

@@ -1,15 +1,15 @@
 """Point clouds read in pieces: positions, GPS times and wavebatch's columns under the names of any style.
 
 All commands that read clouds use `CloudReader` with the fields that they need, or a ColumnReader, which is built on it.
-Files may come from any program: laspy only describes the fields, the bytes are read and checked by wavebatch.
+Files may come from any program: all bytes are read and checked by wavebatch.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -19,16 +19,12 @@ from wavebatch.files.cloud.column_names import STYLES
 from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
-from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
+from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.point_formats import read_angles, read_classes, split_numbers
 from wavebatch.files.las.read_points import open_points
-from wavebatch.files.point_dtypes import list_dimensions
-
-if TYPE_CHECKING:  # laspy takes 50 ms to import, and a run hardly ever needs it
-    import laspy
-    from laspy.point.dims import DimensionInfo, DimensionKind
+from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
 """Columns that are read if the cloud has them."""
@@ -58,16 +54,12 @@ RETURN_DTYPE = np.dtype(
 
 _PIECE = 250_000
 _PIECE_BYTES = 1 << 26
-_LARGEST = 1e30
-"""Larger values are damage and become no data: their squares would overflow in single precision."""
-
 
 class Placing(Protocol):
     """A header or a reader: what stored positions mean."""
 
     scales: tuple[float, float, float]
     offsets: tuple[float, float, float]
-
 
 class CloudReader(Closing):
     """Reads a LAS or LAZ file in pieces. A context manager.
@@ -90,18 +82,18 @@ class CloudReader(Closing):
         """Metres of a step of 1 in x, y and z; NaN in degrees."""
         self.unit = name_units(units)
         self.bounds = checked.header.mins, checked.header.maxs
-        self._format = describe_format(checked)
-        self.point_format: int = self._format.id
-        names = set(self._format.dimension_names)
-        self.has_gps_time = "gps_time" in names
-        self.has_packets = "wavepacket_index" in names
-        extra = list(self._format.extra_dimensions)
-        written = find_written(checked.header, [one.name for one in extra if one.num_elements == 1])
-        kinds = {one.name: one.kind for one in extra}
-        self.written = {column: name for column, name in written.items() if _may_hold(kinds[name], column)}
+        self.point_format: int = checked.header.point_format
+        fields = STANDARD_DTYPES[self.point_format].names
+        self.has_gps_time = "gps_time" in fields
+        self.has_packets = "wavepacket_index" in fields
+        self.extra = {field: record for field, record in checked.extra.items() if not record.dtype.shape}
+        """The record of each extra dimension that is one number, by its field."""
+        self._point_length = checked.dtype.itemsize
+        written = find_written(checked.header, self.extra)
+        self.written = {column: name for column, name in written.items() if _may_hold(self.extra[name], column)}
         """The file's name of each wavebatch column, by its provenance; empty without one. Columns that another
         program has stored as several numbers, or flags as signed ones, are none."""
-        self._sources = self._find_ours(extra, (*dtype.names, "echo_flags"))
+        self._sources = self._find_ours((*dtype.names, "echo_flags"))
         self.columns = tuple(name for name in dtype.names if name in self._sources)
         """The wavebatch columns among the fields that the cloud has."""
         self.has_flags = "echo_flags" in self._sources
@@ -126,7 +118,7 @@ class CloudReader(Closing):
 
     def read_pieces(self, size: int = _PIECE) -> Iterator[np.ndarray]:
         """Yield the points of the file in order, at most `size` at a time."""
-        size = max(min(size, _PIECE_BYTES // self._format.size), 1)
+        size = max(min(size, _PIECE_BYTES // self._point_length), 1)
         for start in range(0, self.point_count, size):
             raw = self._points.read(start, min(start + size, self.point_count))
             if self.keep is not None:
@@ -140,17 +132,18 @@ class CloudReader(Closing):
         """Return the EchoFlag bits of raw records, u2 (n,); 0 where the cloud has no flags."""
         if not self.has_flags:
             return np.zeros(len(raw), np.uint16)
-        return raw[self._sources["echo_flags"].name].astype(np.uint16)
+        return raw[self._sources["echo_flags"]].astype(np.uint16)
 
-    def _find_ours(
-        self, extra: list[DimensionInfo], columns: Iterable[str], *, decibel: bool = False
-    ) -> dict[str, DimensionInfo]:
-        """The dimension of each wavebatch column that the cloud has; decibel: also of those that are written in dB."""
+    def _find_ours(self, columns: Iterable[str], *, decibel: bool = False) -> dict[str, str]:
+        """The field of each wavebatch column that the cloud has; decibel: also of those that are written in dB."""
         if not self.written:
-            return find_columns(extra, columns)
-        by_name = {one.name: one for one in extra}
-        found = {name: by_name[self.written[name]] for name in columns if name in self.written}
-        return {name: one for name, one in found.items() if decibel or not (one.description or "").endswith("[dB]")}
+            return find_columns(self.extra, columns)
+        found = {name: self.written[name] for name in columns if name in self.written}
+        return {name: one for name, one in found.items() if decibel or not self.extra[one].description.endswith("[dB]")}
+
+    def read_extra(self, raw: np.ndarray, field: str) -> np.ndarray:
+        """Return the physical values (n,) of an extra dimension of raw records, with NaN for no data."""
+        return self.extra[field].read(raw[field])
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
         if "ray" in self.dtype.names and self.has_packets:
@@ -165,7 +158,7 @@ class CloudReader(Closing):
     def _read_named(self, raw: np.ndarray, name: str) -> np.ndarray | float | None:
         """Values of a field of `dtype`; None where the file has none and they are 0."""
         if name in COLUMNS:
-            return read_dimension(raw, self._sources[name]) if name in self._sources else np.nan
+            return self.read_extra(raw, self._sources[name]) if name in self._sources else np.nan
         if name == "ray" and self.has_packets:
             ray = np.stack([widen(raw[axis]) for axis in ("x_t", "y_t", "z_t")], axis=1)
             ray[~np.isfinite(ray).all(axis=1)] = 0.0  # damaged: as if there were none
@@ -184,37 +177,6 @@ class CloudReader(Closing):
         }
         return readers[name]() if name in readers else None
 
-
-def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
-    """Return laspy's point format with the extra dimensions of the checked records, under the names of the fields."""
-    import laspy
-
-    point_format = laspy.PointFormat(checked.header.point_format)
-    for field, record in zip(checked.dtype.names[-len(checked.records) :], checked.records, strict=False):
-        point_format.dimensions.append(describe_dimension(field, record))
-    return point_format
-
-
-def describe_dimension(field: str, record: ExtraRecord) -> DimensionInfo:
-    """Return laspy's description of an extra dimension under the name of its field."""
-    from laspy.point.dims import DimensionInfo
-
-    scales, offsets = (None, None) if record.scaling is None else np.array(record.scaling)[:, None]
-    dimension = DimensionInfo.from_dtype(field, record.dtype, False, record.description, offsets, scales)
-    return dimension._replace(no_data=record.no_data)
-
-
-def read_dimension(raw: np.ndarray, dimension: DimensionInfo) -> np.ndarray:
-    """Return the physical values (n,) of a dimension of raw records, with NaN for no data."""
-    values = widen(raw[dimension.name])
-    with np.errstate(over="ignore", invalid="ignore"):
-        if dimension.scales is not None:
-            values = values * dimension.scales[0] + dimension.offsets[0]
-        if dimension.no_data is not None:
-            values[raw[dimension.name] == dimension.no_data[0]] = np.nan
-        return np.where(np.abs(values) <= _LARGEST, values, np.nan)
-
-
 def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) -> np.ndarray:
     """Return the values (n,) of a field of raw records, NaN for those that are not finite.
 
@@ -231,7 +193,6 @@ def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) 
     values[~np.isfinite(values)] = np.nan
     return values
 
-
 def name_standard(point_format: int) -> dict[str, str]:
     """Return the names of the fields of a point format, x, y and z for its integers, each with the field that it means.
 
@@ -241,34 +202,25 @@ def name_standard(point_format: int) -> dict[str, str]:
     angle = next(name for name in names if name in ("scan_angle", "scan_angle_rank"))
     return {**{name: name for name in names}, "scan_angle": angle, "scan_angle_rank": angle}
 
-
-def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:
-    """Return the extra dimension of each column that the cloud has, by its names alone.
+def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> dict[str, str]:
+    """Return the field of each column that the cloud has, by the names of its extra dimensions alone.
 
     For clouds without provenance, which other programs may drop. wavebatch's name is preferred to those of
     other styles, and a name with the prefix `wb_` (`wb ` in old clouds) to one without. A dimension of another style
     counts only if it is stored as that style stores it: RIEGL's Amplitude, for example, is in dB.
     """
-    by_name = {dimension.name: dimension for dimension in extra}
     wanted = set(columns)
     names = [(column, column, None) for column in COLUMNS if column in wanted]
     for style in STYLES.values():
         names += [(key, naming.name, naming.scale) for key, naming in style.items() if not naming.decibel]
-    found: dict[str, DimensionInfo] = {}
+    found: dict[str, str] = {}
     for column, name, scale in names:
-        for dimension in map(by_name.get, (f"wb_{name.replace(' ', '_')}", f"wb {name}", name)):
-            if column in wanted and dimension is not None and _is_stored_as(dimension, column, scale):
-                found.setdefault(column, dimension)
+        for field in (f"wb_{name.replace(' ', '_')}", f"wb {name}", name):
+            record = extra.get(field) if column in wanted else None
+            if record is not None and (record.scaling is None) == (scale is None) and _may_hold(record, column):
+                found.setdefault(column, field)
     return found
 
-
-def _is_stored_as(dimension: DimensionInfo, column: str, scale: float | None) -> bool:
-    """Whether the dimension is one number, scaled if the style scales it, and may hold the column."""
-    if dimension.num_elements != 1 or (dimension.scales is None) != (scale is None):
-        return False
-    return _may_hold(dimension.kind, column)
-
-
-def _may_hold(kind: DimensionKind, column: str) -> bool:
-    """Whether numbers of a kind may be a column: flags are unsigned integers."""
-    return column != "echo_flags" or kind.name == "UnsignedInteger"
+def _may_hold(record: ExtraRecord, column: str) -> bool:
+    """Whether numbers of a dimension may be a column: flags are unsigned integers."""
+    return column != "echo_flags" or record.dtype.kind == "u"

@@ -1,4 +1,4 @@
-"""Records sorted into buckets, so that records that belong together are compared in bounded memory.
+"""Buckets of a `Spool` for records that belong together, so that they are compared in bounded memory.
 
 The comparisons, the statistics and the maps use it. All points of a pulse must come into the same bucket: sort by
 keys that are equal for equal GPS times.
@@ -6,12 +6,7 @@ keys that are equal for equal GPS times.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-
-from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.spool import Spool
 
 BUCKET_ROWS = 400_000
 """Rows in memory at a time, unless MOST_BUCKETS are too few."""
@@ -25,44 +20,15 @@ MOST_RETURNS = 16
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 divided by the golden ratio: multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
 
-Sorter = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""From rows to (row numbers, bucket numbers); a row may go into several buckets, or into none."""
-
-
-class Buckets(Closing):
-    """Rows of one dtype in `number` buckets: `add` all of them, then `read` bucket by bucket. A context manager.
-
-    Raises InputError if there is no room for the temporary file.
-    """
-
-    def __init__(self, dtype: np.dtype, number: int) -> None:
-        self._spool = Spool(number, dtype)
-
-    def add(self, rows: np.ndarray, sorter: Sorter) -> None:
-        """Put rows (n,) into the buckets that `sorter` gives; a single bucket takes all rows."""
-        if self._spool.buckets == 1:
-            self._spool.append(np.zeros(len(rows), np.int64), rows)
-        else:
-            index, bucket = sorter(rows)
-            self._spool.append(bucket, rows[index])
-
-    def read(self, number: int) -> np.ndarray:
-        """Return the rows of one bucket in the order in which they were added."""
-        return self._spool.seal().read(number)
-
-    def close(self) -> None:
-        """Remove the temporary file; may be called twice."""
-        self._spool.close()
-
 
 def count_buckets(rows: int, held: int | None = None) -> int:
     """Return how many buckets of at most `held` rows (None: BUCKET_ROWS) are needed, at most MOST_BUCKETS."""
     return min(-(-max(rows, 1) // (held or BUCKET_ROWS)), MOST_BUCKETS)
 
 
-def sort_by_time(gps_time: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return row numbers and buckets by GPS time f8 (n,) [s]: a pulse in one bucket, pulses spread evenly."""
-    return np.arange(len(gps_time)), spread_keys(time_keys(gps_time), number)
+def spread_times(gps_time: np.ndarray, number: int) -> np.ndarray:
+    """Return the bucket i8 (n,) of GPS times f8 (n,) [s]: a pulse in one bucket, pulses spread evenly."""
+    return spread_keys(time_keys(gps_time), number)
 
 
 def tell_pulses_apart(gps_time: np.ndarray) -> bool:

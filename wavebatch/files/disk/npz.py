@@ -16,13 +16,14 @@ from typing import IO
 
 import numpy as np
 
-from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
+from wavebatch.files.disk.closing import Closing
+from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
 
 _PIECE = 1 << 18
 
 
-class NpzWriter:
-    """Writes columns in pieces: `add` any number of times, then `publish`.
+class NpzWriter(Closing):
+    """Writes columns in pieces: `add` any number of times, then `publish`. A context manager.
 
     columns: dtype of each column; one with a shape (k,) becomes an array (n, k).
     Raises InputError if the target exists (without overwrite) or cannot be written.
@@ -51,6 +52,10 @@ class NpzWriter:
 
     def publish(self, single: Mapping[str, np.ndarray | str | float]) -> None:
         """Write the .npz, with the values `single` after the columns, and give it its name."""
+        publish_together([self.complete(single)])
+
+    def complete(self, single: Mapping[str, np.ndarray | str | float]) -> Draft:
+        """Write the .npz under its temporary name; the draft is published together with others."""
         with reporting(self.target), zipfile.ZipFile(self._draft.file, "w", allowZip64=True) as archive:
             for name, spool in self._spools.items():
                 dtype = self._dtypes[name]
@@ -63,14 +68,9 @@ class NpzWriter:
             for name, value in single.items():
                 with _open_member(archive, name) as member:
                     np.lib.format.write_array(member, np.array(value), allow_pickle=False)
-        self._draft.publish()
-        self.discard()
+        return self._draft
 
-    def withdraw(self) -> None:
-        """Remove the published file again."""
-        self._draft.withdraw()
-
-    def discard(self) -> None:
+    def close(self) -> None:
         """Close and remove all temporary files; may be called after `publish`."""
         with contextlib.suppress(OSError):  # a full disk was reported when it was written to
             self._opened.close()

@@ -1,7 +1,7 @@
 """Entries sorted into numbered buckets: few of them stay in memory, many go to a temporary file.
 
-The strip scan, the second pass and `Buckets` use it. A sealed spool is pickled and read by other processes; only the
-process that made it removes the file.
+The strip scan, the second pass and all that compares clouds use it; `buckets.py` has the usual buckets. A sealed spool
+is pickled and read by other processes; only the process that made it removes the file.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import read_exactly, take_records
 from wavebatch.files.disk.temp_folders import make_folder, reporting_scratch
 
@@ -21,8 +22,8 @@ KEPT = 1 << 20
 """Bytes of entries that a sealed spool keeps in memory: it is pickled for other processes."""
 
 
-class Spool:
-    """Entries of one dtype in buckets 0..n-1: `append`, then `seal`, then `read`; sealed it can be pickled.
+class Spool(Closing):
+    """Entries of one dtype in buckets 0..n-1: `append` all, then `read`; sealed it can be pickled. A context manager.
 
     The temporary file holds segments, each sorted by bucket, after a table of where its buckets begin. `close` removes
     the file; copies in other processes only read it.
@@ -51,7 +52,7 @@ class Spool:
             self._flush()
 
     def seal(self) -> Spool:
-        """End the writing; may be called twice."""
+        """End the writing, as the first reading does; may be called twice."""
         if self._sealed:
             return self
         self._sealed = True
@@ -70,6 +71,7 @@ class Spool:
 
     def pieces(self, bucket: int) -> Iterator[np.ndarray]:
         """Yield the same entries in parts, one per segment."""
+        self.seal()
         if self._memory is not None:
             starts, entries = self._memory
             if starts[bucket + 1] > starts[bucket]:

@@ -49,6 +49,11 @@ class CheckedHeader:
         """The LAS version, for example 1.4."""
         return "{}.{}".format(*self.header.version)
 
+    @property
+    def extra(self) -> dict[str, ExtraRecord]:
+        """The record of each extra dimension by its field of `dtype`, in order."""
+        return dict(zip(self.dtype.names[len(self.dtype.names) - len(self.records) :], self.records, strict=True))
+
 
 def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     """Return the checked header of a full-waveform strip; its VLRs are read, its points and EVLRs are not.

@@ -7,7 +7,6 @@ cannot be read counts as missing, and nothing here raises an error for it.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -25,12 +24,11 @@ from wavebatch.files.las.header import (
     is_projection,
     read_header,
 )
+from wavebatch.files.wkt import Node, read_wkt
 from wavebatch.files.wkt_repair import LONGEST_WKT, repair_wkt
 
 DOUBLES_ID, CITATION_ID = 34736, 34737
 _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
-
-_TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)([\[(])?|([-+]?[0-9.][-+0-9.eE]*)|([\])])|,|\s+')
 
 _SHORT = {"metres": "m", "international feet": "ft", "US survey feet": "us-ft"}
 """Units of pictures and tables."""
@@ -140,16 +138,17 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
     return text, tuple(units)
 
 
-def read_crs_definition(path: Path, header: LasHeader) -> str | None:
+def read_crs_definition(path: Path, header: LasHeader, *, heights: bool = False) -> str | None:
     """Return the CRS of a file as GIS libraries take it: its WKT, else `EPSG:n` from its GeoTIFF keys, else None.
 
-    The WKT is that of `repair_wkt`.
+    The WKT is that of `repair_wkt`. heights: with the code of the heights, `EPSG:n+m`; rasters have no place for it.
     """
-    records = _read_records(path, header)
-    text = records.get(WKT_ID, b"").split(b"\0")[0].decode("utf-8", "replace").strip()
-    if text:
+    text = (read_crs(path, header)[0] or "").strip()
+    if text.startswith("EPSG:"):
+        return text if heights else text.partition("+")[0]
+    if text and not text.startswith("GeoTIFF"):
         return repair_wkt(text)
-    code = GeoKeys.parse(records.get(GEOTIFF_ID, b"")).code  # without its heights, which have no place in a raster
+    code = find_code(header.vlrs)
     return f"EPSG:{code}" if code else None
 
 
@@ -175,67 +174,45 @@ _COMPOUND = ("COMPD_CS", "COMPOUNDCRS")
 
 def parse_wkt(text: str) -> CrsUnits:
     """Return kind and units of the WKT (version 1 or 2) of a CRS."""
-    root = _parse_wkt(text)
-    if root is None:
+    found = read_wkt(text)
+    if not found:
         return CrsUnits()
-    systems = [_unwrap(node) for node in (root if root[0] in _COMPOUND else [root]) if isinstance(node, list)]
-    upright = _find(systems, *_UPRIGHT)
+    root = found[0]
+    systems = [_unwrap(node) for node in (root.nodes if root.word in _COMPOUND else [root])]
+    upright = next((node for node in systems if node.word in _UPRIGHT), None)
     vertical = None if upright is None else _find_unit(upright)
     for node in systems:
-        if node[0] in _GEOGRAPHIC:
+        if node.word in _GEOGRAPHIC:
             return CrsUnits("geographic", None, vertical)
-        if node[0] in _GEODETIC:
-            shape = [value.lower() for value in _find(node, "CS") or () if isinstance(value, str)]
-            return CrsUnits("geographic" if "ellipsoidal" in shape else "geocentric", None, vertical)
-        if node[0] in _PROJECTED:
+        if node.word in _GEODETIC:
+            shape = node.find("CS")
+            is_geographic = shape is not None and "ellipsoidal" in map(str.lower, shape.values)
+            return CrsUnits("geographic" if is_geographic else "geocentric", None, vertical)
+        if node.word in _PROJECTED:
             vertical = _find_unit(node, last=True) if vertical is None else vertical
             return CrsUnits("projected", _find_unit(node), vertical)
     return CrsUnits(None, None, vertical)
 
 
-def _unwrap(node: list) -> list:
+def _unwrap(node: Node) -> Node:
     """The source CRS of a bound CRS, or the node itself."""
-    source = _find(node, "SOURCECRS") if node[0] == "BOUNDCRS" else None
-    return next((child for child in source or () if isinstance(child, list)), node)
+    source = node.find("SOURCECRS") if node.word == "BOUNDCRS" else None
+    return source.nodes[0] if source is not None and source.nodes else node
 
 
-def _find_unit(node: list, *, last: bool = False) -> float | None:
+def _find_unit(node: Node, *, last: bool = False) -> float | None:
     """Metres per unit of a CRS: its unit, else that of its first axis; last: only that of its third axis."""
-    axes = [_find(axis, "LENGTHUNIT", "UNIT") for axis in node if isinstance(axis, list) and axis[0] == "AXIS"]
-    unit = (axes[2] if len(axes) > 2 else None) if last else _find(node, "LENGTHUNIT", "UNIT") or next(iter(axes), None)
+    axes = [axis.find("LENGTHUNIT", "UNIT") for axis in node.nodes if axis.word == "AXIS"]
+    unit = (axes[2] if len(axes) > 2 else None) if last else node.find("LENGTHUNIT", "UNIT") or next(iter(axes), None)
     if unit is None:
         return None
-    for value in [value for value in unit[1:] if isinstance(value, str)][1:]:
+    for value in unit.values[1:]:
         try:
             metres = float(value)
         except ValueError:
             continue
         return metres if math.isfinite(metres) and metres > 0 else math.nan
     return math.nan
-
-
-def _parse_wkt(text: str) -> list | None:
-    """The outermost keyword of WKT as nested lists [keyword, text or list ...]; None if the text is not WKT.
-
-    The text is turned into JSON: Python reads that fast, and reports what is not well formed or nested too deeply.
-    """
-    try:
-        top = json.loads(f'[""{_TOKEN.sub(_to_json, text)}]')
-    except (ValueError, RecursionError):
-        return None
-    return next((item for item in top if isinstance(item, list)), None)
-
-
-def _to_json(token: re.Match) -> str:
-    quoted, word, opens, number, closes = token.groups()
-    if opens:
-        return f',["{word.upper()}"'
-    value = word or number or quoted
-    return "]" if closes else "" if value is None else f",{json.dumps(value)}"
-
-
-def _find(node: list, *words: str) -> list | None:
-    return next((child for child in node if isinstance(child, list) and child[0] in words), None)
 
 
 class CrsWords(NamedTuple):

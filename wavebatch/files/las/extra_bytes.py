@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.header import STANDARD_DTYPES
 
 RECORD_SIZE = 192
@@ -20,6 +21,9 @@ _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _NO_DATA, _MIN, _MAX, _SCALE, _OFFSET = 1, 2, 4, 8, 16
 TEXT_BYTES = 32
 """Length of name and description in a record."""
+
+_LARGEST = 1e30
+"""Larger values are damage and become no data: their squares would overflow in single precision."""
 
 _AT_NAME, _AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_DESCRIPTION = 4, 40, 64, 88, 112, 160
 
@@ -103,6 +107,16 @@ class ExtraRecord:
     def no_data(self) -> np.ndarray | None:
         """Stored value per element that means "no data"; None if the record declares none."""
         return self._numbers(_AT_NO_DATA, _NO_DATA)
+
+    def read(self, stored: np.ndarray) -> np.ndarray:
+        """Return physical values, f8 (n,), of stored values (n,); NaN for no data and for damage."""
+        values, no_data = widen(stored), self.no_data
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self.scaling is not None:
+                values = values * self.scaling[0] + self.scaling[1]
+            if no_data is not None:
+                values[stored == no_data[0]] = np.nan
+            return np.where(np.abs(values) <= _LARGEST, values, np.nan)
 
     @property
     def declared_range(self) -> tuple[np.ndarray, np.ndarray] | None:

@@ -92,7 +92,7 @@ def find_lines(
         return []
     centre = np.array([x.mean(), y.mean()])
     points = np.stack([x, y], axis=1) - centre
-    sheet = _Accumulator(points)
+    image, sheet = _Image(points, weight, pulse, BAND * sigma, gap, shortest), _Accumulator(points)
     sheet.vote(np.arange(len(x)), weight)
     left = np.ones(len(x), bool)
     lines: list[HoughLine] = []
@@ -102,7 +102,7 @@ def find_lines(
         start = sheet.strongest()
         if start is None or len(rows) < 2:
             break
-        found, used = _settle(points, weight, pulse, rows, start, BAND * sigma, gap, shortest)
+        found, used = image.settle(rows, start)
         if found is None:
             failures += 1
         else:
@@ -165,82 +165,70 @@ class _Run:
     rows: np.ndarray
 
 
-def _settle(
-    points: np.ndarray,
-    weight: np.ndarray,
-    pulse: np.ndarray | None,
-    rows: np.ndarray,
-    start: tuple[float, float],
-    band: float,
-    gap: float,
-    shortest: float,
-) -> tuple[_Run | None, np.ndarray]:
-    """The segment near the line `start`, or None, and the pixels to remove."""
-    while True:
-        run, used = _follow(points, weight, rows, start, band, gap, shortest)
-        if run is None or pulse is None:
-            return run, used
-        other = _other_side(points, weight, pulse, run)
-        if other is None:
-            return run, used
-        # Whole pulses: pixels of half a pulse would turn the line.
-        rows = rows[~np.isin(pulse[rows], other)]
-        inside = np.intersect1d(run.rows, rows, assume_unique=True)
-        start = _normal_form(*_fit(points[inside], weight[inside]))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Image:
+    """All pixels (n,), centred, and the limits of a segment."""
 
+    points: np.ndarray
+    weight: np.ndarray
+    pulse: np.ndarray | None
+    band: float
+    gap: float
+    shortest: float
 
-def _other_side(points: np.ndarray, weight: np.ndarray, pulse: np.ndarray, run: _Run) -> np.ndarray | None:
-    """Pulses on the weaker side of a run's bend; None where it has no bend."""
-    apart, light = points[run.rows] - run.middle, weight[run.rows]
-    sums = np.bincount(pulse[run.rows], light)
-    seen = np.flatnonzero(sums)
-    place, off = (
-        np.bincount(pulse[run.rows], light * (apart @ axis))[seen] / sums[seen]
-        for axis in (run.along, _across(run.along))
-    )
-    bend = find_bend(place, off)
-    if bend is None:
-        return None
-    later = place > bend
-    stronger = 2 * sums[seen[later]].sum() > sums.sum()
-    return seen[later != stronger]
+    def settle(self, rows: np.ndarray, start: tuple[float, float]) -> tuple[_Run | None, np.ndarray]:
+        """The segment of `rows` near the line `start`, or None, and the pixels to remove."""
+        while True:
+            run, used = self._follow(rows, start)
+            other = None if run is None or self.pulse is None else self._other_side(run)
+            if other is None:
+                return run, used
+            # Whole pulses: pixels of half a pulse would turn the line.
+            rows = rows[~np.isin(self.pulse[rows], other)]
+            inside = np.intersect1d(run.rows, rows, assume_unique=True)
+            start = _normal_form(*_fit(self.points[inside], self.weight[inside]))
+
+    def _other_side(self, run: _Run) -> np.ndarray | None:
+        """Pulses on the weaker side of a run's bend; None where it has no bend."""
+        apart, light, pulse = self.points[run.rows] - run.middle, self.weight[run.rows], self.pulse[run.rows]
+        sums = np.bincount(pulse, light)
+        seen = np.flatnonzero(sums)
+        axes = (run.along, _across(run.along))
+        place, off = (np.bincount(pulse, light * (apart @ axis))[seen] / sums[seen] for axis in axes)
+        bend = find_bend(place, off)
+        if bend is None:
+            return None
+        later = place > bend
+        stronger = 2 * sums[seen[later]].sum() > sums.sum()
+        return seen[later != stronger]
+
+    def _follow(self, rows: np.ndarray, start: tuple[float, float]) -> tuple[_Run | None, np.ndarray]:
+        """The straight run of `rows` near the line `start`, or None, and the pixels to remove."""
+        angle, rho = start
+        normal = np.array([np.cos(angle), np.sin(angle)])
+        middle, along = rho * normal, _across(normal)
+        first = tried = rows[np.abs((self.points[rows] - middle) @ normal) <= self.band]
+        ends = (0.0, 0.0)
+        for _ in range(ROUNDS):
+            inside = rows[np.abs((self.points[rows] - middle) @ _across(along)) <= self.band]
+            inside, ends = _longest_run(inside, (self.points[inside] - middle) @ along, self.gap)
+            if len(inside) < 2:
+                return None, first
+            tried = inside
+            old = middle
+            middle, along = _fit(self.points[inside], self.weight[inside])
+            shift = float((old - middle) @ along)
+            ends = (ends[0] + shift, ends[1] + shift)
+        spread = _measure_spread(self.points[tried] - middle, self.weight[tried], along)
+        if ends[1] - ends[0] < self.shortest or spread > CROWD * self.band / BAND:
+            return None, np.union1d(first, tried)
+        return _Run(middle, along, ends, tried), tried
 
 
 def _normal_form(middle: np.ndarray, along: np.ndarray) -> tuple[float, float]:
     """Angle [rad] and rho of a line."""
     normal = _across(along)
     return float(np.arctan2(normal[1], normal[0])), float(middle @ normal)
-
-
-def _follow(
-    points: np.ndarray,
-    weight: np.ndarray,
-    rows: np.ndarray,
-    start: tuple[float, float],
-    band: float,
-    gap: float,
-    shortest: float,
-) -> tuple[_Run | None, np.ndarray]:
-    """The straight run of `rows` near the line `start`, or None, and the pixels to remove."""
-    angle, rho = start
-    normal = np.array([np.cos(angle), np.sin(angle)])
-    middle, along = rho * normal, _across(normal)
-    first = tried = rows[np.abs((points[rows] - middle) @ normal) <= band]
-    ends = (0.0, 0.0)
-    for _ in range(ROUNDS):
-        inside = rows[np.abs((points[rows] - middle) @ _across(along)) <= band]
-        inside, ends = _longest_run(inside, (points[inside] - middle) @ along, gap)
-        if len(inside) < 2:
-            return None, first
-        tried = inside
-        old = middle
-        middle, along = _fit(points[inside], weight[inside])
-        shift = float((old - middle) @ along)
-        ends = (ends[0] + shift, ends[1] + shift)
-    spread = _measure_spread(points[tried] - middle, weight[tried], along)
-    if ends[1] - ends[0] < shortest or spread > CROWD * band / BAND:
-        return None, np.union1d(first, tried)
-    return _Run(middle, along, ends, tried), tried
 
 
 def _across(along: np.ndarray) -> np.ndarray:

@@ -29,7 +29,11 @@ SINGLE_PRECISION = 2.0**-23
 amplitudes of 4e9 counts rounding is 200 times a noise of one count."""
 
 
-@stage("decompose", shape=lambda *_: None)
+def _no_pulse(*_: object) -> None:
+    """For an echo of any shape. A function with a name: chains are pickled."""
+
+
+@stage("decompose", shape=_no_pulse)
 def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Echoes of the detector as they are, without a fit and without errors."""
     return flag_echoes(block, noise, system, echoes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -51,16 +51,24 @@ def maximum(
     Wagner et al. (2007), max-detection; smoothing as in docs/algorithms.md 1.1.
     """
     ref = system.sigma_ref / block.spacing
-    samples, broad, taps, gain = samples_of(block, noise), 0.0, None, TWICE_SMOOTHED_GAIN
-    if ref > BROAD:
-        broad, taps = broad_taps(ref)
-        gain = np.sqrt(filter_energy(taps))
-    waveform, time, amplitude, width = find_maxima(samples, threshold * gain, ref, broad, taps)
+    broad, taps, gain = choose_smoothing(ref)
+    waveform, time, amplitude, width = find_maxima(samples_of(block, noise), threshold * gain, ref, broad, taps)
     return make_table(block, waveform, time, amplitude, width)
 
 
-def broad_taps(ref: float) -> tuple[float, np.ndarray]:
-    """Return the Gaussian that smooths waveforms with pulses broader than BROAD.
+class Smoothing(NamedTuple):
+    """How waveforms are smoothed before their maxima are searched."""
+
+    broad: float
+    """Width of the Gaussian [samples]; 0 for two passes of the [1 2 1]/4 filter."""
+    taps: np.ndarray | None
+    """Half of the Gaussian, of unit sum; None without one."""
+    gain: float
+    """Standard deviation of unit white noise after it."""
+
+
+def choose_smoothing(ref: float) -> Smoothing:
+    """Return the smoothing that a system pulse asks for.
 
     Parameters
     ----------
@@ -69,41 +77,15 @@ def broad_taps(ref: float) -> tuple[float, np.ndarray]:
 
     Returns
     -------
-    broad : float
-        Width of the Gaussian [samples].
-    taps : float array, shape (k,)
-        Half of it, of unit sum.
-    """
-    broad = 0.5 * (ref - BROAD) + 1.0
-    taps = gaussian_taps(broad)
-    return broad, taps / (taps[0] + 2 * taps[1:].sum())
-
-
-def smooth_to_pulse(signal: np.ndarray, ref: float) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Smooth waveforms as broadly as the system pulse asks for.
-
-    Parameters
-    ----------
-    signal : float array, shape (s, n)
-        Waveforms above their baselines [count].
-    ref : float
-        Width of the system pulse [samples].
-
-    Returns
-    -------
-    smoothed, even : float array, shape (s, n)
-        Waveforms for the fit of the peak, and those in which maxima are searched.
-    gain : float
-        Standard deviation of unit white noise in `even`.
-    broad : float
-        Width of the Gaussian [samples]; 0 for the short filters.
+    Smoothing
+        A Gaussian for pulses broader than BROAD.
     """
     if ref <= BROAD:
-        smoothed = smooth_121(signal)
-        return smoothed, smooth_121(smoothed), TWICE_SMOOTHED_GAIN, 0.0
-    broad, taps = broad_taps(ref)
-    smoothed = filter_symmetric(signal, taps)
-    return smoothed, smoothed, float(np.sqrt(filter_energy(taps))), broad
+        return Smoothing(0.0, None, TWICE_SMOOTHED_GAIN)
+    broad = 0.5 * (ref - BROAD) + 1.0
+    taps = gaussian_taps(broad)
+    taps = taps / (taps[0] + 2 * taps[1:].sum())
+    return Smoothing(broad, taps, float(np.sqrt(filter_energy(taps))))
 
 
 @stage("detect")

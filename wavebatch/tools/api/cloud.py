@@ -9,6 +9,7 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.files.point_dtypes import STANDARD_DTYPES
 
 
 def read_cloud(path: Path | str, columns: Sequence[str] | None = None) -> np.ndarray:
@@ -71,20 +72,21 @@ class _TableReader(ColumnReader):
     def _name_columns(self) -> dict[str, str]:
         """Name of every column in the table -> its name in the file."""
         known = self.list_columns()
-        extra = [one for one in self._format.extra_dimensions if one.num_elements == 1]
-        ours = {one.name: name for name, one in self._find_ours(extra, COLUMNS).items()}
+        ours = {field: name for name, field in self._find_ours(COLUMNS).items()}
         ours |= {name: f"input_{name}" for name in ours.values() if name in known and name not in ours}
         axes = {axis: axis for axis in "xyz"}
-        standard = {name: name for name in known if name not in axes and name not in {one.name for one in extra}}
-        return axes | standard | {ours.get(one.name, one.name): one.name for one in extra}
+        standard = {name: name for name in known if name not in axes and name not in self.extra}
+        return axes | standard | {ours.get(field, field): field for field in self.extra}
 
     def _choose_dtype(self, stored: str) -> np.dtype:
         if stored in ("x", "y", "z", "scan_angle"):
             return np.dtype(np.float64)
-        dimension = self._format.dimension_by_name(stored)
-        dtype = np.dtype(dimension.dtype if dimension.dtype is not None else np.uint8)  # bit fields have none
-        is_whole = dtype.kind != "f" and dimension.scales is None and dimension.no_data is None
-        return dtype if is_whole or dtype.kind == "f" and dimension.scales is None else np.dtype(np.float64)
+        record = self.extra.get(stored)
+        if record is None:
+            fields = STANDARD_DTYPES[self.point_format].fields
+            return fields[stored][0] if stored in fields else np.dtype(np.uint8)  # a part of a field
+        kept = record.scaling is None and (record.dtype.kind == "f" or record.no_data is None)
+        return record.dtype if kept else np.dtype(np.float64)
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
         rows = np.empty(len(raw), self.dtype)

@@ -108,8 +108,7 @@ def _write_arrays(
     if all(reader.facts.digitizers[index].width <= 2 for index in scan.by_descriptor):
         columns["samples"] = "<u2"
     done, at = 0, 0
-    writer = NpzWriter(target, columns, overwrite=overwrite)
-    try:
+    with NpzWriter(target, columns, overwrite=overwrite) as writer:
         for block in reader.all_blocks(scan, _BLOCK):
             n, s = block.samples.shape
             missing = np.zeros((n, s), bool) if block.missing is None else block.missing
@@ -125,8 +124,6 @@ def _write_arrays(
             progress(n)
         account = _describe(reader, repaired)
         writer.publish({"crs": reader.facts.crs or "", "meta": json.dumps(account, sort_keys=True)})
-    finally:
-        writer.discard()
     return done
 
 

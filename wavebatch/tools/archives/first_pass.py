@@ -79,10 +79,6 @@ class Plan:
     dark: bool
     """No pulse has an intensity."""
 
-    def lengths(self, code: int) -> int:
-        """Samples of a packet of this code, with padding."""
-        return self.digitizers[code].n_samples
-
 
 @dataclass(slots=True)
 class _Found:

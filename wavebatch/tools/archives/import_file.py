@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -201,8 +201,3 @@ def _note(header: PulseHeader, plan: Plan, counts: Counts) -> list[str]:
     if plan.outgoing is None and kinds - {RETURNING}:
         notes.append("its recordings of outgoing pulses show no pulse")
     return notes
-
-
-def describe(summary: ImportSummary) -> dict[str, Any]:
-    """Return the summary for JSON."""
-    return asdict(summary)

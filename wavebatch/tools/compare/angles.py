@@ -13,7 +13,8 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.echo_reader import CloudReader
-from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time
+from wavebatch.files.disk.buckets import count_buckets, spread_times
+from wavebatch.files.disk.spool import Spool
 from wavebatch.tools.compare.differences import SPEED
 from wavebatch.tools.compare.pairing import check_tolerance, pair_echoes
 
@@ -97,11 +98,11 @@ def _pair(widths: CloudReader, normals: CloudReader, reach: float, tally: _Tally
         if not cloud.has_gps_time:
             raise InputError(f"{cloud.path}: has no GPS times to match echoes of two clouds; write both to one cloud")
     number = count_buckets(max(widths.point_count, normals.point_count))
-    with Buckets(ANGLE_DTYPE, number) as first, Buckets(ANGLE_DTYPE, number) as second:
+    with Spool(number, ANGLE_DTYPE) as first, Spool(number, ANGLE_DTYPE) as second:
         for cloud, buckets in ((widths, first), (normals, second)):
             for rows in cloud.read_pieces():
                 finite = np.isfinite(rows["gps_time"]) & np.isfinite(rows["xyz"]).all(axis=1)
-                buckets.add(rows[finite], lambda part: sort_by_time(part["gps_time"], number))
+                buckets.append(spread_times(rows["gps_time"][finite], number), rows[finite])
         for bucket in range(number):
             a, b = first.read(bucket), second.read(bucket)
             pulse = np.unique(np.concatenate([a["gps_time"], b["gps_time"]]), return_inverse=True)[1]

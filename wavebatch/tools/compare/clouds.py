@@ -18,8 +18,9 @@ from wavebatch.core.echoes import PASSED_THROUGH
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_reader import select_points
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
-from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time
+from wavebatch.files.disk.buckets import count_buckets, spread_times
 from wavebatch.files.disk.closing import Closing
+from wavebatch.files.disk.spool import Spool
 from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
 from wavebatch.tools.return_stats.returns import pulses_told_apart
 from wavebatch.tools.simulate.truth import TruthReader
@@ -112,7 +113,7 @@ class CloudTask(Closing):
         self.by_time, self.pairing = by_time, Pairing(tolerance_ns, meta)
         self.number = count_buckets(points)
         dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, PACKET_DTYPE)
-        self.buckets = [Buckets(dtype, self.number) for dtype in dtypes]
+        self.buckets = [Spool(self.number, dtype) for dtype in dtypes]
         self.borders = np.empty(0)
 
     def close(self) -> None:
@@ -128,10 +129,11 @@ class CloudTask(Closing):
 
     def add(self, side: int, rows: np.ndarray) -> None:
         """Adds rows of a (side 0), of b (1) or of the truth's packets (2)."""
-        self.buckets[side].add(rows, self._sort_by_time if self.by_time else self._sort_by_place)
-
-    def _sort_by_time(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return sort_by_time(rows["gps_time"], self.number)
+        if self.by_time:
+            self.buckets[side].append(spread_times(rows["gps_time"], self.number), rows)
+        else:
+            index, bucket = self._sort_by_place(rows)
+            self.buckets[side].append(bucket, rows[index])
 
     def _sort_by_place(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The slab of each point, and the neighbouring slabs that it is close to."""

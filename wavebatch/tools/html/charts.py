@@ -17,8 +17,8 @@ from wavebatch.files.figure_file import has_matplotlib, open_svg, plain_text
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 from wavebatch.tools.html.markup import text
-from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar
-from wavebatch.tools.plots.draw_sheet import HEAD, LEGEND, cell_size, draw_cells
+from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, draw_cells
+from wavebatch.tools.plots.draw_sheet import HEAD, LEGEND, draw_waveforms, sheet_size
 from wavebatch.tools.plots.labels import place_labels
 from wavebatch.tools.plots.raster import Raster
 from wavebatch.tools.plots.waveform import WaveformView
@@ -102,9 +102,9 @@ def draw_pulse(system: SystemPulse, spacing: float, title: str = "System pulse")
 def draw_sheet(views: Sequence[WaveformView], title: str, notes: Sequence[str] = ()) -> str:
     """Small pictures of waveforms; notes: a word on each."""
     columns = min(SHEET_COLUMNS, len(views)) or 1
-    wide, high = cell_size(len(views), columns)
+    wide, high = sheet_size(len(views), columns)
     size = (wide, high - HEAD)
-    return picture(title, size, lambda figure: draw_cells(figure, views, columns, notes=notes, head=0.0), LEGEND)
+    return picture(title, size, lambda figure: draw_waveforms(figure, views, columns, notes=notes, head=0.0), LEGEND)
 
 
 def draw_histogram(edges: np.ndarray, counts: np.ndarray, *, title: str, label: str, log: bool = False,
@@ -176,10 +176,7 @@ def draw_map(found: Raster, note: str = "") -> str:
     def draw(figure: Figure) -> None:
         axes = figure.add_axes((0.95 / size[0], 0.55 / size[1], across / size[0], up / size[1]))
         axes.set_title(f"{found.statistic} of {found.facts.name}", fontsize=9.5)
-        axes.grid(visible=False)
-        axes.set_facecolor("#f2f2f2")
-        shown = axes.imshow(found.values.astype(np.float32), extent=(0, east - west, 0, north - south), origin="lower",
-                            cmap="viridis", interpolation="nearest", aspect="equal")  # fmt: skip
+        shown = draw_cells(axes, found, (0, east - west, 0, north - south))
         place = figure.add_axes(((1.1 + across) / size[0], 0.55 / size[1], 0.12 / size[0], up / size[1]))
         label = found.label if found.statistic == "density" else f"{found.facts.name} [{found.facts.unit}]"
         add_colorbar(axes, shown, found.values, found.shown, label, length=up, flat=False, place=place)

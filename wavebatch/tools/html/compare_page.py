@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,11 @@ from wavebatch.tools.compare.pairing import Comparison
 from wavebatch.tools.html import markup
 from wavebatch.tools.html.charts import draw_counts, draw_histogram, figures
 from wavebatch.tools.html.page import write_page
+
+_SPREAD = ("number", "median", "mean", "rms", "nmad")
+"""What the tables show of a difference."""
+
+_spread = attrgetter(*_SPREAD)
 
 
 def write_compare_page(
@@ -36,21 +42,20 @@ def write_compare_page(
 
 def _echo_parts(result: Comparison | Matchup, one: Any, broken: Sequence[str]) -> Iterator[str]:
     yield markup.section("Summary", markup.bullets(broken, "warning"), _summarise(one))
-    yield markup.section("Sums", markup.table(["sum", "number", "is", "check"], _sums(one)))
+    yield markup.section("Sums", _sums(one))
     if one.pulses:
         charts = [draw_counts(_named(counts), title=f"Echoes per pulse, {side}", label="echoes")
                   for side, counts in (("A", one.counts_a), ("B", one.counts_b))]  # fmt: skip
         yield markup.section("Echoes per pulse", figures(charts))
-    rows = [[name, spread.number, spread.median, spread.mean, spread.rms, spread.nmad]
-            for name, spread in one.differences.items()]  # fmt: skip
-    head = ["A - B", "number", "median", "mean", "rms", "nmad"]
+    rows = [[name, *_spread(spread)] for name, spread in one.differences.items()]
+    head = ["A - B", *_SPREAD]
     yield markup.section("Differences", markup.paragraph("Times and widths in ns, amplitudes in DN."),
                          markup.table(head, rows))  # fmt: skip
-    rows = [[kind, group, quantity, spread.number, spread.median, spread.mean, spread.rms, spread.nmad]
+    rows = [[kind, group, quantity, *_spread(spread)]
             for kind, groups in one.differences_by.items() if len(groups) > 1
             for group, quantities in groups.items() for quantity, spread in quantities.items()]  # fmt: skip
     if rows:
-        head = ["by", "group", "A - B", "number", "median", "mean", "rms", "nmad"]
+        head = ["by", "group", *head]
         yield markup.section("Differences by class and number of echoes", markup.table(head, rows, sortable=True))
     yield _breakdown("Missed echoes of B", one.missed_by)
     yield _breakdown("Extra echoes of A", one.extra_by)
@@ -75,12 +80,12 @@ def _summarise(one: Comparison) -> str:
     ])  # fmt: skip
 
 
-def _sums(one: Comparison) -> Iterable[list[Any]]:
-    for title, whole, rest, name in (("echoes of A", one.echoes_a, one.extra, "extra"),
-                                     ("echoes of B", one.echoes_b, one.missed, "missed")):  # fmt: skip
-        fine = one.matched + rest == whole
-        check = "adds up" if fine else markup.Cell('<span class="mark">does not add up</span>')
-        yield [title, whole, f"{one.matched:,} identical + {rest:,} {name}", check]
+def _sums(one: Comparison) -> str:
+    return markup.sums(
+        (title, whole, f"{one.matched:,} identical + {rest:,} {name}", one.matched + rest == whole)
+        for title, whole, rest, name in (("echoes of A", one.echoes_a, one.extra, "extra"),
+                                         ("echoes of B", one.echoes_b, one.missed, "missed"))
+    )  # fmt: skip
 
 
 def _named(counts: Mapping[int, int]) -> dict[str, int]:

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
+
+from wavebatch.core.errors import ConfigError, InputError, StageError
 
 NO_VALUE = "\u2013"
 """Shown where there is no value."""
@@ -108,6 +110,21 @@ def table(
     kind = ' class="sortable"' if sortable else ""
     whole = f"{title}<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody>"
     return f'<div class="scroll{" tall" if tall else ""}"><table{kind}>{whole}</table></div>'
+
+
+def sums(rows: Iterable[tuple[str, int, str, bool]], caption: str = "") -> str:
+    """A table of sums: name, number, its parts in words, and whether they add up to it; one that does not is marked."""
+    marks = {True: "adds up", False: Cell('<span class="mark">does not add up</span>')}
+    lines = [[*row, marks[fine]] for *row, fine in rows]
+    return table(["sum", "number", "is", "check"], lines, caption=caption)
+
+
+def or_reason(draw: Callable[[], str], what: str) -> str:
+    """What is drawn of a file, or a paragraph that says why it cannot be."""
+    try:
+        return draw()
+    except (InputError, ConfigError, StageError, OSError) as error:
+        return paragraph(f"{what} cannot be drawn: {error}", "warning")
 
 
 def _head(name: str, sortable: bool) -> str:

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from wavebatch.batch.counts import COUNTS, LEFT_OUT, list_sums
 from wavebatch.core.echoes import FLAG_MEANINGS, EchoFlag
-from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.html import markup
 from wavebatch.tools.html.charts import figures, figures_of
 from wavebatch.tools.html.cloud_pictures import picture_cloud
-from wavebatch.tools.html.strip_views import draw_views, read_views
+from wavebatch.tools.html.strip_views import draw_waveforms
 from wavebatch.tools.html.survey_part import draw_survey, list_decisions, read_survey
 
 PICTURED = ("amplitude", "echo_width", "range_err", "range", "reflectance", "cross_section", "incidence_angle")
@@ -39,8 +39,8 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
         markup.section("Decisions", markup.paragraph(f"Chain: {choice['chain']}, chosen by: {choice['by']}."),
                        list_decisions(choice["decisions"]), level=3),
         markup.section("Echoes", figures(figures_of(report["quality"])), level=3),
-        _draw_waveforms(strip, report, read.system),
-        _draw_cloud(cloud),
+        markup.or_reason(partial(_draw_waveforms, strip, report, read.system), "waveforms"),
+        markup.or_reason(partial(_draw_cloud, cloud), "maps"),
         markup.section("Flags", flag_table(report["counts"]), level=3),
         markup.section("Columns and no-data", _list_columns(report), level=3),
         markup.section("Provenance", *_list_provenance(strip, report), level=3),
@@ -66,12 +66,9 @@ def count_tables(counts: Mapping[str, Any], points: str) -> str:
 
 def draw_sums(counts: Mapping[str, Any], points: str) -> str:
     """The sums that the counts must give, with their numbers; one that does not hold is marked."""
-    rows = []
-    for name, parts in list_sums(counts, points).items():
-        fine = sum(parts.values()) == counts[name]
-        check = "adds up" if fine else markup.Cell('<span class="mark">does not add up</span>')
-        rows.append([name, counts[name], _write_sum(parts), check])
-    return markup.table(["sum", "number", "is", "check"], rows, caption="Sums that must hold")
+    rows = [(name, counts[name], _write_sum(parts), sum(parts.values()) == counts[name])
+            for name, parts in list_sums(counts, points).items()]  # fmt: skip
+    return markup.sums(rows, "Sums that must hold")
 
 
 def _write_sum(parts: Mapping[str, int]) -> str:
@@ -91,22 +88,15 @@ def flag_table(counts: Mapping[str, Any]) -> str:
 
 
 def _draw_waveforms(strip: Path, report: Mapping[str, Any], system: Any) -> str:
-    options = report["options"]
-    try:
-        chain = parse_chain(report["chain"], report["choice"]["chain"])
-        views = read_views(strip, chain, system, direction=options["direction"], headerless=options["headerless"])
-    except (InputError, ConfigError, StageError, OSError) as error:
-        return markup.section("Waveforms", markup.paragraph(f"cannot be drawn: {error}", "warning"), level=3)
-    return draw_views(views, report["choice"]["chain"])
+    options, name = report["options"], report["choice"]["chain"]
+    reading = {"direction": options["direction"], "headerless": options["headerless"]}
+    return draw_waveforms(strip, parse_chain(report["chain"], name), system, name, **reading)
 
 
 def _draw_cloud(cloud: Path) -> str:
-    try:
-        histograms, maps = picture_cloud(cloud, PICTURED)
-    except (InputError, ConfigError, OSError) as error:
-        return markup.section("Maps", markup.paragraph(f"cannot be drawn: {error}", "warning"), level=3)
-    parts = [markup.section("Columns of the cloud", figures(histograms), level=3)] if histograms else []
-    return "\n".join([*parts, markup.section("Maps", figures(maps), level=3) if maps else ""])
+    histograms, maps = picture_cloud(cloud, PICTURED)
+    parts = (("Columns of the cloud", histograms), ("Maps", maps))
+    return "\n".join(markup.section(name, figures(drawn), level=3) for name, drawn in parts if drawn)
 
 
 def _list_columns(report: Mapping[str, Any]) -> str:

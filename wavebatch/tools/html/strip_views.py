@@ -95,12 +95,16 @@ def measure_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -
     return np.sqrt(square.sum(axis=1) / np.maximum(number, 1))
 
 
-def draw_views(views: Views, chain: str, level: int = 3) -> str:
-    """The sheet of random waveforms and the worst fits, as sections of a page."""
+def draw_waveforms(path: Path, chain: Chain, system: SystemPulse, name: str, **reading: Any) -> str:
+    """The sheet of random waveforms and the worst fits, as sections of a page; name: of the chain.
+
+    reading, errors: as for `read_views`.
+    """
+    views, level = read_views(path, chain, system, **reading), 3
     whole = f"all {views.searched:,} waveforms"
     part = f"{views.searched:,} waveforms that are spread over the strip ({views.total:,} in all)"
     head = (
-        f"Drawn at random from {whole if views.searched >= views.total else part}. Chain: {chain}. `wavebatch plot "
+        f"Drawn at random from {whole if views.searched >= views.total else part}. Chain: {name}. `wavebatch plot "
         "waveform STRIP --point N -o FILE.png` draws one of them large."
     )
     sheet = figures([draw_sheet(views.random, "Random waveforms")], "sheet")

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.tools.html import markup
 from wavebatch.tools.html.page import write_page
-from wavebatch.tools.html.strip_views import draw_views, read_views
+from wavebatch.tools.html.strip_views import draw_waveforms
 from wavebatch.tools.html.survey_part import draw_survey, list_decisions
 
 MOST_DRAWN = 6
@@ -45,19 +45,13 @@ def _parts(
     yield markup.section("Decisions", list_decisions(document["decisions"]), mark="decisions")
     chain = choose_chain(survey)
     for strip in strips[:MOST_DRAWN]:
-        yield markup.section(strip.name, _draw(strip, chain, survey, reading))
+        draw = partial(draw_waveforms, strip, chain, survey.system, chain.name, **reading)
+        yield markup.section(strip.name, markup.or_reason(draw, "waveforms"))
     if len(strips) > MOST_DRAWN:
         yield markup.paragraph(f"Waveforms of the first {MOST_DRAWN} of {len(strips)} strips are drawn.", "soft")
     provenance = {"wavebatch": document["version"], **{f"strip {n + 1}": path for n, path in enumerate(strips)}}
     yield markup.section("Provenance", markup.facts(provenance), markup.section(
         "Chain that the strip needs", markup.code(document["chain"]), level=3))  # fmt: skip
-
-
-def _draw(strip: Path, chain: Any, survey: Survey, reading: Mapping[str, Any]) -> str:
-    try:
-        return draw_views(read_views(strip, chain, survey.system, **reading), chain.name)
-    except (InputError, ConfigError, StageError, OSError) as error:
-        return markup.paragraph(f"waveforms cannot be drawn: {error}", "warning")
 
 
 def _list_strips(document: Mapping[str, Any]) -> str:

@@ -7,6 +7,7 @@ are read once, in bounded memory, because headers are often wrong.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,6 @@ from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
 from wavebatch.files.las.point_formats import WITHOUT_WAVES, locate, read_angles, read_classes, split_numbers
 from wavebatch.surveying.inspect_strip import describe_strip
-from wavebatch.tools.inspect.provenance import describe_provenance
 
 _GPS_EPOCH = datetime(1980, 1, 6)
 _ADJUSTED = 1e9
@@ -48,7 +48,7 @@ def describe_file(path: Path, *, direction: str = "auto", headerless: bool = Fal
         facts |= _describe_waveforms(path, direction, headerless)
     facts |= _describe_header(path, checked)
     runs = read_provenance(header)
-    facts["provenance"] = [describe_provenance(run) for run in runs]
+    facts["provenance"] = [_describe_provenance(run) for run in runs]
     try:
         facts |= _describe_points(path, header, bool(runs))
     except InputError as error:
@@ -92,6 +92,25 @@ def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
         "extra_dimensions": [record.name for record in checked.records],
         "extra_bytes": [_describe_extra(record) for record in checked.records],
     }  # fmt: skip
+
+
+def _describe_provenance(run: Mapping[str, Any]) -> dict[str, Any]:
+    """What made a cloud: version, command, chain, input; what it does not hold is None.
+
+    The provenance may come from any program, so nothing in it is certain.
+    """
+    return {
+        "version": run.get("wavebatch"),
+        "command": str(run.get("command") or "wavebatch run"),
+        "input": _table(run.get("input")).get("file"),
+        "chain": run.get("chain"),
+        "chosen_by": _table(run.get("choice")).get("by"),
+        "columns": _table(run.get("columns")),
+    }
+
+
+def _table(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
 
 
 def _describe_extra(record: ExtraRecord) -> dict[str, Any]:

@@ -7,7 +7,7 @@ files are those of `files.figure_file`; the same data give the same bytes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,13 +16,12 @@ import numpy as np
 
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.plots.histogram import PERCENTILES, FlagCounts, Histogram
-from wavebatch.tools.plots.labels import fit_parts, fit_text
+from wavebatch.tools.plots.labels import fit_text, set_head, space_ticks
 from wavebatch.tools.plots.raster import Raster
 from wavebatch.tools.plots.values import Tally
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a8a8a")
 """Colours of Okabe and Ito, which colour-blind readers can distinguish; more than eight series repeat them."""
@@ -74,21 +73,22 @@ def _draw_histogram(axes: Axes, found: Histogram, *, log: bool, counts: bool) ->
     figure = axes.figure
     for series in range(len(found.counts)):
         _draw_series(axes, found, series, counts)
-    text = _count_text if counts else _share_text
+    whole = counts and not log
+    text = _count_text if counts else "{:g}".format
     if log:
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(lambda value, _: text(value))
     else:
-        whole = counts
-        axes.yaxis.set_major_formatter(lambda value, _: text(value) if not whole or value == round(value) else "")
         axes.set_ylim(bottom=0)
+    axes.yaxis.set_major_formatter(lambda value, _: text(value) if not whole or value == round(value) else "")
     axes.ticklabel_format(axis="x", useOffset=False)
     axes.set_xlim(found.edges[0], found.edges[-1])
     axes.set_xlabel(fit_text(figure, plain_text(found.facts.label, 300), 7.0, size=9.5))
     width = f"{found.edges[1] - found.edges[0]:.4g}{_unit_text(found)}"
     axes.set_ylabel(f"{'values' if counts else 'share of the series'} per bin of {width} [{'-' if counts else '%'}]")
-    outside = {"below the picture": int(found.below.sum()), "above the picture": int(found.above.sum())}
-    axes.set_title(fit_text(figure, _title(found.clouds, found.total, found.facts.name, outside), 7.1, size=10.5))
+    rest = found.total.list_rest(int(found.below.sum()), "below the picture")
+    above = int(found.above.sum())
+    rest += [f"{above:,} above the picture"] * bool(above)
+    axes.set_title(fit_text(figure, _title(found.clouds, found.total, found.facts.name, rest), 7.1, size=10.5))
     # Below the axes, where it covers no line.
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), borderaxespad=0.0, fontsize=8.0)
 
@@ -128,9 +128,9 @@ def _value_text(value: float, edges: np.ndarray) -> str:
 
 
 def draw_flags(
-    found: FlagCounts, target: Path, *, names: tuple[str, ...], log: bool = False, overwrite: bool = False
+    found: FlagCounts, target: Path, *, log: bool = False, overwrite: bool = False
 ) -> None:
-    """Writes a picture of the points per flag; names: of the clouds; log: logarithmic axis of counts."""
+    """Writes a picture of the points per flag; log: logarithmic axis of counts."""
     with open_picture(target, (8.0, 5.2), overwrite=overwrite) as figure:
         axes = figure.subplots()
         flags, counts = ["no flag", *found.names], np.array([found.clean, *found.counts.tolist()])
@@ -148,14 +148,14 @@ def draw_flags(
         axes.set_xlim(0, max(int(counts.max(initial=1)), 1) * (10.0 if log else 1.25))
         axes.xaxis.set_major_formatter(lambda value, _: _count_text(value))
         axes.set_xlabel("points [-]")
-        name = name_clouds(names)
+        name = name_clouds(found.clouds)
         title = f"{name}   {plain_text(found.facts.name, 40)}\n"
         title += f"{found.total.values:,} points; a point may have several flags"
         axes.set_title(fit_text(figure, title, 6.0, size=10.5))
 
 
-def draw_map(found: Raster, target: Path, *, names: tuple[str, ...], overwrite: bool = False) -> None:
-    """Writes a picture of a map; names: of the clouds. Raises as figure_file.open_picture does."""
+def draw_map(found: Raster, target: Path, *, overwrite: bool = False) -> None:
+    """Writes a picture of a map. Raises as figure_file.open_picture does."""
     grid = found.grid
     ratio = grid.rows / grid.columns
     width, height = _LONG / max(ratio, 1.0), _LONG * min(ratio, 1.0)
@@ -168,25 +168,24 @@ def draw_map(found: Raster, target: Path, *, names: tuple[str, ...], overwrite: 
         if not narrow:
             # Axes with equal scales do not fill their places; this layout brings the colour bar next to them.
             figure.set_layout_engine("compressed")
-        figure.suptitle(_map_title(figure, found, names, size[0] - 0.2), x=0.01, ha="left", fontsize=10.5)
+        rest = found.total.list_rest(found.outside, "outside the map")
+        parts = _title(found.names, found.total, found.facts.name, rest).replace("\n", "   ").split("   ")
+        parts.append(f"{found.statistic} in cells of {grid.size:g} {found.crs.unit}")
+        set_head(figure, [*parts, f"CRS: {plain_text(found.crs.name, 90) or 'not given'}"], size=10.5)
         axes, place = figure.subplots(1, 2, width_ratios=(1, 0.05)) if narrow else (figure.subplots(), None)
-        axes.grid(visible=False)
         axes.set_anchor("E" if narrow else "C")
-        axes.set_facecolor("#f2f2f2")
-        shown = axes.imshow(
-            found.values.astype(np.float32), extent=grid.extent, origin="lower", cmap="viridis",
-            interpolation="nearest", interpolation_stage="data", aspect="equal",
-        )  # fmt: skip
+        shown = draw_cells(axes, found, grid.extent)
         length = width if flat else height
         add_colorbar(axes, shown, found.values, found.shown, found.label, length=length, flat=flat, place=place)
         _place_ticks(axes, width, height, found.crs.unit)
 
 
-def _map_title(figure: Figure, found: Raster, names: tuple[str, ...], inches: float) -> str:
-    where = f"{found.statistic} in cells of {found.grid.size:g} {found.crs.unit}"
-    title = _title(names, found.total, found.facts.name, {"outside the map": found.outside})
-    parts = [part for line in (*title.split("\n"), where) for part in line.split("   ")]
-    return fit_parts(figure, [*parts, f"CRS: {plain_text(found.crs.name, 90) or 'not given'}"], inches, size=10.5)
+def draw_cells(axes: Axes, found: Raster, extent: tuple[float, float, float, float]) -> Any:
+    """Draws the cells of a map with equal scales and gives the image; cells without a value are grey."""
+    axes.grid(visible=False)
+    axes.set_facecolor("#f2f2f2")
+    return axes.imshow(found.values.astype(np.float32), extent=extent, origin="lower", cmap="viridis",
+                       interpolation="nearest", interpolation_stage="data", aspect="equal")  # fmt: skip
 
 
 def add_colorbar(
@@ -213,23 +212,17 @@ def add_colorbar(
 def _place_ticks(axes: Axes, width: float, height: float, unit: str) -> None:
     """Places as many coordinates on the axes as fit; width, height: of the map [inches]."""
     narrow = width < 2.0
-    for axis, length, each in ((axes.xaxis, width, 0.4 if narrow else 1.2), (axes.yaxis, height, 0.5)):
-        if length < 0.4:
-            axis.set_ticks([axis.get_view_interval()[0]])
-        else:
-            axis.get_major_locator().set_params(nbins=int(np.clip(length / each, 1, 8)))
-        axis.set_major_formatter(lambda value, _: f"{value:.10g}")
+    space_ticks(axes.xaxis, width, 0.4 if narrow else 1.2)
+    space_ticks(axes.yaxis, height, 0.5)
     if narrow:
         axes.tick_params(axis="x", labelrotation=90)
     axes.set_xlabel(f"x [{unit}]")
     axes.set_ylabel(f"y [{unit}]")
 
 
-def _title(names: tuple[str, ...], total: Tally, column: str, outside: Mapping[str, int]) -> str:
+def _title(names: tuple[str, ...], total: Tally, column: str, rest: Sequence[str]) -> str:
     """Title: clouds, column, number of values, and points that are not shown, with the reason."""
-    rest = {"without data": total.no_data, "left out": total.left_out, **outside}
-    parts = [f"{total.values:,} values", *(f"{number:,} {text}" for text, number in rest.items() if number)]
-    return f"{name_clouds(names)}   {plain_text(column, 60)}\n{', '.join(parts)}"
+    return f"{name_clouds(names)}   {plain_text(column, 60)}\n{', '.join([f'{total.values:,} values', *rest])}"
 
 
 def name_clouds(names: tuple[str, ...]) -> str:
@@ -238,7 +231,3 @@ def name_clouds(names: tuple[str, ...]) -> str:
 
 def _count_text(value: float) -> str:
     return f"{value:,.0f}" if value >= 1 or value == 0 else f"{value:g}"
-
-
-def _share_text(value: float) -> str:
-    return f"{value:g}"

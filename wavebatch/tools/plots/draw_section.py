@@ -13,8 +13,9 @@ import numpy as np
 
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
-from wavebatch.tools.plots.labels import fit_parts, fit_text, space_ticks
+from wavebatch.tools.plots.labels import fit_text, set_head, space_ticks
 from wavebatch.tools.plots.section_data import Profile, Section
+from wavebatch.tools.rasters.cells import compute_cells
 
 LIGHT, FAINT = ("energy", "cross_section"), 0.02
 """Columns of voxels of which less than this share of the scale is not drawn: deconvolution leaves tails of a few per
@@ -58,8 +59,7 @@ def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite
         add_colorbar(axes, shown, values, found.shown, label, length=length, flat=flat, place=place)
         if not flat:
             space_ticks(axes.xaxis, width, 0.4)
-        title = fit_parts(figure, _parts(found, aspect), figure.get_figwidth() - 0.2, size=10.0)
-        figure.suptitle(title, x=0.01, ha="left", fontsize=10.0)
+        set_head(figure, _parts(found, aspect))
 
 
 def _parts(found: Section, aspect: float) -> list[str]:
@@ -70,9 +70,7 @@ def _parts(found: Section, aspect: float) -> list[str]:
         name_clouds(found.names), found.facts.name, f"{found.inside:,} of {found.total.values:,} {kind}{drawn}",
         f"from {x0} {y0} to {x1} {y1}", f"{found.width:.4g} {found.crs.unit} wide",
     ]  # fmt: skip
-    parts += [f"{found.total.no_data:,} without data"] if found.total.no_data else []
-    parts += [f"{found.total.left_out:,} left out"] if found.total.left_out else []
-    parts += [f"{found.outside:,} outside"] if found.outside else []
+    parts += found.total.list_rest(found.outside)
     parts += [f"below {100 * FAINT:g} % of the scale: empty"] * (found.voxel > 0 and found.facts.name in LIGHT)
     parts.append("equal scales" if aspect == 1.0 else f"heights {aspect:g} times exaggerated")
     return [*parts, f"CRS: {plain_text(found.crs.name, 90) or 'not given'}"]
@@ -97,11 +95,9 @@ def _draw_voxels(axes, found: Section):
     row = np.floor((found.height - base) / edge + 1e-6).astype(np.int64)
     shape = (int(row.max()) + 1, int(column.max()) + 1)
     cell = row * shape[1] + column
-    number = np.bincount(cell, minlength=shape[0] * shape[1])
-    with np.errstate(invalid="ignore"):
-        image = (np.bincount(cell, found.value, shape[0] * shape[1]) / number).reshape(shape)
-        if found.facts.name in LIGHT:
-            image[image < FAINT * found.shown[1]] = np.nan
+    image = compute_cells("mean", cell, found.value, shape[0] * shape[1], 1.0).reshape(shape)
+    if found.facts.name in LIGHT:
+        image[image < FAINT * found.shown[1]] = np.nan
     extent = (0.0, shape[1] * edge, base, base + shape[0] * edge)
     axes.grid(visible=False)
     shown = axes.imshow(image, extent=extent, origin="lower", cmap="viridis", interpolation="nearest", aspect="auto")
@@ -125,22 +121,19 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
                         baseline=base)  # fmt: skip
         if log:
             axes.set_xscale("log")
-            # Labels as powers of ten need math text, which file names forbid: a $ in one would break the picture.
-            axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
             axes.xaxis.set_minor_formatter("")
-        elif np.nanmin(found.values) >= 0 and found.statistic != "mean":
-            axes.set_xlim(left=0)
-        axes.set_ylim(found.edges[0], found.edges[-1])
-        if not log:
-            axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
+        else:
             axes.xaxis.get_major_locator().set_params(nbins=6)
+            if np.nanmin(found.values) >= 0 and found.statistic != "mean":
+                axes.set_xlim(left=0)
+        # Labels as powers of ten need math text, which file names forbid: a $ in one would break the picture.
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
+        axes.set_ylim(found.edges[0], found.edges[-1])
         axes.ticklabel_format(axis="y", useOffset=False, style="plain")
         axes.set_xlabel(fit_text(figure, plain_text(found.label, 300), 5.0, size=9.5))
         axes.set_ylabel(f"{found.upright} [{found.unit}]")
         parts = [name_clouds(found.names), f"{found.total.values:,} {found.noun}"]
         parts[1:1] = [found.facts.name] if found.facts.name != found.noun else []
-        rest = {"without data": found.total.no_data, "left out": found.total.left_out, "outside": found.outside}
-        parts += [f"{number:,} {text}" for text, number in rest.items() if number]
-        figure.suptitle(fit_parts(figure, parts, 5.8, size=10.0), x=0.01, ha="left", fontsize=10.0)
+        set_head(figure, [*parts, *found.total.list_rest(found.outside)])
         if len(found.names) > 1:
             axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), borderaxespad=0.0)

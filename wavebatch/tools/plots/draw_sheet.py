@@ -11,7 +11,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.tools.plots.draw_waveform import CLIPPED, ECHO, FIT, GREY, INK, PULSE, VENDOR, shade_gaps
+from wavebatch.tools.plots.draw_waveform import ECHO, FIT, GREY, draw_samples, find_peaks, fit_height
 from wavebatch.tools.plots.labels import fit_parts, fit_text
 from wavebatch.tools.plots.waveform import WaveformView
 
@@ -55,11 +55,11 @@ def draw_sheet(
     in all [ns]; None: each is cut to its echoes and returns. Raises as figure_file.open_picture does.
     """
     columns = math.ceil(math.sqrt(len(views)))
-    size = cell_size(len(views), columns)
+    size = sheet_size(len(views), columns)
     with open_picture(target, size, overwrite=overwrite) as figure:
         # A layout for 200 axes takes a minute; a grid needs none.
         figure.set_layout_engine("none")
-        draw_cells(figure, views, columns, times)
+        draw_waveforms(figure, views, columns, times)
         parts = (plain_text(strip), plain_text(chain, 200), f"{len(views)} waveforms")
         title = fit_text(figure, "   ".join(parts), size[0] - 0.2, size=10, weight="bold")
         figure.text(0.1 / size[0], 1 - 0.1 / size[1], title, va="top", fontsize=10, weight="bold")
@@ -67,12 +67,12 @@ def draw_sheet(
         figure.text(0.1 / size[0], 0.06 / size[1], legend, va="bottom", fontsize=7, color=GREY)
 
 
-def cell_size(number: int, columns: int) -> tuple[float, float]:
+def sheet_size(number: int, columns: int) -> tuple[float, float]:
     """Size of a sheet of so many pictures [inch]."""
     return CELL[0] * columns, CELL[1] * -(-number // columns) + HEAD + FOOT
 
 
-def draw_cells(
+def draw_waveforms(
     figure: Figure, views: Sequence[WaveformView], columns: int, times: tuple[float, float] | None = None,
     notes: Sequence[str] = (), head: float = HEAD,
 ) -> None:  # fmt: skip
@@ -93,10 +93,13 @@ def _draw_cell(
     left, bottom, width, height = place
     upper = figure.add_axes((left, bottom + SHARE * height, width, (1 - SHARE) * height))
     lower = figure.add_axes((left, bottom, width, (SHARE - 0.03) * height), sharex=upper)
-    low, high = times or view.span
-    _draw_signal(upper, view, low, high)
+    times = times or view.span
+    draw_samples(upper, view, times, dot=1.2, thin=0.55)
+    upper.plot(view.echoes.time, find_peaks(view), "D", color=ECHO, markersize=3, markerfacecolor="none",
+               markeredgewidth=0.7)  # fmt: skip
+    fit_height(upper, view, times)
     _draw_residual(lower, view)
-    upper.set_xlim(low, high)
+    upper.set_xlim(times)
     for axes in (upper, lower):
         axes.tick_params(labelsize=5.5, length=2, pad=1)
         axes.grid(False)
@@ -105,28 +108,6 @@ def _draw_cell(
     lower.set_yticks([])
     title = fit_text(figure, _title(view, note), CELL[0] - 0.45, size=6.5)
     upper.set_title(title, fontsize=6.5, pad=2)
-
-
-def _draw_signal(axes: Axes, view: WaveformView, low: float, high: float) -> None:
-    axes.axhline(view.baseline, color=GREY, linewidth=0.5)
-    shade_gaps(axes, view)
-    for place in view.returns:
-        axes.axvline(place, color=VENDOR, linewidth=0.6, linestyle=(0, (4, 2)))
-    near = (view.fine >= low) & (view.fine <= high)
-    for curve in view.curves:
-        axes.plot(view.fine[near], (view.fine_level + curve)[near], color=PULSE, linewidth=0.6)
-    if view.fit is not None:
-        axes.plot(view.fine[near], view.fit[near], color=FIT, linewidth=0.8)
-    inside = (view.time >= low) & (view.time <= high)
-    free, full = inside & ~view.clipped, inside & view.clipped
-    axes.plot(view.time[free], view.samples[free], "o", color=INK, markersize=1.2, zorder=3)
-    axes.plot(view.time[full], view.samples[full], "^", color=CLIPPED, markersize=2.5, zorder=3)
-    peak = np.interp(view.echoes.time, view.time, view.level) + view.echoes.amplitude.astype(np.float64)
-    axes.plot(view.echoes.time, peak, "D", color=ECHO, markersize=3, markerfacecolor="none", markeredgewidth=0.7)
-    shown = view.samples[inside & np.isfinite(view.samples)]
-    bottom, top = min(shown.min(initial=view.baseline), view.baseline), max(shown.max(initial=0), peak.max(initial=0))
-    span = max(top - bottom, 6 * view.std)
-    axes.set_ylim(bottom - 0.06 * span, bottom + 1.1 * span)
 
 
 def _draw_residual(axes: Axes, view: WaveformView) -> None:

@@ -19,7 +19,7 @@ from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.kernels.signal.runs import find_stretches
 from wavebatch.tools.plots.detector_signals import DetectorSignal
 from wavebatch.tools.plots.echo_table import list_echoes
-from wavebatch.tools.plots.labels import fit_parts, fit_text, place_labels
+from wavebatch.tools.plots.labels import fit_parts, fit_text, place_labels, set_head
 from wavebatch.tools.plots.waveform import WaveformView
 
 if TYPE_CHECKING:
@@ -38,6 +38,11 @@ _LEAST_SCALE = 5.0
 _ERROR_ROOM = 0.5
 """Error bars may widen the signal panel by this share of the signal on each side; longer ones are cut."""
 _DASHED = (0, (4, 2))
+_LEGEND = (
+    "samples", "baseline \N{PLUS-MINUS SIGN} noise", "fit", "one echo", "echoes", "returns of the file", "not recorded",
+    "saturated samples", "detector's threshold", "found by the detector",
+)  # fmt: skip
+"""Labels of the artists, in the order of the legend."""
 _LETTER = 0.085
 """Width of a letter of a title [inches]."""
 
@@ -72,8 +77,7 @@ def draw_waveforms(
     flags = max(sum(len(part) + 3 for part in _list_flags(view)) for view in views)
     height += 0.16 * rows * int(_LETTER * flags / room)
     with open_picture(target, (width, height + below), overwrite=overwrite) as figure:
-        title = fit_parts(figure, (plain_text(strip), plain_text(chain, 300)), width - 0.2, size=11, weight="bold")
-        figure.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
+        set_head(figure, (plain_text(strip), plain_text(chain, 300)), size=11, weight="bold")
         outer = figure.add_gridspec(2, 1, height_ratios=(height - 0.9, below)) if text else figure.add_gridspec(1, 1)
         inner = outer[0].subgridspec(rows, columns)
         panels = []
@@ -87,7 +91,7 @@ def draw_waveforms(
             axes.set_axis_off()
             note = axes.text(0.0, 1.0, text, va="top", family="monospace", fontsize=8, linespacing=1.3)
             note.set_in_layout(False)
-        _place_legend(figure, views, width)
+        _place_legend(figure, width)
         # The panels must have their final size before labels can be placed.
         figure.draw_without_rendering()
         for axes, view in zip(panels, views, strict=True):
@@ -146,26 +150,35 @@ def _list_flags(view: WaveformView) -> list[str]:
 
 def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, small: bool) -> None:
     axes.tick_params(labelbottom=False)
-    axes.axhspan(view.baseline - view.std, view.baseline + view.std, color="#e6e6e6", zorder=0)
-    axes.axhline(view.baseline, color=GREY, linewidth=0.8, zorder=1)
-    shade_gaps(axes, view)
+    axes.axhspan(view.baseline - view.std, view.baseline + view.std, color="#e6e6e6", zorder=0, label=_LEGEND[1])
     level = view.fine_level
     for curve in view.curves:
         axes.fill_between(view.fine, level, level + curve, color=PULSE, alpha=0.15, linewidth=0)
-        axes.plot(view.fine, level + curve, color=PULSE, linewidth=0.9)
-    if view.fit is not None:
-        axes.plot(view.fine, view.fit, color=FIT, linewidth=1.5)
-    size = (2.4 if small else 3.4) * (1.0 if len(view.time) <= _MANY else 0.6)
-    free = ~view.clipped
-    axes.plot(view.time[free], view.samples[free], "o", color=INK, markersize=size, zorder=3)
-    axes.plot(
-        view.time[view.clipped], view.samples[view.clipped], "^", color=CLIPPED, markeredgecolor=INK,
-        markersize=1.6 * size, markeredgewidth=0.6, zorder=3,
-    )  # fmt: skip
+    draw_samples(axes, view, times, dot=(2.4 if small else 3.4) * (1.0 if len(view.time) <= _MANY else 0.6))
+    _draw_errors(axes, view, times, fit_height(axes, view, times))
+
+
+def draw_samples(
+    axes: Axes, view: WaveformView, times: tuple[float, float], *, dot: float, thin: float = 1.0
+) -> None:
+    """Draws baseline, gaps, returns, pulses, fit and samples; dot: size of a sample; thin: factor of all lines."""
+    axes.axhline(view.baseline, color=GREY, linewidth=0.8 * thin, zorder=1)
+    shade_gaps(axes, view)
     for place in view.returns:
-        axes.axvline(place, color=VENDOR, linewidth=1.0, linestyle=_DASHED, zorder=1)
-    low, high = _fit_height(axes, view, times)
-    _draw_errors(axes, view, times, (low, high))
+        axes.axvline(place, color=VENDOR, linewidth=thin, linestyle=_DASHED, zorder=1, label="returns of the file")
+    # Up to the sample beyond each side: all of a long waveform would be most of a page.
+    near = (view.fine >= times[0] - view.spacing) & (view.fine <= times[1] + view.spacing)
+    level = view.fine_level[near]
+    for curve in view.curves:
+        axes.plot(view.fine[near], level + curve[near], color=PULSE, linewidth=0.9 * thin, label="one echo")
+    if view.fit is not None:
+        axes.plot(view.fine[near], view.fit[near], color=FIT, linewidth=1.5 * thin, label="fit")
+    inside = (view.time >= times[0]) & (view.time <= times[1])
+    free, full = inside & ~view.clipped, inside & view.clipped
+    axes.plot(view.time[free], view.samples[free], "o", color=INK, markersize=dot, zorder=3, label="samples")
+    if full.any():
+        axes.plot(view.time[full], view.samples[full], "^", color=CLIPPED, markeredgecolor=INK, markersize=1.6 * dot,
+                  markeredgewidth=0.6 * thin, zorder=3, label="saturated samples")  # fmt: skip
 
 
 def shade_gaps(axes: Axes, view: WaveformView) -> None:
@@ -173,22 +186,21 @@ def shade_gaps(axes: Axes, view: WaveformView) -> None:
     _, start, end = find_stretches(np.isnan(view.samples)[None])
     for first, last in zip(start.tolist(), end.tolist(), strict=True):
         low, high = ((place - 0.5) * view.spacing for place in (first, last))
-        axes.axvspan(low, high, facecolor="none", edgecolor="#cccccc", hatch="//", linewidth=0.0, zorder=0)
+        axes.axvspan(low, high, facecolor="none", edgecolor="#cccccc", hatch="//", linewidth=0.0, zorder=0,
+                     label="not recorded")  # fmt: skip
 
 
-def _peaks(view: WaveformView) -> np.ndarray:
+def find_peaks(view: WaveformView) -> np.ndarray:
     """Heights of the echoes in the signal panel [DN], f8 (k,)."""
     level = np.interp(view.echoes.time, view.time, view.level)
     return level + view.echoes.amplitude.astype(np.float64)
 
 
-def _draw_errors(
-    axes: Axes, view: WaveformView, times: tuple[float, float], heights: tuple[float, float]
-) -> None:
+def _draw_errors(axes: Axes, view: WaveformView, times: tuple[float, float], heights: tuple[float, float]) -> None:
     """Draws the echoes with error bars; a bar that would leave the panel ends at its edge with an arrowhead."""
-    time, peak = view.echoes.time.astype(np.float64), _peaks(view)
+    time, peak = view.echoes.time.astype(np.float64), find_peaks(view)
     shown = (time >= times[0]) & (time <= times[1])
-    axes.plot(time[shown], peak[shown], "D", markersize=4, markerfacecolor="none", color=ECHO, zorder=4)
+    axes.plot(time[shown], peak[shown], "D", markersize=4, markerfacecolor="none", color=ECHO, zorder=4, label="echoes")
     errors = [np.nan_to_num(error.astype(np.float64)) for error in (view.echoes.time_err, view.echoes.amplitude_err)]
     for place, fixed, error, (low, high), heads in (
         (time, peak, errors[0], times, ("<", ">")), (peak, time, errors[1], heights, ("v", "^")),
@@ -207,7 +219,7 @@ def _draw_errors(
 
 def _number_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:
     low, high = axes.get_xlim()
-    peaks = zip(view.echoes.time.tolist(), _peaks(view).tolist(), strict=True)
+    peaks = zip(view.echoes.time.tolist(), find_peaks(view).tolist(), strict=True)
     labels = [(str(row), time, height) for row, (time, height) in enumerate(peaks, 1) if low <= time <= high]
     place_labels(axes, labels, color=ECHO, fontsize=7.5 if small else 9, weight="bold")
 
@@ -222,12 +234,13 @@ def draw_detector(axes: Axes, seen: DetectorSignal, times: tuple[float, float], 
     found = seen.found.time.astype(np.float64)
     height = np.interp(found, seen.time, tested)
     if seen.deep:
-        axes.vlines(found, height, height + seen.least, color=CLIPPED, linewidth=2.0)
+        axes.vlines(found, height, height + seen.least, color=CLIPPED, linewidth=2.0, label="detector's threshold")
         # Strong echoes are so much deeper than the threshold that a bar alone would not be seen.
         axes.plot(found, height + seen.least, "_", color=CLIPPED, markersize=11, markeredgewidth=2.0, zorder=4)
     elif np.isfinite(seen.least):
-        axes.axhline(float(seen.least), color=CLIPPED, linewidth=1.0, linestyle=_DASHED)
-    axes.plot(found, height, "^" if seen.deep else "v", color=ECHO, markersize=5, markerfacecolor="none", zorder=4)
+        axes.axhline(float(seen.least), color=CLIPPED, linewidth=1.0, linestyle=_DASHED, label="detector's threshold")
+    axes.plot(found, height, "^" if seen.deep else "v", color=ECHO, markersize=5, markerfacecolor="none", zorder=4,
+              label="found by the detector")  # fmt: skip
     rule = seen.rule + (f"; blue: {seen.second_label}" if seen.second_label else "")
     wrapped = textwrap.fill(rule, 52 if small else 110)
     inside = (seen.time >= times[0]) & (seen.time <= times[1])
@@ -255,50 +268,31 @@ def _draw_residual(axes: Axes, view: WaveformView, times: tuple[float, float]) -
     axes.set_ylim(-height, height)
 
 
-def _fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> tuple[float, float]:
+def fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> tuple[float, float]:
     """Scales the signal panel to what is shown, with error bars up to half of its height; returns its limits."""
 
     def inside(time: np.ndarray) -> np.ndarray:
         return (time >= times[0]) & (time <= times[1])
 
     echoes = inside(view.echoes.time)
-    peak, error = _peaks(view)[echoes], np.nan_to_num(view.echoes.amplitude_err[echoes].astype(np.float64))
+    peak, error = find_peaks(view)[echoes], np.nan_to_num(view.echoes.amplitude_err[echoes].astype(np.float64))
     values = [view.samples[inside(view.time)], [view.baseline - view.std, view.baseline + view.std], peak]
     if view.fit is not None:
         values.append(view.fit[inside(view.fine)])
     shown = np.concatenate(values)
     low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
     room = _ERROR_ROOM * (high - low)
-    low = min([low, *(peak - np.minimum(error, room)).tolist()])
-    high = max([high, *(peak + np.minimum(error, room)).tolist()])
+    low = min(low, float((peak - np.minimum(error, room)).min(initial=low)))
+    high = max(high, float((peak + np.minimum(error, room)).max(initial=high)), low + 6 * view.std)
     limits = low - 0.05 * (high - low), high + 0.17 * (high - low)
     axes.set_ylim(limits)
     return limits
 
 
-def _place_legend(figure: Figure, views: Sequence[WaveformView], width: float) -> None:
+def _place_legend(figure: Figure, width: float) -> None:
     """One legend for all panels, with the items that occur in them; width: of the picture [inches]."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    handles = [
-        Line2D([], [], marker="o", color=INK, linestyle="", markersize=3.4, label="samples"),
-        Patch(color="#e6e6e6", label="baseline \N{PLUS-MINUS SIGN} noise"),
-    ]
-    if any(view.residual is not None for view in views):
-        handles.append(Line2D([], [], color=FIT, linewidth=1.5, label="fit"))
-        handles.append(Line2D([], [], color=PULSE, linewidth=0.9, label="one echo"))
-    handles.append(Line2D([], [], marker="D", color=ECHO, markerfacecolor="none", markersize=4, label="echoes"))
-    if any(len(view.returns) for view in views):
-        handles.append(Line2D([], [], color=VENDOR, linestyle=_DASHED, label="returns of the file"))
-    if any(np.isnan(view.samples).any() for view in views):
-        handles.append(Patch(facecolor="none", edgecolor="#cccccc", hatch="//", linewidth=0.0, label="not recorded"))
-    if any(view.clipped.any() for view in views):
-        look = {"marker": "^", "color": CLIPPED, "markeredgecolor": INK, "linestyle": ""}
-        handles.append(Line2D([], [], **look, label="saturated samples"))
-    if any(view.seen is not None for view in views):
-        handles.append(Line2D([], [], color=CLIPPED, linestyle=_DASHED, label="detector's threshold"))
-        look = {"marker": "v", "color": ECHO, "markerfacecolor": "none", "linestyle": ""}
-        handles.append(Line2D([], [], **look, label="found by the detector"))
-    rows = -(-len(handles) * 1.35 // width)
-    figure.legend(handles=handles, loc="outside lower left", ncols=-(-len(handles) // max(int(rows), 1)))
+    found = [pair for axes in figure.axes for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+    items = {label: handle for handle, label in reversed(found)}
+    items = {label: items[label] for label in _LEGEND if label in items}
+    rows = -(-len(items) * 1.35 // width)
+    figure.legend(items.values(), items, loc="outside lower left", ncols=-(-len(items) // max(int(rows), 1)))

@@ -38,7 +38,8 @@ def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
         return "no echo"
     rows = [[head, ["flags"]]]
     for view, row in every[:most]:
-        front = [str(view.packet) if view.packet >= 0 else "-"] * several + [str(row + 1), *_measures(view, row)]
+        front = [str(view.packet) if view.packet >= 0 else "-"] * several + [str(row + 1)]
+        front += [_measure(*pair) for pair in _measures(view, row)]
         front += [_measure(*(_column(view, name)[row] for name in ("range", "range_error")))] * ranged
         rows.append([front, textwrap.wrap(name_flags(int(view.echoes.flags[row])) or "-", _FLAGS_WIDE)])
     widths = [max(len(front[place]) for front, _ in rows) for place in range(len(head))]
@@ -51,11 +52,11 @@ def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
     return "\n".join(lines)
 
 
-def _measures(view: WaveformView, row: int) -> Iterator[str]:
-    echoes = view.echoes
-    for name, factor in (("time", 1.0), ("amplitude", 1.0), ("sigma", FWHM_PER_SIGMA)):
-        value, error = (getattr(echoes, name + end)[row] for end in ("", "_err"))
-        yield _measure(factor * value, factor * error)
+def _measures(view: WaveformView, row: int) -> Iterator[tuple[float, float]]:
+    """Time, amplitude and full width of an echo, each with its error."""
+    for name in _NAMES:
+        factor = FWHM_PER_SIGMA if name == "sigma" else 1.0
+        yield tuple(factor * float(getattr(view.echoes, name + end)[row]) for end in ("", "_err"))
 
 
 def _column(view: WaveformView, name: str) -> np.ndarray:
@@ -75,9 +76,8 @@ def _cell(value: float, digits: int) -> str:
 def format_echoes(views: Sequence[WaveformView]) -> str:
     """CSV with one row per echo; a waveform without echoes has one row without values. Empty cells are no data."""
     extra = list(dict.fromkeys(name for view in views for name in view.echoes.attributes))
-    measured = [(name, _NAMES[name], COLUMNS[_NAMES[name]].unit) for name in _NAMES]
     head = ["packet", "point", "gps_time [s]", "echo"]
-    head += [text for _, name, unit in measured for text in (f"{name} [{unit}]", f"{name}_err [{unit}]")]
+    head += [f"{name}{end} [{COLUMNS[name].unit}]" for name in _NAMES.values() for end in ("", "_err")]
     own = (*_NAMES.values(), "point")
     rest = [name for name in extra if name.removesuffix("_err") not in own and not name.endswith("_reason")]
     head += [f"{name} [{COLUMNS[name].unit}]" if name in COLUMNS else name for name in rest]
@@ -87,11 +87,7 @@ def format_echoes(views: Sequence[WaveformView]) -> str:
     for view in views:
         place = [view.packet if view.packet >= 0 else "", view.point, f"{view.gps_time:.9f}"]
         for row in range(len(view.echoes)):
-            values = []
-            for name, _, _ in measured:
-                factor = FWHM_PER_SIGMA if name == "sigma" else 1.0
-                values += [factor * float(getattr(view.echoes, name + end)[row]) for end in ("", "_err")]
-            texts = [_cell(value, 9) for value in values]
+            texts = [_cell(value, 9) for pair in _measures(view, row) for value in pair]
             texts += [_cell(_column(view, name)[row], 9 if name not in ("x", "y", "z") else 13) for name in rest]
             flags = name_flags(int(view.echoes.flags[row])).replace(", ", " ")
             table.writerow([*place, row + 1, *texts, flags])

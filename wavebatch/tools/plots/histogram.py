@@ -75,6 +75,8 @@ class FlagCounts:
     """Points per flag."""
 
     facts: ColumnFacts
+    clouds: tuple[str, ...]
+    """Names of the clouds."""
     names: tuple[str, ...]
     """Names of the flags."""
     counts: np.ndarray
@@ -111,7 +113,7 @@ def count_values(
     if not total.values:
         raise columns[0].complain(total)
     series, merged = _merge_small(series) if by is not None else (series, {})
-    keys = sorted(series, key=lambda key: (key[0], key[1], key[2]))
+    keys = sorted(series)
     kept = [series[key].sample.read().get("value", np.empty(0)) for key in keys]
     least, largest = min(one.least for one in series.values()), max(one.largest for one in series.values())
     everything = np.concatenate(kept)
@@ -170,16 +172,18 @@ def _check_columns(where: str, columns: Sequence[Clouds]) -> ColumnFacts:
     return ColumnFacts(names, first.unit, "", first.step if same else 0.0)
 
 
-def _split(rows: np.ndarray, by: str | None) -> Iterator[tuple[float, np.ndarray]]:
-    """The groups of some rows: value, and the rows' values."""
-    if by is None:
-        yield 0.0, rows["values"][:, 0]
-        return
-    group = rows["values"][:, 1]
-    for value in np.unique(group[~np.isnan(group)]).tolist():
-        yield value, rows["values"][:, 0][group == value]
-    if np.isnan(group).any():
-        yield math.nan, rows["values"][:, 0][np.isnan(group)]
+def _read_groups(
+    columns: Sequence[Clouds], each: bool, by: str | None
+) -> Iterator[tuple[Tally, int, dict[_Key, np.ndarray]]]:
+    """Pieces of all columns: counts, number of the cloud, and the values of each series."""
+    for column, clouds in enumerate(columns):
+        for cloud, rows, tally in clouds.read():
+            values, start = rows["values"][:, 0], (column, cloud if each else 0)
+            if by is None:
+                yield tally, cloud, {(*start, 0.0): values}
+                continue
+            group = np.where(np.isnan(rows["values"][:, 1]), _UNKNOWN, rows["values"][:, 1])
+            yield tally, cloud, {(*start, one): values[group == one] for one in np.unique(group).tolist()}
 
 
 _SMALL = math.inf
@@ -193,20 +197,17 @@ def _survey(columns: Sequence[Clouds], each: bool, by: str | None) -> tuple[dict
     """The first pass: counts, limits and samples of every series, and the counts of all points."""
     found: dict[_Key, _Series] = {}
     total = Tally()
-    for column, clouds in enumerate(columns):
-        if by is not None and clouds.other_facts[0].is_flags:
-            raise ConfigError(f"{clouds.paths[0]}: {by} are bits and form no groups; --flags selects them")
-        for cloud, rows, tally in clouds.read():
-            total += tally
-            if by is None:
-                found.setdefault((column, cloud if each else 0, 0.0), _Series())
-            for value, values in _split(rows, by):
-                found.setdefault((column, cloud if each else 0, _group(value)), _Series()).add(values)
-            if len({key[2] for key in found}) > MOST_GROUPS:
-                raise ConfigError(
-                    f"{clouds.paths[cloud]}: {by} has more than {MOST_GROUPS} different values; --by is for columns "
-                    "with few, like number_of_returns or classification"
-                )
+    if by is not None and columns[0].other_facts[0].is_flags:
+        raise ConfigError(f"{columns[0].paths[0]}: {by} are bits and form no groups; --flags selects them")
+    for tally, cloud, groups in _read_groups(columns, each, by):
+        total += tally
+        for key, values in groups.items():
+            found.setdefault(key, _Series()).add(values)
+        if len({key[2] for key in found}) > MOST_GROUPS:
+            raise ConfigError(
+                f"{columns[0].paths[cloud]}: {by} has more than {MOST_GROUPS} different values; --by is for columns "
+                "with few, like number_of_returns or classification"
+            )
     return found, total
 
 
@@ -224,10 +225,6 @@ def _merge_small(series: dict[_Key, _Series]) -> tuple[dict[_Key, _Series], dict
     for key, other in sorted(merged.items()):
         found.setdefault(other, _Series()).add(series[key].sample.read().get("value", np.empty(0)))
     return found, merged
-
-
-def _group(value: float) -> float:
-    return _UNKNOWN if math.isnan(value) else value
 
 
 def _choose_limits(samples: Sequence[np.ndarray], least: float, largest: float, step: float) -> tuple[float, float]:
@@ -261,21 +258,14 @@ def _count(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The second pass: counts per series and bin, and values below and above; place: row of each group."""
     number = len(set(place.values()))
-    counts = np.zeros((number, len(edges) - 1), np.int64)
-    below, above = np.zeros(number, np.int64), np.zeros(number, np.int64)
-    for column, clouds in enumerate(columns):
-        for cloud, rows, _ in clouds.read():
-            for group, value in _split(rows, by):
-                if not len(value):
-                    continue
-                series = place[column, cloud if each else 0, _group(group)]
-                at = np.searchsorted(edges, value, side="right") - 1
-                at[value == edges[-1]] = len(edges) - 2
-                below[series] += np.count_nonzero(at < 0)
-                above[series] += np.count_nonzero(at > len(edges) - 2)
-                inside = at[(at >= 0) & (at <= len(edges) - 2)]
-                counts[series] += np.bincount(inside, minlength=len(edges) - 1)
-    return counts, below, above
+    # The first and the last column count what lies below and above.
+    counts = np.zeros((number, len(edges) + 1), np.int64)
+    for _, _, groups in _read_groups(columns, each, by):
+        for key, values in groups.items():
+            at = np.searchsorted(edges, values, side="right")
+            at[values == edges[-1]] = len(edges) - 1
+            counts[place[key]] += np.bincount(at, minlength=len(edges) + 1)
+    return counts[:, 1:-1], counts[:, 0], counts[:, -1]
 
 
 def place_edges(
@@ -323,9 +313,5 @@ def count_flags(paths: Sequence[Path], selection: Selection) -> FlagCounts:
         clean += int(np.count_nonzero(flags == 0))
     if not total.values:
         raise clouds.complain(total)
-    return FlagCounts(clouds.facts, tuple(flag.name for flag in EchoFlag), counts, clean, total)
-
-
-def is_flags(path: Path, column: str) -> bool:
-    """Whether the column of the cloud holds EchoFlag bits."""
-    return Clouds([path], Selection(column)).facts.is_flags
+    names = tuple(path.name for path in paths)
+    return FlagCounts(clouds.facts, names, tuple(flag.name for flag in EchoFlag), counts, clean, total)

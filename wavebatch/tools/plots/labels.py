@@ -64,6 +64,12 @@ def fit_parts(figure: Figure, parts: Sequence[str], inches: float, *, size: floa
     return "\n".join(lines)
 
 
+def set_head(figure: Figure, parts: Sequence[str], *, size: float = 10.0, **look: Any) -> None:
+    """Writes the parts of a title above all panels, to the left, as wide as the figure."""
+    text = fit_parts(figure, parts, figure.get_figwidth() - 0.2, size=size, **look)
+    figure.suptitle(text, x=0.01, ha="left", fontsize=size, **look)
+
+
 def place_labels(
     axes: Axes, labels: Sequence[tuple[str, float, float]], *, keep: bool = False, **look: Any
 ) -> list[Any]:
@@ -85,31 +91,14 @@ def place_labels(
     for text, x, y in labels:
         note = axes.annotate(text, (x, y), textcoords="offset points", xytext=(6, 5), annotation_clip=False, **look)
         note.set_in_layout(False)
-        first = note.get_window_extent()
-        places = [_box_at(first.width, first.height, axes, (x, y), place) for place in PLACES]
-        covered = [_cover(box, taken, frame) for box in places]
+        covered = [_cover(_move(note, place), taken, frame) for place in PLACES]
         best = covered.index(min(covered))
         if covered[best] > _TOUCHING and not keep:
             note.remove()
             continue
-        _move(note, PLACES[best])
-        taken.append(places[best])
+        taken.append(_move(note, PLACES[best]))
         written.append(note)
     return written
-
-
-def _box_at(
-    width: float, height: float, axes: Axes, point: tuple[float, float], place: tuple[float, float]
-) -> Any:
-    """The box of a label of this size [pixels] at an offset [points] from its point, as `_move` puts it."""
-    from matplotlib.transforms import Bbox
-
-    x, y = axes.transData.transform(point)
-    scale = axes.figure.dpi / 72
-    sides = [(offset > 0) - (offset < 0) for offset in place]
-    left = x + place[0] * scale - 0.5 * width * (1 - sides[0])
-    low = y + place[1] * scale - 0.5 * height * (1 - sides[1])
-    return Bbox.from_bounds(left, low, width, height)
 
 
 def _cover(box: Any, taken: Sequence[Any], frame: Any) -> float:
@@ -117,11 +106,12 @@ def _cover(box: Any, taken: Sequence[Any], frame: Any) -> float:
     return sum(_overlap(box, other) for other in taken) + box.width * box.height - _overlap(box, frame)
 
 
-def _move(note: Any, place: tuple[float, float]) -> None:
-    """Puts a label at an offset [points] from its point, on the side to which the offset goes."""
+def _move(note: Any, place: tuple[float, float]) -> Any:
+    """Puts a label at an offset [points] from its point, on the side to which the offset goes; returns its box."""
     note.set_position(place)
     note.set_ha("left" if place[0] > 0 else "right" if place[0] < 0 else "center")
     note.set_va("bottom" if place[1] > 0 else "top" if place[1] < 0 else "center")
+    return note.get_window_extent()
 
 
 def _overlap(a: Any, b: Any) -> float:
@@ -134,10 +124,8 @@ def space_ticks(axis: Any, length: float, each: float) -> None:
     """Places as many ticks as fit, or two, or one; length: of the axis, each: room of a tick [inches]."""
     if length >= 2 * each:
         axis.get_major_locator().set_params(nbins=int(min(length / each, 8)))
-        axis.set_major_formatter(lambda value, _: f"{value:.10g}")
-        return
-    low, high = axis.get_view_interval()
-    axis.set_ticks(_round_places(low, high, 2 if length >= each else 1))
+    else:
+        axis.set_ticks(_round_places(*axis.get_view_interval(), 2 if length >= each else 1))
     axis.set_major_formatter(lambda value, _: f"{value:.10g}")
 
 

@@ -18,18 +18,21 @@ from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.files.las.crs import CrsWords, describe_crs
 from wavebatch.tools.even_sample import EvenSample
-from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
-from wavebatch.tools.rasters.cells import Grid
-from wavebatch.tools.rasters.tiles import CellOptions, Placed, compute_tiles
-
-STATISTICS = ("mean", "median", "min", "max", "count", "density")
-"""Statistics of a cell; `density` is points per square metre."""
+from wavebatch.tools.plots.values import (
+    Clouds,
+    Selection,
+    Tally,
+    check_statistic,
+    find_positions,
+    robust_limits,
+    round_up,
+    sample_points,
+)
+from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, check_cells
+from wavebatch.tools.rasters.tiles import Placed, compute_tiles
 
 MOST_CELLS = 4_000_000
 """Most cells of a grid; a picture cannot show more."""
-
-LARGEST_SIZE = 1e9
-"""Largest side of a cell [m]: more than the world; larger ones overflow."""
 
 LEAST_SIZE = 1e-6
 """Least side of a cell [m]: smaller than any scale of LAS coordinates in use."""
@@ -56,6 +59,8 @@ _SIDE = 128
 class Raster:
     """A map."""
 
+    names: tuple[str, ...]
+    """Of the clouds."""
     facts: ColumnFacts
     statistic: str
     grid: Grid
@@ -85,7 +90,7 @@ def grid_values(
     statistic: str = "mean",
     *,
     size: float | None = None,
-    bounds: tuple[float, float, float, float] | None = None,
+    bounds: Box | None = None,
 ) -> Raster:
     """The map of a column of clouds; medians of large clouds need room in TMPDIR.
 
@@ -94,23 +99,21 @@ def grid_values(
     Raises InputError if there is nothing to draw, ConfigError for wrong options, more than MOST_CELLS cells, and clouds
     that are far apart or differ in their CRS.
     """
-    _check(statistic, size, bounds)
+    if size is not None and not (LEAST_SIZE <= size <= LARGEST_SIZE):
+        raise ConfigError(f"cells must be at least {LEAST_SIZE:g} and at most {LARGEST_SIZE:g} m long, got {size:g}")
+    check_cells(statistic, bounds)
+    check_statistic(selection.column, statistic)
     clouds = Clouds(paths, selection)
-    if clouds.facts.is_flags and statistic in ("mean", "median", "min", "max"):
-        raise ConfigError(
-            f"{paths[0]}: {clouds.facts.name} are bits, which have no {statistic}; count the points with a flag: "
-            "--statistic count --flags NAME"
-        )
+    check_statistic(selection.column, statistic, clouds.facts)
     crs = check_crs(paths)
     total, sample, box = _survey(clouds, bounds)
-    if not total.values:
-        raise clouds.complain(total)
     if not sample.seen:
         where = "within the bounds" if bounds else "with finite coordinates"
         raise InputError(f"{paths[0]}: nothing to draw: no point {where} has a value")
     grid = choose_grid(str(paths[0]), sample, box, size, fixed=bounds is not None)
-    values, placed = _fill(paths, selection, statistic, grid, total.values)
-    return Raster(clouds.facts, statistic, grid, values, total, total.values - placed, find_shown(values), crs)
+    values, placed = _fill(clouds, statistic, grid, total.values)
+    names = tuple(path.name for path in paths)
+    return Raster(names, clouds.facts, statistic, grid, values, total, total.values - placed, find_shown(values), crs)
 
 
 def find_shown(values: np.ndarray) -> tuple[float, float]:
@@ -120,54 +123,30 @@ def find_shown(values: np.ndarray) -> tuple[float, float]:
     return low, high
 
 
-def _fill(
-    paths: Sequence[Path], selection: Selection, statistic: str, grid: Grid, points: int
-) -> tuple[np.ndarray, int]:
+def _fill(clouds: Clouds, statistic: str, grid: Grid, points: int) -> tuple[np.ndarray, int]:
     """Values (rows, columns), the first row is the southernmost, and the number of values in the grid."""
-    columns = () if selection.column is None else (selection.column,)
-    options = CellOptions(
-        columns, statistic, flags_with=selection.flags_with, flags_without=selection.flags_without,
-        where=selection.where,
-    )  # fmt: skip
     values, placed = np.full((grid.rows, grid.columns), np.nan), Placed()
-    for row, column, tile in compute_tiles(paths, options, grid, points, placed):
+    for row, column, tile in compute_tiles(clouds, statistic, grid, points, placed):
         part = values[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
         part[:] = tile[0, : part.shape[0], : part.shape[1]]
     return values[::-1], placed.values[0]
 
 
-def _check(statistic: str, size: float | None, bounds: tuple[float, float, float, float] | None) -> None:
-    if statistic not in STATISTICS:
-        raise ConfigError(f"statistic {statistic!r} is not one of {', '.join(STATISTICS)}")
-    if size is not None and not (LEAST_SIZE <= size <= LARGEST_SIZE):
-        raise ConfigError(f"cells must be at least {LEAST_SIZE:g} and at most {LARGEST_SIZE:g} m long, got {size:g}")
-    if bounds is not None:
-        west, south, east, north = bounds
-        if not (math.isfinite(east - west) and math.isfinite(north - south) and west < east and south < north):
-            raise ConfigError("bounds must be WEST,SOUTH,EAST,NORTH in metres, west of east and south of north")
-
-
-def _survey(
-    clouds: Clouds, bounds: tuple[float, float, float, float] | None
-) -> tuple[Tally, EvenSample, tuple[float, float, float, float]]:
+def _survey(clouds: Clouds, bounds: Box | None) -> tuple[Tally, EvenSample, Box]:
     """Counts of the points, an even sample of positions (n, 2), and the box of all positions."""
-    total, sample = Tally(), EvenSample()
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
     each = [EvenSample() for _ in clouds.paths]
-    for cloud, rows, tally in clouds.read():
-        total += tally
-        places = np.stack([rows["x"], rows["y"]], axis=1)
-        keep = np.isfinite(places).all(axis=1)
+
+    def pick(cloud: int, rows: np.ndarray) -> np.ndarray:
+        places = find_positions(rows)
         if bounds is not None:
-            keep &= (places >= bounds[:2]).all(axis=1) & (places <= bounds[2:]).all(axis=1)
-        places = places[keep]
-        if len(places):
-            sample.add({"place": places})
-            if len(clouds.paths) > 1 and bounds is None:
-                each[cloud].add({"place": places})
-            low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+            return places[(places >= bounds[:2]).all(axis=1) & (places <= bounds[2:]).all(axis=1)]
+        if len(clouds.paths) > 1:
+            each[cloud].add({"place": places})
+        return places
+
+    total, sample, box = sample_points(clouds, pick)
     _refuse_far(clouds.paths, [one.read().get("place", np.empty((0, 2))) for one in each])
-    return total, sample, bounds or (*low.tolist(), *high.tolist())
+    return total, sample, bounds or tuple(box.ravel().tolist())
 
 
 def _refuse_far(paths: Sequence[Path], places: Sequence[np.ndarray]) -> None:
@@ -208,9 +187,8 @@ def check_crs(paths: Sequence[Path]) -> CrsWords:
 
 
 def choose_grid(
-    where: str, sample: EvenSample, box: tuple[float, float, float, float], size: float | None, *, fixed: bool,
-    most: int = CHOSEN_SIDE,
-) -> Grid:  # fmt: skip
+    where: str, sample: EvenSample, box: Box, size: float | None, *, fixed: bool, most: int = CHOSEN_SIDE
+) -> Grid:
     """Cells for points of which `sample` has positions.
 
     size: None to choose it, for at most `most` cells along a side. fixed: the box is the user's.
@@ -227,7 +205,7 @@ def choose_grid(
         size = _choose_size(places, sample.seen, (west, south), extent, most)
     grid = Grid.cover((west, south, east, north), size)
     if grid.columns * grid.rows > MOST_CELLS:
-        least = _nice(math.sqrt((east - west) * (north - south) / MOST_CELLS) + 4 * extent / MOST_CELLS)
+        least = round_up(math.sqrt((east - west) * (north - south) / MOST_CELLS) + 4 * extent / MOST_CELLS)
         raise ConfigError(
             f"{where}: {grid.columns} x {grid.rows} cells of {size:g} m are too many to draw; cells of {least:g} m "
             "will do"
@@ -244,10 +222,5 @@ def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], ext
     inside = coarse[((coarse >= -1) & (coarse <= _SIDE + 1)).all(axis=1)].astype(np.int64)
     filled = len(np.unique(inside[:, 0] * 4 * _SIDE + inside[:, 1]))
     area = filled * side**2
-    return _nice(max(math.sqrt(POINTS_PER_CELL * area / seen), extent / most))
+    return round_up(max(math.sqrt(POINTS_PER_CELL * area / seen), extent / most))
 
-
-def _nice(size: float) -> float:
-    """The next of 1, 2, 5, 10 ... times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(size))
-    return next(float(f"{factor * power:.3g}") for factor in (1, 2, 5, 10) if factor * power >= size * (1 - 1e-9))

@@ -17,9 +17,19 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.las.crs import CrsWords
-from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots.raster import check_crs
-from wavebatch.tools.plots.values import MARGIN, Clouds, Selection, Tally, name_paths, robust_limits
+from wavebatch.tools.plots.values import (
+    MARGIN,
+    Clouds,
+    Selection,
+    Tally,
+    check_statistic,
+    find_positions,
+    name_paths,
+    robust_limits,
+    round_up,
+    sample_points,
+)
 from wavebatch.tools.voxels.voxel_points import VoxelFile
 
 MOST_POINTS = 200_000
@@ -99,14 +109,7 @@ def cut_section(
     def cut(rows: np.ndarray) -> np.ndarray:
         return _cut_rows(rows, start, (end - start) / length, length, width)
 
-    sample, total = EvenSample(MOST_POINTS), Tally()
-    for _, rows, tally in clouds.read():
-        total += tally
-        place = cut(rows)
-        if len(place):
-            sample.add({"place": place})
-    if not total.values:
-        raise clouds.complain(total)
+    total, sample, _ = sample_points(clouds, lambda _, rows: cut(rows), MOST_POINTS)
     if not sample.seen:
         raise InputError(
             f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} {crs.unit} of the line from "
@@ -155,15 +158,7 @@ def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
 
 def _choose_line(clouds: Clouds | VoxelFile) -> tuple[float, float, float, float]:
     """A line through the middle of the points, along their longer extent."""
-    sample, total = EvenSample(), Tally()
-    for _, rows, tally in clouds.read():
-        total += tally
-        places = np.stack([rows["x"], rows["y"]], axis=1)
-        places = places[np.isfinite(places).all(axis=1)]
-        if len(places):
-            sample.add({"place": places})
-    if not total.values:
-        raise clouds.complain(total)
+    _, sample, _ = sample_points(clouds, lambda _, rows: find_positions(rows))
     if not sample.seen:
         raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a position")
     places = sample.read()["place"]
@@ -219,22 +214,17 @@ def measure_profile(
     """
     clouds = open_heights(paths, selection)
     crs = _find_crs(clouds)
-    if statistic != "count" and selection.column is None:
-        raise ConfigError(f"--statistic {statistic} needs a --column; only count needs none")
-    if statistic != "count" and clouds.facts.is_flags:
-        raise ConfigError(f"{paths[0]}: {clouds.facts.name} are bits, which have no {statistic}")
-    sample, total, least, largest = EvenSample(), Tally(), math.inf, -math.inf
-    for _, rows, tally in clouds.read():
-        total += tally
-        height = rows["values"][:, 1]
-        height = height[np.isfinite(height)]
-        if len(height):
-            sample.add({"height": height})
-            least, largest = min(least, float(height.min())), max(largest, float(height.max()))
+    check_statistic(selection.column, statistic, clouds.facts)
+
+    def pick(_: int, rows: np.ndarray) -> np.ndarray:
+        height = rows["values"][:, 1:]
+        return height[np.isfinite(height[:, 0])]
+
+    total, sample, box = sample_points(clouds, pick)
     if not sample.seen:
         raise clouds.complain(total)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
-    edges = place_heights(sample.read()["height"], least, largest, size, voxel)
+    edges = place_heights(sample.read()["place"].ravel(), *box.ravel().tolist(), size, voxel)
     series = len(paths) if each else 1
     sums, numbers, outside = np.zeros((series, len(edges) - 1)), np.zeros((series, len(edges) - 1)), 0
     for cloud, rows, _ in clouds.read():
@@ -256,9 +246,7 @@ def place_heights(sample: np.ndarray, least: float, largest: float, size: float 
     """Edges of bins: multiples of their size; for voxels the faces of these, or no voxel would lie on one side only."""
     low, high = robust_limits(sample, least, largest)
     if size is None:
-        span = max(high - low, 1e-3)
-        power = 10.0 ** math.floor(math.log10(span / _CHOSEN_BINS))
-        size = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= span / _CHOSEN_BINS)
+        size = round_up(max(high - low, 1e-3) / _CHOSEN_BINS)
     if not (math.isfinite(size) and size > 0):
         raise ConfigError(f"--size {size:g}: must be above 0")
     base = 0.0

@@ -1,20 +1,22 @@
-"""Values of one column of clouds of any size, read piece by piece: selection of points, counts, robust limits.
+"""Values of columns of clouds of any size, read piece by piece: selection of points, counts, samples, robust limits.
 
-`histogram` and `raster` read their clouds through `Clouds`.
+`histogram`, `raster`, `section_data` and `rasters.grid` read their clouds through `Clouds`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.condition import Condition
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike, select_points
 from wavebatch.files.las.crs import describe_crs
+from wavebatch.tools.even_sample import EvenSample
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""
@@ -54,6 +56,11 @@ class Tally:
     values: int = 0
     """Points with a value."""
 
+    def list_rest(self, outside: int, where: str = "outside") -> list[str]:
+        """Points that a picture does not show, with the reason, for its title."""
+        rest = {"without data": self.no_data, "left out": self.left_out, where: outside}
+        return [f"{number:,} {text}" for text, number in rest.items() if number]
+
     def __add__(self, other: Tally) -> Tally:
         return Tally(*(getattr(self, name) + getattr(other, name) for name in self.__slots__))
 
@@ -72,28 +79,45 @@ class Clouds:
 
     def __init__(self, paths: Sequence[Path], selection: Selection) -> None:
         self.paths, self.selection = tuple(paths), selection
-        found: list[tuple[Path, ColumnFacts]] = []
+        found: list[list[tuple[Path, ColumnFacts]]] = []
         for path in self.paths:
-            with ColumnReader(path, selection.column, *selection.others) as reader:
-                found.append((path, reader.facts[0]))
-                self.other_facts = reader.facts[1:]
-                select_points(reader, selection.where, selection.flags_with, selection.flags_without)  # it can
-        self.facts: ColumnFacts = check_alike(found)
-        if selection.column in ("x", "y", "z"):
-            words = describe_crs(self.paths[0])
-            unit = words.upright_unit if selection.column == "z" else words.unit
-            self.facts = replace(self.facts, unit=unit)
+            with self._open(path) as reader:
+                found.append([(path, facts) for facts in reader.facts])
+        self.facts, *others = (self._with_unit(check_alike(column)) for column in zip(*found, strict=True))
+        self.other_facts: tuple[ColumnFacts, ...] = tuple(others)
+
+    def _open(self, path: Path) -> ColumnReader:
+        """A reader that gives the points of the selection."""
+        wanted = self.selection
+        reader = ColumnReader(path, wanted.column, *wanted.others)
+        try:
+            select_points(reader, wanted.where, wanted.flags_with, wanted.flags_without)
+        except BaseException:
+            reader.close()
+            raise
+        return reader
+
+    def _with_unit(self, facts: ColumnFacts) -> ColumnFacts:
+        """Facts with the unit of the CRS for a coordinate."""
+        if not (facts.is_standard and facts.name in ("x", "y", "z")):
+            return facts
+        words = describe_crs(self.paths[0])
+        return replace(facts, unit=words.upright_unit if facts.name == "z" else words.unit)
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
         """Pieces of all clouds: number of the cloud, selected points with a value, and counts of the piece."""
+        for number, rows, left in self.read_all():
+            good = rows[~np.isnan(rows["values"][:, 0])]
+            yield number, good, Tally(len(rows) + left, left, len(rows) - len(good), len(good))
+
+    def read_all(self) -> Iterator[tuple[int, np.ndarray, int]]:
+        """Pieces of all clouds: number of the cloud, selected points, and how many were left out."""
         for number, path in enumerate(self.paths):
-            with ColumnReader(path, self.selection.column, *self.selection.others) as reader:
-                select_points(reader, self.selection.where, self.selection.flags_with, self.selection.flags_without)
+            with self._open(path) as reader:
                 seen = 0
                 for rows in reader.read_pieces():
                     left, seen = reader.left_out - seen, reader.left_out
-                    good = rows[~np.isnan(rows["values"][:, 0])]
-                    yield number, good, Tally(len(rows) + left, left, len(rows) - len(good), len(good))
+                    yield number, rows, left
 
     def complain(self, tally: Tally) -> InputError:
         """The error that says why nothing can be drawn."""
@@ -107,6 +131,50 @@ class Clouds:
         if tally.no_data:
             reasons.append(f"{tally.no_data} have no data in {self.facts.name}")
         return InputError(f"{where}: nothing to draw: {' and '.join(reasons)}")
+
+
+def sample_points(
+    clouds: Clouds, pick: Callable[[int, np.ndarray], np.ndarray], limit: int | None = None
+) -> tuple[Tally, EvenSample, np.ndarray]:
+    """Counts of all points, an even sample of what is picked of them, and its least and largest values.
+
+    clouds: also a file of voxels, which has the same methods. pick: gives an array (k, m) from the number of a cloud
+    and a piece of it; that is column `place` of the sample. The least and largest values are f8 (2, m), infinite if
+    nothing is picked. Raises InputError without any value.
+    """
+    total, sample, box = Tally(), EvenSample(limit), np.array([[math.inf], [-math.inf]])
+    for number, rows, tally in clouds.read():
+        total += tally
+        place = pick(number, rows)
+        if len(place):
+            sample.add({"place": place})
+            box = np.stack([np.minimum(box[0], place.min(axis=0)), np.maximum(box[1], place.max(axis=0))])
+    if not total.values:
+        raise clouds.complain(total)
+    return total, sample, box
+
+
+def find_positions(rows: np.ndarray) -> np.ndarray:
+    """Finite x and y of points, f8 (k, 2)."""
+    places = np.stack([rows["x"], rows["y"]], axis=1)
+    return places[np.isfinite(places).all(axis=1)]
+
+
+def round_up(size: float) -> float:
+    """The next of 1, 2, 5, 10 ... times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(size))
+    return next(float(f"{factor * power:.3g}") for factor in (1, 2, 5, 10) if factor * power >= size * (1 - 1e-9))
+
+
+def check_statistic(column: str | None, statistic: str, facts: ColumnFacts | None = None) -> None:
+    """Raises ConfigError where a statistic of a cell or a bin needs a column, or its column holds bits."""
+    if statistic in ("count", "density"):
+        return
+    if column is None:
+        raise ConfigError(f"--statistic {statistic} needs a --column; only count and density need none")
+    if facts is not None and facts.is_flags:
+        raise ConfigError(f"{facts.name} are bits, which have no {statistic}; count the points with a flag: "
+                          "--statistic count --flags NAME")  # fmt: skip
 
 
 def shown_limits(samples: Sequence[np.ndarray], least: float, largest: float) -> tuple[float, float]:

@@ -5,10 +5,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
+from wavebatch.core.errors import ConfigError
+
+Box = tuple[float, float, float, float]
+"""West, south, east, north."""
+
+LARGEST_SIZE = 1e9
+"""Largest side of a cell: more than the world; larger ones overflow."""
 
 STATISTICS = ("mean", "median", "min", "max", "std", "count", "density")
 """std: standard deviation with n - 1, no-data for one value; density: points with a value per area."""
@@ -27,7 +36,7 @@ class Grid:
     columns: int
 
     @classmethod
-    def cover(cls, box: tuple[float, float, float, float], size: float) -> Grid:
+    def cover(cls, box: Box, size: float) -> Grid:
         """The cells that hold a box: west, south, east, north."""
         west, south, east, north = (int(np.floor(value / size)) for value in box)
         return cls(size, west, south, north - south + 1, east - west + 1)
@@ -45,6 +54,16 @@ class Grid:
             column, row = np.floor(x / self.size) - self.west, np.floor(y / self.size) - self.south
             inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         return np.where(inside, row, -1).astype(np.int64), np.where(inside, column, -1).astype(np.int64), inside
+
+
+def check_cells(statistic: str, bounds: Box | None) -> None:
+    """Raises ConfigError for an unknown statistic, and for bounds that hold no place."""
+    if statistic not in STATISTICS:
+        raise ConfigError(f"statistic {statistic!r} is not one of {', '.join(STATISTICS)}")
+    if bounds is not None:
+        west, south, east, north = bounds
+        if not (math.isfinite(east - west) and math.isfinite(north - south) and west < east and south < north):
+            raise ConfigError("--bbox must be WEST,SOUTH,EAST,NORTH, west of east and south of north")
 
 
 def compute_cells(statistic: str, cell: np.ndarray, values: np.ndarray, number: int, area: float) -> np.ndarray:

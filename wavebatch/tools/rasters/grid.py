@@ -14,15 +14,13 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader
+from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
-from wavebatch.tools.rasters.cells import STATISTICS, Grid
-from wavebatch.tools.rasters.tiles import CellOptions, Placed, compute_tiles, is_inside, read_pieces
-
-LARGEST_SIZE = 1e9
-"""Largest side of a cell: more than the world; larger ones overflow."""
+from wavebatch.tools.plots.values import Clouds, Selection, check_statistic
+from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, check_cells
+from wavebatch.tools.rasters.tiles import Placed, compute_tiles, is_inside
 
 MOST_SIDE = 2_000_000
 """Most cells along a side: more is damage of coordinates, or a size that was meant in another unit."""
@@ -32,9 +30,14 @@ _EXACT = float(1 << 23)
 
 
 @dataclass(frozen=True, slots=True)
-class GridOptions(CellOptions):
-    """What is written."""
+class GridOptions:
+    """What is written of which points."""
 
+    selection: Selection
+    """A band for each of its columns; points are counted without one."""
+    statistic: str = "mean"
+    bbox: Box | None = None
+    """Only this part."""
     size: float = 1.0
     """Side of a cell, in units of the coordinates."""
     crs: str | None = None
@@ -58,10 +61,13 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     Raises ConfigError for wrong options, InputError for clouds that cannot be read or have no point to write.
     """
     _check(options)
-    options = replace(options, bounds=_grow(options.bounds, options.size))
+    options = replace(options, bbox=_grow(options.bbox, options.size))
     crs, unit = _find_crs(paths, options.crs)
-    facts = _find_facts(paths, options.columns)
-    box, points, largest = _find_extent(paths, options)
+    clouds = Clouds(paths, options.selection)
+    facts = (clouds.facts, *clouds.other_facts)
+    for one in facts:
+        check_statistic(one.name, options.statistic, one)
+    box, points, largest = _find_extent(clouds, options)
     if unit == "degree" and options.size > max(box[2] - box[0], box[3] - box[1]):
         raise ConfigError(f"{paths[0]}: coordinates are degrees, and cells of {options.size:g} degrees are larger than "
                           "the clouds; --size 1e-05 gives cells of about 1 m")  # fmt: skip
@@ -70,11 +76,11 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     layout = RasterLayout(
         west, north, grid.size, grid.rows, grid.columns, _choose_dtype(facts, largest), options.no_data, crs, unit
     )
-    bands = _describe(facts, options.statistic, unit)
+    bands = [_describe(one, options.statistic, unit) for one in facts]
     result = GridResult(layout=layout, bands=tuple(bands))
     tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}", "STATISTIC": options.statistic}
     with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
-        for row, column, values in compute_tiles(paths, options, grid, points, result):
+        for row, column, values in compute_tiles(clouds, options.statistic, grid, points, result, options.bbox):
             result.filled += int(np.isfinite(values).any(axis=0).sum())
             writer.write_tile(row, column, values)
         writer.publish()
@@ -82,23 +88,15 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
 
 
 def _check(options: GridOptions) -> None:
-    if options.statistic not in STATISTICS:
-        raise ConfigError(f"statistic {options.statistic!r} is not one of {', '.join(STATISTICS)}")
-    if not options.columns and options.statistic not in ("count", "density"):
-        raise ConfigError(f"--statistic {options.statistic} needs a --column; only count and density need none")
+    check_cells(options.statistic, options.bbox)
+    check_statistic(options.selection.column, options.statistic)
     if not 0 < options.size <= LARGEST_SIZE:
         raise ConfigError(f"--size must be more than 0 and at most {LARGEST_SIZE:g}, got {options.size:g}")
     if not (math.isnan(options.no_data) or abs(options.no_data) <= float(np.finfo(np.float32).max)):
         raise ConfigError(f"--no-data must be nan or a number that float32 holds, got {options.no_data:g}")
-    if options.bounds is not None:
-        west, south, east, north = options.bounds
-        if not (math.isfinite(east - west) and math.isfinite(north - south) and west < east and south < north):
-            raise ConfigError("--bbox must be WEST,SOUTH,EAST,NORTH, west of east and south of north")
 
 
-def _grow(
-    bounds: tuple[float, float, float, float] | None, size: float
-) -> tuple[float, float, float, float] | None:
+def _grow(bounds: Box | None, size: float) -> Box | None:
     """The bounds up to the next borders of cells, so that no cell holds a part of its points only."""
     if bounds is None:
         return None
@@ -124,41 +122,23 @@ def _find_crs(paths: Sequence[Path], given: str | None) -> tuple[str | None, str
     return (None if first is None else first[1]), unit
 
 
-def _find_facts(paths: Sequence[Path], columns: Sequence[str]) -> tuple[ColumnFacts, ...]:
-    """The columns' facts, which all clouds must share."""
-    known: tuple[ColumnFacts, ...] | None = None
-    for path in paths:
-        with ColumnReader(path, *columns) as reader:
-            for mine, other in zip(reader.facts, known or reader.facts, strict=True):
-                if mine.unit != other.unit:
-                    raise ConfigError(f"{path}: {mine.name} is in [{mine.unit}], in {paths[0]} in [{other.unit}]; make "
-                                      "a raster of each")  # fmt: skip
-                if mine.is_flags:
-                    raise ConfigError(f"{path}: {mine.name} are bits, which have no statistic; count the points with a "
-                                      "flag: --statistic count --flags NAME")  # fmt: skip
-            known = known or reader.facts
-    return known or ()
-
-
-def _find_extent(
-    paths: Sequence[Path], options: GridOptions
-) -> tuple[tuple[float, float, float, float], int, np.ndarray]:
+def _find_extent(clouds: Clouds, options: GridOptions) -> tuple[Box, int, np.ndarray]:
     """The box of all points, their number, and the largest absolute value of each column."""
     low, high, points = np.full(2, np.inf), np.full(2, -np.inf), 0
-    largest = np.zeros(len(options.columns))
-    for rows, _ in read_pieces(paths, options):
-        rows = rows[is_inside(rows, options.bounds)]
+    largest = np.zeros(1 + len(clouds.other_facts))
+    for _, rows, _ in clouds.read_all():
+        rows = rows[is_inside(rows, options.bbox)]
         if len(rows):
             places = np.stack([rows["x"], rows["y"]], axis=1)
             low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
             largest = np.maximum(largest, np.nan_to_num(np.abs(rows["values"])).max(axis=0, initial=0.0))
             points += len(rows)
     if not points:
-        wanted = ["a position within --bbox" if options.bounds else "a position"]
-        wanted += ["the chosen flags"] if options.flags_with or options.flags_without else []
-        wanted += ["what --where asks for"] if options.where is not None else []
-        raise InputError(f"{paths[0]}: no raster: no point has {' and '.join(wanted)}")
-    return options.bounds or (*low.tolist(), *high.tolist()), points, largest
+        wanted, selection = ["a position within --bbox" if options.bbox else "a position"], options.selection
+        wanted += ["the chosen flags"] if selection.flags_with or selection.flags_without else []
+        wanted += ["what --where asks for"] if selection.where is not None else []
+        raise InputError(f"{clouds.paths[0]}: no raster: no point has {' and '.join(wanted)}")
+    return options.bbox or (*low.tolist(), *high.tolist()), points, largest
 
 
 def _choose_dtype(facts: Sequence[ColumnFacts], largest: np.ndarray) -> str:
@@ -168,7 +148,7 @@ def _choose_dtype(facts: Sequence[ColumnFacts], largest: np.ndarray) -> str:
     return "float64" if any(wide) else "float32"
 
 
-def _lay_out(where: str, box: tuple[float, float, float, float], options: GridOptions) -> Grid:
+def _lay_out(where: str, box: Box, options: GridOptions) -> Grid:
     """The cells of the raster; ConfigError for too many."""
     west, south, east, north = box
     size = options.size
@@ -177,15 +157,13 @@ def _lay_out(where: str, box: tuple[float, float, float, float], options: GridOp
             f"{where}: {(east - west) / size:.3g} x {(north - south) / size:.3g} cells of {size:g} are too many; a "
             "coordinate may be damaged: give --bbox, or a larger --size"
         )
-    if options.bounds is not None:  # they end at a border, where no other cell begins
+    if options.bbox is not None:  # its cells end at a border, where no other cell begins
         first = round(west / size), round(south / size)
         last = max(round(east / size) - 1, first[0]), max(round(north / size) - 1, first[1])
         return Grid(size, *first, last[1] - first[1] + 1, last[0] - first[0] + 1)
     return Grid.cover(box, size)
 
 
-def _describe(facts: Sequence[ColumnFacts], statistic: str, length: str) -> list[Band]:
-    unit = {"count": "", "density": f"1/{length}2"}.get(statistic)
-    if not facts:
-        return [Band(f"{statistic} of points", unit or "")]
-    return [Band(f"{statistic} of {one.name}", (one.unit.strip("-") if unit is None else unit)) for one in facts]
+def _describe(facts: ColumnFacts, statistic: str, length: str) -> Band:
+    unit = {"count": "", "density": f"1/{length}2"}.get(statistic, facts.unit.strip("-"))
+    return Band(f"{statistic} of {facts.name}", unit)

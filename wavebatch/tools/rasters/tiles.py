@@ -6,38 +6,21 @@ bucket after the other is read and its tiles are computed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.condition import Condition
-from wavebatch.files.cloud.column_reader import ColumnReader, select_points
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.geotiff_file import TILE
-from wavebatch.tools.rasters.cells import Grid, compute_cells
+from wavebatch.tools.plots.values import Clouds
+from wavebatch.tools.rasters.cells import Box, Grid, compute_cells
 
 HELD = 2_000_000
 """Points in memory at a time."""
 
 MOST_BUCKETS = 4096
 """With HELD / 2 points each they hold 4e9 points."""
-
-
-@dataclass(frozen=True, slots=True)
-class CellOptions:
-    """What is computed of which points."""
-
-    columns: tuple[str, ...]
-    """A band each; empty for count and density of all points."""
-    statistic: str = "mean"
-    bounds: tuple[float, float, float, float] | None = None
-    """West, south, east, north."""
-    flags_with: int = 0
-    flags_without: int = 0
-    where: Condition | None = None
-    """Points must meet this."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -54,20 +37,21 @@ class Placed:
 
 
 def compute_tiles(
-    paths: Sequence[Path], options: CellOptions, grid: Grid, points: int, result: Placed
+    clouds: Clouds, statistic: str, grid: Grid, points: int, result: Placed, bounds: Box | None = None
 ) -> Iterator[tuple[int, int, np.ndarray]]:
     """Row from the north, column and values f8 (bands, TILE, TILE) of every tile with a point; NaN without a value.
 
-    points: of all clouds, about. result: gets the counts before the first tile comes.
+    There is a band for each column of the clouds. points: of all clouds, about. result: gets the counts before the
+    first tile comes. bounds: only points within them count.
     """
     number = int(np.clip(-(-points // (HELD // 2)), 1, MOST_BUCKETS))
-    bands = max(len(options.columns), 1)
+    bands = 1 + len(clouds.other_facts)
     entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (bands,))]))
     try:
-        _fill(paths, options, grid, entries, result)
+        _fill(clouds, bounds, grid, entries, result)
         entries.seal()
         for bucket in range(number):
-            for tile, values in _compute_bucket(entries, bucket, options, grid.size**2):
+            for tile, values in _compute_bucket(entries, bucket, statistic, grid.size**2):
                 yield *divmod(tile, _across(grid)), values
     finally:
         entries.close()
@@ -77,18 +61,7 @@ def _across(grid: Grid) -> int:
     return -(-grid.columns // TILE)
 
 
-def read_pieces(paths: Sequence[Path], options: CellOptions) -> Iterator[tuple[np.ndarray, int]]:
-    """Pieces of all clouds: points with the right flags that meet the condition, and the number of those left out."""
-    for path in paths:
-        with ColumnReader(path, *options.columns) as reader:
-            select_points(reader, options.where, options.flags_with, options.flags_without)
-            seen = 0
-            for rows in reader.read_pieces():
-                more, seen = reader.left_out - seen, reader.left_out
-                yield rows, more
-
-
-def is_inside(rows: np.ndarray, bounds: tuple[float, float, float, float] | None) -> np.ndarray:
+def is_inside(rows: np.ndarray, bounds: Box | None) -> np.ndarray:
     """Points with a position within the bounds, bool (n,)."""
     inside = np.isfinite(rows["x"]) & np.isfinite(rows["y"])
     if bounds is not None:
@@ -97,30 +70,28 @@ def is_inside(rows: np.ndarray, bounds: tuple[float, float, float, float] | None
     return inside
 
 
-def _fill(paths: Sequence[Path], options: CellOptions, grid: Grid, entries: Spool, result: Placed) -> None:
+def _fill(clouds: Clouds, bounds: Box | None, grid: Grid, entries: Spool, result: Placed) -> None:
     """Put every point with a value into the bucket of its tile."""
-    bands = max(len(options.columns), 1)
-    counted = np.zeros(bands, np.int64)
-    for rows, left_out in read_pieces(paths, options):
-        inside = is_inside(rows, options.bounds)
+    counted = np.zeros(1 + len(clouds.other_facts), np.int64)
+    for _, rows, left_out in clouds.read_all():
+        inside = is_inside(rows, bounds)
         result.points += len(rows) + left_out
         result.left_out += left_out
         row, column, in_grid = grid.place(rows["x"], rows["y"])
         inside &= in_grid
         result.outside += int(len(rows) - inside.sum())
         rows, column, row = rows[inside], column[inside], grid.rows - 1 - row[inside]
-        values = rows["values"] if options.columns else np.ones((len(rows), 1))
-        counted += np.isfinite(values).sum(axis=0)
+        counted += np.isfinite(rows["values"]).sum(axis=0)
         found = np.empty(len(rows), entries.dtype)
         found["tile"] = row // TILE * _across(grid) + column // TILE
         found["cell"] = row % TILE * TILE + column % TILE
-        found["values"] = values
+        found["values"] = rows["values"]
         entries.append((found["tile"] % np.uint64(entries.buckets)).astype(np.int64), found)
     result.values = tuple(counted.tolist())
 
 
 def _compute_bucket(
-    entries: Spool, bucket: int, options: CellOptions, area: float
+    entries: Spool, bucket: int, statistic: str, area: float
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Number and values (bands, TILE, TILE) of every tile of a bucket."""
     total = sum(len(piece) for piece in entries.pieces(bucket))
@@ -131,14 +102,14 @@ def _compute_bucket(
         rows = rows[np.argsort(rows["tile"], kind="stable")]
         tiles, first = np.unique(rows["tile"], return_index=True)
         for tile, part in zip(tiles.tolist(), np.split(rows, first[1:]), strict=True):
-            yield tile, _compute(part, options, area)
+            yield tile, _compute(part, statistic, area)
         return
     tiles = np.unique(np.concatenate([np.unique(piece["tile"]) for piece in entries.pieces(bucket)]))
     for tile in tiles.tolist():
-        yield tile, _compute_dense(entries, bucket, tile, options, area)
+        yield tile, _compute_dense(entries, bucket, tile, statistic, area)
 
 
-def _compute_dense(entries: Spool, bucket: int, tile: int, options: CellOptions, area: float) -> np.ndarray:
+def _compute_dense(entries: Spool, bucket: int, tile: int, statistic: str, area: float) -> np.ndarray:
     """A tile of a bucket that does not fit in memory: groups of cells, each of about HELD points, one by one."""
     count = np.zeros(TILE * TILE, np.int64)
     for piece in entries.pieces(bucket):
@@ -148,12 +119,12 @@ def _compute_dense(entries: Spool, bucket: int, tile: int, options: CellOptions,
     for number in np.unique(group[count > 0]).tolist():
         wanted = group == number
         parts = [piece[(piece["tile"] == tile) & wanted[piece["cell"]]] for piece in entries.pieces(bucket)]
-        part = _compute(np.concatenate(parts), options, area).reshape(len(values), -1)
+        part = _compute(np.concatenate(parts), statistic, area).reshape(len(values), -1)
         values[:, wanted] = part[:, wanted]
     return values.reshape(-1, TILE, TILE)
 
 
-def _compute(rows: np.ndarray, options: CellOptions, area: float) -> np.ndarray:
+def _compute(rows: np.ndarray, statistic: str, area: float) -> np.ndarray:
     cell = rows["cell"].astype(np.int64)
-    bands = [compute_cells(options.statistic, cell, values, TILE * TILE, area) for values in rows["values"].T]
+    bands = [compute_cells(statistic, cell, values, TILE * TILE, area) for values in rows["values"].T]
     return np.stack(bands).reshape(-1, TILE, TILE)

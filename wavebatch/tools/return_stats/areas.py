@@ -1,6 +1,7 @@
-"""Counts of returns per area: cells of a grid, or polygons.
+"""Counts of returns per area: whole clouds, cells of a grid, or polygons.
 
-`returns` has one AreaTally per division and cloud; `wavebatch stats --area` and `--polygon` choose the divisions.
+`returns` has one AreaTally per division and cloud, and one for the whole cloud; `wavebatch stats --area` and
+`--polygon` choose the divisions.
 """
 
 from __future__ import annotations
@@ -56,12 +57,14 @@ class Division(Protocol):
 
     def place(self, cloud: Path) -> Division:
         """The division in the coordinates of a cloud."""
+        return self
 
     def miss(self, cloud: Path) -> str:
         """Says that no area lies in the cloud, once it is placed; empty where one does."""
+        return ""
 
 
-class Grid:
+class Grid(Division):
     """Square cells whose borders are multiples of `size`, in the unit of the coordinates."""
 
     def __init__(self, size: float) -> None:
@@ -86,16 +89,8 @@ class Grid:
         x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
         return Area("cell", f"{x:.10g} {y:.10g}", x, y)
 
-    def place(self, cloud: Path) -> Grid:
-        """As Division.place."""
-        return self
 
-    def miss(self, cloud: Path) -> str:
-        """As Division.miss."""
-        return ""
-
-
-class PolygonSet:
+class PolygonSet(Division):
     """Polygons; where polygons overlap, a position belongs to the first one."""
 
     def __init__(self, polygons: Sequence[Polygon]) -> None:
@@ -123,8 +118,28 @@ class PolygonSet:
         return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
 
 
-RANKS = ("1-2", "2-3", "3-4", "4-")
-"""Classes of pairs of consecutive returns by the number of the first one; the last class holds all higher numbers."""
+class Whole(Division):
+    """One area without borders, which counts also where it holds no pulse."""
+
+    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """As Division.find."""
+        return np.zeros(len(x), np.int64)
+
+    def describe(self, number: int) -> Area:
+        """As Division.describe."""
+        return Area("cloud", "")
+
+
+def name_ranks(number: int) -> tuple[str, ...]:
+    """Names of so many classes of pairs of consecutive returns.
+
+    They count by the number of the first return; the last class holds all higher numbers.
+    """
+    return (*(f"{k}-{k + 1}" for k in range(1, number)), f"{number}-")
+
+
+RANKS = name_ranks(4)
+"""Classes of pairs per area and of dead zones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,24 +191,26 @@ class AreaStats:
 class AreaTally:
     """Sums per area of one division; tallies of several clouds can be merged."""
 
-    def __init__(self, division: Division) -> None:
-        self.division = division
-        self._areas = np.empty(0, np.int64)
-        self._counts = np.zeros((0, MOST_NUMBER + 1 + MOST_COUNT + 1 + len(RANKS) + 1), np.int64)
-        self._sums = np.zeros((0, len(RANKS) + 1))
-        self._least = np.zeros((0, len(RANKS)))
+    def __init__(self, division: Division, ranks: tuple[str, ...] = RANKS) -> None:
+        self.division, self._ranks = division, ranks
+        n = int(isinstance(division, Whole))
+        self._areas = np.zeros(n, np.int64)
+        self._counts = np.zeros((n, MOST_NUMBER + 1 + MOST_COUNT + 1 + len(ranks) + 1), np.int64)
+        self._sums = np.zeros((n, len(ranks) + 1))
+        self._least = np.full((n, len(ranks)), np.inf)
 
     def __len__(self) -> int:
         return len(self._areas)
 
     def add(
-        self, rows: np.ndarray, first: np.ndarray, before: np.ndarray, distance: np.ndarray, up: float = 1.0
+        self, rows: np.ndarray, first: np.ndarray, pairs: tuple[np.ndarray, ...], depths: tuple[np.ndarray, ...]
     ) -> None:
         """Adds whole pulses: a pulse belongs, with all its returns, to the area of its first return.
 
-        rows: returns sorted by pulse, then number; first: row of the first return of each pulse; before: rows that form
-        a pair with the next row; distance: of these pairs [m]; up: metres of a step of 1 in height.
+        rows: returns sorted by pulse, then number; first: row of the first return of each pulse; pairs: rows that form
+        a pair with the next row, and their distances [m]; depths: from `measure_depths`.
         """
+        (before, distance), (pulses, depth), ranks = pairs, depths, len(self._ranks)
         places = rows["xyz"][first]
         areas, area = np.unique(self.division.find(places[:, 0], places[:, 1]), return_inverse=True)
         n, number = len(areas), np.diff(np.append(first, len(rows)))
@@ -201,14 +218,13 @@ class AreaTally:
         by_number = np.bincount(of_row * (MOST_NUMBER + 1) + rows["number"], minlength=n * (MOST_NUMBER + 1))
         classes = area * (MOST_COUNT + 1) + np.minimum(number, MOST_COUNT)
         by_count = np.bincount(classes, minlength=n * (MOST_COUNT + 1))
-        rank = np.minimum(rows["number"][before].astype(np.int64), len(RANKS)) - 1
-        of_pair, cells = of_row[before] * len(RANKS) + rank, n * len(RANKS)
-        pairs = np.bincount(of_pair, minlength=cells).reshape(n, -1)
+        rank = np.minimum(rows["number"][before].astype(np.int64), ranks) - 1
+        of_pair, cells = of_row[before] * ranks + rank, n * ranks
+        number_of_pairs = np.bincount(of_pair, minlength=cells).reshape(n, -1)
         least = np.full(cells, np.inf)
         np.minimum.at(least, of_pair, distance)
-        pulses, depth = measure_depths(rows, first, up)
         several = np.bincount(area[pulses], minlength=n)[:, None]
-        tables = (by_number.reshape(n, -1), by_count.reshape(n, -1), pairs, several)
+        tables = (by_number.reshape(n, -1), by_count.reshape(n, -1), number_of_pairs, several)
         apart = np.bincount(of_pair, distance, cells).reshape(n, -1)
         sums = np.concatenate([apart, np.bincount(area[pulses], depth, n)[:, None]], axis=1)
         self._join(areas, np.concatenate(tables, axis=1), sums, least.reshape(n, -1))
@@ -241,18 +257,18 @@ class AreaTally:
 
     def _describe(self, row: int) -> AreaStats:
         edge = MOST_NUMBER + 2 + MOST_COUNT
-        by_number, by_count, pairs, several = np.split(self._counts[row], [MOST_NUMBER + 1, edge, edge + len(RANKS)])
+        by_number, by_count, pairs, several = np.split(self._counts[row], [MOST_NUMBER + 1, edge, -1])
         points, pulses, number = int(by_number.sum()), int(by_count.sum()), int(several[0])
         apart, depth = self._sums[row, :-1], float(self._sums[row, -1])
         every = describe_pairs(pairs.sum(), apart.sum(), self._least[row].min())
-        ranks = zip(RANKS, pairs, apart, self._least[row], strict=True)
+        ranks = zip(self._ranks, pairs, apart, self._least[row], strict=True)
         return AreaStats(
             *self.division.describe(int(self._areas[row])),
             points=points,
             pulses=pulses,
-            returns_per_pulse=points / pulses,
-            by_number=share_counts(by_number),
-            by_count=share_counts(by_count),
+            returns_per_pulse=points / pulses if pulses else math.nan,
+            by_number=_share_counts(by_number),
+            by_count=_share_counts(by_count),
             pairs=every.pairs,
             mean=every.mean,
             least=every.least,
@@ -262,7 +278,7 @@ class AreaTally:
         )
 
 
-def measure_depths(rows: np.ndarray, first: np.ndarray, up: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def measure_depths(rows: np.ndarray, first: np.ndarray, up: float) -> tuple[np.ndarray, np.ndarray]:
     """Pulses with several returns, and the height of their first above their last return [m].
 
     rows: returns sorted by pulse, then number; first: row of the first return of each pulse; up: metres of a step of 1
@@ -275,7 +291,7 @@ def measure_depths(rows: np.ndarray, first: np.ndarray, up: float = 1.0) -> tupl
     return pulses, depth[pulses]
 
 
-def share_counts(counts: np.ndarray) -> dict[int, float]:
+def _share_counts(counts: np.ndarray) -> dict[int, float]:
     """Shares of the sum, without zeros."""
     total = int(counts.sum())
     return {int(n): int(counts[n]) / total for n in np.flatnonzero(counts)}

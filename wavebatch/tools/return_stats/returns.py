@@ -19,22 +19,22 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
 from wavebatch.files.cloud.column_reader import select_points
 from wavebatch.files.cloud.echo_reader import RETURN_DTYPE, CloudReader
-from wavebatch.files.disk.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
+from wavebatch.files.disk.buckets import count_buckets, spread_keys, tell_pulses_apart, time_keys
+from wavebatch.files.disk.spool import Spool
 from wavebatch.tools.return_stats.areas import (
     MOST_AREAS,
-    MOST_COUNT,
     AreaStats,
     AreaTally,
     Division,
     Separation,
-    describe_pairs,
+    Whole,
     measure_depths,
-    share_counts,
+    name_ranks,
 )
 from wavebatch.tools.return_stats.dead_zones import DeadZone, Distances
 
-_MOST_PAIR = 15
-"""Classes of pairs by return number; the last one holds all higher numbers."""
+_RANKS = name_ranks(15)
+"""Classes of pairs of whole clouds."""
 
 _NOT_A_TIME = np.uint64(0x7FF8 << 48)
 """Bits of a NaN: above the key of every GPS time that is a number and at least 0."""
@@ -142,12 +142,12 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | N
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
         number = count_buckets(reader.point_count)
-        with Buckets(_ROW, number) as buckets:
+        with Spool(number, _ROW) as buckets:
             keys = _Keys(by_time)
             for rows in reader.read_pieces():
                 tally.add_points(rows)
                 shaped = _shape(rows, keys.of(rows))
-                buckets.add(shaped, lambda part: (np.arange(len(part)), spread_keys(part["key"], number)))
+                buckets.append(spread_keys(shaped["key"], number), shaped)
             for bucket in range(number):
                 tally.add_pulses(buckets.read(bucket))
         if keys.untimed:
@@ -199,18 +199,12 @@ def _shape(rows: np.ndarray, key: np.ndarray) -> np.ndarray:
 class _Tally:
     """Sums of one cloud; tallies of several clouds can be merged."""
 
-    points: int = 0
     left_out: int = 0
     incomplete: int = 0
-    several: int = 0
     depth: float = 0.0
     methods: set[str] = field(default_factory=set)
-    by_number: np.ndarray = field(default_factory=lambda: np.zeros(16, np.int64))
-    by_count: np.ndarray = field(default_factory=lambda: np.zeros(MOST_COUNT + 1, np.int64))
     distances: Distances = field(default_factory=Distances)
-    pairs: np.ndarray = field(default_factory=lambda: np.zeros(_MOST_PAIR, np.int64))
-    sums: np.ndarray = field(default_factory=lambda: np.zeros(_MOST_PAIR))
-    least: np.ndarray = field(default_factory=lambda: np.full(_MOST_PAIR, np.inf))
+    whole: AreaTally = field(default_factory=lambda: AreaTally(Whole(), _RANKS))
     flags: np.ndarray | None = None
     areas: list[AreaTally] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -219,9 +213,7 @@ class _Tally:
     """Of a step of 1 in x, y and z; NaN in degrees, which have no distances."""
 
     def add_points(self, rows: np.ndarray) -> None:
-        """Adds return numbers and flags of some points."""
-        self.points += len(rows)
-        self.by_number += np.bincount(rows["number"], minlength=16)
+        """Adds the flags of some points."""
         if self.flags is not None:
             self.flags += [int(np.count_nonzero(rows["flags"] & np.uint16(flag))) for flag in EchoFlag]
 
@@ -232,76 +224,63 @@ class _Tally:
         rows = rows[np.lexsort((rows["number"], rows["key"]))]
         first = np.flatnonzero(np.concatenate([[True], rows["key"][1:] != rows["key"][:-1]]))
         counts = np.diff(np.append(first, len(rows)))
-        self.by_count += np.bincount(np.minimum(counts, MOST_COUNT), minlength=MOST_COUNT + 1)
         self.incomplete += int(np.count_nonzero(counts != rows["total"][first]))
-        pulses, depth = measure_depths(rows, first, self.metres[2])
-        self.several += len(pulses)
-        self.depth += float(depth.sum())
+        depths = measure_depths(rows, first, self.metres[2])
+        self.depth += float(depths[1].sum())
         pair = (rows["key"][1:] == rows["key"][:-1]) & rows["echo"][1:] & rows["echo"][:-1]
         before = np.flatnonzero(pair & (rows["number"][1:] == rows["number"][:-1] + 1) & (rows["number"][:-1] > 0))
         with np.errstate(over="ignore", invalid="ignore"):
             distance = np.linalg.norm((rows["xyz"][before + 1] - rows["xyz"][before]) * self.metres, axis=1)
         known = np.isfinite(distance)
         before, distance = before[known], distance[known]
-        rank = np.minimum(rows["number"][before], _MOST_PAIR) - 1
         self.distances.add(rows["number"][before], distance)
-        self.pairs += np.bincount(rank, minlength=_MOST_PAIR)
-        self.sums += np.bincount(rank, distance, _MOST_PAIR)
-        np.minimum.at(self.least, rank, distance)
-        for area in self.areas:
-            area.add(rows, first, before, distance, self.metres[2])
+        for area in (self.whole, *self.areas):
+            area.add(rows, first, (before, distance), depths)
 
     def merge(self, other: _Tally) -> None:
         """Adds the sums of another cloud."""
         self.methods |= other.methods
-        for name in ("points", "left_out", "incomplete", "several", "depth", "by_number", "by_count", "pairs", "sums"):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.left_out += other.left_out
+        self.incomplete += other.incomplete
+        self.depth += other.depth
         self.distances.merge(other.distances)
-        self.least = np.minimum(self.least, other.least)
-        for area, more in zip(self.areas, other.areas, strict=True):
+        for area, more in zip((self.whole, *self.areas), (other.whole, *other.areas), strict=True):
             area.merge(more)
         if other.flags is not None:
             self.flags = other.flags + (0 if self.flags is None else self.flags)
 
     def finish(self, cloud: str) -> ReturnStats:
         """The statistics."""
-        pulses = int(self.by_count.sum())
+        (whole,) = self.whole.finish()
         zones = self.distances.list_zones()
         zone = zones["all"].size
-        hidden = math.nan if math.isnan(zone) else self.distances.count_hidden(zone) / pulses
+        hidden = math.nan if math.isnan(zone) else self.distances.count_hidden(zone) / whole.pulses
         names = [flag.name for flag in EchoFlag]
         return ReturnStats(
             cloud=cloud,
-            points=self.points,
-            pulses=pulses,
+            points=whole.points,
+            pulses=whole.pulses,
             incomplete=self.incomplete,
             pulses_by=" and ".join(sorted(self.methods)),
-            by_number=share_counts(self.by_number),
-            by_count=share_counts(self.by_count),
-            separations=self._list_separations(),
-            several=self.several,
-            depth=self.depth / self.several if self.several else math.nan,
+            by_number=whole.by_number,
+            by_count=whole.by_count,
+            separations={"all": Separation(whole.pairs, whole.mean, whole.least), **whole.separations},
+            several=whole.several,
+            depth=self.depth / whole.several if whole.several else math.nan,
             dead_zone=zone,
             dead_zones=zones,
             hidden=hidden,
             flags=None if self.flags is None else dict(zip(names, self.flags.tolist(), strict=True)),
-            warnings=tuple(self._warn(zone, hidden, pulses)),
+            warnings=tuple(self._warn(zone, hidden, whole)),
             areas=tuple(stats for area in self.areas for stats in area.finish()),
             left_out=self.left_out,
         )
 
-    def _list_separations(self) -> dict[str, Separation]:
-        table = {"all": describe_pairs(self.pairs.sum(), self.sums.sum(), self.least.min())}
-        for rank in np.flatnonzero(self.pairs).tolist():
-            name = f"{rank + 1}-{rank + 2}" if rank + 1 < _MOST_PAIR else f"{rank + 1}-"
-            table[name] = describe_pairs(self.pairs[rank], self.sums[rank], self.least[rank])
-        return table
-
-    def _warn(self, zone: float, hidden: float, pulses: int) -> list[str]:
+    def _warn(self, zone: float, hidden: float, whole: AreaStats) -> list[str]:
         lines = list(self.notes)
         if self.left_out:
             lines.append(
-                f"--where: {self.left_out} of {self.points + self.left_out} points are left out; pulses and distances "
+                f"--where: {self.left_out} of {whole.points + self.left_out} points are left out; pulses and distances "
                 "are those of the points that are left"
             )
         if zone >= 0.05 and hidden > 0.001:
@@ -310,16 +289,16 @@ class _Tally:
                 "ns); surfaces that are closer give one return. If returns were as frequent there as just above it, "
                 f"there would be {hidden:.3f} more returns per pulse"
             )
-        most = int(np.flatnonzero(self.by_count).max(initial=0))
-        last, before = int(self.by_count[most]), int(self.by_count[max(most - 1, 0)])
+        most = max(whole.by_count, default=0)
+        last, before = (round(whole.pulses * whole.by_count.get(k, 0.0)) for k in (most, most - 1))
         if most >= 3 and last - before > _SURE * math.sqrt(last + before):
             lines.append(
-                f"limit: {self.by_count[most] / pulses:.1%} of the pulses have {most} returns, more than have "
+                f"limit: {whole.by_count[most]:.1%} of the pulses have {most} returns, more than have "
                 f"{most - 1}; the sensor records at most {most}, and later surfaces are missing"
             )
-        if self.incomplete > 0.001 * pulses:
+        if self.incomplete > 0.001 * whole.pulses:
             lines.append(
-                f"incomplete: {self.incomplete} of {pulses} pulses have another number of points than stored in them; "
-                "tiles and thinned clouds give fewer returns per pulse than the sensor recorded"
+                f"incomplete: {self.incomplete} of {whole.pulses} pulses have another number of points than stored in "
+                "them; tiles and thinned clouds give fewer returns per pulse than the sensor recorded"
             )
         return lines

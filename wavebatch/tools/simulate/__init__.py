@@ -6,7 +6,6 @@ scenes, canopy, hazards, draws   which echoes a waveform holds: kinds of land, p
 geometry                         flight, rays and terrain
 pulses, render                   shape of an echo; echoes to samples with noise
 blocks                           a scene as blocks in memory, with the true echoes
-given_echoes                     a block with exactly the echoes that the caller gives
 returns                          true echoes to discrete returns, as vendors and discrete receivers record them
 strip, truth                     a scene as a LAS or LAZ file, and the .npz with its true echoes
 from_returns, return_light       an existing cloud of returns as a strip with modelled waveforms
@@ -16,7 +15,6 @@ Called by `wavebatch simulate`, `wavebatch synthesize`, tools.bench, the example
 
 from wavebatch.tools.simulate.blocks import flag_truth, simulate_block, simulate_blocks
 from wavebatch.tools.simulate.canopy import CANOPIES
-from wavebatch.tools.simulate.given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.tools.simulate.pulses import PULSES, PulseModel, find_pulse, shape_pulse
 from wavebatch.tools.simulate.render import Recording
 from wavebatch.tools.simulate.returns import DiscreteReceiver
@@ -25,8 +23,8 @@ from wavebatch.tools.simulate.strip import ReturnSummary, StripOptions, StripSum
 from wavebatch.tools.simulate.truth import TruthReader
 
 __all__ = [
-    "CANOPIES", "FINE", "PULSES", "SCENES",
+    "CANOPIES", "PULSES", "SCENES",
     "DiscreteReceiver", "PulseModel", "Recording", "ReturnSummary", "Scene", "StripOptions", "StripSummary",
-    "TruthReader", "find_pulse", "find_scene", "fine_recording", "flag_truth", "known_noise", "known_system",
-    "shape_pulse", "simulate_block", "simulate_blocks", "simulate_echoes", "simulate_returns", "simulate_strip",
+    "TruthReader", "find_pulse", "find_scene", "flag_truth",
+    "shape_pulse", "simulate_block", "simulate_blocks", "simulate_returns", "simulate_strip",
 ]  # fmt: skip

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
+from wavebatch.core.errors import InputError
+from wavebatch.core.units import HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud.echo_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.disk.protect import protecting
@@ -24,13 +23,9 @@ from wavebatch.files.las.header import is_projection, read_header
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.files.wkt_repair import repair_records
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
-from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
-from wavebatch.tools.simulate.return_light import Light, LightCounts, LightModel, Radar, open_light
+from wavebatch.tools.simulate.return_light import Light, LightCounts, LightModel, SynthesisOptions
 from wavebatch.tools.simulate.returns import fill_packets
-
-INTENSITIES = ("peak", "reflectance")
-"""Meanings of the intensities of a cloud, see SynthesisOptions."""
 
 MARGIN = 6.0
 """Time before the first and after the last return of a pulse, in standard deviations of the pulse."""
@@ -49,65 +44,6 @@ _PAINTED = 1 << 22
 _LEVELS = np.geomspace(1e-12, 1e12, 4801)
 """Edges of the histogram of strengths, 1.2 % apart, from which the gain is chosen."""
 
-MOST_WIDTH = 1000.0
-"""Largest full width of a pulse [ns]."""
-
-MOST_GAIN = 1e20
-"""Largest gain: amplitudes must stay numbers in float32."""
-
-
-@dataclass(frozen=True, slots=True)
-class SynthesisOptions:
-    """How returns become waveforms."""
-
-    intensity: str = "peak"
-    """`peak`: intensities are peak amplitudes; `reflectance`: they are reflectances, weakened by the lidar equation."""
-    gain: float | None = None
-    """`peak`: DN per unit of intensity; `reflectance`: DN per W, where intensity 65535 is reflectance 1. None: chosen
-    so that the strongest returns fill FULL_SHARE of the digitizer's range."""
-    radar: Radar | None = None
-    """Needed for `reflectance`, and only there."""
-    width: float = 4.7
-    """Full width at half maximum of the pulse [ns], and of echoes whose width is not known."""
-    widths: str | None = None
-    """Column of the cloud with the full width at half maximum of each echo [ns]; None: echo_width, where it has it."""
-    shares: str | None = None
-    """Column with the share of the beam that each return takes, or `equal`; only for `reflectance`. None: reflectances
-    are those of surfaces that fill the beam."""
-    spacing: float = 1.0
-    """Time between two samples [ns]."""
-    bits: int = 8
-    baseline: float = 12.0
-    """Level without signal [DN]."""
-    noise: float = 0.0
-    """Standard deviation before rounding [DN]."""
-    seed: int = 0
-    internal: bool = True
-    """Packets in the file itself, else in a .wdp next to it."""
-
-    def __post_init__(self) -> None:
-        if self.intensity not in INTENSITIES:
-            raise ConfigError(f"intensity {self.intensity!r} is unknown; choose peak or reflectance")
-        if (self.radar is None) != (self.intensity == "peak"):
-            raise ConfigError("the sensor's height is needed for intensity reflectance, and only there")
-        if self.shares is not None and self.radar is None:
-            raise ConfigError(
-                "shares of the beam need intensity reflectance: the peaks of returns hold their shares already"
-            )
-        if not (0 < self.width <= MOST_WIDTH and (self.gain is None or 0 < self.gain <= MOST_GAIN)):
-            raise ConfigError(f"width and gain must be above 0, at most {MOST_WIDTH:g} ns and {MOST_GAIN:g}")
-        if self.sigma < 0.5 * self.spacing:
-            raise ConfigError(f"a pulse of {self.width} ns is too short for samples every {self.spacing} ns")
-
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of an echo [ns]."""
-        return self.width / FWHM_PER_SIGMA
-
-    def recording(self, n_samples: int) -> Recording:
-        """The receiver with waveforms of that length; raises ConfigError for values that none can have."""
-        pulse = PulseModel(self.sigma)
-        return Recording(n_samples, self.spacing, self.bits, self.baseline, 0.0, self.noise, pulse=pulse)
 
 
 @dataclass(slots=True)
@@ -204,17 +140,15 @@ def synthesize_strip(
             raise InputError(
                 f"{cloud}: coordinates are {reader.unit}, but times along a ray need metres; project it to metres first"
             )
-        model = partial(open_light, reader.path, options.radar, options.sigma, options.spacing,
-                        widths=options.widths, shares=options.shares)  # fmt: skip
-        light = model()
+        light = LightModel(reader.path, options)
         # A model counts what it sees: each pass over the cloud has one.
-        gain = _choose_gain(reader, options, model()) if options.gain is None else options.gain
+        gain = _choose_gain(reader, LightModel(reader.path, options)) if options.gain is None else options.gain
         summary = SynthesisSummary(gain=gain, light=light.counts, level=recordings[0].empty_level)
         rise = options.spacing * (summary.level - options.baseline)
         with _open_writer(reader, Path(target), options, overwrite) as writer:
             for number, (rows, records) in enumerate(_read_pulses(reader)):
                 rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(number,)))
-                pulses = _model_pulses(rows, records, options, gain, light, rng)
+                pulses = _model_pulses(rows, records, gain, light, rng)
                 offset, energy = _write_packets(writer, recordings, pulses, rng)
                 summary.energy_recorded += energy
                 summary.energy_of_level += rise * float(np.append(_LENGTHS, 0)[pulses.kind].sum())
@@ -257,9 +191,9 @@ def _open_writer(reader: CloudReader, target: Path, options: SynthesisOptions, o
     )
 
 
-def _choose_gain(reader: CloudReader, options: SynthesisOptions, light: LightModel) -> float:
+def _choose_gain(reader: CloudReader, light: LightModel) -> float:
     """The gain that fills the digitizer; reads all points."""
-    counts = np.zeros(len(_LEVELS) + 1, np.int64)
+    counts, options = np.zeros(len(_LEVELS) + 1, np.int64), light.options
     for rows, records in _read_pulses(reader):
         strength = light.measure(rows, records, group_pulses(rows["gps_time"], rows["number"])).strength
         counts += np.bincount(np.searchsorted(_LEVELS, strength[strength > 0]), minlength=len(counts))
@@ -274,15 +208,10 @@ def _choose_gain(reader: CloudReader, options: SynthesisOptions, light: LightMod
 
 
 def _model_pulses(
-    rows: np.ndarray,
-    records: np.ndarray,
-    options: SynthesisOptions,
-    gain: float,
-    light: LightModel,
-    rng: np.random.Generator,
+    rows: np.ndarray, records: np.ndarray, gain: float, light: LightModel, rng: np.random.Generator
 ) -> _Pulses:
     """Echoes of the returns, with sample 0 a margin and a random part of a sample before the first of each pulse."""
-    starts = group_pulses(rows["gps_time"], rows["number"])
+    spacing, starts = light.options.spacing, group_pulses(rows["gps_time"], rows["number"])
     count = np.diff(np.append(starts, len(rows)))
     pulse = np.repeat(np.arange(len(starts)), count)
     ray = fit_rays(rows["xyz"], starts, rows["scan_angle"], rows["source"])
@@ -290,9 +219,9 @@ def _model_pulses(
     sigma = seen.sigma
     delay = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], ray[pulse]) / HALF_C
     margin = MARGIN * np.maximum.reduceat(sigma, starts)
-    phase = options.spacing * rng.random(len(starts))
+    phase = spacing * rng.random(len(starts))
     time = delay + (margin + phase - np.minimum.reduceat(delay, starts))[pulse]
-    n_samples = np.ceil((np.maximum.reduceat(time, starts) + margin) / options.spacing) + 1
+    n_samples = np.ceil((np.maximum.reduceat(time, starts) + margin) / spacing) + 1
     return _Pulses(
         pulse=pulse,
         time=time,

@@ -1,6 +1,6 @@
 """Echoes to raw counts: lobes painted into waveforms, noise, clipping and rounding, all waveforms at once.
 
-`blocks`, `given_echoes` and `from_returns` call `paint_echoes`, then `record_counts`. This is the slow part of a
+`blocks` and `from_returns` call `paint_echoes`, then `record_counts`. This is the slow part of a
 simulation: lobes of equal length are painted together, noise is drawn in cache-sized parts.
 """
 

@@ -1,14 +1,14 @@
 """How much light each return of a cloud sends back, how wide its echo is, and which share of the beam it takes.
 
-`from_returns` makes waveforms of it. Shares are the partial footprints A_i over A of Ussyshkin and Theriault (2011):
-the light that one return takes is missing for the others of its pulse, so that its shares are at most 1 together.
+`from_returns` makes waveforms of it, by the same SynthesisOptions. Shares are the partial footprints A_i over A of
+Ussyshkin and Theriault (2011): the light that one return takes is missing for the others of its pulse, so that its
+shares are at most 1 together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,8 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
+from wavebatch.tools.simulate.pulses import PulseModel
+from wavebatch.tools.simulate.render import Recording
 
 EQUAL = "equal"
 """Word in place of a column of shares: the returns of a pulse take the same share each, as many as it had."""
@@ -35,6 +37,15 @@ RADAR_LIMITS = {
     "attenuation": (0.0, 100.0),
 }
 """Least and largest values of the lidar equation, in the units of Radar: beyond them no lidar is, and numbers end."""
+
+INTENSITIES = ("peak", "reflectance")
+"""Meanings of the intensities of a cloud, see SynthesisOptions."""
+
+MOST_WIDTH = 1000.0
+"""Largest full width of a pulse [ns]."""
+
+MOST_GAIN = 1e20
+"""Largest gain: amplitudes must stay numbers in float32."""
 
 MOST_HEIGHT = 1e6
 """Largest height of a sensor [m]."""
@@ -69,6 +80,60 @@ class Radar:
             raise ConfigError(f"lidar equation: the sensor's height must lie within +-{MOST_HEIGHT:g} m")
 
 
+@dataclass(frozen=True, slots=True)
+class SynthesisOptions:
+    """How returns become waveforms."""
+
+    intensity: str = "peak"
+    """`peak`: intensities are peak amplitudes; `reflectance`: they are reflectances, weakened by the lidar equation."""
+    gain: float | None = None
+    """`peak`: DN per unit of intensity; `reflectance`: DN per W, where intensity 65535 is reflectance 1. None: chosen
+    so that the strongest returns fill FULL_SHARE of the digitizer's range."""
+    radar: Radar | None = None
+    """Needed for `reflectance`, and only there."""
+    width: float = 4.7
+    """Full width at half maximum of the pulse [ns], and of echoes whose width is not known."""
+    widths: str | None = None
+    """Column of the cloud with the full width at half maximum of each echo [ns]; None: echo_width, where it has it."""
+    shares: str | None = None
+    """Column with the share of the beam that each return takes, or `equal`; only for `reflectance`. None: reflectances
+    are those of surfaces that fill the beam."""
+    spacing: float = 1.0
+    """Time between two samples [ns]."""
+    bits: int = 8
+    baseline: float = 12.0
+    """Level without signal [DN]."""
+    noise: float = 0.0
+    """Standard deviation before rounding [DN]."""
+    seed: int = 0
+    internal: bool = True
+    """Packets in the file itself, else in a .wdp next to it."""
+
+    def __post_init__(self) -> None:
+        if self.intensity not in INTENSITIES:
+            raise ConfigError(f"intensity {self.intensity!r} is unknown; choose peak or reflectance")
+        if (self.radar is None) != (self.intensity == "peak"):
+            raise ConfigError("the sensor's height is needed for intensity reflectance, and only there")
+        if self.shares is not None and self.radar is None:
+            raise ConfigError(
+                "shares of the beam need intensity reflectance: the peaks of returns hold their shares already"
+            )
+        if not (0 < self.width <= MOST_WIDTH and (self.gain is None or 0 < self.gain <= MOST_GAIN)):
+            raise ConfigError(f"width and gain must be above 0, at most {MOST_WIDTH:g} ns and {MOST_GAIN:g}")
+        if self.sigma < 0.5 * self.spacing:
+            raise ConfigError(f"a pulse of {self.width} ns is too short for samples every {self.spacing} ns")
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of an echo [ns]."""
+        return self.width / FWHM_PER_SIGMA
+
+    def recording(self, n_samples: int) -> Recording:
+        """The receiver with waveforms of that length; raises ConfigError for values that none can have."""
+        pulse = PulseModel(self.sigma)
+        return Recording(n_samples, self.spacing, self.bits, self.baseline, 0.0, self.noise, pulse=pulse)
+
+
 @dataclass(slots=True)
 class LightCounts:
     """What was assumed about widths and shares."""
@@ -101,83 +166,91 @@ class Light:
     """Standard deviation of each echo [ns], f8 (k,)."""
 
 
-@dataclass(slots=True)
 class LightModel:
-    """Gives the light of the returns of one cloud; `open_light` makes it."""
+    """The light of the returns of one cloud; counts what is assumed.
 
-    path: Path
-    radar: Radar | None
-    """None: intensities are peaks."""
-    sigma: float
-    """Of the pulse [ns]."""
-    spacing: float
-    read_width: Callable[[np.ndarray], np.ndarray] | None
-    """From raw records to widths [ns]; None: the column echo_width, where the cloud has it."""
-    read_share: Callable[[np.ndarray], np.ndarray] | None
-    share_column: str | None
-    """Column of the shares, EQUAL, or None for returns that fill the beam each."""
-    width_column: str | None = None
-    """Column of the widths; None where no option names it."""
-    counts: LightCounts = field(default_factory=LightCounts)
+    Raises ConfigError if the cloud lacks a column of the options, or has it in another unit, or if it is a field that
+    LAS itself defines: none of these is a width or a share, and integers such as the class pass for both.
+    """
+
+    def __init__(self, path: Path, options: SynthesisOptions) -> None:
+        self.path, self.options, self.counts = path, options, LightCounts()
+        self._read_width = self._open("widths", ("-", "ns"), "the width of each echo in ns")
+        self._read_share = None
+        if options.shares != EQUAL:
+            self._read_share = self._open("shares", ("-",), "the share of each return, 0 to 1")
+
+    def _open(self, option: str, units: tuple[str, ...], needed: str) -> Callable[[np.ndarray], np.ndarray] | None:
+        """From raw records to the values of an option's column; None where none is named."""
+        column = getattr(self.options, option)
+        if column is None:
+            return None
+        with ColumnReader(self.path, column) as reader:
+            facts = reader.facts[0]
+            if facts.unit not in units:
+                raise ConfigError(f"{self.path}: --{option} {column}: is in [{facts.unit}], needed is [{units[-1]}]")
+            if facts.is_standard:
+                raise ConfigError(
+                    f"{self.path}: --{option} {column}: is the LAS field {facts.name}; give an extra dimension with "
+                    f"{needed}"
+                )
+            self.counts.assumed_unit |= option == "widths" and facts.unit == "-"
+            return reader.find_value(column)
 
     def measure(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> Light:
         """The light of returns (k,), RETURN_DTYPE, with their raw records; starts: first return of each pulse.
 
         Raises InputError for shares that are none, and for points above the sensor.
         """
-        sigma = self._measure_sigma(rows["echo_width"] if self.read_width is None else self.read_width(records))
+        sigma = self._measure_sigma(rows["echo_width"] if self._read_width is None else self._read_width(records))
         intensity = rows["intensity"].astype(np.float64)
-        if self.radar is None:
+        if self.options.radar is None:
             return Light(intensity, sigma)
-        power = _receive(intensity / 65535, rows, self.radar, self.path)
+        power = _receive(intensity / 65535, rows, self.options.radar, self.path)
         # The power is that of an echo as short as the pulse: a wider one spreads the same energy over a longer time.
-        power *= self.sigma / sigma
-        if self.share_column is not None:
+        power *= self.options.sigma / sigma
+        if self.options.shares is not None:
             power *= self._measure_shares(rows, records, starts)
         return Light(power, sigma)
 
     def check_widths(self) -> None:
         """Raises ConfigError where most widths of the named column had to be limited: they are no widths in ns."""
         counts = self.counts
-        if self.width_column is not None and counts.limited_width > _MOST_LIMITED * counts.own_width:
-            least, most = 0.5 * self.spacing * FWHM_PER_SIGMA, WIDEST * FWHM_PER_SIGMA
+        if self.options.widths is not None and counts.limited_width > _MOST_LIMITED * counts.own_width:
+            least, most = 0.5 * self.options.spacing * FWHM_PER_SIGMA, WIDEST * FWHM_PER_SIGMA
             raise ConfigError(
-                f"{self.path}: --widths {self.width_column}: {counts.limited_width} of {counts.own_width} values are "
+                f"{self.path}: --widths {self.options.widths}: {counts.limited_width} of {counts.own_width} values are "
                 f"outside of {least:.2g} to {most:.0f} ns; give a column with the width of each echo in ns"
             )
 
     def _measure_sigma(self, width: np.ndarray) -> np.ndarray:
         known = width > 0
         measured = np.where(known, width, 0.0) / FWHM_PER_SIGMA
-        limited = np.clip(measured, 0.5 * self.spacing, WIDEST)
+        limited = np.clip(measured, 0.5 * self.options.spacing, WIDEST)
         self.counts.own_width += int(np.count_nonzero(known))
         self.counts.limited_width += int(np.count_nonzero(known & (limited != measured)))
-        return np.where(known, limited, self.sigma)
+        return np.where(known, limited, self.options.sigma)
 
     def _measure_shares(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        if self.read_share is None:
+        known = over = 0
+        if self._read_share is None:
             share = share_equally(rows["total"], starts)
-            self._count_shares(share, 0, 0, starts)
-            return share
-        share = self.read_share(records).astype(float)
-        wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
-        if len(wrong):
-            raise InputError(
-                f"{self.path}: {self.share_column} holds {share[wrong[0]]:g}, which is no share of a footprint: shares "
-                "are 0 to 1; give a column with such values to --shares"
-            )
-        known = int(np.count_nonzero(np.isfinite(share)))
-        share, over = fill_shares(share, starts)
-        self._count_shares(share, known, over, starts)
+        else:
+            share = self._read_share(records).astype(float)
+            wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
+            if len(wrong):
+                raise InputError(
+                    f"{self.path}: {self.options.shares} holds {share[wrong[0]]:g}, which is no share of a footprint: "
+                    "shares are 0 to 1; give a column with such values to --shares"
+                )
+            known = int(np.count_nonzero(np.isfinite(share)))
+            share, over = fill_shares(share, starts)
+        self.counts.own_share += known
+        self.counts.assumed_share += len(share) - known
+        self.counts.over_one += over
+        self.counts.pulses += len(starts)
+        self.counts.shares += float(share.sum())
         return share
-
-    def _count_shares(self, share: np.ndarray, known: int, over: int, starts: np.ndarray) -> None:
-        counts = self.counts
-        counts.own_share += known
-        counts.assumed_share += len(share) - known
-        counts.over_one += over
-        counts.pulses += len(starts)
-        counts.shares += float(share.sum())
 
 
 def share_equally(total: np.ndarray, starts: np.ndarray) -> np.ndarray:
@@ -205,36 +278,6 @@ def fill_shares(share: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, int]
     rest = np.clip(1.0 - total, 0.0, 1.0) / np.maximum(unknown, 1.0)
     filled = np.where(known, share, rest[pulse]) / np.maximum(total, 1.0)[pulse]
     return filled, int(np.count_nonzero(total > 1.0 + _TOLERANCE))
-
-
-def open_light(
-    path: Path, radar: Radar | None, sigma: float, spacing: float, *, widths: str | None, shares: str | None
-) -> LightModel:
-    """The model of a cloud; widths, shares: columns, or EQUAL for shares.
-
-    Raises ConfigError if the cloud has no such column, or in another unit, or if it is a field that LAS itself defines:
-    none of these is a width or a share, and integers such as the class pass for both.
-    """
-    read = {"widths": None, "shares": None}
-    counts = LightCounts()
-    wanted = {"widths": (widths, ("-", "ns")), "shares": (None if shares == EQUAL else shares, ("-",))}
-    for name, (column, units) in wanted.items():
-        if column is None:
-            continue
-        with ExitStack() as stack:
-            reader = stack.enter_context(ColumnReader(path, column))
-            if reader.facts[0].unit not in units:
-                raise ConfigError(f"{path}: --{name} {column}: is in [{reader.facts[0].unit}], needed is [{units[-1]}]")
-            if reader.facts[0].is_standard:
-                needed = "the width of each echo in ns" if name == "widths" else "the share of each return, 0 to 1"
-                raise ConfigError(
-                    f"{path}: --{name} {column}: is the LAS field {reader.facts[0].name}; give an extra dimension with "
-                    f"{needed}"
-                )
-            if name == "widths":
-                counts.assumed_unit = reader.facts[0].unit == "-"
-            read[name] = reader.find_value(column)
-    return LightModel(path, radar, sigma, spacing, read["widths"], read["shares"], shares, widths, counts)
 
 
 def _receive(reflectance: np.ndarray, rows: np.ndarray, radar: Radar, path: Path) -> np.ndarray:

@@ -8,6 +8,7 @@ come from a generator of their own: the waveforms do not depend on StripOptions.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -114,24 +115,17 @@ def simulate_strip(
     """
     scene, options = find_scene(scene), options or StripOptions()
     parts = _simulate_parts(scene, pulses, seed, flight, progress)
-    truth_writer = TruthWriter(truth, overwrite=overwrite) if truth else None
     summary = StripSummary()
-    try:
-        with _open_writer(target, scene, options, overwrite) as writer:
-            for number, simulated in enumerate(parts):
-                rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, 1)))
-                _write_part(writer, truth_writer, simulated, scene, options, rng, summary)
-            if truth_writer:
-                truth_writer.publish(_describe(scene, seed, summary))
-            try:
-                writer.commit()
-            except BaseException:  # both files or none
-                if truth_writer:
-                    truth_writer.withdraw()
-                raise
-    finally:
+    with (
+        TruthWriter(truth, overwrite=overwrite) if truth else nullcontext() as truth_writer,
+        _open_writer(target, scene, options, overwrite) as writer,
+    ):
+        for number, simulated in enumerate(parts):
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, 1)))
+            _write_part(writer, truth_writer, simulated, scene, options, rng, summary)
         if truth_writer:
-            truth_writer.discard()
+            writer.drafts.insert(0, truth_writer.complete(_describe(scene, seed, summary)))
+        writer.commit()
     return summary
 
 

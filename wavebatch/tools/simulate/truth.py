@@ -18,6 +18,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.npz_reader import read_header, read_text, reading_npz
+from wavebatch.files.disk.publish import Draft
 
 ECHO_COLUMNS: dict[str, str] = {
     "waveform": "<u8",
@@ -54,7 +55,7 @@ _LARGEST = 1e30
 
 
 class TruthWriter(NpzWriter):
-    """Takes columns block by block and writes them as one .npz on `publish`; memory does not grow with their length.
+    """Takes columns block by block and writes them as one .npz; memory does not grow with their length.
 
     Raises InputError where it cannot write.
     """
@@ -62,9 +63,9 @@ class TruthWriter(NpzWriter):
     def __init__(self, target: Path, *, overwrite: bool = False) -> None:
         super().__init__(target, _DTYPES, overwrite=overwrite)
 
-    def publish(self, meta: Mapping[str, Any]) -> None:
-        """Writes and publishes the .npz; meta: plain values, stored as JSON in the array `meta`."""
-        super().publish({_META: json.dumps(meta, sort_keys=True)})
+    def complete(self, meta: Mapping[str, Any]) -> Draft:
+        """Writes the .npz; meta: plain values, stored as JSON in the array `meta`."""
+        return super().complete({_META: json.dumps(meta, sort_keys=True)})
 
 
 def _check_meta(meta: Any) -> dict[str, Any]:

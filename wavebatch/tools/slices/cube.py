@@ -18,7 +18,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.npz_reader import read_npz
 from wavebatch.files.disk.publish import Draft, reporting
-from wavebatch.tools.slices.lines import ScanLine
+from wavebatch.tools.slices.lines import ScanLine, align_times, find_main_axis
 
 MOST_VALUES = 200_000_000
 """Most values of a cube (800 MB): it is built in memory."""
@@ -131,25 +131,18 @@ def _scan_angles(lines: Sequence[ScanLine]) -> list[np.ndarray]:
     direction = np.concatenate([line.direction for line in lines])
     unit = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
     apart = unit - unit.mean(axis=0)
-    across = np.linalg.eigh(apart.T @ apart)[1][:, 2]
-    across *= np.sign(across[np.argmax(np.abs(across))])
-    angle = np.arcsin(np.clip(apart @ across, -1.0, 1.0))
-    return np.split(angle, np.cumsum([len(line) for line in lines])[:-1])
+    return _split(np.arcsin(np.clip(apart @ find_main_axis(apart), -1.0, 1.0)), lines)
 
 
 def _find_starts(lines: Sequence[ScanLine]) -> list[np.ndarray]:
     """Time from the common plane to the first sample of each pulse [ns]; 0 where it is not known."""
-    direction = np.concatenate([line.direction for line in lines])
-    origin = np.concatenate([line.origin for line in lines])
-    along = np.linalg.norm(direction, axis=1)
-    mean = (direction / np.where(along > 0, along, 1.0)[:, None]).mean(axis=0)
-    mean /= max(float(np.linalg.norm(mean)), 1e-12)
-    depth, speed = (origin - origin.mean(axis=0)) @ mean, direction @ mean
-    known = speed > 1e-3 * along
-    if known.any():
-        depth = depth - depth[known].min()
-    start = np.where(known, depth / np.where(known, speed, 1.0), 0.0)
-    return np.split(start, np.cumsum([len(line) for line in lines])[:-1])
+    origin, direction = (np.concatenate([getattr(line, name) for line in lines]) for name in ("origin", "direction"))
+    return _split(align_times(origin, direction), lines)
+
+
+def _split(values: np.ndarray, lines: Sequence[ScanLine]) -> list[np.ndarray]:
+    """Values of the pulses of all lines, line by line."""
+    return np.split(values, np.cumsum([len(line) for line in lines])[:-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,25 +178,29 @@ def cut_cube(path: Path, wanted: dict[str, float | None]) -> list[CubeSlice]:
     if all(value is None for value in wanted.values()):
         peak = int(np.nanargmax(np.nansum(values, axis=(0, 1))))
         wanted = {"x": values.shape[1] // 2, "y": int(number[len(number) // 2]), "t": float(time[peak])}
-    x_edges, y_edges = (-0.5, values.shape[1] - 0.5), (-0.5, len(number) - 0.5)
-    t_edges = (float(time[0]) - 0.5 * spacing, float(time[-1]) + 0.5 * spacing)
-    x_label, y_label = "pulse, aligned by scan angle [-]", "scan line, in the order of the cube [-]"
-    t_label = "time [ns]"
+    axes = {
+        "x": ("pulse, aligned by scan angle [-]", -0.5, values.shape[1] - 0.5),
+        "y": ("scan line, in the order of the cube [-]", -0.5, len(number) - 0.5),
+        "t": ("time [ns]", float(time[0]) - 0.5 * spacing, float(time[-1]) + 0.5 * spacing),
+    }
+
+    def cut(image: np.ndarray, across: str, up: str, title: str) -> CubeSlice:
+        extent = (*axes[across][1:], *axes[up][1:])
+        return CubeSlice(image, extent, axes[across][0], axes[up][0], title, up == "t")
+
     found = []
     if wanted["x"] is not None:
         place = _check("--x", wanted["x"], values.shape[1])
-        found.append(CubeSlice(values[:, place].T, (*y_edges, *t_edges), y_label, t_label, f"x = {place}", True))
+        found.append(cut(values[:, place].T, "y", "t", f"x = {place}"))
     if wanted["y"] is not None:
         row = np.flatnonzero(number == int(wanted["y"]))
         if not len(row):
             raise ConfigError(f"--y {int(wanted['y'])}: the cube has scan lines {number.min()} to {number.max()}")
-        title = f"y = {int(wanted['y'])} (scan line)"
-        found.append(CubeSlice(values[row[0]].T, (*x_edges, *t_edges), x_label, t_label, title, True))
+        found.append(cut(values[row[0]].T, "x", "t", f"y = {int(wanted['y'])} (scan line)"))
     if wanted["t"] is not None:
         sample = round((wanted["t"] - float(time[0])) / spacing)
         place = _check("--t", sample, len(time), f"{time[0]:g} to {time[-1]:g} ns")
-        title = f"t = {time[place]:.4g} ns"
-        found.append(CubeSlice(values[:, :, place], (*x_edges, *y_edges), x_label, y_label, title))
+        found.append(cut(values[:, :, place], "x", "y", f"t = {time[place]:.4g} ns"))
     return found
 
 

@@ -93,7 +93,7 @@ def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
             continue
         pulses = _join(parts)
         pulses = pulses.take(np.argsort(pulses.point, kind="stable"))
-        axis = _find_axis(pulses.direction) if axis is None else axis
+        axis = _find_across(pulses.direction) if axis is None else axis
         edges = _cut_long(np.append(find_sweeps(_measure_angle(pulses, axis), pulses.gps_time), len(pulses)))
         last = unit.number == reader.unit_count() - 1
         for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
@@ -133,12 +133,16 @@ def _join(parts: list[_Pulses]) -> _Pulses:
     return _Pulses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def _find_axis(direction: np.ndarray) -> np.ndarray:
+def find_main_axis(apart: np.ndarray) -> np.ndarray:
+    """Direction (k,) of the largest spread of vectors (n, k), positive along its longest component."""
+    axis = np.linalg.eigh(apart.T @ apart)[1][:, -1]
+    return axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
+
+
+def _find_across(direction: np.ndarray) -> np.ndarray:
     """Horizontal axis (2,) with the largest spread of the rays: across the flight."""
     flat = direction[:, :2] / np.linalg.norm(direction, axis=1)[:, None]
-    flat = flat - flat.mean(axis=0)
-    axis = np.linalg.eigh(flat.T @ flat)[1][:, 1]
-    return axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
+    return find_main_axis(flat - flat.mean(axis=0))
 
 
 def _measure_angle(pulses: _Pulses, axis: np.ndarray) -> np.ndarray:
@@ -156,3 +160,36 @@ def _build_line(number: int, pulses: _Pulses) -> ScanLine:
     time = (np.arange(len(row)) - pulses.first[row]) * pulses.spacing[row]
     place, there = (pulses.point, pulses.gps_time, pulses.origin, pulses.direction), ~np.isnan(pulses.values)
     return ScanLine(number, *place, float(pulses.spacing[0]), row[there], time[there], pulses.values[there])
+
+
+def align_times(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Find where the windows of pulses begin on one axis of time.
+
+    Windows open when the receiver sees an echo, at another height for every pulse: counted from their own first
+    samples, the relief is lost. The axis begins at the plane across the mean ray through the sample that is nearest to
+    the sensor; every pulse passes it, wherever its window is.
+
+    Parameters
+    ----------
+    origin : float64 (n, 3), m
+        Positions of the first samples.
+    direction : float64 (n, 3), m/ns
+        Away from the sensor.
+
+    Returns
+    -------
+    float64 array, shape (n,)
+        Two-way time from that plane to the first sample of each pulse [ns], 0 and above; 0 where it is not known.
+
+    References
+    ----------
+    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
+    """
+    along = np.linalg.norm(direction, axis=1)
+    mean = (direction / np.where(along > 0, along, 1.0)[:, None]).mean(axis=0)
+    mean /= max(float(np.linalg.norm(mean)), 1e-12)
+    depth, speed = (origin - origin.mean(axis=0)) @ mean, direction @ mean
+    # Rays across the mean one never pass the plane; none of a scan line is.
+    known = speed > 1e-3 * along
+    depth -= depth[known].min() if known.any() else 0.0
+    return np.where(known, depth / np.where(known, speed, 1.0), 0.0)

@@ -17,7 +17,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.tools.plots.section_data import Profile, place_heights
-from wavebatch.tools.plots.values import Tally, name_paths
+from wavebatch.tools.plots.values import Tally, check_statistic, name_paths
 from wavebatch.tools.slices.output import SEGMENT_SUFFIXES
 
 UNIT = "units of the strip"
@@ -84,8 +84,7 @@ def profile_segments(
     Arguments and errors as `section_data.measure_profile`; sums and means weight a segment by the share of its height
     in a bin.
     """
-    if statistic != "count" and column is None:
-        raise ConfigError(f"--statistic {statistic} needs a --column; only count needs none")
+    check_statistic(column, statistic)
     files = [read_segments(path, column) for path in paths]
     heights = np.concatenate([ends for ends, _ in files])
     if not len(heights):

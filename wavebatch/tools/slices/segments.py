@@ -13,7 +13,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
 from wavebatch.kernels.geometry.hough import HoughLine, find_lines
-from wavebatch.tools.slices.lines import ScanLine
+from wavebatch.tools.slices.lines import ScanLine, align_times, find_main_axis
 
 GEOMETRIES = ("plane", "time")
 _GAP, _PULSES_PER_GAP = 10.0, 3.0
@@ -122,7 +122,7 @@ def cut_slice(line: ScanLine, options: SliceOptions) -> Slice:
     roi = line.value > limit
     zero, start = np.zeros(3), np.zeros(len(line))
     if options.geometry == "time":
-        start = align_times(line)
+        start = align_times(line.origin, line.direction)
         x, y = (line.time + start[line.row]) / line.spacing, line.row.astype(np.float64)
         pixel, base, axis = line.spacing, zero, zero
     else:
@@ -131,42 +131,6 @@ def cut_slice(line: ScanLine, options: SliceOptions) -> Slice:
         place = line.origin[line.row] - base + line.time[:, None] * line.direction[line.row]
         x, y = place @ axis / pixel, place[:, 2] / pixel
     return Slice(line, options.geometry, x, y, pixel, base, axis, roi, start)
-
-
-def align_times(line: ScanLine) -> np.ndarray:
-    """Find where the windows of pulses begin on one axis of time.
-
-    Windows open when the receiver sees an echo, at another height for every pulse: counted from their own first
-    samples, the relief is lost. The axis begins at the plane across the mean ray of the line through the sample that is
-    nearest to the sensor; every pulse passes it, wherever its window is.
-
-    Parameters
-    ----------
-    line : ScanLine
-        n pulses.
-
-    Returns
-    -------
-    float64 array, shape (n,)
-        Two-way time from that plane to the first sample of each pulse [ns], 0 and above.
-
-    References
-    ----------
-    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
-    """
-    along = np.linalg.norm(line.direction, axis=1)
-    unit = line.direction / along[:, None]
-    mean = unit.mean(axis=0)
-    length = np.linalg.norm(mean)
-    if not length > 0:
-        return np.zeros(len(line))
-    mean /= length
-    speed = line.direction @ mean
-    depth = (line.origin - line.origin.mean(axis=0)) @ mean
-    # Rays across the mean one never pass the plane; none of a scan line is.
-    known = speed > 1e-3 * along
-    depth -= depth[known].min(initial=np.inf) if known.any() else 0.0
-    return np.where(known, depth / np.where(known, speed, 1.0), 0.0)
 
 
 def find_segments(piece: Slice, options: SliceOptions) -> list[Segment]:
@@ -188,11 +152,7 @@ def _find_plane(line: ScanLine, roi: np.ndarray) -> tuple[np.ndarray, np.ndarray
     use = np.flatnonzero(roi) if roi.any() else np.arange(len(line.row))
     place = line.origin[line.row[use]] + line.time[use, None] * line.direction[line.row[use]]
     base = place.mean(axis=0)
-    flat = place[:, :2] - base[:2]
-    main = np.linalg.eigh(flat.T @ flat)[1][:, 1]
-    if main[np.argmax(np.abs(main))] < 0:
-        main = -main
-    return base, np.array([main[0], main[1], 0.0])
+    return base, np.append(find_main_axis(place[:, :2] - base[:2]), 0.0)
 
 
 def _choose_gap(piece: Slice) -> float:

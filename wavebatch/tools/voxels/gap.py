@@ -7,7 +7,7 @@ interception: leaves of .5 over ground of .15 hide a gap probability of .61 as o
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,17 +24,6 @@ LEAST_CANOPY = 0.01
 """Share of the light from the canopy below which its ratio to the ground does not matter."""
 
 
-@dataclass(frozen=True, slots=True)
-class RatioFacts:
-    """The reflectance ratio of canopy and ground, and where it comes from."""
-
-    ratio: float
-    error: float | None
-    """Its standard deviation; None where it was given or assumed."""
-    source: str
-    """`given`, `strip`, `assumed`, or `no canopy`."""
-
-
 def find_rule(
     blocks: Iterable[WaveformBlock],
     pulse: SystemPulse,
@@ -42,10 +31,10 @@ def find_rule(
     floor: Floor,
     ground_height: float,
     given: float | None,
-) -> tuple[LightRule, RatioFacts]:
+) -> LightRule:
     """The rule by which signal counts as light, from a sample of the waveforms with their sensor's positions."""
     if given is not None:
-        return LightRule(floor, ground_height, given), RatioFacts(given, None, "given")
+        return LightRule(floor, ground_height, given, None, "given")
     rule = LightRule(floor, ground_height)
     energies = []
     for block in blocks:
@@ -55,8 +44,6 @@ def find_rule(
         energies.append(np.stack(parts))
     canopy, ground = np.concatenate(energies, axis=1) if energies else np.zeros((2, 0))
     if canopy.sum() < LEAST_CANOPY * (canopy.sum() + ground.sum()):
-        return rule, RatioFacts(1.0, None, "no canopy")
+        return replace(rule, source="no canopy")
     found = estimate_canopy_ratio(canopy, ground)
-    if found is None:
-        return rule, RatioFacts(1.0, None, "assumed")
-    return LightRule(floor, ground_height, found.ratio), RatioFacts(found.ratio, found.error, "strip")
+    return rule if found is None else replace(rule, ratio=found.ratio, error=found.error, source="strip")

@@ -17,7 +17,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.protect import protecting
-from wavebatch.files.disk.publish import Draft
+from wavebatch.files.disk.publish import Draft, publish_together
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import (
     PROJECTION,
@@ -64,17 +64,22 @@ class VoxelSpace:
     """How the voxels were made."""
 
 
-def write_voxels(target: Path, space: VoxelSpace, pieces: Iterable[Piece], *, overwrite: bool) -> int:
+def write_voxels(
+    target: Path, space: VoxelSpace, pieces: Iterable[Piece], *, others: Sequence[Draft] = (), overwrite: bool
+) -> int:
     """Writes voxels in the format of the target's suffix; returns their number.
 
-    pieces: index i8 (m, 3) and columns of some voxels at a time. After an error nothing remains.
+    pieces: index i8 (m, 3) and columns of some voxels at a time. others: complete files that are published with this
+    one. After an error nothing remains.
     Raises InputError where the target cannot be written.
     """
     write = _write_npz if target.suffix.lower() == ".npz" else _write_las
-    return write(target, space, pieces, overwrite)
+    return write(target, space, pieces, others, overwrite)
 
 
-def _write_npz(target: Path, space: VoxelSpace, pieces: Iterable[Piece], overwrite: bool) -> int:
+def _write_npz(
+    target: Path, space: VoxelSpace, pieces: Iterable[Piece], others: Sequence[Draft], overwrite: bool
+) -> int:
     """An .npz of index i4 (n, 3), an array per column, origin f8 (3,) [m], size [m], crs (WKT or empty), meta (JSON).
 
     Voxel i lies between origin + i size and origin + (i + 1) size. No-data is NaN.
@@ -82,19 +87,19 @@ def _write_npz(target: Path, space: VoxelSpace, pieces: Iterable[Piece], overwri
     dtypes = {"index": np.dtype(("<i4", (3,)))}
     dtypes |= {column.name: np.dtype(f"<{column.dtype}") for column in space.columns}
     meta = json.dumps(space.meta, sort_keys=True)
-    file = NpzWriter(target, dtypes, overwrite=overwrite)
     number = 0
-    try:
+    with NpzWriter(target, dtypes, overwrite=overwrite) as file:
         for index, columns in pieces:
             file.add({"index": index, **columns})
             number += len(index)
-        file.publish({"origin": space.origin, "size": space.size, "crs": space.facts.crs or "", "meta": meta})
-    finally:
-        file.discard()
+        facts = {"origin": space.origin, "size": space.size, "crs": space.facts.crs or "", "meta": meta}
+        publish_together([*others, file.complete(facts)])
     return number
 
 
-def _write_las(target: Path, space: VoxelSpace, pieces: Iterable[Piece], overwrite: bool) -> int:
+def _write_las(
+    target: Path, space: VoxelSpace, pieces: Iterable[Piece], others: Sequence[Draft], overwrite: bool
+) -> int:
     """A .las or .laz with a point at the centre of each voxel, the columns as extra bytes, and the CRS of the strip.
 
     The centres are exact: coordinates count half voxels from the lower corner of the grid.
@@ -104,9 +109,8 @@ def _write_las(target: Path, space: VoxelSpace, pieces: Iterable[Piece], overwri
     columns = zip(space.columns, texts, strict=True)
     records = [ExtraRecord.build(one.name, one.dtype, text, no_data=one.no_data) for one, text in columns]
     dtype = build_dtype(header.point_format, records)
-    file = PointFile(target, header, dtype, records, overwrite=overwrite)
     number = 0
-    try:
+    with PointFile(target, header, dtype, records, overwrite=overwrite) as file:
         for index, columns in pieces:
             rows = np.zeros(len(index), dtype)
             for axis, name in enumerate("XYZ"):
@@ -119,11 +123,8 @@ def _write_las(target: Path, space: VoxelSpace, pieces: Iterable[Piece], overwri
                 rows[column.name] = values
             file.write(rows)
             number += len(rows)
-        file.finish_points()
-        file.finish()
-        file.draft.publish()
-    finally:
-        file.abort()
+        file.drafts[:0] = others
+        file.commit()
     return number
 
 

@@ -6,9 +6,8 @@ of the strip. The output must not depend on block size: nothing here may mix wav
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.protect import protecting
+from wavebatch.files.disk.publish import Draft
 from wavebatch.tools.voxels.profile import Profiles
 from wavebatch.tools.voxels.rays import RayTable
 
@@ -42,8 +42,8 @@ SAMPLE_COLUMNS = {
 """Arrays with a value per sample with signal; cross_section only with a calibration."""
 
 
-class ProfileWriter:
-    """Writes profiles block by block: `add` for each, then `publish`; `discard` at the end in any case."""
+class ProfileWriter(NpzWriter):
+    """Writes profiles block by block: `add_block` for each, then `complete_profiles`."""
 
     def __init__(self, target: Path, strip: Path, *, sections: bool, overwrite: bool) -> None:
         if target.suffix.lower() != ".npz":
@@ -52,10 +52,10 @@ class ProfileWriter:
         columns = {**PULSE_COLUMNS, **{name: SAMPLE_COLUMNS[name] for name in self._names}}
         self._meanings = {name: meaning for name, (_, meaning) in columns.items()}
         with protecting([strip]):
-            self._file = NpzWriter(target, {name: dtype for name, (dtype, _) in columns.items()}, overwrite=overwrite)
+            super().__init__(target, {name: dtype for name, (dtype, _) in columns.items()}, overwrite=overwrite)
         self.pulses = self.samples = 0
 
-    def add(self, block: WaveformBlock, profiles: Profiles, rays: RayTable) -> None:
+    def add_block(self, block: WaveformBlock, profiles: Profiles, rays: RayTable) -> None:
         """Adds the pulses of a block that have signal."""
         rows = np.flatnonzero(profiles.seen)
         pulse, sample = np.nonzero(profiles.value[rows])
@@ -77,32 +77,11 @@ class ProfileWriter:
         if "cross_section" in self._names:
             section = np.diff(rays.section, axis=1)[owner, sample]
             values["cross_section"] = np.where(rays.unknown[owner], np.nan, section)
-        self._file.add(values)
+        self.add(values)
         self.pulses += len(rows)
         self.samples += len(sample)
 
-    def publish(self, meta: Mapping[str, Any], crs: str) -> None:
-        """Gives the file its name, with how it was made as JSON in `meta`."""
+    def complete_profiles(self, meta: Mapping[str, Any], crs: str) -> Draft:
+        """Writes the file, with how it was made as JSON in `meta`."""
         text = json.dumps({**meta, "columns": self._meanings}, sort_keys=True)
-        self._file.publish({"crs": crs, "meta": text})
-
-    def withdraw(self) -> None:
-        """Removes the published file again."""
-        self._file.withdraw()
-
-    def discard(self) -> None:
-        """Removes what is temporary."""
-        self._file.discard()
-
-
-@contextlib.contextmanager
-def open_profiles(target: Path | None, strip: Path, sections: bool, overwrite: bool) -> Iterator[ProfileWriter | None]:
-    """The writer of profiles, if they are wanted; what is not published is removed."""
-    if target is None:
-        yield None
-        return
-    writer = ProfileWriter(Path(target), strip, sections=sections, overwrite=overwrite)
-    try:
-        yield writer
-    finally:
-        writer.discard()
+        return self.complete({"crs": crs, "meta": text})

@@ -54,6 +54,10 @@ class LightRule:
     """Signal up to this height above the ground is the ground's [m]."""
     ratio: float = 1.0
     """Reflectance of canopy over that of ground."""
+    error: float | None = None
+    """Its standard deviation; None where it was given or assumed."""
+    source: str = "assumed"
+    """`given`, `strip`, `assumed` (1, because the strip does not show it), or `no canopy`."""
 
     def split(self, block: WaveformBlock, profiles: Profiles) -> tuple[np.ndarray, np.ndarray]:
         """Signal of each sample from canopy and from ground, f8 (n, s) each.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -34,11 +35,11 @@ from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.floor import Floor
-from wavebatch.tools.voxels.gap import SAMPLED, RatioFacts, find_rule
+from wavebatch.tools.voxels.gap import SAMPLED, find_rule
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.tools.voxels.output import VoxelSpace, check_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
-from wavebatch.tools.voxels.profile_file import ProfileWriter, open_profiles
+from wavebatch.tools.voxels.profile_file import ProfileWriter
 from wavebatch.tools.voxels.rays import LightRule, trace_profiles
 
 BLOCK_SAMPLES = 1 << 20
@@ -181,10 +182,14 @@ def voxelize_strip(
         ceiling = find_ceiling(reader, scan, middle, options.size, floor)
         sample = (source.fill(block) for block in reader.sample_blocks(scan, SAMPLED))
         deconvolution, height, given = options.deconvolution, options.ground_height, options.reflectance_ratio
-        rule, ratio = find_rule(sample, pulse, deconvolution, floor.finish(), height, given)
+        rule = find_rule(sample, pulse, deconvolution, floor.finish(), height, given)
         with (
             _open_grid(reader, middle, options, calibration is not None, held) as grid,
-            open_profiles(profiles, strip, calibration is not None, overwrite) as writer,
+            (
+                ProfileWriter(Path(profiles), strip, sections=calibration is not None, overwrite=overwrite)
+                if profiles is not None
+                else nullcontext()
+            ) as writer,
         ):
             counts: Counter[str] = Counter(waveforms=0, with_signal=0, anchored=0, clipped=0)
             energy = find_pulse_energy(reader, scan, options.energy)
@@ -195,7 +200,9 @@ def voxelize_strip(
                     _add_block(grid, counts, source.fill(used), pulse, options, ceiling, rule, writer)
                 if progress is not None:
                     progress(len(block), scan.packets)
-            meta = _describe(strip, options, pulse, calibration) | {"reflectance_ratio": asdict(ratio)}
+            meta = _describe(strip, options, pulse, calibration) | {
+                "reflectance_ratio": {"ratio": rule.ratio, "error": rule.error, "source": rule.source}
+            }
             meta["pulse_energy"] = None if energy is None else energy.describe()
             space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
             voxels = _write_both(target, space, grid, writer, overwrite)
@@ -211,38 +218,27 @@ def voxelize_strip(
                 noise=pulse.noise.std,
                 sensor=None if calibration is None else source.kind,
                 warnings=doubts,
-                **_list_figures(grid, ratio),
+                size=grid.size,
+                shape=tuple(grid.shape.tolist()),
+                origin=tuple((grid.low * grid.size).tolist()),
+                outside=grid.outside,
+                energy=grid.energy,
+                unknown=grid.unknown,
+                reflectance_ratio=rule.ratio,
+                reflectance_ratio_err=rule.error,
+                reflectance_ratio_source=rule.source,
             )
-
-
-def _list_figures(grid: VoxelGrid, ratio: RatioFacts) -> dict[str, Any]:
-    """What the summary says about the grid and the reflectance ratio."""
-    return {
-        "size": grid.size,
-        "shape": tuple(grid.shape.tolist()),
-        "origin": tuple((grid.low * grid.size).tolist()),
-        "outside": grid.outside,
-        "energy": grid.energy,
-        "unknown": grid.unknown,
-        "reflectance_ratio": ratio.ratio,
-        "reflectance_ratio_err": ratio.error,
-        "reflectance_ratio_source": ratio.source,
-    }
 
 
 def _write_both(
     target: Path, space: VoxelSpace, grid: VoxelGrid, writer: ProfileWriter | None, overwrite: bool
 ) -> int:
     """Writes profiles and voxels, or neither; the number of voxels."""
-    if writer is None:
-        return write_voxels(target, space, grid.pieces(), overwrite=overwrite)
-    meta = {name: value for name, value in space.meta.items() if name not in ("columns", "size_m", "headroom_m")}
-    writer.publish(meta, space.facts.crs or "")
-    try:
-        return write_voxels(target, space, grid.pieces(), overwrite=overwrite)
-    except BaseException:
-        writer.withdraw()
-        raise
+    others = []
+    if writer is not None:
+        meta = {name: value for name, value in space.meta.items() if name not in ("columns", "size_m", "headroom_m")}
+        others.append(writer.complete_profiles(meta, space.facts.crs or ""))
+    return write_voxels(target, space, grid.pieces(), others=others, overwrite=overwrite)
 
 
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
@@ -332,7 +328,7 @@ def _add_block(
     )
     grid.add(rays, block.spacing)
     if writer is not None:
-        writer.add(block, profiles, rays)
+        writer.add_block(block, profiles, rays)
     anchored = int((profiles.seen & profiles.anchored).sum())
     counts.update(with_signal=int(profiles.seen.sum()), anchored=anchored, clipped=int(profiles.clipped.sum()))
     counts["waveforms"] += len(block)

@@ -1,6 +1,7 @@
 """A block of waveforms with exactly the echoes that the caller gives, and its noise and system pulse without error.
 
-Tests and examples/papers use it where a scene is too random. `known_noise` and `known_system` stand in for a survey.
+The scripts of this folder and the tests use it where a scene is too random. `known_noise` and `known_system` stand in
+for a survey.
 """
 
 from __future__ import annotations
