@@ -50,6 +50,17 @@ def naive_plane(xyz):
     return kept.sum(), axes[2], np.sort(singular**2 / kept.sum())
 
 
+@pytest.mark.parametrize("points", [6, 8, 12])
+def test_errors_of_planes_of_few_points_are_right(rng, points):
+    n = 3000
+    xyz = np.concatenate([slope(rng, points, 40.0) for _ in range(n)])
+    planes = fit_planes(xyz, np.repeat(np.arange(n), points), n)
+    angle, error = measure_angles(planes, np.tile([0, 0, -1.0], (n, 1)))
+    whole = planes.kept == points
+    square = np.mean((angle[whole] - np.radians(40.0)) ** 2)
+    assert whole.mean() > 0.95 and square / np.mean(error[whole] ** 2) == pytest.approx(1.0, abs=0.12)
+
+
 def test_many_planes_at_once_are_those_of_a_loop(rng):
     sets = [slope(rng, rng.integers(8, 60), rng.uniform(0, 70)) for _ in range(150)]
     for xyz in sets[::2]:
