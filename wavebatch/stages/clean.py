@@ -166,7 +166,9 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     missing = None if block.missing is None else block.missing.T
     std, width = system.noise.quiet, system.sigma_ref / block.spacing
     reach = int(np.ceil(3 * width))
-    spread, defects = _slope_spread(signal, std, reach, missing), Defects()
+    # Slopes come from runs of samples much longer than the noise is correlated.
+    colour = float(np.sqrt(max(1.0 + 2.0 * sum(system.noise.correlation), 1.0)))
+    spread, defects = _slope_spread(signal, std, colour, reach, missing), Defects()
     if spread:
         # Everything else is measured about level baselines.
         defects = Defects(slope_spread=spread / block.spacing)
@@ -197,9 +199,13 @@ RARER = 0.1
 way."""
 
 
-def _slope_spread(signal: np.ndarray, std: float, reach: int, missing: np.ndarray | None) -> float:
-    """Standard deviation of the slopes of baselines [count per sample]; 0 where chance or signal explains them."""
+def _slope_spread(signal: np.ndarray, std: float, colour: float, reach: int, missing: np.ndarray | None) -> float:
+    """Standard deviation of the slopes of baselines [count per sample]; 0 where chance or signal explains them.
+
+    colour: errors of slopes over those in white noise.
+    """
     slope, error = fit_slopes(signal, std, reach, missing=missing)
+    error = colour * error
     known = np.isfinite(error)
     if np.count_nonzero(known) < LEAST_WAVEFORMS:
         return 0.0
