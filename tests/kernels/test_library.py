@@ -82,11 +82,12 @@ def test_a_change_of_the_source_is_compiled_and_nothing_else(checkout, monkeypat
 def test_processes_that_build_at_once_load_a_whole_library(checkout):
     code = (
         f"import sys, ctypes; sys.path.insert(0, {str(checkout.LIBRARY.parent)!r}); import build_kernels as b\n"
-        "assert b.is_outdated(); sys.stdin.read(1); b.compile_library()\n"
+        "print(b.is_outdated(), flush=True); sys.stdin.read(1); b.compile_library()\n"
         "print(ctypes.CDLL(str(b.LIBRARY)).decompose_clusters(), b.is_outdated())"
     )
     call = [sys.executable, "-c", code]
     jobs = [subprocess.Popen(call, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    assert [job.stdout.readline() for job in jobs] == ["True\n"] * 3  # none builds before all have looked
     for job in jobs:
         job.stdin.write("x")
         job.stdin.flush()

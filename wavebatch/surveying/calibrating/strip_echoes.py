@@ -96,7 +96,8 @@ class EchoSource:
                 near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
                 if len(near):
                     part = block.rows(near)
-                    given = None if self.column is None else self.column.values(take_records(part, unit))
+                    records = take_records(part, unit)
+                    given = None if self.column is None else self.column.record.read(records[self.column.field])
                     part = self.sensor.fill(part if self.energy is None else self.energy.fill(part, unit))
                     yield take_clean(part, self.chain.run(part, self.system), given)
 
