@@ -56,7 +56,7 @@ def measure_skew(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     -------
     SystemPulse
         With `skew`, the median of the echoes that the target has not widened, and `skew_spread`, how far the skews of
-        all single echoes lie from it beyond their errors. Unchanged where fewer than 50 echoes are clear.
+        all single echoes lie from it beyond their errors. Unchanged where fewer than 20 echoes are clear.
 
     References
     ----------
