@@ -8,12 +8,14 @@ from helpers_scenes import make_scene
 from strips import cut_strip
 
 from wavebatch.cli import main
-from wavebatch.cli.survey import NOISE_KINDS
+from wavebatch.cli.survey import NOISE_KINDS, _pulse_lines
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.stages.chain_file import load_chain
+from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import chain_text, decide
-from wavebatch.surveying.system_file import load_survey
-from wavebatch.surveying.systems.figures import describe_figures
+from wavebatch.surveying.system_file import SavedSurvey, load_survey
+from wavebatch.surveying.systems.figures import Figures, describe_figures
 from wavebatch.tools.simulate import simulate_strip
 
 
@@ -128,6 +130,12 @@ def test_what_is_no_strip_gives_one_line(tmp_path, data):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_figures_have_the_digits_that_they_deserve():
+    lines = list(_pulse_lines(SavedSurvey(Survey(SystemPulse(2.0, misfit=0.00154777), 9, Figures(kappa=-1e-6)))))
+    assert any(line.split() == ["kappa", "0.0000"] for line in lines)
+    assert any(line.startswith("misfit            0.15 % ") for line in lines)
+
+
 def test_strips_of_a_flight_are_surveyed_together(flat_strip, tmp_path):
     other, odd = tmp_path / "b.las", tmp_path / "odd.las"
     simulate_strip("urban", other, pulses=1200, seed=2)
@@ -144,6 +152,7 @@ def test_strips_of_a_flight_are_surveyed_together(flat_strip, tmp_path):
     again = _survey(f"@{listed}", odd, "--json", "--waveforms", 2400, "-o", tmp_path / "2.toml")
     assert (tmp_path / "2.toml").read_text() == (tmp_path / "1.toml").read_text()
     told = json.loads(again.stdout)
+    assert told["points"] == sum(strip["points"] for strip in told["strips"] if strip["fits"]), "of those that belong"
     assert [(strip["strip"], strip["fits"]) for strip in told["strips"]] == [
         (str(other), True), (str(flat_strip), True), (str(odd), False)
     ]  # fmt: skip

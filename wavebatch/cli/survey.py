@@ -179,8 +179,8 @@ def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Pat
     strips = sorted(flight.strips, key=lambda strip: order[strip.path])
     return {
         "strips": [strip.to_json() for strip in strips],
-        "points": sum(strip.facts["points"] for strip in strips),
-        "packets": sum(strip.facts["packets"] for strip in strips),
+        "points": sum(strip.facts["points"] for strip in strips if strip.fits),
+        "packets": sum(strip.facts["packets"] for strip in strips if strip.fits),
         "misfits": [str(strip.path) for strip in strips if not strip.fits],
         "failed": list(map(str, failed)),
     }
@@ -305,12 +305,11 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
         yield f"  too few to learn a pulse from: {model} is used"
     else:
         yield from _misfit_lines(saved)
-    yield _line("kappa", f"{figures.kappa:.4f}" if figures.kappa is not None else "not known")
+    yield _line("kappa", f"{figures.kappa:z.4f}" if figures.kappa is not None else "not known")
     yield _line("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
     yield _line("acceptance", f"one more echo must lower chi2 by {system.acceptance:g}")
     if system.misfit:
-        text = "of the amplitude between strong and weaker echoes; residuals within it add no echo"
-        yield _line("misfit", f"{100 * system.misfit:g} % {text}")
+        yield _line("misfit", f"{100 * system.misfit:.2g} % of the amplitude; residuals below it add no echo")
 
 
 def _digitizer_lines(saved: SavedSurvey) -> Iterator[str]:

@@ -550,4 +550,4 @@ def _explain_skew(system: SystemPulse, figures: Figures) -> str:
     if figures.misfit_skewed is None:
         return "no pulse was learned"
     misfit, kappa = figures.misfit_skewed, figures.kappa
-    return f"with kappa {kappa:.3f} it misses the stacked echoes by {misfit:.4f} of the amplitude"
+    return f"with kappa {kappa:z.3f} it misses the stacked echoes by {misfit:.4f} of the amplitude"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch import __version__
+from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.npz import NpzWriter
@@ -70,7 +71,11 @@ def export_strip(
     ------
     InputError
         Where the strip cannot be read or the output cannot be written.
+    ConfigError
+        Where the output's name has another end than .las, .laz or .npz.
     """
+    if target.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"{target}: an output's name must end in .las, .laz or .npz")
     write = _write_arrays if target.suffix.lower() == ".npz" else _write_strip
     with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
         repaired = tuple(_list_repairs(reader, scan))

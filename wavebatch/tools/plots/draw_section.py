@@ -65,7 +65,7 @@ def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite
 def _parts(found: Section, aspect: float) -> list[str]:
     x0, y0, x1, y1 = (f"{value:.10g}" for value in found.line)
     kind = "voxels" if found.voxel else "points"
-    drawn = "" if len(found.value) == found.inside - found.outside else f", of which {len(found.value):,} are drawn"
+    drawn = "" if len(found.value) == found.inside - found.outside else f", {len(found.value):,} are drawn"
     parts = [
         name_clouds(found.names), found.facts.name, f"{found.inside:,} of {found.total.values:,} {kind}{drawn}",
         f"from {x0} {y0} to {x1} {y1}", f"{found.width:.4g} {found.crs.unit} wide",
