@@ -237,7 +237,7 @@ def test_options_that_the_chain_ignores(tmp_path, tiny_strip):
     chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
     done = run(tiny_strip, "-o", tmp_path / "out", "-c", chain, "--flight-height", "800")
     assert done.exit_code == 2
-    assert "--flight-height: chain" in done.stderr and "add stage attribute.range" in done.stderr
+    assert "--flight-height: chain" in done.stderr and "give --columns +range, or add stage" in done.stderr
 
 
 def test_a_wrong_trajectory_fails_its_strip_in_one_line(tmp_path, tiny_strip):

@@ -256,6 +256,8 @@ def test_columns_are_chosen_and_added():
     assert choose_columns(chain, "echo_width,+echo_time") == ("echo_width", "echo_time")
     with pytest.raises(ConfigError, match="did you mean 'amplitude'"):
         choose_columns(chain, "amplitud")
+    with pytest.raises(ConfigError, match=r"write \+amplitude to add it too"):
+        choose_columns(chain, "+echo_time,amplitude")
     with pytest.raises(ConfigError, match=r"does not compute 'energy'; add stage attribute\.energy"):
         choose_columns(chain, "+energy")
 

@@ -132,6 +132,8 @@ def test_strips_without_points_pass_through_every_stage(place):
     done = CliRunner().invoke(main, ["run", str(empty), "-o", "o", "--columns", columns])
     assert done.exit_code == 0, done.stderr
     assert CliRunner().invoke(main, ["check", str(empty)]).stdout.endswith("ok (0 points, 0 packets)\n")
+    one = cut_strip(place / "strip.las", place / "one.las", 1)
+    assert "ok (1 point, 1 packet, " in CliRunner().invoke(main, ["check", str(one)]).stdout
     shown = CliRunner().invoke(main, ["compare", "o/empty.laz", str(empty)]).stdout
     assert "nan" not in shown and "completeness         no-data   correctness no-data" in shown
 

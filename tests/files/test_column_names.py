@@ -5,6 +5,7 @@ import pytest
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.cloud.column_names import _SHORT as SHORT
 from wavebatch.files.cloud.column_names import STYLES, describe, describe_roundings, name_columns, normalise, resolve
 
 ALL = tuple(COLUMNS)
@@ -25,7 +26,9 @@ def test_every_style_writes_every_column_under_a_name_of_its_own(style):
 def test_descriptions_fit_and_end_with_the_unit(column):
     text = describe(column)
     assert len(text.encode()) <= 32 and text.endswith(f"[{column.unit}]")
-    assert not text.split(" [")[0].endswith((" the", " of", " after", " over", " and", " per"))
+    meaning = text.rpartition(" [")[0]
+    error = f"1 sigma of {column.name.removesuffix('_err')}"
+    assert not column.extra_bytes or meaning in (SHORT.get(column.name), column.meaning, error), "the meaning is cut"
 
 
 @pytest.mark.parametrize("style", STYLES)

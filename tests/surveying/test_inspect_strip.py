@@ -75,7 +75,8 @@ def test_info_of_a_strip_that_cannot_be_processed_still_tells_what_it_holds(tmp_
     assert facts["samples"]["least"] is None
     json.dumps(facts, allow_nan=False)
     result = run("info", path)
-    assert result.exit_code == 0 and "problem        no packet can be used" in result.stdout
+    assert result.exit_code == 1 and "problem        no packet can be used" in result.stdout
+    assert result.stderr.startswith(f"error: {path}: no packet can be used")
 
 
 def test_info_of_something_else_is_one_line_and_exit_1(tmp_path):

@@ -63,6 +63,16 @@ def test_signal_dependent_noise_and_clipping_are_found():
     assert needed["censored fit"] and needed["signal-dependent weights"]
 
 
+def test_the_range_of_counts_is_the_recorded_one_though_a_pattern_is_taken_off():
+    block = make_block(make_scene("flat", baseline=3.0), 2000, seed=5)[0]
+    samples = block.samples + np.where(np.arange(block.samples.shape[1]) % 2, 2, 0).astype(block.samples.dtype)
+    block = replace(block, samples=samples)
+    for survey in (survey_block(block), survey_blocks([block])):
+        assert survey.system.defects.pattern
+        counts = survey.figures.least_count, survey.figures.largest_count
+        assert counts == (samples.min(), samples.max()) and samples.min() == 0
+
+
 def test_waveforms_of_several_lengths_are_surveyed_together():
     flat, other = make_block("flat", 1000, seed=6)[0], make_block(make_scene("flat", n_samples=40), 1500, seed=6)[0]
     ends = [(other, 0, 700), (flat, 0, 600), (other, 700, 1500), (flat, 600, 1000)]

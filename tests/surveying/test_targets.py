@@ -35,6 +35,21 @@ def test_what_lies_in_a_polygon():
     assert Target("w", 0.2, corners).contains(*many).mean() * 14**2 == pytest.approx(65.0, rel=0.02)
 
 
+def test_long_packets_of_the_digitizer_have_its_constant(riegl, tmp_path):
+    """Descriptor 2 of this strip differs in the number of samples only: a run takes the constant of the other."""
+    (tmp_path / "t.csv").write_text("reflectance,x,y,radius\n0.3,548355,5389940,3\n")
+    cal = tmp_path / "cal.toml"
+    done = call("calibrate", riegl, "--targets", tmp_path / "t.csv", "-o", cal)
+    assert done.exit_code == 0 and "has no constant" not in done.stderr
+    assert [row.digitizer for row in load_calibration(cal).channels] == [1]
+    call("run", riegl, "-o", tmp_path, "--calibration", cal, "-q")
+    cloud = laspy.read(tmp_path / f"{riegl.stem}.laz")
+    echoes = np.asarray(cloud["echo_width"]) > 0
+    assert (np.asarray(cloud["backscatter_coefficient"])[echoes] > 0).all()
+    meaning = {one.name: one.description for one in cloud.point_format.extra_dimensions}
+    assert meaning["reflectance"] == "reflectance at true angle [-]"
+
+
 def test_circles_and_polygons_of_csv_and_geojson(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("name,reflectance,x,y,radius,incidence\ngrey,0.25,100,200,5,\nwhite,0.8,300,400,2,12.5\n")

@@ -126,19 +126,35 @@ def test_every_bin_of_angles_holds_on_longer_strips(tmp_path, seed):
         assert np.mean(off[inside] <= error[inside]) == pytest.approx(0.683, abs=0.08), low
 
 
-@pytest.mark.parametrize("half_angle", [10.0, 25.0])
-def test_level_ground_is_told_from_the_swath(half_angle):
-    """The survey's pulse holds the rays' own slopes; what is left without them is the true pulse."""
+def see_swath(half_angle):
+    """Level ground seen across a swath as slopes, and its survey with the beam's divergence."""
     made = simulate_seed_block(replace(SCENE, flight=Flight(640.0, half_angle=half_angle, look_ahead=0.0)), 6, 0)
     back = made.rays.direction / AIR_SPEED * made.rays.distance[:, None]
     block = replace(made.block, sensor=made.rays.ground - back)
     surveyed = survey_block(block).system.with_radiometry(divergence=SCENE.divergence)
+    return Slopes(block, made.rays.incidence, np.full(len(block), np.radians(0.3))), surveyed
+
+
+@pytest.mark.parametrize("half_angle", [10.0, 25.0])
+def test_level_ground_is_told_from_the_swath(half_angle):
+    """The survey's pulse holds the rays' own slopes; what is left without them is the true pulse."""
+    known, surveyed = see_swath(half_angle)
     true = SCENE.recording.pulse.sigma
     assert surveyed.sigma_ref / true > 1.005
-    known = Slopes(block, made.rays.incidence, np.full(len(block), np.radians(0.3)))
-    seen = measure_reference([known], surveyed, block.spacing).system
+    seen = measure_reference([known], surveyed, known.block.spacing).system
     assert np.sqrt(seen.sigma_ref**2 + seen.widths.variance) == pytest.approx(true, rel=0.002)
     assert seen.widths.scatter < 0.01 * true
+
+
+def test_a_digitizer_has_the_beam_of_its_strip_and_its_error():
+    known, pulse = see_swath(10.0)
+    doubtful = pulse.with_radiometry(divergence_error=0.2)
+    index, spacing = known.block.digitizer.index, known.block.spacing
+    certain, main = (measure_reference([known], system, spacing).system.widths for system in (pulse, doubtful))
+    assert main.error > 2.0 * certain.error
+    blind = pulse.with_radiometry(divergence=None)
+    both = measure_reference([known], replace(doubtful, digitizers={index: blind}), spacing).system
+    assert both.digitizers[index].widths == main
 
 
 @pytest.mark.slow

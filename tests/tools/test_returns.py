@@ -93,7 +93,7 @@ def test_points_without_a_time_are_not_one_pulse(tmp_path, missing, monkeypatch)
     parts["time"][np.tile(np.arange(7) < 3, 10)] = missing
     (found,), _ = count_returns([write_cloud(tmp_path / "a.las", **parts)])
     assert (found.pulses, found.pulses_by) == (40, "gps_time") and found.by_count[3] == pytest.approx(0.25)
-    assert found.warnings[0].startswith("30 points have no GPS time (0 or NaN)")
+    assert found.warnings[0].startswith("points without GPS time (0 or NaN): 30;")
     monkeypatch.setattr(buckets, "BUCKET_ROWS", 5)
     (again,), _ = count_returns([tmp_path / "a.las"])
     assert again.by_count == found.by_count

@@ -119,7 +119,8 @@ def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
     Raises
     ------
     ConfigError
-        Where a column does not exist or the chain does not compute it, and for a chain without positions.
+        Where a column does not exist or the chain does not compute it, where a name without `+` follows one with it,
+        and for a chain without positions.
     """
     missing = [name for name in NEEDED if name not in chain.makes]
     if missing:
@@ -134,6 +135,10 @@ def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
     chosen = [entry for entry in entries if not entry.startswith("+")]
     if wanted is not None and not entries:
         raise ConfigError("--columns: names no column; leave it out for the usual ones, or write a,b or +a,+b")
+    if chosen and entries[0].startswith("+"):
+        raise ConfigError(
+            f"--columns: '+{added[0]}' adds, but {chosen[0]!r} has no +; write +{chosen[0]} to add it too"
+        )
     for name in [*chosen, *added]:
         _check_column(name, (*computed, *WITHOUT_STAGE))
     return tuple(dict.fromkeys([*(chosen or default), *added]))

@@ -185,5 +185,5 @@ def _describe_channel(channel: ChannelConstant) -> str:
     constant = f"constant {value} +- {100 * channel.relative_error:.1f} %"
     if not channel.echoes:
         return f"{name}: no target, by overlap, {constant}"
-    scatter = f"spread {100 * channel.spread:.1f} %, from shot to shot {100 * channel.shot_energy:.1f} %"
+    scatter = f"spread {100 * channel.spread:.1f} %, {100 * channel.shot_energy:.1f} % without fit errors"
     return f"{name}: {count(channel.echoes, 'echo')}, {constant}, {scatter}"

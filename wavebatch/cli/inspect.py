@@ -53,7 +53,7 @@ def info(
         if not as_json:
             lines = ["", *_list_lines(facts)][path == paths[0] :]
             print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
-        if "packets" not in facts and facts["problems"]:  # points are shown, packets cannot be
+        if facts["problems"] and not facts.get("points_with_waveform"):  # points are shown, packets cannot be
             nonlocal lost
             lost += 1
             talk(f"error: {path}: {facts['problems'][0]}")

@@ -245,9 +245,8 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
             continue
         parts.setdefault(index if index in system.digitizers else None, []).append(_measure(sample, system))
     found = {index: np.concatenate(rows, axis=1) for index, rows in parts.items()}
-    divergence = system.radiometry.divergence
     others = {
-        index: _refer(other.with_radiometry(divergence=divergence), found.get(index, np.empty((4, 0))))
+        index: _refer(replace(other, radiometry=system.radiometry), found.get(index, np.empty((4, 0))))
         for index, other in system.digitizers.items()
     }
     main = found.get(None, np.empty((4, 0)))

@@ -130,7 +130,7 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
     except InputError as error:
         problems.append(_without_name(path, error))
     notes = [*_note_descriptors(facts, scan), *scan.notes, *audit_header(reader, scan)]
-    summary = f"{scan.points} points, {scan.packets} packets"
+    summary = ", ".join(f"{n} {name}{'s' * (n != 1)}" for n, name in ((scan.points, "point"), (scan.packets, "packet")))
     if scan.packets:
         summary += f", vectors {scan.vectors.direction} the sensor"
     return Findings(str(path), tuple(problems), tuple(notes), summary)

@@ -145,8 +145,10 @@ def _survey_joined(joined: list[WaveformBlock], *, learn: bool) -> Survey:
         members = [block for block in members if block.digitizer.index not in strangers]
         main = pool_blocks(members)
         plain = measure_gaussian(main)
-    main, plain = clean_sample(main, plain)
+    raw = main
+    main, plain = clean_sample(raw, plain)
     found = _survey(main, plain, learn=learn)
+    _note_counts(found.figures, raw)
     found.figures.descriptors_pooled = float(len(members))
     if not others:
         return found
@@ -337,7 +339,15 @@ def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
     """Survey of one block: noise and width of isolated echoes, the pulse's shape, noise again, the threshold."""
     if not len(block):
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0)
-    return _survey(*clean_sample(block, measure_gaussian(block)), learn=learn)
+    found = _survey(*clean_sample(block, measure_gaussian(block)), learn=learn)
+    _note_counts(found.figures, block)
+    return found
+
+
+def _note_counts(figures: Figures, block: WaveformBlock) -> None:
+    """Add the range of the counts as they were recorded: a block that was cleaned may leave the digitizer's range."""
+    figures.least_count = float(block.samples.min(initial=block.digitizer.max_count))
+    figures.largest_count = float(block.samples.max(initial=0))
 
 
 def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlock, SystemPulse]:
@@ -448,8 +458,6 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figu
         n_samples=float(block.samples.shape[1]),
         bits=float(block.digitizer.bits),
         inverted=float(block.digitizer.inverted),
-        least_count=float(block.samples.min(initial=block.digitizer.max_count)),
-        largest_count=float(block.samples.max(initial=0)),
         empty_share=float((number == 0).mean()),
         single_share=float((number == 1).mean()),
         overlapped_share=float(overlapped.mean()),

@@ -87,9 +87,12 @@ _SHORT = {
     "amplitude_normalized_db": "at reference range",
     "amplitude_normalized_err": "1 sigma, normalized",
     "amplitude_normalized_db_err": "1 sigma, normalized",
+    "reflectance": "reflectance at true angle",
     "level_reflectance": "reflectance if level",
     "level_reflectance_err": "1 sigma, slope unknown",
-    **{f"relative_{name}": "relative to strip only" for name in _RELATIVE},
+    "range_error": "1 sigma of range with sensor",
+    "skew": "skew; 0 is a Gaussian",
+    **{f"relative_{name}": "relative to strip" for name in _RELATIVE},
     **{f"relative_{name}_err": "1 sigma, relative" for name in _RELATIVE},
 }
 """Short meanings of columns whose declared meaning does not fit into the 32 bytes of a description."""

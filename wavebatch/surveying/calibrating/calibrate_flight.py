@@ -89,9 +89,26 @@ def calibrate_flight(
     calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath)
     names = [source.name for source in sources]
     pairs = tuple(compare_pairs(ties, adjusted, names))
-    notes = [*calibration.notes, *find_doubts(names, adjusted, calibration.strips, pairs)]
+    lost = [
+        source.name
+        for source, value in zip(sources, adjusted.value, strict=True)
+        if not (np.isfinite(value) or _is_covered(source.row, calibration.channels))
+    ]
+    notes = [*calibration.notes, *find_doubts(lost, calibration.strips, pairs)]
     calibration, more = _widen(calibration, adjusted, find_trend(ties, anchors, seen, adjusted))
     return FlightCalibration(replace(calibration, notes=(*notes, *more)), pairs, ties.size)
+
+
+def _is_covered(row: ChannelConstant, channels: Sequence[ChannelConstant]) -> bool:
+    """Whether a run takes the constant of other channels for this one, which differs in its samples per waveform only:
+    see `strip_match`."""
+    alike = [
+        other
+        for other in channels
+        if (other.scanner, other.bits, other.spacing_ns, other.gain)
+        == (row.scanner, row.bits, row.spacing_ns, row.gain)
+    ]
+    return bool(alike) and all(other.samples != row.samples for other in alike)
 
 
 def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) -> tuple[Calibration, list[str]]:

@@ -77,16 +77,13 @@ def compare_pairs(ties: Ties, adjusted: Adjustment, names: Sequence[str]) -> Ite
             )
 
 
-def find_doubts(
-    names: Sequence[str], adjusted: Adjustment, strips: Sequence[StripConstant], pairs: Sequence[PairOverlap]
-) -> Iterator[str]:
-    """Find sources without a constant, strips that drift, and heights that do not fit.
+def find_doubts(lost: Sequence[str], strips: Sequence[StripConstant], pairs: Sequence[PairOverlap]) -> Iterator[str]:
+    """Name sources without a constant, strips that drift, and heights that do not fit.
 
     Parameters
     ----------
-    names : sequence of str
-        Of the sources.
-    adjusted : Adjustment
+    lost : sequence of str
+        Names of the sources without a constant.
     strips : sequence of StripConstant
     pairs : sequence of PairOverlap
 
@@ -95,12 +92,11 @@ def find_doubts(
     str
         One line each.
     """
-    for name, value in zip(names, adjusted.value, strict=True):
-        if not np.isfinite(value):
-            yield (
-                f"{name}: has no constant: no target lies on it, and fewer than {LEAST_TIES} flat cells tie it to a "
-                "strip or channel that has one"
-            )
+    for name in lost:
+        yield (
+            f"{name}: has no constant: no target lies on it, and fewer than {LEAST_TIES} flat cells tie it to a "
+            "strip or channel that has one"
+        )
     for row in strips:
         if row.drift_error > 0 and abs(row.drift) > max(LEAST_DRIFT * row.drift_error, 0.01):
             yield (

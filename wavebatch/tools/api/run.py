@@ -187,8 +187,9 @@ def _check_use(chain: Chain, job: StripJob) -> None:
     if option is not None and not needs_sensor(chain):
         stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized",
                   "--energy": "amplitude_normalized"}  # fmt: skip
-        stage = f"attribute.{stages.get(option, 'range')}"
-        raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage {stage}")
+        name = stages.get(option, "range")
+        remedy = f"give --columns +{name}, or add stage attribute.{name} to a chain file"
+        raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; {remedy}")
 
 
 def _check_trajectory(sensor: SensorRequest) -> None:

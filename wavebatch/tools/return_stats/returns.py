@@ -151,8 +151,9 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | N
             for bucket in range(number):
                 tally.add_pulses(buckets.read(bucket))
         if keys.untimed:
-            notes = f"{keys.untimed} points have no GPS time (0 or NaN): pulses by their return numbers there"
-            tally.notes.append(notes)
+            tally.notes.append(
+                f"points without GPS time (0 or NaN): {keys.untimed}; their pulses are found by return numbers"
+            )
         tally.left_out = reader.left_out
     return tally
 
