@@ -149,11 +149,9 @@ def test_errors_count_what_the_prior_knows_of_widths(rng):
     truth[:, 2] = [1.7, 2.6]
     y, prior = record(rng, truth), (2.2, 0.15)
     held = fit(y, near(rng, truth), width_ref=prior[0], prior_spread=prior[1], **TIGHT)
-    same = 0
     for p, errors in zip(held.parameters[:, :3], held.errors[:, :3], strict=True):
         expected = naive_fit.errors_of(p, np.arange(float(LENGTH)), 1.0, prior, slice(None), {})
-        same += np.allclose(errors, expected, rtol=5e-3)
-    assert same >= 10  # echoes that overlap much have errors of their own
+        np.testing.assert_allclose(errors, expected, rtol=5e-3)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32])

@@ -61,7 +61,7 @@ def test_residuals_are_those_of_the_cleaned_samples():
     np.testing.assert_allclose(measure_residuals(block, chain, system), residual, rtol=1e-3)
     found = ChainRun(chain, system, 1.0)
     solved = found.find(block)
-    misfit, floor = measure_fit(solved.cleaned, solved.noise, solved.system, chain.steps[2], solved.echoes)
+    misfit, floor = measure_fit(solved.block, solved.noise, solved.system, chain.steps[2], solved.echoes)
     assert np.nanmedian(misfit / floor) == pytest.approx(1.0, abs=0.2)
 
 

@@ -6,11 +6,14 @@ shell finds may be that of another Python than the one that runs wavebatch.
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import shlex
 import shutil
 import sys
+from collections.abc import Callable
+from types import ModuleType
 
 PACKAGES = {
     "matplotlib": "matplotlib>=3.8",
@@ -20,6 +23,14 @@ PACKAGES = {
     "laszip": "laszip>=0.3",
 }
 """What pyproject.toml asks for of each optional package; `tests/test_docs.py` compares them."""
+
+
+def need(package: str, complain: Callable[[str], Exception]) -> ModuleType:
+    """Return an optional package; where it is missing, raise the error that `complain` makes of how to install it."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise complain(advise_install(package)) from error
 
 
 def advise_install(package: str) -> str:

@@ -7,6 +7,22 @@ import numpy as np
 from wavebatch.core.units import MAD_TO_STD
 
 
+def even_places(number: int, most: int) -> np.ndarray:
+    """Places of at most `most` of so many rows, spread evenly from the first to the last.
+
+    Parameters
+    ----------
+    number, most : int
+        From 0 and from 1.
+
+    Returns
+    -------
+    int64 (k,)
+        Ascending, each once.
+    """
+    return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(np.int64))
+
+
 def find_order(waveform: np.ndarray, time: np.ndarray) -> np.ndarray | None:
     """Order of rows by waveform, then time.
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.optional import advise_install
+from wavebatch.core.optional import need
 from wavebatch.files.las.crs import CrsUnits, find_epsg, parse_wkt, read_crs_definition
 from wavebatch.files.las.header import LasHeader
 
@@ -157,15 +157,12 @@ def _project(
     file: AreaFile, rings: Sequence[np.ndarray], source: str, strip: Path, definition: str
 ) -> list[np.ndarray]:
     """Rings of the CRS `source` in that of a strip, `definition`."""
-    try:
-        import pyproj
-    except ImportError as error:
-        other = _code(definition)
-        own = f"is in {other}" if other else "does not name its CRS by a code"
-        raise ConfigError(
-            f"{file.path}: is in {source[:_LONGEST_NAME]}, and {strip} {own}; projecting it needs pyproj: "
-            f"{advise_install('pyproj')}; or write it in the coordinates of the strip, without a member crs"
-        ) from error
+    other = _code(definition)
+    own = f"is in {other}" if other else "does not name its CRS by a code"
+    pyproj = need("pyproj", lambda advice: ConfigError(
+        f"{file.path}: is in {source[:_LONGEST_NAME]}, and {strip} {own}; projecting it needs pyproj: {advice}; or "
+        "write it in the coordinates of the strip, without a member crs"
+    ))  # fmt: skip
     try:
         target = pyproj.CRS.from_user_input(definition).to_2d()
         transformer = pyproj.Transformer.from_crs(pyproj.CRS.from_user_input(source).to_2d(), target, always_xy=True)

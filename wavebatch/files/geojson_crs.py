@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.optional import advise_install
+from wavebatch.core.optional import need
 from wavebatch.files.las.crs import find_epsg
 from wavebatch.files.wkt_repair import drop_empty_codes
 
@@ -58,13 +58,10 @@ def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
             f"{path}: has no CRS, so its points have no longitude and latitude, which GeoJSON needs; write .csv, or "
             "--geojson-crs keep for the coordinates of the strip"
         )
-    try:
-        import pyproj
-    except ImportError as error:
-        raise ConfigError(
-            f"{path}: GeoJSON in WGS 84 needs pyproj: {advise_install('pyproj')}; or write .csv, or "
-            "--geojson-crs keep for the coordinates of the strip"
-        ) from error
+    pyproj = need("pyproj", lambda advice: ConfigError(
+        f"{path}: GeoJSON in WGS 84 needs pyproj: {advice}; or write .csv, or --geojson-crs keep for the coordinates "
+        "of the strip"
+    ))  # fmt: skip
     try:
         source = pyproj.CRS.from_user_input(crs)
         transformer = pyproj.Transformer.from_crs(source.to_2d(), "EPSG:4326", always_xy=True)

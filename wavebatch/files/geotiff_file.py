@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,11 +111,19 @@ def _flatten(crs: Any) -> Any:
     return CRS.from_wkt((text[:start] + text[third.end :]).replace("CS[Cartesian,3]", "CS[Cartesian,2]"))
 
 
-def _writing() -> Any:
-    """Settings of GDAL: what a GeoTIFF cannot hold goes to no .aux.xml, which would have the temporary file's name."""
-    from rasterio.env import Env
+@contextlib.contextmanager
+def _writing(target: Path) -> Iterator[None]:
+    """Settings of GDAL: what a GeoTIFF cannot hold goes to no .aux.xml, which would have the temporary file's name.
 
-    return Env(GDAL_PAM_ENABLED="NO")
+    Errors of GDAL and of the disk become InputError.
+    """
+    import rasterio
+
+    try:
+        with rasterio.Env(GDAL_PAM_ENABLED="NO"):
+            yield
+    except (rasterio.errors.RasterioError, OSError) as error:
+        raise InputError(f"{target}: cannot be written: {error}; check disk and permissions") from error
 
 
 class RasterWriter(Closing):
@@ -133,7 +142,7 @@ class RasterWriter(Closing):
         self._target = target
         self._layout = layout
         try:
-            with _writing():
+            with _writing(target):
                 crs = None if layout.crs is None else _flatten(_read_crs(layout.crs, str(target)))
                 self._file = rasterio.open(
                     self._draft.path, "w", driver="GTiff", width=layout.columns, height=layout.rows, count=len(bands),
@@ -147,8 +156,6 @@ class RasterWriter(Closing):
                     self._file.set_band_unit(number, band.unit)
         except BaseException as error:
             self._draft.discard()
-            if isinstance(error, rasterio.errors.RasterioError | OSError):
-                raise InputError(f"{target}: cannot be written: {error}; check disk and permissions") from error
             if layout.crs is not None and type(error).__module__.startswith("rasterio"):
                 # GDAL has no keys for some numbers that it has read.
                 raise _complain(str(target), "written", error) from error
@@ -156,7 +163,6 @@ class RasterWriter(Closing):
 
     def write_tile(self, row: int, column: int, values: np.ndarray) -> None:
         """Write a tile by its place: values (bands, TILE, TILE), NaN for no-data; what lies outside is cut off."""
-        import rasterio
         from rasterio.windows import Window
 
         rows = min(TILE, self._layout.rows - row * TILE)
@@ -168,23 +174,17 @@ class RasterWriter(Closing):
                 "another with --no-data"
             )
         stored = np.where(np.isnan(cut), self._layout.no_data, cut).astype(self._layout.dtype)
-        try:
-            with _writing():
-                self._file.write(stored, window=Window(column * TILE, row * TILE, columns, rows))
-        except (rasterio.errors.RasterioError, OSError) as error:
-            raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
+        with _writing(self._target):
+            self._file.write(stored, window=Window(column * TILE, row * TILE, columns, rows))
 
     def publish(self) -> None:
         """End the file and give it its name."""
         import rasterio
 
-        try:
-            with _writing():
-                self._file.close()
-                with rasterio.open(self._draft.path) as written:
-                    lost = self._layout.crs is not None and written.crs is None
-        except (rasterio.errors.RasterioError, OSError) as error:
-            raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
+        with _writing(self._target):
+            self._file.close()
+            with rasterio.open(self._draft.path) as written:
+                lost = self._layout.crs is not None and written.crs is None
         if lost:
             raise ConfigError(f"{self._target}: a GeoTIFF cannot hold the CRS of the clouds; use --crs EPSG:n")
         self._draft.publish()
@@ -192,6 +192,6 @@ class RasterWriter(Closing):
     def close(self) -> None:
         """Remove what was not published; may be called twice."""
         if not self._file.closed:
-            with _writing():
+            with _writing(self._target):
                 self._file.close()
         self._draft.discard()

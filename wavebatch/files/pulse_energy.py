@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.order import even_places
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.extra_bytes import ExtraRecord
@@ -137,8 +138,7 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
     if found is None and request is None:
         return None
     found = found or _read_file(reader, request)
-    units = reader.unit_count()
-    chosen = np.unique(np.linspace(0, units - 1, min(units, SAMPLED_UNITS)).round().astype(int)) if units else []
+    chosen = even_places(reader.unit_count(), SAMPLED_UNITS)
     # Points of one pulse follow each other: each pulse counts once.
     values = np.concatenate([np.empty(0), *(_once(found, reader.read_unit(int(number), scan)) for number in chosen)])
     there = values[np.isfinite(values)]

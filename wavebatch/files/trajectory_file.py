@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.optional import advise_install
+from wavebatch.core.optional import need
 from wavebatch.core.trajectory import Trajectory, apply_lever_arm
 from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads, widen
 
@@ -157,13 +157,9 @@ def _project(path: Path, columns: dict[str, np.ndarray], crs: str | None) -> np.
         return np.stack([columns["x"], columns["y"], columns["z"]], axis=1)
     if crs is None:
         raise InputError(f"{path}: the trajectory is in degrees, but the strip has no CRS; give a trajectory in metres")
-    try:
-        import pyproj
-    except ImportError as error:
-        raise InputError(
-            f"{path}: the trajectory is in degrees, which needs pyproj: {advise_install('pyproj')}; or give x, y, "
-            "z in the strip's CRS"
-        ) from error
+    pyproj = need("pyproj", lambda advice: InputError(
+        f"{path}: the trajectory is in degrees, which needs pyproj: {advice}; or give x, y, z in the strip's CRS"
+    ))  # fmt: skip
     try:
         target = pyproj.CRS.from_user_input(crs)
         if target.is_geographic:

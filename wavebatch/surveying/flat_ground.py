@@ -17,6 +17,7 @@ import numpy as np
 import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import UNCLEAN
+from wavebatch.core.order import even_places
 from wavebatch.core.system import LevelWidths
 from wavebatch.core.units import SQUARED_NORMAL_MEDIAN, C, format_measure
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -196,10 +197,7 @@ def sample_slopes(reader: StripReader, scan: StripScan, fill: object, n_waveform
     ------
     Slopes
     """
-    units = reader.unit_count()
-    chosen = (
-        np.unique(np.linspace(0, units - 1, min(units, SAMPLED_UNITS)).round().astype(int)).tolist() if units else []
-    )
+    chosen = even_places(reader.unit_count(), SAMPLED_UNITS).tolist()
     for number in chosen:
         unit = reader.read_unit(number, scan)
         rows = np.flatnonzero(unit.packets.owned)

@@ -1,4 +1,4 @@
-"""Tables as CSV text: `stats`, `compare` and `survey --angles` write theirs with `format_csv`."""
+"""Tables as CSV text: `stats`, `compare`, `survey --angles` and `plot waveform` write theirs with `format_csv`."""
 
 from __future__ import annotations
 

@@ -26,17 +26,22 @@ def make_locked(make: Callable[[], tuple[Path, int]]) -> tuple[Path, int]:
     """
     while True:
         path, descriptor = make()
-        try:
-            if fcntl is not None:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            is_there = os.fstat(descriptor).st_nlink > 0
-        except BlockingIOError:
-            is_there = False
-        except OSError:  # a file system without locks
-            is_there = True
-        if is_there:
-            return path, descriptor
+        with contextlib.suppress(BlockingIOError):
+            if hold(descriptor):
+                return path, descriptor
         os.close(descriptor)
+
+
+def hold(descriptor: int) -> bool:
+    """Lock an open file; False if it was removed meanwhile. Raises BlockingIOError if another process has locked it."""
+    try:
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.fstat(descriptor).st_nlink > 0
+    except BlockingIOError:
+        raise
+    except OSError:  # a file system without locks
+        return True
 
 
 def remove_unlocked(

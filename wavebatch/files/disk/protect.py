@@ -86,8 +86,6 @@ def _packet_files(path: Path) -> list[Path]:
     if path.suffix.lower() not in (".las", ".laz") or not os.path.isfile(path):  # a pipe would block for ever
         return []
     try:
-        if not path.is_file():  # opening a pipe waits for ever
-            return []
         with open(path, "rb") as file:
             head = file.read(_FORMAT_BYTE + 1)
     except (OSError, ValueError):

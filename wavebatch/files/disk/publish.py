@@ -15,7 +15,7 @@ import os
 import secrets
 import stat
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -23,6 +23,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.files.disk import locks
 from wavebatch.files.disk.protect import refuse_input
+from wavebatch.files.disk.raw_bytes import in_one_line
 
 _PREFIX, _SUFFIX = ".wavebatch-", ".tmp"
 _CLAIM_PATIENCE = 0.5
@@ -30,15 +31,9 @@ _CLAIM_PATIENCE = 0.5
 _NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK, errno.EINVAL}
 
 
-@contextlib.contextmanager
-def reporting(target: Path) -> Iterator[None]:
+def reporting(target: Path) -> contextlib.AbstractContextManager[None]:
     """Turn an error of the operating system while `target` is written into one InputError line."""
-    try:
-        yield
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written: {error.strerror or error}; {_remedy(error)}") from error
+    return in_one_line(lambda error, why: f"{target}: cannot be written: {why}; {_remedy(error)}")
 
 
 def _remedy(error: OSError) -> str:
@@ -222,18 +217,13 @@ class Claim:
 
 def _lock(path: Path) -> int | None:
     """A descriptor of the locked file; None if it was removed meanwhile. BlockingIOError if another process has it."""
-    descriptor = os.open(path, locks.FLAGS | os.O_CREAT, 0o666)
+    descriptor, held = os.open(path, locks.FLAGS | os.O_CREAT, 0o666), False
     try:
-        locks.fcntl.flock(descriptor, locks.fcntl.LOCK_EX | locks.fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise
-    except OSError:  # a file system without locks
-        return descriptor
-    if os.fstat(descriptor).st_nlink:
-        return descriptor
-    os.close(descriptor)
-    return None
+        held = locks.hold(descriptor)
+    finally:
+        if not held:
+            os.close(descriptor)
+    return descriptor if held else None
 
 
 def remove_stale(folder: Path) -> list[Path]:

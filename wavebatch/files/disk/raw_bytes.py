@@ -10,7 +10,7 @@ import contextlib
 import os
 import stat
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -34,15 +34,20 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 @contextlib.contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn an error of the operating system while a file is opened into one InputError line."""
+def in_one_line(explain: Callable[[OSError, object], str]) -> Iterator[None]:
+    """Turn an error of the operating system into one InputError line; explain: the line of an error and its reason."""
     try:
         yield
     except InputError:
         raise
     except OSError as error:
-        name = error.filename or path
-        raise InputError(f"{name}: cannot be read: {error.strerror or error}; check disk and permissions") from error
+        raise InputError(explain(error, error.strerror or error)) from error
+
+
+def reading(path: Path) -> contextlib.AbstractContextManager[None]:
+    """Turn an error of the operating system while a file is opened into one InputError line."""
+    remedy = "check disk and permissions"
+    return in_one_line(lambda error, why: f"{error.filename or path}: cannot be read: {why}; {remedy}")
 
 
 def damaged(path: Path, what: str) -> InputError:

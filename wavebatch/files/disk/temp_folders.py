@@ -18,8 +18,8 @@ from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
-from wavebatch.core.errors import InputError
 from wavebatch.files.disk import locks
+from wavebatch.files.disk.raw_bytes import in_one_line
 
 _LOCK = "lock"
 _place: ContextVar[Path | None] = ContextVar("wavebatch_scratch", default=None)
@@ -45,18 +45,10 @@ def scratch_place() -> Path:
     return _place.get() or Path(tempfile.gettempdir())
 
 
-@contextlib.contextmanager
-def reporting_scratch() -> Iterator[None]:
+def reporting_scratch() -> contextlib.AbstractContextManager[None]:
     """Turn an error of the operating system with a temporary file into one InputError line."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{scratch_place()}: no temporary file can be used there ({error.strerror or error}); free space or set "
-            "TMPDIR to another folder"
-        ) from error
+    remedy = "free space or set TMPDIR to another folder"
+    return in_one_line(lambda _, why: f"{scratch_place()}: no temporary file can be used there ({why}); {remedy}")
 
 
 def use_scratch(folder: Path | None) -> None:

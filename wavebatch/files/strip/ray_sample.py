@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.order import even_places
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.point_formats import locate
@@ -109,9 +110,7 @@ def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
 def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
     """Units [start, stop) all over the strip, at most MOST_SLICES of them."""
     borders = scan.borders
-    if not scan.points:
-        return []
-    chosen = np.unique(np.linspace(0, len(borders) - 2, min(len(borders) - 1, MOST_SLICES)).round().astype(int))
+    chosen = even_places(len(borders) - 1, MOST_SLICES)
     return [(int(borders[i]), int(borders[i + 1])) for i in chosen.tolist() if borders[i + 1] > borders[i]]
 
 

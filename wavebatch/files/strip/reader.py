@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.order import even_places
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.closing import Closing
@@ -207,18 +208,16 @@ class StripReader(Closing):
         Within a unit the packets are taken in the order of their bytes, and blocks come in that order: a survey of the
         strip does not change where its points are sorted in another way.
         """
-        units = self.unit_count()
-        if not units or n_waveforms <= 0:
+        if n_waveforms <= 0:
             return
-        chosen = np.unique(np.linspace(0, units - 1, min(units, _SAMPLED_UNITS)).round().astype(int)).tolist()
+        chosen = even_places(self.unit_count(), _SAMPLED_UNITS).tolist()
         left = n_waveforms
         for position, number in enumerate(chosen):
             unit = self.read_unit(number, scan)
             rows = np.flatnonzero(unit.packets.owned)
             rows = rows[np.lexsort((unit.packets.digitizer[rows], unit.packets.offset[rows]))]
             share = -(-left // (len(chosen) - position))
-            if len(rows) > share:
-                rows = rows[np.linspace(0, len(rows) - 1, share).round().astype(int)]
+            rows = rows[even_places(len(rows), share)]
             left -= len(rows)
             for block, _ in self.read_rows(unit, rows, size):
                 yield block

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from wavebatch.core.order import even_places
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judged, packed_bytes
 from wavebatch.files.strip.packets import PacketFile
@@ -117,7 +118,7 @@ class FormSample:
 
     def add(self, judged: Judged, rows: np.ndarray) -> None:
         """Take some of the packets of a unit; rows: points with different packets, ordered by byte offset."""
-        rows = _spread(rows, SAMPLED_PER_UNIT)
+        rows = rows[even_places(len(rows), SAMPLED_PER_UNIT)]
         self.keys.append(judged.keys[rows])
         self.n_samples.append(judged.n_samples[rows])
         self.packed.append(judged.packed[rows])
@@ -130,15 +131,12 @@ class FormSample:
         index = (keys & np.uint64(255)).astype(np.int64)
         found: dict[tuple[int, int, bool], np.ndarray] = {}
         for number in np.unique(index).tolist():
-            rows = _spread(np.flatnonzero(index == number), SAMPLED)
+            rows = np.flatnonzero(index == number)
+            rows = rows[even_places(len(rows), SAMPLED)]
             kinds, kind = np.unique(np.stack([n_samples[rows], packed[rows]], axis=1), axis=0, return_inverse=True)
             for place, (length, is_packed) in enumerate(kinds.tolist()):
                 found[number, length, bool(is_packed)] = keys[rows[kind.ravel() == place]] >> INDEX_BITS
         return found
-
-
-def _spread(rows: np.ndarray, number: int) -> np.ndarray:
-    return rows if len(rows) <= number else rows[np.linspace(0, len(rows) - 1, number).round().astype(int)]
 
 
 @dataclass(slots=True)

@@ -20,7 +20,6 @@ static const double LEAST_AWAY = 0.25;         /* of a peak from a log-normal's 
 static const double LEAST_WIDTH = 0.1;         /* below it a fit without damping is lost: the echo lies on one sample */
 
 typedef struct { double low[4], high[4]; } Limits;
-typedef struct { double width, spread, skew, skew_spread; } Prior; /* spread 0: none */
 
 /* The sample of the window at which a log-normal as printed in papers begins, 1.2. */
 INLINE double origin_of(const Settings *s, const Window *w) { return s->pulse.from_waveform ? -1.0 - w->begin : -1; }
@@ -161,7 +160,7 @@ INLINE int has_vanished(int64_t k, const double *amplitude) {
 }
 
 /* Fits from fit->parameters. Given up as hopeless where it cannot come below the cost `target`. */
-INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *limits, const Prior *prior, double target, Work *work) {
+INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *limits, double target, Work *work) {
     const int64_t n = per * k, rows = n + 1;
     const double std = work->window.std, variance = std * std;
     int64_t most = work->window.any_clipped && s->max_iterations < CENSORED ? CENSORED : s->max_iterations;
@@ -173,7 +172,7 @@ INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *
     for (int64_t iteration = 0;; iteration++) {
         evaluate_rows(k, per, s, work, trial);
         multiply_rows(rows, work->window.vectors, work->rows, work->products);
-        double cost = work->products[n * rows + n] + add_prior(k, per, prior, std, trial, work->products), before = fit->cost;
+        double cost = work->products[n * rows + n] + add_prior(k, per, &fit->prior, std, trial, work->products), before = fit->cost;
         int accepted = iteration == 0 || cost <= fit->cost * (1 + 1e-6);
         if (iteration) damping = fmax(damping * (!accepted ? raise : fit->cost - cost > KEPT * promised ? EASE : 1), 1e-7);
         raise = accepted ? RAISE : 2 * raise;
@@ -196,6 +195,7 @@ INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *
         if (fit->converged) return;
         evaluate_rows(k, per, s, work, fit->parameters); /* the rows are those of a step that was refused */
         multiply_rows(rows, work->window.vectors, work->rows, fit->gram);
+        add_prior(k, per, &fit->prior, std, fit->parameters, fit->gram);
         return;
     }
 }
@@ -262,6 +262,7 @@ INLINE void find_errors(int64_t k, int64_t per, Work *work, Solution *out) {
                 for (int64_t x = 0; x < samples; x++) sum += (double)row[i * samples + x] * row[j * samples + x];
                 work->products[i * rows + j] = sum;
             }
+        add_prior(k, per, &work->fit.prior, std, p, work->products);
         invert(k, per, work, work->products, out->errors, out->shared);
     }
     for (int64_t i = 0; i < n; i++) out->errors[i] = sqrt(fmax(out->errors[i], 0)) * unit_of(k, i, p, std) * std;
@@ -273,9 +274,9 @@ INLINE void find_errors(int64_t k, int64_t per, Work *work, Solution *out) {
     (k == 1 && per == 3 ? call(1, 3, __VA_ARGS__) : k == 2 && per == 3 ? call(2, 3, __VA_ARGS__) : call(k, per, __VA_ARGS__))
 
 static void fit_window(int64_t k, int64_t per, const Settings *s, const Limits *limits, const Prior *prior, double target, Work *work) {
-    work->fit.k = k; work->fit.per = per;
+    work->fit.k = k; work->fit.per = per; work->fit.prior = *prior;
     if (s->undamped) fit_undamped(k, s, limits, work);
-    else FOR_EACH_NUMBER(fit_echoes, s, limits, prior, target, work);
+    else FOR_EACH_NUMBER(fit_echoes, s, limits, target, work);
 }
 
 /* The fit as a solution: errors, root mean square residual in noise, parameters that lie on their limits. */

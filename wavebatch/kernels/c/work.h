@@ -8,10 +8,13 @@ typedef struct { /* samples of one cluster, padded to whole vectors */
     int any_clipped, is_weighted;
 } Window;
 
+typedef struct { double width, spread, skew, skew_spread; } Prior; /* spread 0: none */
+
 typedef struct { /* k echoes with `per` parameters each: k amplitudes, then k times, widths, skews */
     int64_t k, per;
     int converged, hopeless;
     double cost;                               /* chi2 and prior */
+    Prior prior;
     double *parameters, *gram;                 /* gram: products of the rows, the last row is the residual */
 } Fit;
 

@@ -27,7 +27,7 @@ from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.angle_limits import REFERENCE_ERROR
 from wavebatch.tools.csv_table import format_csv
 from wavebatch.tools.plots.draw_cloud import SERIES
-from wavebatch.tools.plots.labels import fit_parts
+from wavebatch.tools.plots.labels import set_head
 
 ANGLES = np.arange(0.0, 81.0)
 """Angles of the table [deg]."""
@@ -165,6 +165,5 @@ def draw_angles(tables: Sequence[AngleTable], target: Path, *, strip: str = "", 
         errors.set_ylabel("rms error [deg]")
         errors.set_xlabel("echo_width [ns]")
         parts = [plain_text(strip), f"{found.distance:.0f} m, {found.divergence:g} mrad"]
-        figure.suptitle(fit_parts(figure, [part for part in parts if part], 6.8, size=10.5), x=0.01, ha="left",
-                        fontsize=10.5)  # fmt: skip
+        set_head(figure, [part for part in parts if part], size=10.5)
         errors.legend(loc="upper right")

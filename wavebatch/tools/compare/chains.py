@@ -12,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import list_profiles
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import widest_chain
@@ -170,14 +169,8 @@ def _match_cloud(
         return task.finish(a.name, b.name)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    """Noise and echoes of a chain in a block; as Solved of the chain."""
-
-    cleaned: WaveformBlock
-    noise: Noise
-    system: SystemPulse
-    echoes: EchoTable
+class _Found(Solved):
+    """Noise and echoes of a chain in a block, as rows of clouds."""
 
     def rows(self, block: WaveformBlock) -> np.ndarray:
         """The echoes as rows of a cloud; gps_time is the row of the waveform in the block."""
@@ -219,10 +212,10 @@ class _Found:
         inside = np.flatnonzero((sample >= 0) & (sample < block.samples.shape[1]))
         waveform = returns.waveform[inside]
         at = sample[inside].astype(np.int64)
-        level = np.broadcast_to(self.noise.level, self.cleaned.samples.shape)[waveform, at]
-        rows["amplitude"][inside] = self.cleaned.samples[waveform, at] - level
-        if self.cleaned.missing is not None:
-            rows["amplitude"][inside[self.cleaned.missing[waveform, at]]] = np.nan
+        level = np.broadcast_to(self.noise.level, self.block.samples.shape)[waveform, at]
+        rows["amplitude"][inside] = self.block.samples[waveform, at] - level
+        if self.block.missing is not None:
+            rows["amplitude"][inside[self.block.missing[waveform, at]]] = np.nan
         return rows
 
 
@@ -242,7 +235,7 @@ class ChainRun:
     def add(self, block: WaveformBlock, found: _Found, both: np.ndarray) -> None:
         """Adds the result of a block; both: waveforms in which the other side has an echo, bool (n,)."""
         number = found.echoes.count(len(block))
-        misfit, floor = measure_fit(found.cleaned, found.noise, found.system, self.chain.steps[2], found.echoes)
+        misfit, floor = measure_fit(found.block, found.noise, found.system, self.chain.steps[2], found.echoes)
         self.fit.add(misfit, floor, number, both & (number > 0))
         self.vendor.pair_by_time(found.rows(block), found.vendor_rows(block), _keys(block))
 

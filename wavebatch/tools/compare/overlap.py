@@ -7,8 +7,6 @@ medians of single echoes in cells are compared, as in the calibration of a fligh
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -94,9 +92,9 @@ def compare_overlap(a: Path, b: Path) -> OverlapComparison:
     InputError
         Where a cloud cannot be read, or they do not overlap.
     """
-    with _open_both(a, b) as readers:
-        rows = [_read(reader, other) for reader, other in (readers, readers[::-1])]
-        shared = set(readers[0].columns) & set(readers[1].columns)
+    with CloudReader(a, OVERLAP_DTYPE) as first, CloudReader(b, OVERLAP_DTYPE) as second:
+        rows = [_read(first, second), _read(second, first)]
+        shared = set(first.columns) & set(second.columns)
         angles = "normals" if ANGLE in shared else "scan angle"
     if not all(map(len, rows)):
         raise InputError(f"{a} and {b}: have no single echoes in a common area; they do not overlap")
@@ -117,12 +115,6 @@ def compare_overlap(a: Path, b: Path) -> OverlapComparison:
     return OverlapComparison(
         str(a), str(b), size, _summarise(height, _difference(height, height.height)), columns, angles
     )
-
-
-@contextmanager
-def _open_both(a: Path, b: Path) -> Iterator[tuple[CloudReader, CloudReader]]:
-    with CloudReader(a, OVERLAP_DTYPE) as first, CloudReader(b, OVERLAP_DTYPE) as second:
-        yield first, second
 
 
 def _read(reader: CloudReader, other: CloudReader) -> np.ndarray:

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -15,6 +13,7 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
+from wavebatch.tools.csv_table import format_csv
 from wavebatch.tools.plots.waveform import WaveformView
 
 MOST_LISTED = 40
@@ -81,16 +80,14 @@ def format_echoes(views: Sequence[WaveformView]) -> str:
     own = (*_NAMES.values(), "point")
     rest = [name for name in extra if name.removesuffix("_err") not in own and not name.endswith("_reason")]
     head += [f"{name} [{COLUMNS[name].unit}]" if name in COLUMNS else name for name in rest]
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow([*head, "flags"])
+    table = []
     for view in views:
         place = [view.packet if view.packet >= 0 else "", view.point, f"{view.gps_time:.9f}"]
         for row in range(len(view.echoes)):
             texts = [_cell(value, 9) for pair in _measures(view, row) for value in pair]
             texts += [_cell(_column(view, name)[row], 9 if name not in ("x", "y", "z") else 13) for name in rest]
             flags = name_flags(int(view.echoes.flags[row])).replace(", ", " ")
-            table.writerow([*place, row + 1, *texts, flags])
+            table.append([*place, row + 1, *texts, flags])
         if not len(view.echoes):
-            table.writerow([*place, *[""] * (len(head) - 2)])
-    return text.getvalue()
+            table.append([*place, *[""] * (len(head) - 2)])
+    return format_csv([*head, "flags"], table)

@@ -15,6 +15,7 @@ import numpy as np
 from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.order import even_places
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
@@ -140,7 +141,7 @@ def _list_numbers(scan: StripScan, wanted: Wanted, path: str) -> list[int]:
         number = min(wanted.random, scan.packets)
         return np.sort(np.random.default_rng(wanted.seed).choice(scan.packets, number, replace=False)).tolist()
     if not (wanted.packets or wanted.points or wanted.times):
-        return np.unique(np.linspace(0, scan.packets - 1, wanted.number).round().astype(int)).tolist()
+        return even_places(scan.packets, wanted.number).tolist()
     numbers: list[int] = []
     for first, end in wanted.packets:
         end = scan.packets if end is None else end

@@ -17,8 +17,10 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.cloud.return_writer import ReturnWriter
+from wavebatch.files.las.extra_bytes import build_dtype
+from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.point_formats import WITHOUT_WAVES
+from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated
 from wavebatch.tools.simulate.blocks import Simulated, seed_block, simulate_seed_block
@@ -155,14 +157,10 @@ def simulate_returns(
         )
     parts = _simulate_parts(scene, pulses, seed, flight, progress)
     summary = ReturnSummary()
-    with ReturnWriter(
-        target,
-        point_format=WITHOUT_WAVES[options.point_format],
-        scales=(options.scale,) * 3,
-        offsets=(EAST, NORTH, 0.0),
-        wkt=WKT,
-        overwrite=overwrite,
-    ) as writer:
+    point_format = WITHOUT_WAVES[options.point_format]
+    version, wkt = ((1, 4), WKT) if point_format >= 6 else ((1, 2), None)
+    header = LasHeader.new(version, point_format, (options.scale,) * 3, (EAST, NORTH, 0.0), wkt)
+    with PointFile(Path(target), header, build_dtype(point_format, ()), (), overwrite=overwrite) as writer:
         for simulated in parts:
             n = len(simulated.block)
             returns = receiver.list_returns(simulated.truth, n)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.tools.plots.labels import fit_parts
+from wavebatch.tools.plots.labels import set_head
 from wavebatch.tools.slices.cube import CubeSlice
 from wavebatch.tools.slices.output import NO_SAMPLE
 from wavebatch.tools.slices.segments import Segment
@@ -34,9 +34,8 @@ def draw_segments(
     with open_picture(target, (12.0, 6.0), overwrite=overwrite) as figure:
         numbers = [f"{number:,} {name}{'s' * (number != 1)}" for number, name in
                    ((len(segments), "segment"), (lines, "scan line"))]  # fmt: skip
-        parts = [plain_text(strip), " in ".join(numbers),
-                 f"CRS: {plain_text(crs, 90) or 'not given'}"]  # fmt: skip
-        figure.suptitle(fit_parts(figure, parts, 11.8, size=10.5), x=0.01, ha="left", fontsize=10.5)
+        parts = (plain_text(strip), " in ".join(numbers), f"CRS: {plain_text(crs, 90) or 'not given'}")
+        set_head(figure, parts, size=10.5)
         plan = figure.add_subplot(1, 2, 1)
         # Coordinates from a corner: seven digits per tick would cover each other in 3D.
         base = np.floor(low / 10.0) * 10.0
@@ -87,8 +86,7 @@ def draw_cube(slices: Sequence[CubeSlice], target: Path, *, name: str, overwrite
     known = np.concatenate([one.image[np.isfinite(one.image)] for one in slices])
     high = float(np.percentile(known, 99.8)) if len(known) else 1.0
     with open_picture(target, (max(4.6 * len(slices), 6.0), 4.8), overwrite=overwrite) as figure:
-        title = fit_parts(figure, [plain_text(name), "blue: no sample"], max(4.6 * len(slices), 6.0) - 0.2, size=10.5)
-        figure.suptitle(title, x=0.01, ha="left", fontsize=10.5)
+        set_head(figure, (plain_text(name), "blue: no sample"), size=10.5)
         panels = figure.subplots(1, len(slices), squeeze=False)[0]
         for axes, one in zip(panels, slices, strict=True):
             axes.grid(visible=False)

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.geojson_crs import GeoJsonCrs
-from wavebatch.tools.plots.labels import fit_parts, space_ticks
+from wavebatch.tools.plots.labels import set_head, space_ticks
 from wavebatch.tools.slices.segments import Segment, Slice
 
 SEGMENT_SUFFIXES = (".csv", ".geojson")
@@ -34,7 +35,7 @@ _MOST_PIXELS = 40_000_000
 """Most pixels of a picture (160 MB): more come from damaged coordinates."""
 
 
-class SegmentWriter:
+class SegmentWriter(Closing):
     """Writes segments to a .csv or .geojson file: `write` as often as needed, then `commit`.
 
     A context manager: without `commit` no file remains. crs: how points are written as GeoJSON; a .csv has the
@@ -56,10 +57,8 @@ class SegmentWriter:
         else:
             self._put(",".join(_HEAD) + "\n")
 
-    def __enter__(self) -> SegmentWriter:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
+        """Removes the file if it was not committed."""
         self._draft.discard()
 
     def write(self, segments: Sequence[Segment]) -> None:
@@ -124,8 +123,7 @@ def draw_slice(
         axes.set_ylabel("height [m]" if plane else "pulse")
         parts = [plain_text(strip), f"scan line {piece.line.number}", f"{len(piece.line)} pulses"]
         parts += [f"{len(segments)} segment" + "s" * (len(segments) != 1), "blue: no sample"]
-        title = fit_parts(figure, [part for part in parts if part], figure.get_figwidth() - 0.2, size=10.5)
-        figure.suptitle(title, x=0.01, ha="left", fontsize=10.5)
+        set_head(figure, [part for part in parts if part], size=10.5)
 
 
 def _paint(piece: Slice) -> tuple[np.ndarray, tuple[float, float, float, float]]:
