@@ -1,4 +1,4 @@
-"""The command line: one module per command, each of which reads options, calls the library once and prints.
+"""The command line: one module per command; it reads options, calls the library once and prints.
 
 `wavebatch.__main__` calls `main`. Modules of commands are imported only when their command is used, so that
 `wavebatch --help` stays fast: a new command needs an entry in COMMANDS, no import here.

@@ -68,9 +68,9 @@ def calibrate(
     STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line. Each channel
     (digitizer, or scanner channel of the points) gets its own constant.
 
-    Used are echoes that are alone in their waveform, lie on the plane of a target, and have their whole footprint
-    inside its outline. The incidence angle comes from that plane, unless the target file gives it; targets that do not
-    say are refused by name. Pulse and chain are chosen as `wavebatch run` chooses them.
+    It uses echoes that are alone in their waveform, lie on the plane of a target, and have their whole footprint inside
+    its outline. The incidence angle comes from that plane, unless the target file gives it. Unusable targets are
+    rejected, with the reason. Pulse and chain are chosen as `wavebatch run` chooses them.
 
     Without targets, --from-column takes the sensor vendor's own reflectances; the spread says how well they agree.
 

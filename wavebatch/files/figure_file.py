@@ -87,7 +87,7 @@ def open_picture(
 def open_svg(size: tuple[float, float]) -> Iterator[tuple[Figure, list[str]]]:
     """Give a figure of `size` inches and a list to the `with` block, which gets the SVG at the end of the block.
 
-    For pictures inside of pages, of which there are many: no layout is computed, and places have a tenth of a point.
+    For the many pictures inside of pages: no layout is computed, and places have a tenth of a point.
     """
     with _style("the page", {"font.sans-serif": ["DejaVu Sans", "Verdana"]}), _new_figure(size, 72) as figure:
         drawn: list[str] = []

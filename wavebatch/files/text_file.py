@@ -79,7 +79,7 @@ def _read_first(descriptor: int) -> bytes:
 
 
 class _Pipe(io.RawIOBase):
-    """A pipe, of which some bytes are read already."""
+    """A pipe whose first bytes are read already."""
 
     def __init__(self, file: BinaryIO, begin: bytes) -> None:
         self._file, self._begin = file, begin

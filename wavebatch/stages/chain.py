@@ -71,7 +71,7 @@ class Stage:
     its columns with no-data; stages that need them run again once they are known.
 
     The kernel gets points (n, 3) [m], rays (n, 3), kernels.geometry.normals.Surroundings and the stage's parameters,
-    of which `radius` [m] is the largest distance at which a point matters. It returns the columns' values and a
+    where `radius` [m] is the largest distance at which a point matters. It returns the columns' values and a
     kernels.geometry.normals.Gap for each point."""
     fits: Callable[[SystemPulse, Mapping[str, Any]], SystemPulse] | None = None
     """Of a decomposer: the strip's system with the pulse that it fits, from system and parameters. Attribute stages get

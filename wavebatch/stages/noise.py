@@ -78,8 +78,8 @@ def pooled(
 def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit: float) -> Noise:
     """The noise with a level of its own for each recording that differs from the baseline of its waveform.
 
-    The level of a recording is that of its quiet samples, found from itself. Where echoes leave fewer than LEAST_QUIET
-    it is that of its lowest samples: too high a level loses the foot of an echo, too low a one makes echoes of nothing.
+    The level of a recording is that of its quiet samples. Where echoes leave fewer than LEAST_QUIET, it is that of its
+    lowest samples: a level that is too high loses the foot of an echo, one that is too low makes false echoes.
     """
     row, start, end = find_stretches(~block.missing)
     several = np.bincount(row, minlength=len(block))[row] > 1

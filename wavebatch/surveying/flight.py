@@ -44,14 +44,14 @@ LEAST_SHARE = 64
 
 HELD = 512
 """Waveforms of a strip from which it is decided whether it belongs to a flight. Their width scatters by 0.6 %, far less
-than NARROWER and WIDER, and each 100 take 2 ms per strip; a saved survey is held against one strip with twice as many.
+than NARROWER and WIDER, and each 100 take 2 ms per strip; a saved survey is compared with one strip by twice as many.
 """
 
 CANDIDATES = 32
 """Strips that are tried as the one that most others agree with."""
 
 ROUNDS = 3
-"""Times, at most, that strips are pooled and held against the result."""
+"""Times, at most, that strips are pooled and compared with the result."""
 
 NARROWER = 0.06
 """How much narrower than those of the flight the echoes of a strip may be, as a share of the width: find_edge gives it
@@ -103,7 +103,7 @@ class StripSample:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """A strip held against a flight."""
+    """A strip compared with a flight."""
 
     path: Path
     fingerprint: Mapping[str, Any]
@@ -222,8 +222,8 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     -----
     A descriptor index must mean the same bits, spacing, gain and offset in all strips: those that contradict the
     majority are left out. The strip whose level, noise and width most others share chooses the first group. Its
-    waveforms are surveyed together and all strips are held against the result; those that fit are surveyed again, until
-    the group stays.
+    waveforms are surveyed together, and all strips are compared with the result. Those that fit are surveyed again,
+    until the group stays.
     """
     kinds = _agree_on_kinds(samples)
     group = _find_group([sample for sample in samples if not _compare_kinds(sample.blocks, kinds)], spread)
@@ -270,7 +270,7 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: Survey) -> str:
 
 
 def _hold(sample: StripSample, system: SystemPulse, whole: Look, kinds: Mapping[int, Kind]) -> Held:
-    """A strip held against what the flight records."""
+    """A strip compared with what the flight records."""
     kind, look = _compare_kinds(sample.blocks, kinds), look_at(sample.blocks, system)
     # Counts of other bits or another gain say nothing; times do.
     pulse = "" if look is None else (_compare_pulses if kind else compare_looks)(look, whole, system)

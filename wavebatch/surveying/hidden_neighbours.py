@@ -18,7 +18,7 @@ from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.predict_error import SEED, simulate_again
 
 PAIRS = 1024
-"""Pairs that are simulated; a class of widths then holds some tens that were not told apart."""
+"""Pairs that are simulated; a class of widths then holds some tens that were not separated."""
 
 NEAR, FAR = 2.5, 4.0
 """Distances, in widths of the system pulse, from which pairs are found nearly always, and up to which as many echoes
@@ -83,7 +83,7 @@ def _measure_class(
     excess, shift = _hide_pairs(block, system, echoes.take(pick))
     expected = near / (FAR - NEAR) * FAR / min(PAIRS, len(block))
     if company:
-        # Groups of which one more echo is hidden look smaller: the near pairs in them were not counted.
+        # A group with one more, hidden echo looks smaller: its near pair was not counted.
         groups = len(np.unique(echoes.waveform[source]))
         expected /= 1.0 - min(expected * len(excess) / groups, MOST_LOST)
     clear = (echoes.amplitude > CLEAR * system.noise.std) & ((number > 1) if company else (number == 1))

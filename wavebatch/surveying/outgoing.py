@@ -30,7 +30,7 @@ REACH = (6.0, 12.0)
 ALIGNED = 3
 """Times that pulses are aligned to what was learned before."""
 GOAL = 1.25
-"""Misfit of a pulse, in errors of the stack, that nobody can tell from none."""
+"""Misfit of a pulse, in errors of the stack, that chance alone makes."""
 WIDENED = 1.15
 """Ratio of widths up to which slopes and plants may have widened even the narrowest echoes of a strip."""
 PART = "outgoing pulse"

@@ -53,7 +53,7 @@ LEAST_QUIET_SAMPLES = 4
 """Samples before the strongest echo from which a waveform has a level."""
 
 LEAST_LEVELS = 5
-"""Waveforms of a descriptor from which its level can be told from that of others."""
+"""Waveforms of a descriptor from which on its level is compared with that of others."""
 
 SAME_THRESHOLD = 1.03
 """Ratio of two noises up to which the sample is not decomposed again."""

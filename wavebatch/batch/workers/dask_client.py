@@ -60,7 +60,7 @@ def _knock(address: str) -> None:
 
 
 def _check_keys(address: str) -> None:
-    """Raise ValueError where TLS is wanted and dask has no keys; a client that fails complains again when it ends."""
+    """Raise ValueError where TLS is wanted and dask has no keys; a client that fails prints more when it ends."""
     from distributed.security import Security
 
     if address.startswith("tls://") and Security().get_connection_args("client").get("ssl_context") is None:

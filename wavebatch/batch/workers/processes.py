@@ -135,7 +135,7 @@ class Workers:
         self._end()
 
     def _end(self) -> None:
-        """End all processes: those that wait for a call by themselves, all others at once."""
+        """End all processes: those that wait for a call are asked to end, the others are killed."""
         try:
             end_early()
             for worker in self._workers:

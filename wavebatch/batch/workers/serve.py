@@ -27,7 +27,7 @@ _SET_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of linux/prctl.h."""
 
 PATIENCE = 3.0
-"""Seconds that processes have to end by themselves."""
+"""Seconds that processes have to end before they are killed."""
 
 
 def serve_calls(pipe: Connection) -> None:

@@ -29,7 +29,7 @@ _logger.propagate = False  # a program that calls commands has its own log
 
 
 class _LogFile(logging.FileHandler):
-    """A file of lines with time and level. A full disk ends the log, not the work; it is said once."""
+    """A file of lines with time and level. A full disk ends the log, not the work; one message says so."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "a", "utf-8", errors="backslashreplace")

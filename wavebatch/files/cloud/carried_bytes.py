@@ -26,7 +26,7 @@ class Carried:
 
 
 def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[Carried, ...]:
-    """Return the extra dimensions of the input, all of which are copied.
+    """Return the extra dimensions of the input; all are copied.
 
     whole: every output row comes from an input point, so no value for "no data" is needed.
     """

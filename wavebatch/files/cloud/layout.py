@@ -45,7 +45,7 @@ class OutputLayout:
 
     @property
     def copied(self) -> tuple[str, ...]:
-        """Extra bytes of the input of which added echoes get the value of the nearest return."""
+        """Extra bytes of the input that added echoes copy from the nearest return."""
         fields = self.extra_fields
         return tuple(name for name, carried in zip(fields, self.carried, strict=False) if carried.copied)
 

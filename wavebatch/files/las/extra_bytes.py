@@ -149,7 +149,7 @@ class ExtraRecord:
         return ExtraRecord(bytes(data))
 
     def with_name(self, name: str) -> ExtraRecord:
-        """Return the record with another name, of which 32 bytes are kept."""
+        """Return the record with another name, cut to 32 bytes."""
         return ExtraRecord(self.data[:_AT_NAME] + _as_field(name) + self.data[_AT_NAME + TEXT_BYTES :])
 
     def with_no_data(self, numbers: np.ndarray | list) -> ExtraRecord:

@@ -10,7 +10,7 @@ import numpy as np
 from wavebatch.core.units import MAD_TO_STD
 
 OWN = 0.5
-"""Pulses whose first and last return are at least this far apart [m] give their direction themselves."""
+"""Pulses whose first and last return are at least this far apart [m] have their own direction."""
 _SURE = 2.0
 """Distance of first and last return [m] from which a direction is good enough to fit those of other pulses."""
 _ENOUGH = 20

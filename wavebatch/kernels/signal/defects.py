@@ -69,8 +69,8 @@ def _least_between(above: np.ndarray, width: np.float32) -> np.ndarray:
     """Least value (s - 4, n) that a sum of pulses can have at a sample, as its two neighbours on either side say.
 
     The logarithm of a sum of Gaussians of a width w or more bends down by at most 1 / w^2 at any place. So a sample is
-    at least the square of its neighbour over the next one, less that: between two strong echoes, whose sum falls to the
-    valley, next to nothing. The neighbour itself is the most that it says.
+    at least the square of its neighbour over the next one, reduced by that bend. In a valley between two strong echoes
+    this bound is nearly 0. It is never above the neighbour.
     """
     bend = exp(np.float32(-CURVATURE) / (width * width))
     sides = []

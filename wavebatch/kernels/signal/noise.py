@@ -178,7 +178,7 @@ def _estimate_from(
 def _lopsided(signal: np.ndarray, level: np.ndarray, quiet: np.ndarray) -> float:
     """Sum of squares of smoothed quiet samples above their median over that of those below it.
 
-    1 also where it cannot be told: counts that hardly leave one value, or are cut off at the least one.
+    1 also where it is not known: counts that hardly leave one value, or are cut off at the least one.
     """
     inner = quiet[1:-1] & quiet[:-2] & quiet[2:]
     values = smooth_121(np.where(quiet, signal - np.nan_to_num(level), np.float32(0)))[1:-1][inner]
@@ -481,7 +481,7 @@ def residual_noise(
 
     Notes
     -----
-    Values are limited to CLIPPED robust standard deviations, so that weak echoes nobody fitted do not count as noise.
+    Values are limited to CLIPPED robust standard deviations, so that weak echoes without a fit do not count as noise.
     No mean of a waveform is taken off: what its baseline is wrong by is noise to its amplitudes.
     """
     values = residual[used]

@@ -74,7 +74,7 @@ def find_clusters(
 
 
 def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float) -> Candidates:
-    """Candidates of which no two stand on one flat top: clipped samples between two are no sign of two echoes."""
+    """Candidates, one for each flat top: clipped samples between two candidates are no sign of two echoes."""
     waveform, time, amplitude, _ = candidates
     if len(waveform) < 2:
         return candidates

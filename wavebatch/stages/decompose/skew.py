@@ -80,8 +80,8 @@ def skewed(
     """Sum of skewed pulses: the log-normal of Wang et al. in its stable form, with one skew for the strip or per echo.
 
     With `kappa = "free"` every echo gets its skew, within 0.6 and with a prior: a normal law around the skew of the
-    strip, as wide as the survey saw the skews of single echoes scatter. `attribute.skew` writes it with its error. The
-    time is then that of the peak; of one skew for the strip it is that of the datum, as of every other pulse.
+    strip, with the spread of single echoes that the survey measured. `attribute.skew` writes it with its error. The
+    time is then that of the peak; with one skew for the strip it is that of the datum, as for every other pulse.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ def _time_to_peak(edge: np.ndarray, ratio: np.ndarray, ref: float) -> np.ndarray
     """Time from an edge to the peak of an echo of the system's width, smoothed by [1 2 1]/4 (m,) [samples].
 
     edge: where a line between two samples meets the level. Flanks are bent, so that the line meets it too early, by .1
-    sample for strong echoes; by how much follows from where between the samples it is.
+    sample for strong echoes; the place between the samples gives the correction.
     ratio: height of the peak over the level.
     """
     width = np.sqrt(ref * ref + 0.5)

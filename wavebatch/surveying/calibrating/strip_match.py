@@ -1,8 +1,8 @@
 """Whether a calibration fits the strip that it is used for: channel, recording, pulse, chain, day, distance.
 
 `batch.unit` and `tools.voxels` call `match_strip` once per strip. A constant belongs to one channel of one sensor with
-its settings: for anything else it is wrong by any factor. What contradicts is refused by name; what only makes the
-constant less sure is warned about, and widens its error.
+its settings: for anything else it is wrong by any factor. What contradicts is refused, with the reason; what only makes
+the constant less sure gives a warning and a larger error.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ def _pool_lengths(rows: list[ChannelConstant], digitizer: Digitizer) -> list[Cha
     """Constants for a descriptor that differs from all calibrated ones in the number of samples only.
 
     Some sensors have a descriptor per packet length for one and the same digitizer. A descriptor of the same length is
-    another channel: nobody knows its gain.
+    another channel: its gain is not known.
     """
     if any(row.samples in (None, digitizer.n_samples) for row in rows):
         return []

@@ -36,16 +36,16 @@ SEPARATE = 5.0
 """Widths of the pulse to the next echo from which its error does not matter to a stack."""
 
 FIRST_COMPONENTS = 3
-"""Components of the first pulse, which only has to fit well enough for echoes to be told apart."""
+"""Components of the first pulse, which only has to fit well enough to separate echoes."""
 
 MOST_STRONG = 800
 """Strong echoes in which the misfit of the pulse is measured."""
 
 REACHED = 0.3
-"""Misfit of a pulse model, in noise at the strip's strongest amplitudes, that nobody can see."""
+"""Misfit of a pulse model, in noise at the strip's strongest amplitudes, that is too small to be seen."""
 
 GOAL = 1.25
-"""Misfit of a pulse model, in errors of the stack, that nobody can tell from none."""
+"""Misfit of a pulse model, in errors of the stack, that chance alone makes."""
 
 NEAR_BEST = 1.25
 """Misfit, over that of the best model, at which a simpler one is taken."""
@@ -214,10 +214,10 @@ def _learn(
 
 
 def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[SystemPulse, SystemPulse]) -> SystemPulse:
-    """The first of two pulses that level ground cannot tell apart, unless the other fits widened echoes better.
+    """The first of two pulses that fit level ground equally well, unless the other fits widened echoes better.
 
-    A skewed pulse is stretched as a whole where a target widens it, a sum of Gaussians grows round: which of them is
-    right only the strongest echoes of slopes and plants say.
+    A target that widens a skewed pulse stretches it as a whole; a sum of Gaussians grows round. Only the strongest
+    echoes of slopes and plants show which of them is right.
     """
     clear = find_clear(block, system)
     top = system.saturation or float(block.samples.max())

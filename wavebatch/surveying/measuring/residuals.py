@@ -300,7 +300,7 @@ def _fit_growth(terms: np.ndarray, values: np.ndarray, columns: tuple[int, ...])
 def _noise_gain(
     residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float, coloured: bool
 ) -> float:
-    """Growth of the variance per count of signal, 0 where it cannot be told from none (H12)."""
+    """Growth of the variance per count of signal, 0 where it could be chance (H12)."""
     core = np.abs(lag) < GROWTH_REACH
     taken, brought = _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
     squared = _chance_part(residual, model, lag, core) ** 2 / (1 - taken)

@@ -65,7 +65,7 @@ class Figures:
     isolated_echoes: float | None = None
     """Echoes that the pulse was learned from."""
     misfit_goal: float | None = None
-    """Misfit of a pulse model that nobody can tell from none, as a share of the amplitude."""
+    """Misfit of a pulse model that chance alone makes, as a share of the amplitude."""
     misfit_skewed: float | None = None
     """Of the skewed pulse."""
     kappa: float | None = None

@@ -137,7 +137,7 @@ def _add(found: _Found, piece: Piece, every: int) -> None:
 
 
 def _find_ratios(found: _Found, primary: int) -> tuple[dict[int, float], tuple[int, ...]]:
-    """Ratios of gains; only that of sensors with two channels can be told from the overlaps."""
+    """Ratios of gains; overlaps show only that of sensors with two channels."""
     others = [channel for channel in found.channels if channel != primary]
     ratio = found.overlaps[primary].find_ratio() if len(others) == 1 and primary in found.overlaps else None
     if ratio is None or ratio <= 1:

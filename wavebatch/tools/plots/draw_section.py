@@ -18,7 +18,7 @@ from wavebatch.tools.plots.section_data import Profile, Section
 from wavebatch.tools.rasters.cells import compute_cells
 
 LIGHT, FAINT = ("energy", "cross_section"), 0.02
-"""Columns of voxels of which less than this share of the scale is not drawn: deconvolution leaves tails of a few per
+"""Columns of voxels; less than this share of the scale is not drawn: deconvolution leaves tails of a few per
 mille below the ground, which would look as solid as the ground does."""
 
 _NARROW = 3.0

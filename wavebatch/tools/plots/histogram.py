@@ -27,7 +27,7 @@ SMALL_GROUP = 20
 """Groups of --by with fewer values are one series: two values make bins of 50 %."""
 
 MOST_GROUPS = 12
-"""Most series of --by: more cannot be told apart in a picture."""
+"""Most series of --by: a picture of more cannot be read."""
 
 FEW_STEPS = 64
 """A column with at most so many possible values is shown whole: a rare class is no outlier."""

@@ -189,7 +189,7 @@ def check_crs(paths: Sequence[Path]) -> CrsWords:
 def choose_grid(
     where: str, sample: EvenSample, box: Box, size: float | None, *, fixed: bool, most: int = CHOSEN_SIDE
 ) -> Grid:
-    """Cells for points of which `sample` has positions.
+    """Cells for points; `sample` has positions of some of them.
 
     size: None to choose it, for at most `most` cells along a side. fixed: the box is the user's.
     """

@@ -70,7 +70,7 @@ class Section:
     total: Tally
     """Counts of all points of the clouds."""
     inside: int
-    """Points with a value in the section, of which at most MOST_POINTS are here."""
+    """Points with a value in the section; at most MOST_POINTS are here."""
     outside: int
     """Of these, far outliers in height, which are not here: they would press all others into a line."""
     shown: tuple[float, float]

@@ -69,7 +69,7 @@ class VoxelOptions:
     reflectance_ratio: float | None = None
     """Reflectance of canopy over that of ground; None: estimated from the strip."""
     where: Condition | None = None
-    """Use only waveforms of which a return meets this, with all of their signal."""
+    """Use only waveforms with a return that meets this, with all of their signal."""
     energy: str | None = None
     """Energy of each emitted pulse, by which the signal is divided; see `find_pulse_energy`."""
 
@@ -127,7 +127,7 @@ class VoxelSummary:
     profile_samples: int = 0
     """Samples with signal in that file."""
     left_out: int = 0
-    """Waveforms of which no return meets the condition of --where; `waveforms` are the others."""
+    """Waveforms without a return that meets the condition of --where; `waveforms` are the others."""
     warnings: tuple[str, ...] = ()
     """Why cross sections may be less sure than the calibration says."""
 

@@ -118,7 +118,7 @@ def _find_missed(deviation: np.ndarray, quiet: np.ndarray, width: float) -> np.n
 
 
 def _usual(values: np.ndarray) -> float:
-    """Standard deviation from the median of squares, of which 0.455 is that of standard normal numbers."""
+    """Standard deviation from the median of squares, which is 0.455 for standard normal numbers."""
     return float(np.sqrt(np.median(values**2) / 0.455))
 
 

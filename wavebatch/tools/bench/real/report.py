@@ -26,7 +26,7 @@ MOST_FALSE = 1e-4
 """False echoes per ns of recording without signal that are too many."""
 
 LEAST_SHOWN = 10
-"""Injected echoes near others of which a share is printed."""
+"""Injected echoes near others from which on a share is printed."""
 
 
 def format_report(report: RealReport) -> str:
