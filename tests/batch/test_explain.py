@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -47,8 +48,16 @@ def test_return_locations_that_are_not_those_of_echoes_are_doubted(tiny_strip, t
         points["return_point_wave_location"] *= factor
         return points
 
-    (line,) = remarks(edit_points(tiny_strip, tmp_path / "bad.las", change), tmp_path)
-    assert "returns lie where their packet has an echo" in line and "picoseconds" in line
+    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "bad.las", change), tmp_path)
+    assert "returns lie where their packet has an echo: the return locations" in line and "picoseconds" in line
+
+
+def test_packets_of_another_strip_warn_in_cron_too(riegl, tmp_path):
+    strip = tmp_path / "mixed.las"
+    shutil.copy(riegl, strip)
+    shutil.copy(data_file("lvis/lvis1.wdp"), strip.with_suffix(".wdp"))
+    (line,) = warn_quietly(strip, tmp_path)
+    assert "returns lie where their packet has an echo: mixed.wdp belongs to another strip, or" in line
 
 
 def test_inverted_and_empty_waveforms_are_told(tiny_strip, tmp_path):

@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 from html_tools import Page
 
+import wavebatch as wb
 from wavebatch.cli.compare import compare
 from wavebatch.tools.simulate import simulate_strip
 
@@ -108,6 +109,14 @@ def test_text_table_and_page_have_the_classes_and_the_numbers_of_echoes(strips, 
             assert rows[f"differences by {kind}", "", group, "time", "number"] == str(one["number"])
             row = next(row for row in shown.rows if row[:3] == [kind, group, "time"])
             assert row[3] == f"{one['number']:,}"
+
+
+def test_a_truth_says_whose_times_it_tests(strips):
+    wb.run([strips / "a.las"], strips / "out", columns="+echo_time", profile="fast", overwrite=True)
+    for cloud, said in ((strips / "a.las", True), (strips / "out" / "a.laz", False)):
+        shown = run(cloud, "--truth", strips / "a.npz").stdout
+        assert ("`run --columns +echo_time` adds" in shown) is said
+        assert ("isolated echo_time" in shown) is not said
 
 
 def test_a_truth_is_compared_at_the_chosen_points(strips):

@@ -282,7 +282,8 @@ def test_strips_of_folders_with_different_settings_are_not_mixed(folder, tmp_pat
 def test_a_log_has_what_quiet_hides_and_is_appended(folder, tmp_path):
     log = tmp_path / "night.log"
     (folder / "broken.las").write_bytes((folder / "tiny.las").read_bytes()[:300])
-    arguments = ["run", folder, "-o", tmp_path / "out", "-q", "--profile", "fast", "--log-file", log]
+    task = ["run", folder, "-o", tmp_path / "out", "--profile", "fast", "--columns", "+cross_section"]
+    arguments = [*task, "-q", "--log-file", log]
     assert invoke(*arguments).exit_code == 3
     lines = log.read_text().splitlines()
     assert all(re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ (INFO|WARNING|ERROR) ", line) for line in lines)
@@ -290,6 +291,12 @@ def test_a_log_has_what_quiet_hides_and_is_appended(folder, tmp_path):
     assert any("ERROR" in line and "broken.las" in line for line in lines)
     assert invoke(*arguments, "--resume", "--log-level", "error").exit_code == 3
     assert log.read_text().count("broken.las") == 2 and not log_file.is_open()
+    loud = invoke(*task, "--overwrite").stderr.splitlines()
+    said = [line.partition(": ")[2] for line in loud if "tiny.las: " in line]
+    assert len(said) > 1 and all(any(text in line for line in lines) for text in said), "also remarks and warnings"
+    assert invoke(*arguments, "--resume").exit_code == 3 and "tiny.las: is up to date, skipped" in log.read_text()
+    done = invoke("export", folder / "tiny.las", "-o", tmp_path / "x.npz", "-q", "--log-file", log)
+    assert done.exit_code == 0 and done.stderr == "" and "INFO    " + str(tmp_path / "x.npz: ") in log.read_text()
 
 
 @pytest.mark.parametrize("words", ["run in -o out", "plot map in --column z -o m.png"])

@@ -134,6 +134,8 @@ def test_figures_have_the_digits_that_they_deserve():
     lines = list(_pulse_lines(SavedSurvey(Survey(SystemPulse(2.0, misfit=0.00154777), 9, Figures(kappa=-1e-6)))))
     assert any(line.split() == ["kappa", "0.0000"] for line in lines)
     assert any(line.startswith("misfit            0.15 % ") for line in lines)
+    figures = Figures(n_samples=254.0, bits=8.0, spacing_ns=1.0, descriptors_pooled=14.0)
+    assert figures.samples == "up to 254 of 8 bits, 1 ns apart" and Figures().samples == ""
 
 
 def test_strips_of_a_flight_are_surveyed_together(flat_strip, tmp_path):

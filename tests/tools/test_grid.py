@@ -155,7 +155,7 @@ def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(r
         (["--column", "height", "-o", "x.png"], "use .tif"),
         (["--column", "height", "--size", "0", "-o", "x.tif"], "not in the range 0<x"),
         (["--column", "height", "--crs", "EPSG:4978", "-o", "x.tif"], "geocentric"),
-        (["--column", "height", "--crs", "EPSG:0", "-o", "x.tif"], "give it with --crs"),
+        (["--column", "height", "--crs", "EPSG:0", "-o", "x.tif"], "write the code of a CRS"),
         (["--column", "height", "--no-data", "1e39", "-o", "x.tif"], "float32"),
         (["--statistic", "count", "--no-data", "1", "-o", "x.tif"], "choose another with --no-data"),
         (["--statistic", "count", "--flags", "WEAK", "-o", "x.tif"], "has no column echo_flags"),
@@ -175,6 +175,12 @@ def test_a_crs_that_gdal_reads_but_cannot_write_is_one_line(rasterio, rng, tmp_p
     result = _run(tmp_path / "a.las", "--statistic", "count", "-o", tmp_path / "x.tif", code=2)
     assert "the CRS cannot be" in result.stderr and result.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
+
+
+def test_a_code_that_is_no_crs_is_not_answered_with_the_same_option(rasterio, rng, tmp_path):
+    _cloud(tmp_path / "a.las", rng, 50)
+    words = (tmp_path / "a.las", "--statistic", "count", "-o", tmp_path / "x.tif", "--crs", "EPSG:99999")
+    assert _run(*words, code=2).stderr.endswith("; write the code of a CRS, e.g. EPSG:32632\n")
 
 
 def test_a_crs_with_heights_is_written_without_them(rasterio, rng, tmp_path):

@@ -86,10 +86,10 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     -------
     tuple of str
         One line each: a column that no echo has, with the commonest reason and its remedy; angles that the beam can
-        hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors, or
+        hardly measure; a trajectory that contradicts the vectors, or
         that does not cover the strip.
     """
-    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report)]
+    lines = [*prepared.scan.notes]
     lines += filter(None, [prepared.sensor.doubt()])
     lines += _find_gaps(prepared.sensor, report.no_data)
     lines += _doubt_units(prepared)
@@ -121,7 +121,8 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     -------
     tuple of str
         One line each: a forced survey of another sensor, a selection that leaves nothing, a strip without any waveform
-        or echo, a pulse that is a guess, a chain that does not fit the strip's pulse.
+        or echo, packets that do not fit the returns, a pulse that is a guess, a chain that does not fit the strip's
+        pulse.
     """
     choice, echoes = prepared.choice, report.count("echoes")
     lines = []
@@ -133,6 +134,7 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
             lines.append(f"{doubt}: {prepared.forced}")
     lines += _miss_all(prepared, report)
     lines += _find_nothing(prepared, report)
+    lines += _doubt_waveforms(prepared, report)
     lines += _doubt_pulse(prepared, report)
     lines += () if choice.doubted else _doubt_fits(prepared, report)
     lines += _doubt_reflectance(report)
@@ -256,9 +258,11 @@ def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
     matched = report.count("matched_returns")
     near = matched + report.count("unmatched_returns")
     if near >= LEAST_JUDGED and matched < LEAST_MATCHED * near:
+        packets = prepared.facts.packets
+        other = "" if packets.internal else f"{packets.file.name} belongs to another strip, or "
         yield (
-            f"only {matched} of {near} returns lie where their packet has an echo: the strip's return locations (which "
-            "should be picoseconds after the first sample) are doubtful, and so are the positions of added echoes"
+            f"only {matched} of {near} returns lie where their packet has an echo: {other}the return locations (which "
+            "should be picoseconds after the first sample) are wrong, and so are the positions of added echoes"
         )
 
 

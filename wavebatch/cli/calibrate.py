@@ -14,7 +14,7 @@ import click
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, format_json, talk
+from wavebatch.cli.messages import answer, count, format_json, talk, tell
 from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.inputs import find_files
@@ -107,19 +107,17 @@ def calibrate(
     answer(_list_report(flight))
     for note in found.notes:
         talk(f"warning: {note}")
-    if options["quiet"]:
-        return
     for line in [*map(_describe_target, found.targets), *map(_describe_channel, found.channels)]:
-        talk(line)
+        tell(line)
     for line in [*map(_describe_strip, found.strips), *map(_describe_pair, flight.pairs)]:
-        talk(line)
+        tell(line)
     if found.swath:
         edge = math.expm1(-sum(found.swath[1:]))
-        talk(f"scan angle: {100 * edge:+.1f} % light at {math.degrees(found.swath[0]):.1f} deg against straight down")
+        tell(f"scan angle: {100 * edge:+.1f} % light at {math.degrees(found.swath[0]):.1f} deg against straight down")
     numbers = f"constant {format_relative(found.constant, found.relative_error)} +- {100 * found.relative_error:.1f} %"
     if len(found.channels) > 1:
         numbers = f"constants of {len(found.channels)} channels"
-    talk(f"{output}: {numbers}; {found.conditions}")
+    tell(f"{output}: {numbers}; {found.conditions}")
 
 
 def _read_options(options: dict[str, Any]) -> CalibrationOptions:

@@ -52,6 +52,8 @@ def list_lines(result: Comparison) -> Iterator[str]:
             if one.number:
                 scaled = (one.rms_per_bound, one.nmad_per_bound, one.calibration, one.calibration_nmad)
                 yield row(f"{kind + ' ' + name:<23}", (one.number, one.bias, one.rmse, *scaled), ".4f")
+    if result.errors and "echo_time" not in result.differences:
+        yield "time: of positions, which the strip's returns anchor; `run --columns +echo_time` adds that of the fits"
 
 
 def _known(value: float, form: str) -> str:

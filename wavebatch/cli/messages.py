@@ -126,9 +126,10 @@ def talk(message: str) -> None:
 
 
 def tell(message: str) -> None:
-    """`talk`, unless --quiet was given."""
+    """As `talk`; with --quiet in the file of --log-file only."""
     if not click.get_current_context().params["quiet"]:
-        talk(message)
+        write_message(printable(message))
+    log_file.log(printable(message))
 
 
 def write_message(line: str) -> None:

@@ -16,7 +16,7 @@ import click
 
 from wavebatch import __version__
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, talk
+from wavebatch.cli.messages import answer, count, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.figure_file import check_picture
@@ -148,11 +148,10 @@ def _slice(
         none = "no scan line" if scan.with_waveform else "no waveform, so no scan line"
         talk(f"{strip}: has {none}" + ("" if lines == _ALL else " with a number in --lines"))
     found = f"{count(counts['segments'], 'segment')} in {count(counts['lines'], 'scan line')}"
-    if not options["quiet"]:
-        talk(f"{strip}: {found} of {count(counts['pulses'], 'pulse')}")
-        if counts["full"]:
-            talk(f"{strip}: {count(counts['full'], 'scan line')} may have more segments than --most {settings.most}; "
-                 "raise it")  # fmt: skip
+    tell(f"{strip}: {found} of {count(counts['pulses'], 'pulse')}")
+    if counts["full"]:
+        tell(f"{strip}: {count(counts['full'], 'scan line')} may have more segments than --most {settings.most}; "
+             "raise it")  # fmt: skip
     return {"strip": str(strip), **counts}
 
 

@@ -227,8 +227,7 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     else:
         yield _line("strip", f"{facts['strip']}: {size}")
     yield _line("surveyed", count(saved.survey.waveforms, "waveform"))
-    most = "up to " * ((figures.descriptors_pooled or 0.0) > 1.0)
-    yield _line("samples", f"{most}{figures.n_samples:.0f} of {figures.bits:.0f} bits, {figures.spacing_ns:g} ns apart")
+    yield _line("samples", figures.samples)
     yield _line("ADC range", f"counts {round(figures.least_count)} to {round(figures.largest_count)}")
     if "direction" in facts:
         yield _line("vectors", f"{facts['direction']['sign']} the sensor: {facts['direction']['evidence']}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, counting, talk
+from wavebatch.cli.messages import answer, count, counting, talk, tell
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import format_measure
 from wavebatch.files.disk.protect import refuse_input
@@ -111,9 +111,8 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
             summary = voxelize_strip(strip, targets[strip], settings, progress=show, **more)
         for line in summary.warnings:  # with --quiet too: they say how far the values can be trusted
             talk(f"warning: {line}")
-        if not options["quiet"]:
-            for line in _list_lines(summary):
-                talk(line)
+        for line in _list_lines(summary):
+            tell(line)
         return summary
 
     summaries, failed = shared.for_each(paths, work, debug=options["debug"])

@@ -92,7 +92,8 @@ def _read_crs(text: str, where: str) -> Any:
 
 def _complain(where: str, what: str, error: Exception) -> ConfigError:
     why = " ".join(str(error).split())
-    return ConfigError(f"{where}: the CRS cannot be {what} ({why[:120]}); give it with --crs EPSG:n")
+    remedy = "write the code of a CRS, e.g. EPSG:32632" if where == "--crs" else "give it with --crs EPSG:n"
+    return ConfigError(f"{where}: the CRS cannot be {what} ({why[:120]}); {remedy}")
 
 
 def _flatten(crs: Any) -> Any:

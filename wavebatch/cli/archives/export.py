@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import answer, count, counting, printable, talk
+from wavebatch.cli.messages import answer, count, counting, tell
 from wavebatch.cli.options import (
     common_options,
     for_each,
@@ -53,8 +53,7 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
             summary = export_strip(
                 path, targets[path], progress=bar.update, **{name: options[name] for name in names}
             )
-        if not options["quiet"]:
-            _say(summary)
+        _say(summary)
         return summary
 
     summaries, failed = for_each(paths, work, debug=options["debug"])
@@ -64,6 +63,6 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
 
 def _say(summary: ExportSummary) -> None:
     numbers = f"{count(summary.points, 'point')} and {count(summary.waveforms, 'waveform')}"
-    talk(printable(f"{summary.output}: {numbers}"))
+    tell(f"{summary.output}: {numbers}")
     for line in summary.repaired:
-        talk(printable(f"{summary.output}: repaired: {line}"))
+        tell(f"{summary.output}: repaired: {line}")

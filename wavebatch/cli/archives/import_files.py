@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import answer, count, counting, printable, talk
+from wavebatch.cli.messages import answer, count, counting, tell
 from wavebatch.cli.options import (
     common_options,
     declared,
@@ -69,22 +69,21 @@ def _import(path: Path, target: Path, chosen: ImportOptions, options: dict[str, 
     bar = counting("pulses", options["quiet"])
     with bar:
         summary = import_file(path, target, chosen, bar.update)
-    if not options["quiet"]:
-        _say(summary)
+    _say(summary)
     return summary
 
 
 def _say(summary: ImportSummary) -> None:
     if summary.skipped:
-        talk(f"{summary.output}: is up to date, skipped")
+        tell(f"{summary.output}: is up to date, skipped")
         return
     parts = (summary.points, "point"), (summary.packets, "packet"), (summary.pulses, "pulse")
     points, packets, pulses = (count(*part) for part in parts)
-    talk(f"{summary.output}: {points} and {packets} of {pulses}")
+    tell(f"{summary.output}: {points} and {packets} of {pulses}")
     sent = summary.outgoing
     if sent is not None:
         spread, error = 100 * sent["energy_scatter"], 100 * sent["energy_error"]
         width = f"{sent['fwhm_ns']:.3f} ns wide at half maximum"
-        talk(f"{summary.output}: outgoing pulses {width}, energies vary by {spread:.2f} %, known to {error:.2f} %")
+        tell(f"{summary.output}: outgoing pulses {width}, energies vary by {spread:.2f} %, known to {error:.2f} %")
     for note in summary.notes:
-        talk(printable(f"{summary.output}: {note}"))
+        tell(f"{summary.output}: {note}")

@@ -62,20 +62,17 @@ class Progress:
             if self._debug:
                 self._say("".join(traceback.format_exception(error)).rstrip())
             self._say(f"error: {_place(printable(strip), one_line(error))}")
-        elif kind == "written" and self._level >= 0:
-            self._say(printable(_summary(event, self._level > 0)))
-            warnings = [f"warning: {line}" for line in event["warnings"]]
-            more = [*_decisions(event), *_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])]
-            more *= self._level > 0
-            for line in [*warnings, *more, *event["remarks"]]:
-                self._say(printable(f"{strip}: {line}"))
         elif kind == "written":
-            log_file.log(printable(_summary(event, False)))
+            self._tell(_summary(event, self._level > 0))
             # Printed with --quiet too: what is written is less sure, or less, than its inputs promise.
-            for line in (*event["serious"], *event["doubts"]):
-                self._say(printable(f"{strip}: warning: {line}"))
-        elif kind == "skipped" and self._level >= 0:
-            self._say(printable(f"{strip}: is up to date, skipped"))
+            loud = {*event["serious"], *event["doubts"]}
+            for line in event["warnings"]:
+                (self._say if line in loud else self._tell)(printable(f"{strip}: warning: {line}"))
+            more = [*_decisions(event), *_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])]
+            for line in [*more * (self._level > 0), *event["remarks"]]:
+                self._tell(f"{strip}: {line}")
+        elif kind == "skipped":
+            self._tell(f"{strip}: is up to date, skipped")
         elif kind == "worker":
             self._say(printable(f"{strip}: warning: {event['warning']}"))
         elif kind == "flight" and self._level > 0:
@@ -86,6 +83,13 @@ class Progress:
         self._bar.set_description(Path(strip).name, refresh=False)
         self._bar.update(max(done - self._shown.get(strip, 0), 0))
         self._shown[strip] = done
+
+    def _tell(self, line: str) -> None:
+        """A message that --quiet leaves to the log."""
+        if self._level >= 0:
+            self._say(printable(line))
+        else:
+            log_file.log(printable(line))
 
     def _say(self, line: str) -> None:
         if self._bar is not None:

@@ -109,6 +109,14 @@ class Figures:
     outgoing_energy_error: float | None = None
     outgoing_width_scatter: float | None = None
 
+    @property
+    def samples(self) -> str:
+        """The samples of a waveform, for people; empty where they are not known."""
+        if None in (self.n_samples, self.bits, self.spacing_ns):
+            return ""
+        most = "up to " * ((self.descriptors_pooled or 0.0) > 1.0)
+        return f"{most}{self.n_samples:.0f} of {self.bits:.0f} bits, {self.spacing_ns:g} ns apart"
+
 
 _LOOK = ("width", "steady", "misfit")
 _GAUSSIANS = re.compile(r"misfit_([0-9]{1,3})_gaussians")

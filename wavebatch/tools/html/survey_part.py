@@ -47,8 +47,8 @@ def draw_survey(survey: Survey) -> str:
 def _list_figures(survey: Survey) -> Iterable[tuple[str, str]]:
     system, found = survey.system, survey.figures
     yield "surveyed", f"{survey.waveforms:,} waveforms" if survey.waveforms else "not known"
-    if None not in (found.n_samples, found.bits, found.spacing_ns):
-        yield "samples", f"{found.n_samples:.0f} of {found.bits:.0f} bits, {found.spacing_ns:g} ns apart"
+    if found.samples:
+        yield "samples", found.samples
     yield "baseline", f"{system.noise.baseline:.3f} \u00b1 {system.noise.baseline_spread:.3f} DN between waveforms"
     yield "noise", f"{system.noise.std:.3f} DN"
     gain = system.noise.gain
