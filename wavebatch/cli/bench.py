@@ -113,20 +113,21 @@ def _bench_real(
     reports, failed = [], False
     for path in strips:
         try:
-            report = measure_real(path, seed=options["seed"], say=say)
+            found = measure_real(path, seed=options["seed"], say=say)
         except InputError as error:
             failed = True
             talk(f"error: {one_line(error)}")
             continue
-        reports.append(report)
-        if output:
-            talk(write_report(report, output))
-        if not options["as_json"]:
-            click.echo(format_report(report) + "\n")
+        reports += found
+        for report in found:
+            if output:
+                talk(write_report(report, output))
+            if not options["as_json"]:
+                click.echo(format_report(report) + "\n")
     if html_file is not None and reports:
         from wavebatch.tools.html.bench_page import write_real_page
 
-        write_real_page(html_file, [(report.strip, format_report(report)) for report in reports])
+        write_real_page(html_file, [(report.title, format_report(report)) for report in reports])
         talk(f"{html_file}: written")
     answer({"strips": [asdict(report) for report in reports]}, "real")
     if failed:
