@@ -1,6 +1,7 @@
 """The program as a whole: help with examples, manual pages, version, settings from outside, log files."""
 
 import inspect
+import math
 import re
 import shlex
 import shutil
@@ -19,6 +20,10 @@ from wavebatch.cli.program.about import roff
 from wavebatch.cli.program.command import ProgramCommand, group_options
 from wavebatch.cli.program.examples import EXAMPLES, GROUPS
 from wavebatch.cli.program.settings import NEVER, OLD_NAMES
+from wavebatch.core.errors import ConfigError
+from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions
+from wavebatch.tools.slices.segments import SliceOptions
+from wavebatch.tools.voxels.profile import Deconvolution
 
 
 def invoke(*arguments, **environment):
@@ -70,9 +75,9 @@ def test_run_has_the_options_of_runoptions_and_python_the_same():
     command = dict(_commands())["run"]
     names = {option.name: option for option in command.params}
     keywords = inspect.signature(wb.run).parameters
-    for name, told in OPTIONS.items():
+    for name, one in OPTIONS.items():
         assert max(names[name].opts, key=len) == f"--{name.replace('_', '-')}"
-        assert name in keywords and names[name].help.startswith(told.help.split("  [")[0])
+        assert name in keywords and names[name].help.startswith(one.told.help.split("  [")[0])
         if name != "output":
             assert f"{name} : " in wb.run.__doc__ and keywords[name].default == getattr(RunOptions(), name)
     extra = {"strips", "dry_run", "report", "html_file", "progress", "verbose", "as_json", "quiet", "log_path",
@@ -122,7 +127,7 @@ def test_options_of_several_commands_mean_the_same():
         for option in command.params:
             if isinstance(option, click.Option):
                 name = max(option.opts, key=len)
-                kind = (type(option.type).__name__, option.is_flag)
+                kind = (type(option.type).__name__.replace("Range", "ParamType"), option.is_flag)
                 seen.setdefault(name, {}).setdefault(kind, []).append(title)
     mixed = {name: kinds for name, kinds in seen.items() if len(kinds) > 1}
     # Files that are written in one command are read by others; other names stand for numbers of different things.
@@ -320,3 +325,12 @@ def test_a_log_never_grows_into_another_file(folder):
     assert result.exit_code == 2 and "is no log" in result.stderr and (folder / "tiny.las").read_bytes() == before
     result = invoke("info", folder / "tiny.las", "--log-file", folder / "no" / "x.log")
     assert result.exit_code == 2 and "cannot be written" in result.stderr
+
+
+def test_python_is_refused_what_the_command_line_is():
+    for options, words in (
+        (SliceOptions, {"std": 0.0}), (Deconvolution, {"method": "golden"}), (Deconvolution, {"threshold": math.nan}),
+        (StripOptions, {"scale": 2.0}), (DiscreteReceiver, {"most": 0}), (Recording, {"bits": 12}),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match="^--[a-z-]+ [^:]+: (must lie (from|above)|choose) "):
+            options(**words)

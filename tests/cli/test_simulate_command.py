@@ -70,7 +70,6 @@ def test_every_option_reaches_the_recording(tmp_path):
         (["flat", "--rho", "0.3"], "rho must be"),
         (["flat", "--kappa", "3"], "kappa"),
         (["flat", "--pulses", "0"], "at least one pulse"),
-        (["flat", "--samples", "2"], "n_samples"),
         (["flat", "--las-version", "1.3", "--point-format", "9"], "1.3"),
         (["flat", "--baseline", "255"], "baseline must lie"),
     ],

@@ -79,7 +79,7 @@ def test_calibrated_strips_have_cross_sections(strip, tmp_path):
     [
         (("-o", "v.npz"), 2, "--size"),
         (("--size", 1), 2, "--output"),
-        (("--size", 0, "-o", "v.npz"), 2, "--size 0"),
+        (("--size", 0, "-o", "v.npz"), 2, "not in the range 0<x"),
         (("--size", "nan", "-o", "v.npz"), 2, "'--size': nan"),
         (("--size", 1e-7, "-o", "v.npz"), 2, "too small"),
         (("--size", 1, "-o", "v.tif"), 2, ".npz, .las or .laz"),

@@ -5,10 +5,10 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from bench.agreement import compare_parts, compare_solvers, format_agreement
 from click.testing import CliRunner
 from scipy.signal import lfilter
 from strips import make_raw
+from writer_tools import data_file
 
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
@@ -17,7 +17,10 @@ from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.tools.bench.real import pool
+from wavebatch.surveying.measuring.trial import Trial, limit_surveys
+from wavebatch.surveying.systems.known_systems import find_source, known_systems
+from wavebatch.tools.bench.real import pool, templates
+from wavebatch.tools.bench.real.agreement import compare_models, compare_solvers, find_sensor
 from wavebatch.tools.bench.real.inject import add_signal, inject_echoes
 from wavebatch.tools.bench.real.measure import measure_real
 from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise, unround
@@ -37,7 +40,7 @@ def strip(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def report(strip):
-    return measure_real(strip)
+    return measure_real(strip)[0]
 
 
 def correlated(n, s, rho=0.6, std=0.9, seed=1):
@@ -92,7 +95,7 @@ def test_noise_and_templates_are_those_that_were_simulated(report):
 @pytest.mark.slow
 def test_seed_decides_all_and_json_holds_it(strip):
     few = {"injections": 300, "waveforms": 1200}
-    one, same, other = (replace(measure_real(strip, seed=seed, **few), seconds={}) for seed in (1, 1, 2))
+    one, same, other = (replace(measure_real(strip, seed=seed, **few)[0], seconds={}) for seed in (1, 1, 2))
     assert one == same and one.quiet_by_sigma != other.quiet_by_sigma
     assert json.loads(json.dumps(asdict(one)))["seed"] == 1
     assert "misses a goal" in format_report(one)
@@ -106,7 +109,7 @@ def test_a_wrong_survey_is_seen(strip, report, monkeypatch):
         return replace(survey, system=replace(survey.system, noise=noise))
 
     monkeypatch.setattr(pool, "survey_blocks", deaf)
-    found = measure_real(strip, injections=2000)
+    found = measure_real(strip, injections=2000)[0]
     rows = [{row.low: row.recall for row in each.quiet_by_sigma} for each in (report, found)]
     assert rows[0][6.0] > 0.99 and rows[1][6.0] < 0.5
     assert found.noise.std == pytest.approx(report.noise.std, rel=0.06)
@@ -158,7 +161,7 @@ def test_gaps_of_fill_are_seen_and_left_alone(strip):
     solver = Solver.of_blocks(whole.surveyed)
     echoes = [solver.run(block) for block in whole.blocks]
     noise = measure_noise(whole, solver, echoes)
-    templates = learn_templates(whole, solver, echoes, noise.std, np.random.default_rng(1))
+    made_of = learn_templates(whole, solver, echoes, noise.std, np.random.default_rng(1))
     counts = whole.blocks[0].samples[:200].copy()
     counts[:, :] = np.rint(12 + correlated(200, counts.shape[1]))
     counts[:, 25:] = 0
@@ -166,7 +169,7 @@ def test_gaps_of_fill_are_seen_and_left_alone(strip):
     gapped = replace(gapped, digitizer=whole.blocks[0].digitizer)
     none = EchoTable.empty()
     made = inject_echoes(
-        replace(whole, blocks=(gapped,)), solver, [none], templates, noise, 300, np.random.default_rng(3)
+        replace(whole, blocks=(gapped,)), solver, [none], made_of, noise, 300, np.random.default_rng(3)
     )
     assert 0 < len(made) <= 150 and not made.near.any()
 
@@ -176,19 +179,65 @@ def test_clipped_echoes_are_injected_where_the_strip_has_some(strip, report, tmp
     assert report.clipped is None
     path = tmp_path / "shore.las"
     simulate_strip("shore", path, pulses=2000, seed=3)
-    found = measure_real(path, injections=3000)
+    found = measure_real(path, injections=3000)[0]
     assert found.clipped.injected > 50 and found.clipped.recall > 0.98
     assert found.clipped.extra < 0.05 * found.clipped.injected
 
 
-def test_surveys_of_parts_agree(strip):
+def test_surveys_of_parts_and_in_any_order_agree(strip, report):
+    assert [row.parts for row in report.agreement[:2]] == ["even/odd", "first/last"]
     whole = read_pool(strip)
-    rows = compare_parts(whole, Solver.of_blocks(whole.surveyed), np.random.default_rng(3))
-    assert [row.parts for row in rows] == ["even/odd", "first/last", "west/east", "in order/shuffled"]
-    for row in rows:
+    rng = np.random.default_rng(3)
+    shuffled = Solver.of_blocks([block.rows(rng.permutation(len(block))) for block in whole.surveyed])
+    solver = Solver.of_blocks(whole.surveyed)
+    for row in (*report.agreement, compare_solvers("in order/shuffled", solver, shuffled, whole.blocks)):
         assert row.differ < 0.02 and row.apart < 0.02 and abs(row.amplitude_ratio - 1) < 0.005
         assert row.packets == len(whole)
-    assert format_agreement(rows).count("\n") == len(rows)
+    assert "even/odd" in format_report(report)
+
+
+def test_models_that_were_not_chosen_are_compared(strip):
+    whole = read_pool(strip, 500)
+    chosen = Solver.of_blocks(whole.blocks)
+    skewed = Solver(replace(chosen.survey, system=replace(chosen.system, kappa=0.3)), chosen.chain)
+    (row,) = compare_models(whole, skewed, "")
+    assert row.parts == "as it is/at most 2 Gaussians" and row.surveys[0].model == "skewed 0.300"
+    assert compare_models(whole, chosen, "") == []
+
+
+def test_errors_and_further_echoes_are_given_by_separation(report):
+    near = [row for row in report.near_by_separation if abs(row.apart[0]) >= 1.5 and row.low >= 10 and row.found > 50]
+    assert len(near) > 4 and all(0.75 < row.ratio[0] < 1.3 and row.extra < 0.03 * row.injected for row in near)
+    names = ("found %", "further echoes %", "time error / reported")
+    assert all(f"{name} near the strongest" in format_report(report) for name in names)
+
+
+def test_a_stranger_has_no_shipped_pulse(strip, report):
+    lvis = next(known for known in known_systems() if known.name == "nasa-lvis")
+    solver = Solver.of_blocks(read_pool(strip, 500).blocks)
+    assert find_sensor(solver) == ""
+    assert find_sensor(Solver(replace(solver.survey, system=lvis.system), solver.chain)) == "nasa-lvis"
+    with limit_surveys(Trial("nasa-lvis", 2)):
+        assert lvis not in known_systems() and len(known_systems()) == 4
+        assert find_source(lvis.system) is None
+    assert lvis in known_systems()
+    assert "a stranger: without nasa-lvis" in format_report(replace(report, left_out="nasa-lvis"))
+
+
+def test_a_strip_without_clear_echoes_has_the_other_figures(strip, monkeypatch):
+    monkeypatch.setattr(templates, "LEAST_SNR", 1e6)
+    (found,) = measure_real(strip, waveforms=300)
+    assert found.templates is None and not found.quiet_by_sigma and found.false_echoes.echoes > 0
+    text = format_report(found)
+    assert "nothing injected" in text and "first/last" in text and "found %" not in text
+
+
+@pytest.mark.slow
+def test_a_real_stranger_is_measured_as_one():
+    known, stranger = measure_real(data_file("geolas/geolas1.las"), injections=1000)
+    assert (known.left_out, stranger.left_out) == ("", "geolas-q560")
+    assert known.survey.fwhm == pytest.approx(4.05, rel=0.03) == stranger.survey.fwhm
+    assert {row.parts for row in known.agreement} >= {"even/odd", "as it is/at most 2 Gaussians"}
 
 
 def test_agreement_sees_a_survey_that_is_off(strip):
@@ -232,7 +281,7 @@ def test_wrong_usage_is_one_line(words, message):
 @pytest.mark.slow
 def test_real_strips(riegl, leica):
     for path in (riegl, leica):
-        found = measure_real(path, injections=3000)
+        found = measure_real(path, injections=3000)[0]
         strong = [row for row in found.quiet_by_count if row.low >= 9]
         assert sum(row.found for row in strong) > 0.99 * sum(row.injected for row in strong) > 500
         assert 0.5 < found.noise.std < 1.5 and found.noise.correlation[0] > 0.3

@@ -153,7 +153,7 @@ def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(r
     [
         (["-o", "x.tif"], "needs a --column"), (["--column", "heigt", "-o", "x.tif"], "did you mean 'height'"),
         (["--column", "height", "-o", "x.png"], "use .tif"),
-        (["--column", "height", "--size", "0", "-o", "x.tif"], "must be more than 0"),
+        (["--column", "height", "--size", "0", "-o", "x.tif"], "not in the range 0<x"),
         (["--column", "height", "--crs", "EPSG:4978", "-o", "x.tif"], "geocentric"),
         (["--column", "height", "--crs", "EPSG:0", "-o", "x.tif"], "write the code of a CRS"),
         (["--column", "height", "--no-data", "1e39", "-o", "x.tif"], "float32"),

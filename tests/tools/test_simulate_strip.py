@@ -210,7 +210,7 @@ def test_failures_half_way_leave_nothing(tmp_path):
 def test_wrong_options_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="at least one pulse"):
         simulate_strip("flat", tmp_path / "s.las", pulses=0)
-    with pytest.raises(ConfigError, match="4, 5, 9 or 10"):
+    with pytest.raises(ConfigError, match="choose 4, 5, 9, 10"):
         StripOptions(point_format=6)
     with pytest.raises(ConfigError, match="scale"):
         StripOptions(scale=0.0)

@@ -195,7 +195,7 @@ def test_errors_are_one_line_and_leave_nothing(strip, tmp_path):
     cases = [
         ((strip, "-o", tmp_path / "old.csv"), 1, "exists already"),
         ((strip, "-o", tmp_path / "s.txt"), 2, ".csv or .geojson"),
-        ((strip, "-o", tmp_path / "s.csv", "--std", "0"), 2, "above 0"),
+        ((strip, "-o", tmp_path / "s.csv", "--std", "0"), 2, "not in the range x>0"),
         ((tmp_path / "none.las", "-o", tmp_path / "s.csv"), 1, "none.las"),
         ((strip, "--png", tmp_path / "s.png", "--lines", "99"), 1, "--lines"),
     ]

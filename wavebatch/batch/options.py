@@ -1,30 +1,25 @@
 """The options of a run: one declaration each, for the command, the Python function and the documentation.
 
-`cli.options` makes click's options of the fields of RunOptions, `tools.api.run` the keywords of `wavebatch.run`. Type,
-choices and range come from a field's annotation, all else from `option`. Before you change it: this module is imported
-for `--help`, so it imports nothing that takes time.
+`cli.options` makes click's options of the fields of RunOptions, `tools.api.run` the keywords of `wavebatch.run`. Before
+you change it: this module is imported for `--help`, so it imports nothing that takes time.
 """
 
 from __future__ import annotations
 
 import re
 import shlex
-import typing
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.schema import Range, read_hint
+from wavebatch.core.schema import Range, check_options, declared_options, option, typed
 
 if TYPE_CHECKING:
     from wavebatch.core.condition import Condition
     from wavebatch.stages.chain import Chain
     from wavebatch.surveying.survey import Survey
-
-_LATE = ("Chain", "Condition", "Survey")
-"""Types that only Python gives; they take time to import."""
 
 CHAIN, READING, SENSOR, AIR = "Chain and pulse", "Reading", "Position of the sensor", "Air and light"
 WHICH, OUTPUT, SPEED, RUNNING = "Which points", "Output", "Speed and memory", "How it runs"
@@ -60,7 +55,7 @@ def check_together(given: Mapping[str, Any], known: Collection[str] | None = Non
         Names of the options that there are: another command may have one without those that it needs in `run`.
     """
     for rivals in EXCLUSIVE:
-        names = [_typed(name) for name in rivals if name in given]
+        names = [typed(name) for name in rivals if name in given]
         if len(names) > 1:
             raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
     if "system" in given and given.get("survey") == "flight":
@@ -69,33 +64,8 @@ def check_together(given: Mapping[str, Any], known: Collection[str] | None = Non
         if known is not None and not set(known) & set(needed):
             continue
         if name in given and not any(one in given for one in needed):
-            others = " or ".join(map(_typed, needed))
-            raise ConfigError(f"{_typed(name)} is of no use without {others}; give that too, or leave it out")
-
-
-def _typed(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
-@dataclass(frozen=True, slots=True)
-class Option:
-    """What the documentation says about an option."""
-
-    help: str
-    group: str
-    form: str = ""
-    """What its value looks like, or its unit: `METAVAR` of --help."""
-    unset: str = ""
-    """The default in words, where a value does not say it."""
-    short: str = ""
-    """A letter for the command line."""
-    usual: bool = False
-    """Whether most users need it; --help of a long command begins with these."""
-
-
-def option(default: Any, text: str, group: str, form: str = "", **more: Any) -> Any:
-    """A field of RunOptions; text: its help, which calls other options as the command does; more: of Option."""
-    return field(default=default, metadata={"option": Option(text, group, form, **more)})
+            others = " or ".join(map(typed, needed))
+            raise ConfigError(f"{typed(name)} is of no use without {others}; give that too, or leave it out")
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,14 +203,8 @@ class RunOptions:
 
     def check(self) -> None:
         """Raise ConfigError for options that exclude or need each other, and for values that they do not take."""
-        given = self.given()
-        check_together(given)
-        for name, value in given.items():
-            _, choices, limits = SCHEMA[name]
-            if choices is not None and value not in choices:
-                raise ConfigError(f"{_typed(name)}: {value!r} is not one of {', '.join(choices)}")
-            if limits is not None and not limits.low <= value <= limits.high:
-                raise ConfigError(f"{_typed(name)}: {value:g} is not in {limits.low:g} to {limits.high:g}")
+        check_together(self.given())
+        check_options(self)
         if self.scheduler is not None and not self.scheduler.strip():
             raise ConfigError("--scheduler: the address is empty; leave it out to work on this machine")
 
@@ -250,7 +214,7 @@ class RunOptions:
         return {
             name: value
             for name, value in values.items()
-            if value is not DEFAULTS[name] and (DEFAULTS[name] is None or value != DEFAULTS[name])
+            if value is not OPTIONS[name].default and (OPTIONS[name].default is None or value != OPTIONS[name].default)
         }
 
     def command(self, strip: str) -> str:
@@ -259,7 +223,7 @@ class RunOptions:
         for name, value in self.given().items():
             if name in ELSEWHERE:
                 continue
-            option = _typed("profile" if name == "chain" and _is_name(value) else name)
+            option = typed("profile" if name == "chain" and _is_name(value) else name)
             parts.append(option if value is True else f"{option} {shlex.quote(_text(name, value))}")
         return " ".join(parts)
 
@@ -277,25 +241,17 @@ def _text(name: str, value: Any) -> str:
         return getattr(value, "text", value)
     if not isinstance(value, str | Path):
         return {"chain": "CHAIN.toml", "system": "SYSTEM.toml", "tolerance": f"{value}m"}.get(name, str(value))
-    return Path(value).name if Path in SCHEMA[name][0] else str(value)
+    return Path(value).name if Path in OPTIONS[name].kinds else str(value)
 
 
-OPTIONS: dict[str, Option] = {one.name: one.metadata["option"] for one in fields(RunOptions)}
-DEFAULTS: dict[str, Any] = {one.name: one.default for one in fields(RunOptions)}
-SCHEMA = {
-    name: read_hint(hint)
-    for name, hint in typing.get_type_hints(
-        RunOptions, localns=dict.fromkeys(_LATE, object), include_extras=True
-    ).items()
-}
-"""Types, choices and range of every option."""
+OPTIONS = declared_options(RunOptions)
 
 
 def describe_options() -> str:
     """Return the options as the section Parameters of a docstring."""
     lines = []
     for one in fields(RunOptions)[1:]:  # the output is no keyword
-        told = OPTIONS[one.name]
+        told = OPTIONS[one.name].told
         text = re.sub(r"--([a-z][a-z-]+)", lambda found: f"`{found[1].replace('-', '_')}`", told.help)
         default = told.unset or ("" if one.default in (None, False) else repr(one.default))
         kind = re.sub(r"^Annotated\[(.*?), Range.*\]$", r"\1", str(one.type))

@@ -21,11 +21,13 @@ from wavebatch.cli.options import (
     declared,
     from_options,
     html_option,
+    options_of,
     output_option,
     seed_option,
 )
 from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.core.errors import InputError
+from wavebatch.tools.bench.command import BenchOptions, run_bench
 
 _REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "log_path", "log_level", "debug")
 """Options that --real uses."""
@@ -35,15 +37,10 @@ _REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "lo
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[STRIP...] [CHAIN...]")
 @click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete_scenes,
               help="Simulate this scene: mixed, open, forest, empty, flat or stiff; may be repeated.")
-@click.option("--waveforms", type=click.IntRange(1), default=65_536, show_default=True, metavar="N",
-              help="Simulated waveforms per scene.")
-@click.option("--pulses", type=click.IntRange(0), default=50_000, show_default=True, metavar="N",
-              help="Pulses of the strip that is timed from file to file; 0: time the algorithms only.")
-@click.option("--repeat", "repeats", type=click.IntRange(1), default=3, show_default=True, metavar="N",
-              help="Repetitions of the timing.")
+@options_of(BenchOptions, "waveforms", "pulses", "repeats")
 @seed_option("Seed of the simulated waveforms.")
 @declared("tolerance", "Name the cheapest chain whose range error of isolated echoes is at most this, e.g. 0.02m.")
-@click.option("--all-methods", is_flag=True, help="Also measure every detector and every decomposer.")
+@options_of(BenchOptions, "all_methods")
 @click.option("--real", is_flag=True,
               help="Inject echoes into the waveforms of each STRIP and count those found, and count false echoes.")
 @output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR", required=False,
@@ -64,7 +61,6 @@ def bench(
 
     Exit code: 0 done, 1 the strip cannot be read or the folder cannot be written, 2 wrong usage.
     """
-    from wavebatch.tools.bench.command import BenchOptions, run_bench
     from wavebatch.tools.bench.report import format_document, write_outputs
 
     check_html(html_file)
@@ -117,20 +113,21 @@ def _bench_real(
     reports, failed = [], False
     for path in strips:
         try:
-            report = measure_real(path, seed=options["seed"], say=say)
+            found = measure_real(path, seed=options["seed"], say=say)
         except InputError as error:
             failed = True
             talk(f"error: {one_line(error)}")
             continue
-        reports.append(report)
-        if output:
-            talk(write_report(report, output))
-        if not options["as_json"]:
-            click.echo(format_report(report) + "\n")
+        reports += found
+        for report in found:
+            if output:
+                talk(write_report(report, output))
+            if not options["as_json"]:
+                click.echo(format_report(report) + "\n")
     if html_file is not None and reports:
         from wavebatch.tools.html.bench_page import write_real_page
 
-        write_real_page(html_file, [(report.strip, format_report(report)) for report in reports])
+        write_real_page(html_file, [(report.title, format_report(report)) for report in reports])
         talk(f"{html_file}: written")
     answer({"strips": [asdict(report) for report in reports]}, "real")
     if failed:

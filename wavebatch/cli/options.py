@@ -12,19 +12,20 @@ import os
 import re
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 from click.core import ParameterSource
 
-from wavebatch.batch.options import DEFAULTS, OPTIONS, SCHEMA, check_together
+from wavebatch.batch.options import OPTIONS, RunOptions, check_together
 from wavebatch.cli.messages import one_line, report_errors, talk
 from wavebatch.cli.program.completion import complete_files, complete_flags, complete_profiles, complete_written
 from wavebatch.cli.program.log_file import LEVELS, LOG, begin_log, keep_level
 from wavebatch.cli.program.settings import READ
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.schema import Above, Declared, declared_options, typed
 from wavebatch.files.disk.protect import protecting, refuse_input
 
 _Options = TypeVar("_Options")
@@ -136,7 +137,7 @@ def bbox_option(text: str) -> Callable:
 
 _READERS: dict[str, Callable[[str], Any]] = {
     "bbox": lambda text: parse_floats(text, "WEST,SOUTH,EAST,NORTH"),
-    "lever_arm": lambda text: parse_floats(text, OPTIONS["lever_arm"].form),
+    "lever_arm": lambda text: parse_floats(text, OPTIONS["lever_arm"].told.form),
     "tolerance": lambda text: parse_length(text) / 100.0,
     "memory": _parse_size,
     "classes": _parse_classes,
@@ -167,40 +168,54 @@ class Text(click.ParamType):
             raise click.UsageError(f"{place}{error}", ctx) from error
 
 
-def declared(name: str, text: str = "", **more: Any) -> Callable:
-    """An option that is declared in RunOptions; text: its help in this command; more: what differs for click."""
-    one, (kinds, choices, limits) = OPTIONS[name], SCHEMA[name]
-    parts = [text or one.help, f"[default: {one.unset}]" if one.unset and "default" not in more else ""]
-    how: dict[str, Any] = {} if more.get("required") else {"default": DEFAULTS[name]}
-    how |= {"help": "  ".join(filter(None, parts)), "metavar": one.form or None, "shell_complete": _COMPLETE.get(name)}
-    how["show_default"] = not one.unset and {**how, **more}.get("default") not in (None, False)
-    if kinds == (bool,):
-        how |= {"is_flag": True, "show_default": False}
-    else:
-        how["type"] = _find_type(name, kinds, choices, limits)
-    names = [f"-{one.short}"] * bool(one.short) + [f"--{name.replace('_', '-')}"]
-    return click.option(*names, name, **{**how, **more})
+def declared(name: str, text: str = "", kind: type = RunOptions, **more: Any) -> Callable:
+    """An option that is declared in a dataclass; text: its help in this command; more: what differs for click."""
+    one = declared_options(kind)[name]
+    told, default = one.told, more.get("default", one.default)
+    parts = [text or told.help, f"[default: {told.unset}]" if told.unset and more.get("default") is None else ""]
+    how: dict[str, Any] = {"help": "  ".join(filter(None, parts)), "metavar": told.form or None}
+    how |= {"shell_complete": _COMPLETE.get(name), "required": default is MISSING}
+    if default is not MISSING and not more.get("required"):
+        how |= {"default": default, "show_default": not told.unset and default is not None and one.kinds != (bool,)}
+    how |= {"is_flag": True} if one.kinds == (bool,) else _find_type(name, one)
+    word = typed(told.name or name) + f"/--{told.opposite}" * bool(told.opposite)
+    return click.option(*[f"-{told.short}"] * bool(told.short), word, name, **{**how, **more})
 
 
-def _find_type(name: str, kinds: Sequence[type], choices: Sequence[Any] | None, limits: Any) -> Any:
-    """Click's type of an option of RunOptions."""
-    form = OPTIONS[name].form
-    if choices is not None:
-        return click.Choice(choices)
+def options_of(kind: type, *names: str, **more: Any) -> Callable:
+    """All options of a dataclass, or those of these names, in the order of the names; more: as in `declared`."""
+    return together(*(declared(name, kind=kind, **more) for name in names or declared_options(kind)))
+
+
+def _find_type(name: str, one: Declared) -> dict[str, Any]:
+    """Click's type of an option, and what belongs to it."""
+    if one.choices is not None:
+        if int in one.kinds:
+            numbers = click.Choice([str(choice) for choice in one.choices])
+            return {"type": numbers, "callback": lambda context, parameter, text: text and int(text)}
+        return {"type": click.Choice(one.choices)}
     if name in _READERS:
-        return Text(form, _READERS[name])
-    if limits is not None:
-        low, high = (None if math.isinf(limit) else limit for limit in limits)
-        return (click.IntRange if int in kinds else click.FloatRange)(low, high)
+        return {"type": Text(one.told.form, _READERS[name])}
+    number = next((number for number in (int, float) if number in one.kinds), None)
+    if one.limits is not None:
+        kind = click.IntRange if number is int else click.FloatRange
+        return {"type": kind(*map(_plain, one.limits), isinstance(one.limits, Above))}
     if name == "output":
-        return OutputPath(file_okay=False, path_type=Path)
-    is_path = Path in kinds and name != "energy"
-    return click.Path(path_type=Path) if is_path else str
+        return {"type": OutputPath(file_okay=False, path_type=Path)}
+    is_path = Path in one.kinds and name != "energy"
+    return {"type": click.Path(path_type=Path) if is_path else number or str}
+
+
+def _plain(limit: float) -> float | None:
+    """A limit as the help shows it."""
+    if math.isinf(limit):
+        return None
+    return int(limit) if limit % 1 == 0 and abs(limit) < 1e7 else limit
 
 
 def where_option(text: str) -> Callable:
     """`--where`; text: what is done with the points that meet the condition."""
-    return declared("where", OPTIONS["where"].help.replace("Write only points", text, 1))
+    return declared("where", OPTIONS["where"].told.help.replace("Write only points", text, 1))
 
 
 selection_options = together(

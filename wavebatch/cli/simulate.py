@@ -6,7 +6,7 @@ they fill (see `from_options`), so that a renamed field needs a renamed option h
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from wavebatch.cli.messages import count, counting, print_summary
-from wavebatch.cli.options import common_options, from_options, given_options, output_option, seed_option
+from wavebatch.cli.options import common_options, from_options, given_options, options_of, output_option, seed_option
 from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.tools.simulate import (
     CANOPIES,
@@ -29,24 +29,14 @@ from wavebatch.tools.simulate import (
     simulate_strip,
 )
 from wavebatch.tools.simulate.from_returns import SynthesisSummary, synthesize_strip
-from wavebatch.tools.simulate.render import LEAST_SPACING, MOST_NOISE, MOST_NOISE_GAIN, MOST_SPACING
-from wavebatch.tools.simulate.return_light import (
-    EQUAL,
-    INTENSITIES,
-    MOST_GAIN,
-    MOST_HEIGHT,
-    MOST_WIDTH,
-    RADAR_LIMITS,
-    Radar,
-    SynthesisOptions,
-)
+from wavebatch.tools.simulate.render import Recording
+from wavebatch.tools.simulate.return_light import EQUAL, Radar, SynthesisOptions
 
-_RECORDING = ("n_samples", "spacing", "noise_std", "baseline", "rho", "noise_gain", "saturation")
+_RECORDING = ("n_samples", "spacing", "baseline", "noise_std", "rho", "noise_gain", "saturation")
 """Options that change the recording of the scene."""
 
-_SPACING = {"type": click.FloatRange(LEAST_SPACING, MOST_SPACING), "metavar": "NS"}
-_NOISE = {"type": click.FloatRange(0.0, MOST_NOISE), "metavar": "DN"}
-_RADAR = ("power", "aperture", "divergence", "efficiency", "attenuation")
+_LIGHT = ("height", "power", "aperture", "divergence", "efficiency", "attenuation")
+_RECEIVER = ("dead_zone", "threshold", "most")
 _SEEN = 0.001
 """Share of the energy that is worth a note where it is not of echoes."""
 
@@ -56,8 +46,10 @@ _SCENE_LINES = "\n\n".join(
 )
 
 _output = output_option("Strip to write: .las or .laz.")
-_internal = click.option("--internal/--external", default=True,
-                         help="Store packets in the file or in a .wdp file.  [default: internal]")  # fmt: skip
+
+def _changes(kind: type, *names: str) -> Callable:
+    """Options that are not given unless the user gives them."""
+    return options_of(kind, *names, default=None)
 
 
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
@@ -66,40 +58,15 @@ _internal = click.option("--internal/--external", default=True,
 @output_option("Write the true echoes to this .npz file.", "FILE", "--truth", required=False)
 @click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Number of pulses.")
 @seed_option("Seed of the random numbers; pulse k of a scene and a seed is always the same.")
-@click.option("--bits", type=click.Choice(["8", "16", "32"]), help="Bits per sample.  [default: 8]")
-@click.option("--samples", "n_samples", type=int, help="Samples per waveform.  [default: the scene's, 80 or 96]")
-@click.option("--spacing", **_SPACING, help="Time between samples [ns].  [default: 1]")
-@click.option("--baseline", type=float, help="Level without signal [DN].  [default: 12]")
-@click.option("--noise", "noise_std", **_NOISE,
-              help="Standard deviation of the noise before rounding [DN].  [default: the scene's, 1 or 1.2]")
-@click.option("--rho", type=float,
-              help="Correlation of the noise of neighbouring samples: 0, .5, .667, .75 or .8.  [default: 0]")
-@click.option("--noise-gain", type=click.FloatRange(0.0, MOST_NOISE_GAIN), metavar="DN",
-              help="Noise variance that the signal adds [DN2 per DN].  [default: 0]")
-@click.option("--saturation", type=int,
-              help="Count at which the receiver saturates [DN].  [default: the largest that the bits can hold]")
+@_changes(Recording, "bits", *_RECORDING)
 @click.option("--pulse", type=click.Choice(list(PULSES)), help="Shape of the system pulse.  [default: gaussian]")
 @click.option("--sigma", type=float, help="Standard deviation of the pulse's main lobe [ns].  [default: the scene's]")
 @click.option("--kappa", type=float, help="Skew of the main lobe.  [default: 0]")
 @click.option("--ringing", default=0.0, help="Share of the amplitude in lobes 4 and 8 sigma after the peak.")
-@click.option("--point-format", type=click.Choice(["4", "5", "9", "10"]), default="4", show_default=True,
-              help="LAS point format.")
-@click.option("--las-version", "version", type=click.Choice(["1.3", "1.4"]),
-              help="LAS version.  [default: 1.3 for point formats 4 and 5, else 1.4]")
-@_internal
-@click.option("--scale", default=0.001, show_default=True, help="Unit of the stored coordinates [m].")
-@click.option("--without-waveform", default=0.01, show_default=True, help="Share of the pulses without a packet.")
-@click.option("--keep-empty/--drop-empty", default=True,
-              help="Keep or leave out pulses without an echo.  [default: keep]")
-@click.option("--toward/--away", default=True,
-              help="Direction of the packet vectors: toward or away from the sensor.  [default: toward]")
+@options_of(StripOptions)
 @click.option("--sensor", type=click.Choice(["waveform", "discrete"]), default="waveform", show_default=True,
               help="waveform: record every waveform; discrete: record only returns, by a receiver with a dead zone.")
-@click.option("--dead-zone", type=click.FloatRange(0.0, 1e6, min_open=True), metavar="M",
-              help="Discrete: least distance of two returns [m].  [default: 0.65]")
-@click.option("--threshold", type=click.FloatRange(0.0, 1e10), metavar="DN",
-              help="Discrete: amplitude that triggers a return [DN].  [default: 12]")
-@click.option("--most-returns", "most", type=int, help="Discrete: most returns per pulse.  [default: 4]")
+@_changes(DiscreteReceiver, *_RECEIVER)
 @common_options("overwrite", "json")
 def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | None, **options: Any) -> None:
     """Simulate a full-waveform strip of a SCENE with known echoes.
@@ -117,7 +84,7 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
     common = {
         "pulses": pulses,
         "seed": seed,
-        "options": from_options(StripOptions, options, point_format=int(options["point_format"])),
+        "options": from_options(StripOptions, options),
         "overwrite": options["overwrite"],
         "progress": bar.update,
     }
@@ -140,16 +107,14 @@ def _build_receiver(truth: Path | None, options: dict[str, Any]) -> DiscreteRece
         if not options["internal"]:
             raise click.UsageError("--external is about packets; --sensor discrete writes none")
         return from_options(DiscreteReceiver, options)
-    if given_options(options, ("dead_zone", "threshold", "most")):
+    if given_options(options, _RECEIVER):
         raise click.UsageError("--dead-zone, --threshold and --most-returns need --sensor discrete")
     return None
 
 
 def _shape_scene(scene: Scene, options: dict[str, Any]) -> Scene:
     """The scene with the recording of the options."""
-    given = given_options(options, _RECORDING)
-    if options["bits"]:
-        given["bits"] = int(options["bits"])
+    given = given_options(options, ("bits", *_RECORDING))
     shape = {name: options[name] for name in ("pulse", "sigma", "kappa", "ringing")}
     pulse = shape_pulse(scene.recording.pulse, **shape)
     return replace(scene, recording=replace(scene.recording, pulse=pulse, **given))
@@ -158,39 +123,10 @@ def _shape_scene(scene: Scene, options: dict[str, Any]) -> Scene:
 @click.command()
 @click.argument("cloud", type=click.Path(path_type=Path))
 @_output
-@click.option("--intensity", type=click.Choice(INTENSITIES), default="peak", show_default=True,
-              help="Meaning of the intensities: peak amplitudes, or reflectances (65535 is 1), from which the lidar "
-              "equation computes amplitudes.")
-@click.option("--gain", type=click.FloatRange(0.0, MOST_GAIN, min_open=True), metavar="DN",
-              help="DN per unit of intensity, or per W.  [default: fills 80 % of the digitizer]")
-@click.option("--width", type=click.FloatRange(0.0, MOST_WIDTH, min_open=True), metavar="NS",
-              default=4.7, show_default=True,
-              help="Full width of the pulse at half maximum [ns], and of echoes without a width of their own.")
-@click.option("--widths", metavar="COLUMN",
-              help="Column with the full width of each echo at half maximum [ns].  [default: echo_width, if present]")
-@click.option("--shares", metavar="COLUMN|equal",
-              help="Reflectance: column with the share of the footprint that each return takes, 0 to 1, or equal. "
-              "Returns without data take evenly what the others of their pulse leave; shares above 1 together are "
-              "scaled to 1.  [default: each return fills it]")
-@click.option("--spacing", **_SPACING, default=1.0, show_default=True, help="Time between samples [ns].")
-@click.option("--bits", type=click.Choice(["8", "16", "32"]), default="8", show_default=True, help="Bits per sample.")
-@click.option("--baseline", default=12.0, show_default=True, help="Level without signal [DN].")
-@click.option("--noise", **_NOISE, default=0.0, show_default=True,
-              help="Standard deviation of the noise before rounding [DN].")
+@options_of(SynthesisOptions, "intensity", "gain", "width", "widths", "shares", "spacing", "bits", "baseline", "noise")
 @seed_option("Seed of the noise and of the first sample's time.")
-@_internal
-@click.option("--sensor-height", type=click.FloatRange(-MOST_HEIGHT, MOST_HEIGHT), metavar="M",
-              help="Reflectance: height of the sensor, in the heights of CLOUD [m].")
-@click.option("--power", type=click.FloatRange(*RADAR_LIMITS["power"]), metavar="W",
-              help="Reflectance: peak power of the pulse [W].  [default: 1]")
-@click.option("--aperture", type=click.FloatRange(*RADAR_LIMITS["aperture"]), metavar="M",
-              help="Reflectance: diameter of the receiver [m].  [default: 0.1]")
-@click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
-              help="Reflectance: full angle of the beam [mrad].  [default: 0.5]")
-@click.option("--efficiency", type=click.FloatRange(*RADAR_LIMITS["efficiency"]), metavar="SHARE",
-              help="Reflectance: efficiency of the optics.  [default: 0.5]")
-@click.option("--attenuation", type=click.FloatRange(*RADAR_LIMITS["attenuation"]), metavar="DB_KM",
-              help="Reflectance: attenuation of the air [dB/km].  [default: 0.22]")
+@options_of(SynthesisOptions, "internal")
+@_changes(Radar, *_LIGHT)
 @common_options("overwrite", "json")
 def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     """Model waveforms from the discrete returns of CLOUD: one Gaussian per return, from its range and intensity.
@@ -201,7 +137,7 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
 
     Exit code: 0 done, 1 the cloud cannot be read or the strip cannot be written, 2 wrong usage.
     """  # fmt: skip
-    settings = from_options(SynthesisOptions, options, bits=int(options["bits"]), radar=_build_radar(options))
+    settings = from_options(SynthesisOptions, options, radar=_build_radar(options))
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
     lines = _list_lines(output, summary, settings)
@@ -210,17 +146,13 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
 
 def _build_radar(options: dict[str, Any]) -> Radar | None:
     """The figures of the lidar equation; None if intensities are peaks."""
-    given = given_options(options, _RADAR)
-    height = options["sensor_height"]
     if options["intensity"] == "peak":
-        if given or height is not None or options["shares"] is not None:
+        if given_options(options, (*_LIGHT, "shares")):
             raise click.UsageError("the options of the lidar equation and --shares need --intensity reflectance")
         return None
-    if height is None:
+    if options["height"] is None:
         raise click.UsageError("--intensity reflectance needs --sensor-height")
-    if "divergence" in given:
-        given["divergence"] *= 1e-3
-    return Radar(height, **given)
+    return from_options(Radar, options)
 
 
 def _list_lines(output: Path, summary: SynthesisSummary, settings: SynthesisOptions) -> Iterator[str]:

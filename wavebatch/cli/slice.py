@@ -71,18 +71,13 @@ class Extras:
                       "FILE.npz", "--cube", required=False)
 @click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else _ALL,
               metavar="N|FIRST:END", help="Scan lines, counted from 0; END is not included.  [default: all]")
-@click.option("--geometry", type=click.Choice(["plane", "time"]), default="plane", show_default=True,
-              help="plane: slices are vertical planes; time: rows are pulses, columns times on one axis.")
-@click.option("--std", default=2.0, show_default=True, metavar="STD",
-              help="Search samples above this many standard deviations of the slice, and above the noise.")
-@click.option("--sigma", type=float, metavar="NS",
-              help="Standard deviation of the pulse [ns].  [default: surveyed from the strip]")
-@click.option("--shortest", default=20.0, show_default=True, metavar="PIXELS",
-              help="Least length of a segment [pixels of one sample].")
+@shared.options_of(SliceOptions, "geometry", "std")
+@shared.declared("sigma", kind=SliceOptions, default=None)
+@shared.options_of(SliceOptions, "shortest")
 @click.option("--geojson-crs", type=click.Choice(GEOJSON_CRS), default="wgs84", show_default=True,
               help="Coordinates of a .geojson: longitude and latitude (needs pyproj), or those of the strip with its "
               "CRS, which GDAL and QGIS read.")
-@click.option("--most", default=20, show_default=True, metavar="N", help="Most segments per slice.")
+@shared.options_of(SliceOptions, "most")
 @shared.declared("direction")
 @shared.common_options("overwrite", "json")
 def slice_(
@@ -147,7 +142,7 @@ def _slice(
         if scan.with_waveform:
             system = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system
             sigma, floor = system.sigma_ref if sigma is None else sigma, _NOISE_FLOOR * system.noise.std
-        settings = shared.from_options(SliceOptions, options, sigma=2.0 if sigma is None else sigma, floor=floor)
+        settings = shared.from_options(SliceOptions, options, **{"sigma": sigma} if sigma else {}, floor=floor)
         counts = _find(reader, scan, settings, output, lines, extras, crs, options["overwrite"])
     if not counts["lines"]:
         none = "no scan line" if scan.with_waveform else "no waveform, so no scan line"

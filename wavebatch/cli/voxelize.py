@@ -19,6 +19,8 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import format_measure
 from wavebatch.files.disk.protect import refuse_input
 from wavebatch.files.inputs import find_files
+from wavebatch.tools.voxels.profile import Deconvolution
+from wavebatch.tools.voxels.strip import VoxelOptions
 
 if TYPE_CHECKING:
     from wavebatch.tools.voxels.strip import VoxelSummary
@@ -33,28 +35,14 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @shared.strips_argument
 @shared.output_option("Voxels to write: .npz, or .las or .laz with a point at the centre of each; or a folder, which "
                       "gets STEM.npz for each strip.", "FILE|DIR", folder=None)
-@click.option("--size", required=True, type=float, metavar="M",
-              help="Edge of a voxel [m]; the faces of voxels lie at multiples of it.")
-@click.option("--method", type=click.Choice(["richardson_lucy", "gold", "wiener"]), default="richardson_lucy",
-              show_default=True, help="How waveforms are deconvolved with the system pulse.")
-@click.option("--iterations", type=click.IntRange(1, 10_000), metavar="N",
-              help="Iterations: more resolve closer surfaces, but take longer.  [default: 40; gold: 100]")
-@click.option("--snr", type=click.FloatRange(0, min_open=True), metavar="RATIO",
-              help="wiener: amplitude over noise for which the filter is designed.  [default: 20]")
-@click.option("--threshold", type=click.FloatRange(0), default=4.27, show_default=True, metavar="STD",
-              help="Ignore signal weaker than a single echo of this many standard deviations of the noise.")
-@click.option("--headroom", type=click.FloatRange(0, 100_000), metavar="M",
-              help="Count each ray from this distance before its first sample [m], whether recorded or not.  [default: "
-              "from the highest return near it]")
-@click.option("--ground-height", type=click.FloatRange(0, 100), default=0.5, show_default=True, metavar="M",
-              help="Signal up to this height above the lowest returns is the ground's [m].")
-@click.option("--reflectance-ratio", type=float, metavar="RATIO",
-              help="Reflectance of the canopy over that of the ground.  [default: estimated from the strip]")
+@shared.options_of(VoxelOptions, "size")
+@shared.options_of(Deconvolution)
+@shared.options_of(VoxelOptions, "headroom", "ground_height", "reflectance_ratio")
 @shared.where_option("Use only waveforms with a return (a point of the strip)")
 @click.option("--profiles", type=shared.OutputPath(path_type=Path), metavar="FILE.npz",
               help="Also write the deconvolved signal of every pulse: energy and, with --calibration, cross section by "
               "time.")
-@click.option("--all-crossed", is_flag=True, help="Also write voxels that rays crossed without any signal.")
+@shared.options_of(VoxelOptions, "all_crossed")
 @shared.system_option
 @shared.declared("calibration")
 @shared.declared("energy")
@@ -97,8 +85,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     from wavebatch.surveying.calibrating.calibration_file import load_calibration
     from wavebatch.surveying.system_file import load_survey
     from wavebatch.tools.api.run import read_sensor
-    from wavebatch.tools.voxels.profile import Deconvolution
-    from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
+    from wavebatch.tools.voxels.strip import voxelize_strip
 
     _check_options(options)
     settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options))

@@ -1,13 +1,18 @@
-"""Types, choices and ranges from annotations: a signature is a schema.
+"""Types, choices and ranges from annotations, and options that are declared once: as fields of a dataclass.
 
-`stages.chain` reads the parameters of stages with it, `batch.options` the options of a run.
+A signature is a schema: `stages.chain` reads the parameters of stages with it. A field made by `option` has the default
+and the help of an option too: `cli.options` makes click's options of them; Python fills the dataclass itself.
 """
 
 from __future__ import annotations
 
+import functools
 import types
 import typing
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
+
+from wavebatch.core.errors import ConfigError
 
 
 class Range(NamedTuple):
@@ -15,6 +20,24 @@ class Range(NamedTuple):
 
     low: float
     high: float
+
+    def hold(self, value: float) -> bool:
+        """Whether a value lies in it; NaN does not."""
+        return self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        return f"from {self.low:g} to {self.high:g}"
+
+
+class Above(Range):
+    """A range without its least value."""
+
+    def hold(self, value: float) -> bool:
+        """Whether a value lies in it; NaN does not."""
+        return self.low < value <= self.high
+
+    def __str__(self) -> str:
+        return f"above {self.low:g}, up to {self.high:g}"
 
 
 def read_hint(hint: Any) -> tuple[tuple[type, ...], tuple[Any, ...] | None, Range | None]:
@@ -44,3 +67,70 @@ def read_hint(hint: Any) -> tuple[tuple[type, ...], tuple[Any, ...] | None, Rang
         chosen = next((choice for choice in choices if choice is not None), None)
         return sum(kinds, ()), chosen, next((limit for limit in limits if limit is not None), None)
     return (hint,), None, None
+
+
+_LATE = ("Chain", "Condition", "Survey")
+"""Types that only Python gives; they take time to import."""
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """What the documentation says about an option."""
+
+    help: str
+    group: str = ""
+    """Its heading in the help of a long command."""
+    form: str = ""
+    """What its value looks like, or its unit: `METAVAR` of --help."""
+    unset: str = ""
+    """The default in words, where a value does not say it."""
+    short: str = ""
+    """A letter for the command line."""
+    usual: bool = False
+    """Whether most users need it; --help of a long command begins with these."""
+    name: str = ""
+    """Its name on the command line, if not that of the field."""
+    opposite: str = ""
+    """Name of the flag that says no, if there is one."""
+
+
+def option(default: Any, text: str, group: str = "", form: str = "", **more: Any) -> Any:
+    """A field that is an option; text: its help, which calls other options as the command does; more: of Option."""
+    return field(default=default, metadata={"option": Option(text, group, form, **more)})
+
+
+class Declared(NamedTuple):
+    """An option with what its annotation says."""
+
+    default: Any
+    told: Option
+    kinds: tuple[type, ...]
+    choices: tuple[Any, ...] | None
+    limits: Range | None
+
+
+@functools.cache
+def declared_options(kind: type) -> dict[str, Declared]:
+    """The options of a dataclass by the names of their fields."""
+    hints = typing.get_type_hints(kind, localns=dict.fromkeys(_LATE, object), include_extras=True)
+    declared = {one.name: one for one in fields(kind) if "option" in one.metadata}
+    return {
+        name: Declared(one.default, one.metadata["option"], *read_hint(hints[name])) for name, one in declared.items()
+    }
+
+
+def typed(name: str) -> str:
+    """An option as it is typed."""
+    return f"--{name.replace('_', '-')}"
+
+
+def check_options(options: Any) -> None:
+    """Raise ConfigError for an option that is none of its choices, or outside of its range."""
+    for name, one in declared_options(type(options)).items():
+        value, place = getattr(options, name), typed(one.told.name or name)
+        if value is None and type(None) in one.kinds:
+            continue
+        if one.choices is not None and value not in one.choices:
+            raise ConfigError(f"{place} {value!r}: choose {', '.join(map(str, one.choices))}")
+        if one.limits is not None and not one.limits.hold(value):
+            raise ConfigError(f"{place} {value!s:.20}: must lie {one.limits}")

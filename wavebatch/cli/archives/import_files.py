@@ -19,6 +19,7 @@ from wavebatch.cli.options import (
     for_each,
     from_options,
     name_outputs,
+    options_of,
     output_option,
 )
 from wavebatch.cli.program.completion import complete_files
@@ -34,12 +35,7 @@ EXIT_SOME, EXIT_NONE = 3, 4
 @declared("recursive")
 @output_option("Strip to write, .las or .laz, or a folder.  [default: X.las beside each X.pls]", "FILE|DIR",
                required=False, folder=None)
-@click.option("--returns", type=click.Choice(["strongest", "detect"]), default="strongest", show_default=True,
-              help="strongest: one point per recorded segment, at its strongest sample; detect: one at each maximum "
-              "that stands out of the noise.")
-@click.option("--internal/--external", default=False,
-              help="Store packets in the strip or in a .wdp file beside it.  [default: external]")
-@click.option("--resume", is_flag=True, help="Skip files whose strip is there and up to date.")
+@options_of(ImportOptions)
 @common_options("overwrite", "json")
 def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **options: Any) -> None:
     """Import PulseWaves FILEs (.pls with the .wvs beside it) as LAS 1.4 strips of point format 9.

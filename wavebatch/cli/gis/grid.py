@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -15,9 +15,7 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, count, talk, tell
 from wavebatch.cli.plot.clouds import find_clouds, select
 from wavebatch.cli.program.completion import complete_columns
-
-if TYPE_CHECKING:
-    from wavebatch.tools.rasters.grid import GridResult
+from wavebatch.tools.rasters.grid import GridOptions, GridResult, write_grid
 
 
 @click.command()
@@ -25,18 +23,11 @@ if TYPE_CHECKING:
 @shared.declared("recursive")
 @click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete_columns,
               help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
-@click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "std", "count", "density"]),
-              default="mean", show_default=True,
-              help="Statistic of the values in a cell; density is points per area.")
-@click.option("--size", type=float, default=1.0, show_default=True, metavar="M",
-              help="Side of a cell, in the unit of the coordinates. Borders are multiples of it, so that neighbouring "
-              "rasters fit together.")
+@shared.options_of(GridOptions, "statistic", "size")
 @shared.output_option("Raster to write: .tif.", "X.tif")
 @shared.bbox_option("Write")
 @shared.selection_options
-@click.option("--crs", metavar="CRS", help="CRS of the clouds, e.g. EPSG:32632.  [default: that of their headers]")
-@click.option("--no-data", type=float, default=-9999.0, show_default=True, metavar="VALUE",
-              help="Value of cells without data; nan is possible.")
+@shared.options_of(GridOptions, "crs", "no_data")
 @shared.common_options("overwrite", "json")
 def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
     """Write columns of CLOUDs as a GeoTIFF, of clouds of any size.
@@ -48,7 +39,6 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     Exit code: 0 done, 1 a cloud cannot be read or the raster cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.files.geotiff_file import check_raster
-    from wavebatch.tools.rasters.grid import GridOptions, write_grid
 
     paths = find_clouds(clouds, options)
     check_raster(output, overwrite=options["overwrite"])

@@ -18,6 +18,7 @@ from wavebatch.stages.pulse_tables import model_parameters, pulse_measures, puls
 from wavebatch.surveying.measuring.lone_echoes import ALONE, MIN_SNR, fit_lone
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, SMALL, find_edge
 from wavebatch.surveying.measuring.residuals import subtract_echoes
+from wavebatch.surveying.measuring.trial import TRIAL
 from wavebatch.surveying.systems.figures import Figures
 
 MOST_STACKED = 3000
@@ -198,6 +199,7 @@ def _learn(
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = max(REACHED * system.noise.std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
     small = len(block) < SMALL
+    most = min(most, TRIAL.get().most_components)
     sums = fit_gaussians(stack, width, most, 0.0 if small else goal)
     skewed = fit_skewed(stack, width)
     figures.misfit_goal, figures.misfit_skewed, figures.kappa = goal, skewed.rms, skewed.kappa

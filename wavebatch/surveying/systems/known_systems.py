@@ -30,6 +30,7 @@ from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
 from wavebatch.surveying.measuring.misfit import measure_misfit
 from wavebatch.surveying.measuring.noise_and_width import FEW, SMALL
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
+from wavebatch.surveying.measuring.trial import TRIAL
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.system_table import read_system
 
@@ -111,9 +112,13 @@ class KnownSystem:
     system: SystemPulse
 
 
-@cache
 def known_systems() -> tuple[KnownSystem, ...]:
-    """Return the shipped pulses by name."""
+    """Return the shipped pulses by name, without one that surveys must do without."""
+    return tuple(known for known in _load_all() if known.name != TRIAL.get().left_out)
+
+
+@cache
+def _load_all() -> tuple[KnownSystem, ...]:
     return tuple(_load(path) for path in sorted(Path(__file__).parent.glob("*.toml")))
 
 

@@ -10,10 +10,11 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from wavebatch import __version__
 from wavebatch.core.errors import InputError
+from wavebatch.core.schema import option
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.las.header import Vlr, read_header
@@ -36,13 +37,15 @@ USER_ID = b"wavebatch_import"
 class ImportOptions:
     """How files are imported."""
 
-    internal: bool = False
-    """Packets go into the strip, else into a .wdp."""
-    returns: str = "strongest"
-    """`strongest`: a point at the strongest sample of each segment; `detect`: at each maximum that stands out."""
+    returns: Literal["strongest", "detect"] = option(
+        "strongest", "strongest: one point per recorded segment, at its strongest sample; detect: one at each maximum "
+        "that stands out of the noise.",
+    )  # fmt: skip
+    internal: bool = option(
+        False, "Store packets in the strip or in a .wdp file beside it.", opposite="external", unset="external"
+    )
     overwrite: bool = False
-    resume: bool = False
-    """Skip files whose strip is there and was made from the same bytes with the same options."""
+    resume: bool = option(False, "Skip files whose strip is there and up to date.")
 
     def describe(self) -> dict[str, Any]:
         """Return what changes the strip."""

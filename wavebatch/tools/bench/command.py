@@ -6,16 +6,18 @@ SCHEMA when they change. All but times and memory is the same for the same optio
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from wavebatch import __version__
 from wavebatch.batch.unit import BLOCK_SAMPLES
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.schema import Range, option
 from wavebatch.stages.chain import Chain
 from wavebatch.tools.bench.accuracy import Group, Tally, derive_seed, describe_found, make_groups
 from wavebatch.tools.bench.chains import AUTO, choose_chains, find_twin, list_methods, load_chains
@@ -40,15 +42,13 @@ class BenchOptions:
     """Named scenes, in addition to the strip."""
     chains: tuple[Path, ...] = ()
     """Chain files, in addition to the shipped chains."""
-    all_methods: bool = False
-    """Measure every detector and decomposer too, each in its own chain."""
+    all_methods: bool = option(False, "Also measure every detector and every decomposer.")
     seed: int = 0
-    waveforms: int = 65_536
-    """Simulated waveforms per scene."""
-    repeats: int = 3
-    """Times that every chain is timed."""
-    pulses: int = 50_000
-    """Pulses of the strip that is timed from file to file; 0: kernels only."""
+    waveforms: Annotated[int, Range(1, math.inf)] = option(65_536, "Simulated waveforms per scene.", form="N")
+    repeats: Annotated[int, Range(1, math.inf)] = option(3, "Repetitions of the timing.", form="N", name="repeat")
+    pulses: Annotated[int, Range(0, math.inf)] = option(
+        50_000, "Pulses of the strip that is timed from file to file; 0: time the algorithms only.", form="N"
+    )
     tolerance_cm: float | None = None
     """Largest error of the range of isolated echoes for the choice of the cheapest chain."""
 

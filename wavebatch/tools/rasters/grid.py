@@ -9,11 +9,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.schema import Above, check_options, option
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
 from wavebatch.files.las.checked_header import read_checked_header
@@ -35,13 +37,19 @@ class GridOptions:
 
     selection: Selection
     """A band for each of its columns; points are counted without one."""
-    statistic: str = "mean"
+    statistic: Literal["mean", "median", "min", "max", "std", "count", "density"] = option(
+        "mean", "Statistic of the values in a cell; density is points per area."
+    )
     bbox: Box | None = None
     """Only this part."""
-    size: float = 1.0
-    """Side of a cell, in units of the coordinates."""
-    crs: str | None = None
-    no_data: float = -9999.0
+    size: Annotated[float, Above(0.0, LARGEST_SIZE)] = option(
+        1.0, "Side of a cell, in the unit of the coordinates. Borders are multiples of it, so that neighbouring "
+        "rasters fit together.", form="M",
+    )  # fmt: skip
+    crs: str | None = option(
+        None, "CRS of the clouds, e.g. EPSG:32632.", form="CRS", unset="that of their headers"
+    )
+    no_data: float = option(-9999.0, "Value of cells without data; nan is possible.", form="VALUE")
 
 
 @dataclass(slots=True, kw_only=True)
@@ -90,8 +98,7 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
 def _check(options: GridOptions) -> None:
     check_cells(options.statistic, options.bbox)
     check_statistic(options.selection.column, options.statistic)
-    if not 0 < options.size <= LARGEST_SIZE:
-        raise ConfigError(f"--size must be more than 0 and at most {LARGEST_SIZE:g}, got {options.size:g}")
+    check_options(options)
     if not (math.isnan(options.no_data) or abs(options.no_data) <= float(np.finfo(np.float32).max)):
         raise ConfigError(f"--no-data must be nan or a number that float32 holds, got {options.no_data:g}")
 

@@ -7,10 +7,12 @@ simulation: lobes of equal length are painted together, noise is drawn in cache-
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.strip.packets import MAX_SAMPLES
@@ -19,10 +21,7 @@ from wavebatch.tools.simulate.pulses import PulseModel, main_lobe, spread_lobes
 REACH = 5.5
 """Lobes are painted this many sigma to both sides: beyond it they are below 3e-7 of their height."""
 
-LEAST_SPACING, MOST_SPACING = 0.001, 4000.0
-"""Time between two samples [ns]: descriptors hold it in 32 bits of picoseconds."""
-
-MOST_NOISE, MOST_NOISE_GAIN = 1e10, 1e6
+MOST_NOISE = 1e10
 """More noise than any digitizer shows, as in the files of surveys: beyond it float32 overflows."""
 
 _ROWS = 2048
@@ -33,35 +32,37 @@ _ROWS = 2048
 class Recording:
     """How the simulated receiver records: window, levels, noise and system pulse."""
 
-    n_samples: int = 80
-    spacing: float = 1.0
-    """Time between two samples [ns]."""
-    bits: int = 8
-    baseline: float = 12.0
-    """Mean level without signal [count]."""
+    n_samples: Annotated[int, Range(8, MAX_SAMPLES)] = option(
+        80, "Samples per waveform.", name="samples", unset="the scene's, 80 or 96"
+    )
+    spacing: Annotated[float, Range(0.001, 4000.0)] = option(
+        1.0, "Time between samples [ns].", form="NS", unset="1"
+    )  # descriptors hold it in 32 bits of picoseconds
+    bits: Literal[8, 16, 32] = option(8, "Bits per sample.", unset="8")
+    baseline: float = option(12.0, "Level without signal [DN].", unset="12")
     baseline_spread: float = 0.4
     """Standard deviation of the level between waveforms [count]."""
-    noise_std: float = 1.0
-    """Standard deviation of the noise before rounding [count]."""
-    rho: float = 0.0
-    """Correlation of the noise of neighbouring samples: 0 (white) or m/(m+1), m = 1, 2, ... (binomial filters)."""
-    noise_gain: float = 0.0
-    """Variance that the signal adds, per count of signal [count]."""
-    saturation: int | None = None
-    """Count at which the receiver clips; None: the digitizer's largest."""
+    noise_std: Annotated[float, Range(0.0, MOST_NOISE)] = option(
+        1.0, "Standard deviation of the noise before rounding [DN].", form="DN", name="noise",
+        unset="the scene's, 1 or 1.2",
+    )  # fmt: skip
+    rho: float = option(
+        0.0, "Correlation of the noise of neighbouring samples: 0, .5, .667, .75 or .8.", unset="0"
+    )  # m/(m+1), m = 1, 2, ...: binomial filters
+    noise_gain: Annotated[float, Range(0.0, 1e6)] = option(
+        0.0, "Noise variance that the signal adds [DN2 per DN].", form="DN", unset="0"
+    )
+    saturation: int | None = option(
+        None, "Count at which the receiver saturates [DN].", unset="the largest that the bits can hold"
+    )
     pulse: PulseModel = field(default_factory=PulseModel)
 
     def __post_init__(self) -> None:
-        known_spacing = LEAST_SPACING <= self.spacing <= MOST_SPACING
+        check_options(self)
         check = {
-            "bits must be 8, 16 or 32": self.bits in (8, 16, 32),
-            f"n_samples must lie from 8 to {MAX_SAMPLES}": 8 <= self.n_samples <= MAX_SAMPLES,
-            f"spacing must lie from {LEAST_SPACING} to {MOST_SPACING} ns": known_spacing,
-            f"noise_std must lie from 0 to {MOST_NOISE:g}": 0 <= self.noise_std <= MOST_NOISE,
-            f"noise_gain must lie from 0 to {MOST_NOISE_GAIN:g}": 0 <= self.noise_gain <= MOST_NOISE_GAIN,
             f"the pulse's sigma, {self.pulse.sigma:g} ns, must be no longer than the "
             f"waveform, {self.n_samples} samples {self.spacing:g} ns apart": self.pulse.sigma
-            <= min(self.n_samples, MAX_SAMPLES) * self.spacing,
+            <= self.n_samples * self.spacing,
             "rho must be 0 or m/(m+1): .5, .667, .75, .8 ...": 0 <= self.rho < 0.95
             and abs(self.rho - self.color / (self.color + 1)) < 0.006,
             "baseline must lie from 0 to below the largest count": 0 <= self.baseline < self.clip,

@@ -8,17 +8,19 @@ shares are at most 1 together.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 from wavebatch.tools.simulate.pulses import PulseModel
-from wavebatch.tools.simulate.render import Recording
+from wavebatch.tools.simulate.render import MOST_NOISE, Recording
 
 EQUAL = "equal"
 """Word in place of a column of shares: the returns of a pulse take the same share each, as many as it had."""
@@ -29,27 +31,6 @@ WIDEST = 50.0
 _MOST_LIMITED = 0.5
 """Largest share of the widths of a column that may be limited: with more, the column is not what was meant."""
 
-RADAR_LIMITS = {
-    "power": (1e-6, 1e12),
-    "aperture": (1e-4, 100.0),
-    "divergence": (1e-6, 0.1),
-    "efficiency": (1e-6, 1.0),
-    "attenuation": (0.0, 100.0),
-}
-"""Least and largest values of the lidar equation, in the units of Radar: beyond them no lidar is, and numbers end."""
-
-INTENSITIES = ("peak", "reflectance")
-"""Meanings of the intensities of a cloud, see SynthesisOptions."""
-
-MOST_WIDTH = 1000.0
-"""Largest full width of a pulse [ns]."""
-
-MOST_GAIN = 1e20
-"""Largest gain: amplitudes must stay numbers in float32."""
-
-MOST_HEIGHT = 1e6
-"""Largest height of a sensor [m]."""
-
 _TOLERANCE = 1e-4
 """Shares that are stored as float32 or in steps of 1e-4 may be above 1 by so much."""
 
@@ -58,68 +39,73 @@ _TOLERANCE = 1e-4
 class Radar:
     """Parameters of the lidar equation besides range and reflectance, see kernels.physics.radar."""
 
-    height: float
-    """Height of the sensor, in the height system of the cloud [m]."""
-    power: float = 1.0
-    """Peak power of the pulse [W]; matters only with a gain."""
-    aperture: float = 0.1
-    """Diameter of the receiver [m]."""
-    divergence: float = 0.5e-3
-    """Full angle of the beam [rad]."""
-    efficiency: float = 0.5
-    """Share of the light that the optics let through."""
-    attenuation: float = 0.22
-    """Attenuation by the air [dB/km]."""
+    height: Annotated[float, Range(-1e6, 1e6)] = option(
+        MISSING, "Reflectance: height of the sensor, in the heights of CLOUD [m].", form="M", name="sensor-height"
+    )
+    power: Annotated[float, Range(1e-6, 1e12)] = option(
+        1.0, "Reflectance: peak power of the pulse [W].", form="W", unset="1"
+    )  # matters only with a gain
+    aperture: Annotated[float, Range(1e-4, 100.0)] = option(
+        0.1, "Reflectance: diameter of the receiver [m].", form="M", unset="0.1"
+    )
+    divergence: Annotated[float, Range(0.001, 100.0)] = option(
+        0.5, "Reflectance: full angle of the beam [mrad].", form="MRAD", unset="0.5"
+    )
+    efficiency: Annotated[float, Range(1e-6, 1.0)] = option(
+        0.5, "Reflectance: efficiency of the optics.", form="SHARE", unset="0.5"
+    )
+    attenuation: Annotated[float, Range(0.0, 100.0)] = option(
+        0.22, "Reflectance: attenuation of the air [dB/km].", form="DB_KM", unset="0.22"
+    )
 
     def __post_init__(self) -> None:
-        for name, (least, most) in RADAR_LIMITS.items():
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ConfigError(f"lidar equation: {name} must lie from {least:g} to {most:g}, it is {value:g}")
-        if not abs(self.height) <= MOST_HEIGHT:
-            raise ConfigError(f"lidar equation: the sensor's height must lie within +-{MOST_HEIGHT:g} m")
+        check_options(self)
 
 
 @dataclass(frozen=True, slots=True)
 class SynthesisOptions:
     """How returns become waveforms."""
 
-    intensity: str = "peak"
-    """`peak`: intensities are peak amplitudes; `reflectance`: they are reflectances, weakened by the lidar equation."""
-    gain: float | None = None
-    """`peak`: DN per unit of intensity; `reflectance`: DN per W, where intensity 65535 is reflectance 1. None: chosen
-    so that the strongest returns fill FULL_SHARE of the digitizer's range."""
+    intensity: Literal["peak", "reflectance"] = option(
+        "peak", "Meaning of the intensities: peak amplitudes, or reflectances (65535 is 1), from which the lidar "
+        "equation computes amplitudes.",
+    )  # fmt: skip
+    gain: Annotated[float | None, Above(0.0, 1e20)] = option(
+        None, "DN per unit of intensity, or per W.", form="DN", unset="fills 80 % of the digitizer"
+    )  # amplitudes must stay numbers in float32
     radar: Radar | None = None
     """Needed for `reflectance`, and only there."""
-    width: float = 4.7
-    """Full width at half maximum of the pulse [ns], and of echoes whose width is not known."""
-    widths: str | None = None
-    """Column of the cloud with the full width at half maximum of each echo [ns]; None: echo_width, where it has it."""
-    shares: str | None = None
-    """Column with the share of the beam that each return takes, or `equal`; only for `reflectance`. None: reflectances
-    are those of surfaces that fill the beam."""
-    spacing: float = 1.0
-    """Time between two samples [ns]."""
-    bits: int = 8
-    baseline: float = 12.0
-    """Level without signal [DN]."""
-    noise: float = 0.0
-    """Standard deviation before rounding [DN]."""
+    width: Annotated[float, Above(0.0, 1000.0)] = option(
+        4.7, "Full width of the pulse at half maximum [ns], and of echoes without a width of their own.", form="NS"
+    )
+    widths: str | None = option(
+        None, "Column with the full width of each echo at half maximum [ns].", form="COLUMN",
+        unset="echo_width, if present",
+    )  # fmt: skip
+    shares: str | None = option(
+        None, "Reflectance: column with the share of the footprint that each return takes, 0 to 1, or equal. Returns "
+        "without data take evenly what the others of their pulse leave; shares above 1 together are scaled to 1.",
+        form="COLUMN|equal", unset="each return fills it",
+    )  # fmt: skip
+    spacing: Annotated[float, Range(0.001, 4000.0)] = option(1.0, "Time between samples [ns].", form="NS")
+    bits: Literal[8, 16, 32] = option(8, "Bits per sample.")
+    baseline: float = option(12.0, "Level without signal [DN].")
+    noise: Annotated[float, Range(0.0, MOST_NOISE)] = option(
+        0.0, "Standard deviation of the noise before rounding [DN].", form="DN"
+    )
     seed: int = 0
-    internal: bool = True
-    """Packets in the file itself, else in a .wdp next to it."""
+    internal: bool = option(
+        True, "Store packets in the file or in a .wdp file.", opposite="external", unset="internal"
+    )
 
     def __post_init__(self) -> None:
-        if self.intensity not in INTENSITIES:
-            raise ConfigError(f"intensity {self.intensity!r} is unknown; choose peak or reflectance")
+        check_options(self)
         if (self.radar is None) != (self.intensity == "peak"):
             raise ConfigError("the sensor's height is needed for intensity reflectance, and only there")
         if self.shares is not None and self.radar is None:
             raise ConfigError(
                 "shares of the beam need intensity reflectance: the peaks of returns hold their shares already"
             )
-        if not (0 < self.width <= MOST_WIDTH and (self.gain is None or 0 < self.gain <= MOST_GAIN)):
-            raise ConfigError(f"width and gain must be above 0, at most {MOST_WIDTH:g} ns and {MOST_GAIN:g}")
         if self.sigma < 0.5 * self.spacing:
             raise ConfigError(f"a pulse of {self.width} ns is too short for samples every {self.spacing} ns")
 
@@ -287,11 +273,11 @@ def _receive(reflectance: np.ndarray, rows: np.ndarray, radar: Radar, path: Path
         highest = rows["xyz"][:, 2].max()
         raise InputError(f"{path}: points as high as {highest:g} m lie above the sensor at {radar.height:g} m")
     return receive_power(
-        spread_cross_section(reflectance, distance, radar.divergence),
+        spread_cross_section(reflectance, distance, 1e-3 * radar.divergence),
         distance,
         transmitted=radar.power,
         aperture=radar.aperture,
-        divergence=radar.divergence,
+        divergence=1e-3 * radar.divergence,
         efficiency=radar.efficiency,
         attenuation=radar.attenuation,
     )

@@ -7,11 +7,12 @@ a DiscreteReceiver, which has no waveforms. Both models give a Returns table.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
 from wavebatch.tools.simulate.render import Recording
 
@@ -45,19 +46,18 @@ class DiscreteReceiver:
     A return fires at the first echo from which the amplitudes, summed over one dead zone, exceed the threshold.
     """
 
-    dead_zone: float = 0.65
-    """Least distance of two returns of a pulse [m]."""
-    threshold: float = 12.0
-    """[count]."""
-    most: int = 4
-    """Returns per pulse."""
+    dead_zone: Annotated[float, Above(0.0, 1e6)] = option(
+        0.65, "Discrete: least distance of two returns [m].", form="M", unset="0.65"
+    )
+    threshold: Annotated[float, Range(0.0, 1e10)] = option(
+        12.0, "Discrete: amplitude that triggers a return [DN].", form="DN", unset="12"
+    )
+    most: Annotated[int, Range(1, 15)] = option(
+        4, "Discrete: most returns per pulse.", name="most-returns", unset="4"
+    )
 
     def __post_init__(self) -> None:
-        if not (self.dead_zone > 0 and self.threshold >= 0 and 1 <= self.most <= 15):
-            raise ConfigError(
-                f"receiver: dead zone {self.dead_zone} m must be above 0, threshold {self.threshold} not below 0, "
-                f"and {self.most} returns must be 1 to 15"
-            )
+        check_options(self)
 
     def list_returns(self, truth: EchoTable, n: int) -> Returns:
         """The returns that the echoes of n pulses fire."""

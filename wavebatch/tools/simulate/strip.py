@@ -11,11 +11,13 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.extra_bytes import build_dtype
 from wavebatch.files.las.header import LasHeader
@@ -43,25 +45,24 @@ WKT = (
 class StripOptions:
     """How a simulated strip is stored; its contents are those of the scene."""
 
-    version: str | None = None
-    """LAS version; None: 1.3 for point formats 4 and 5, 1.4 for 9 and 10."""
-    point_format: int = 4
-    internal: bool = True
-    """Packets in the file itself, else in a .wdp next to it."""
-    scale: float = 0.001
-    """Unit of the stored coordinates [m]."""
-    without_waveform: float = 0.01
-    """Share of the pulses whose points have no packet (descriptor index 0)."""
-    keep_empty: bool = True
-    """A pulse without any echo keeps its packet and one point; else it is left out."""
-    toward: bool = True
-    """The stored vectors point to the sensor."""
+    point_format: Literal[4, 5, 9, 10] = option(4, "LAS point format.")
+    version: Literal["1.3", "1.4"] | None = option(
+        None, "LAS version.", name="las-version", unset="1.3 for point formats 4 and 5, else 1.4"
+    )
+    internal: bool = option(
+        True, "Store packets in the file or in a .wdp file.", opposite="external", unset="internal"
+    )
+    scale: Annotated[float, Range(1e-5, 1.0)] = option(0.001, "Unit of the stored coordinates [m].")
+    without_waveform: Annotated[float, Range(0.0, 1.0)] = option(0.01, "Share of the pulses without a packet.")
+    keep_empty: bool = option(
+        True, "Keep or leave out pulses without an echo.", opposite="drop-empty", unset="keep"
+    )
+    toward: bool = option(
+        True, "Direction of the packet vectors: toward or away from the sensor.", opposite="away", unset="toward"
+    )
 
     def __post_init__(self) -> None:
-        if self.point_format not in (4, 5, 9, 10):
-            raise ConfigError(f"point format {self.point_format} holds no waveforms; choose 4, 5, 9 or 10")
-        if not 0 <= self.without_waveform <= 1 or not 1e-5 <= self.scale <= 1:
-            raise ConfigError("the share without waveform must lie in 0 to 1, the coordinates' scale in 1e-5 to 1 m")
+        check_options(self)
 
     @property
     def las_version(self) -> str:

@@ -6,16 +6,18 @@ A slice is either a vertical plane, in metres, or an image of pulses by time. Li
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import HALF_C
 from wavebatch.kernels.geometry.hough import HoughLine, find_lines
 from wavebatch.tools.slices.lines import ScanLine, align_times, find_main_axis
 
-GEOMETRIES = ("plane", "time")
+_POSITIVE = Above(0.0, math.inf)
 _GAP, _PULSES_PER_GAP = 10.0, 3.0
 """Largest hole in a segment [pixels, pulses]: whichever is larger in a plane."""
 
@@ -24,24 +26,24 @@ _GAP, _PULSES_PER_GAP = 10.0, 3.0
 class SliceOptions:
     """How slices are cut and searched."""
 
-    geometry: str = "plane"
-    """`plane`: vertical plane, in metres; `time`: rows are pulses, columns are times on one axis for all pulses."""
-    std: float = 2.0
-    """Samples above this many standard deviations of their slice are searched."""
-    sigma: float = 2.0
-    """Standard deviation of the pulse [ns]."""
-    shortest: float = 20.0
-    """Least length of a segment [pixels]: a pixel is the length of a sample in a plane, else a sample or a pulse."""
-    most: int = 20
-    """Most segments per slice."""
+    geometry: Literal["plane", "time"] = option(
+        "plane", "plane: slices are vertical planes; time: rows are pulses, columns times on one axis."
+    )
+    std: Annotated[float, _POSITIVE] = option(
+        2.0, "Search samples above this many standard deviations of the slice, and above the noise.", form="STD"
+    )
+    sigma: Annotated[float, _POSITIVE] = option(
+        2.0, "Standard deviation of the pulse [ns].", form="NS", unset="surveyed from the strip"
+    )
+    shortest: Annotated[float, _POSITIVE] = option(
+        20.0, "Least length of a segment [pixels of one sample].", form="PIXELS"
+    )
+    most: Annotated[int, Range(1, math.inf)] = option(20, "Most segments per slice.", form="N")
     floor: float = 0.0
     """Samples up to this far above their level are not searched [DN]: the noise of the strip."""
 
     def __post_init__(self) -> None:
-        if self.geometry not in GEOMETRIES:
-            raise ConfigError(f"geometry {self.geometry!r} is unknown; choose plane or time")
-        if not (self.std > 0 and self.sigma > 0 and self.shortest > 0 and self.most >= 1):
-            raise ConfigError("std, sigma and shortest must be above 0, segments per slice at least 1")
+        check_options(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

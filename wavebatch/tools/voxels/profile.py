@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.deconvolve import (
     deconvolve_gold,
@@ -27,7 +29,6 @@ from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.reference_pulse import reference_pulse
 from wavebatch.surveying.measuring.learn_pulse import AFTER, BEFORE
 
-METHODS = ("richardson_lucy", "gold", "wiener")
 ITERATIONS = {"richardson_lucy": 40, "gold": 100}
 """Default iterations: Gold converges more slowly (docs/algorithms.md 2.5)."""
 
@@ -57,23 +58,25 @@ _REACH = 4.0
 class Deconvolution:
     """How waveforms are deconvolved, and how much signal counts as noise."""
 
-    method: str = "richardson_lucy"
-    iterations: int | None = None
-    """None: ITERATIONS of the method."""
-    snr: float | None = None
-    """For wiener; None: SNR."""
-    threshold: float = 4.27
-    """Least sum of a run of signal, in standard deviations of the amplitude of a lone echo."""
+    method: Literal["richardson_lucy", "gold", "wiener"] = option(
+        "richardson_lucy", "How waveforms are deconvolved with the system pulse."
+    )
+    iterations: Annotated[int | None, Range(1, 10_000)] = option(
+        None, "Iterations: more resolve closer surfaces, but take longer.", form="N", unset="40; gold: 100"
+    )
+    snr: Annotated[float | None, Above(0.0, 1e9)] = option(
+        None, "wiener: amplitude over noise for which the filter is designed.", form="RATIO", unset="20"
+    )
+    threshold: Annotated[float, Range(0.0, 1e9)] = option(
+        4.27, "Ignore signal weaker than a single echo of this many standard deviations of the noise.", form="STD"
+    )
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise ConfigError(f"method {self.method!r} is unknown; choose {', '.join(METHODS)}")
-        if self.iterations is not None and (self.method not in ITERATIONS or not 1 <= self.iterations <= 10_000):
-            raise ConfigError(f"--iterations {self.iterations}: give 1 to 10000; --method wiener has no --iterations")
-        if self.snr is not None and (self.method != "wiener" or not 0 < self.snr < 1e9):
-            raise ConfigError(f"--snr needs --method wiener and a number above 0, not {self.snr:g}")
-        if not 0 <= self.threshold < 1e9:
-            raise ConfigError("the threshold must not be below 0")
+        check_options(self)
+        if self.iterations is not None and self.method == "wiener":
+            raise ConfigError("--method wiener has no --iterations")
+        if self.snr is not None and self.method != "wiener":
+            raise ConfigError("--snr needs --method wiener")
 
     @property
     def steps(self) -> int | None:

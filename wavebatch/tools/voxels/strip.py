@@ -9,15 +9,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import MISSING, asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.column_reader import find_keep
@@ -45,10 +46,11 @@ from wavebatch.tools.voxels.rays import LightRule, trace_profiles
 BLOCK_SAMPLES = 1 << 20
 """Samples read at a time."""
 
+LARGEST = 1e6
+"""Largest voxel [m]."""
+
 _SAMPLED = 2048
 """Waveforms from which the middle and the extent of the strip are found."""
-_LARGEST = 1e6
-"""Largest voxel [m]."""
 _MOST_FITTING = 0.9
 """Share of the sampled rays that must fit the grid; fewer mean damaged coordinates or too small voxels."""
 
@@ -57,32 +59,28 @@ _MOST_FITTING = 0.9
 class VoxelOptions:
     """How a strip becomes voxels."""
 
-    size: float
-    """Edge of a voxel [m]."""
+    size: Annotated[float, Above(0.0, LARGEST)] = option(
+        MISSING, "Edge of a voxel [m]; the faces of voxels lie at multiples of it.", form="M"
+    )
     deconvolution: Deconvolution = field(default_factory=Deconvolution)
-    headroom: float | None = None
-    """Length before the first sample over which every ray counts too [m]; None: up to the highest return near it."""
-    all_crossed: bool = False
-    """Write voxels that rays crossed without any signal, too."""
-    ground_height: float = 0.5
-    """Signal up to this height above the ground is the ground's [m]."""
-    reflectance_ratio: float | None = None
-    """Reflectance of canopy over that of ground; None: estimated from the strip."""
+    headroom: Annotated[float | None, Range(0.0, 1e5)] = option(
+        None, "Count each ray from this distance before its first sample [m], whether recorded or not.", form="M",
+        unset="from the highest return near it",
+    )  # fmt: skip
+    all_crossed: bool = option(False, "Also write voxels that rays crossed without any signal.")
+    ground_height: Annotated[float, Range(0.0, 100.0)] = option(
+        0.5, "Signal up to this height above the lowest returns is the ground's [m].", form="M"
+    )
+    reflectance_ratio: Annotated[float | None, Range(LOWEST, HIGHEST)] = option(
+        None, "Reflectance of the canopy over that of the ground.", form="RATIO", unset="estimated from the strip"
+    )
     where: Condition | None = None
-    """Use only waveforms with a return that meets this, with all of their signal."""
+    """Use only waveforms of which a return meets this, with all of their signal."""
     energy: str | None = None
     """Energy of each emitted pulse, by which the signal is divided; see `find_pulse_energy`."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.size <= _LARGEST:
-            raise ConfigError(f"--size {self.size:g}: the size of a voxel must lie above 0 and up to {_LARGEST:g} m")
-        if self.headroom is not None and not 0 <= self.headroom < 1e5:
-            raise ConfigError(f"--headroom {self.headroom:g}: must lie between 0 and 100000 m")
-        if not 0 <= self.ground_height <= 100:
-            raise ConfigError(f"--ground-height {self.ground_height:g}: must lie between 0 and 100 m")
-        ratio = self.reflectance_ratio
-        if ratio is not None and not LOWEST <= ratio <= HIGHEST:
-            raise ConfigError(f"--reflectance-ratio {ratio:g}: must lie between {LOWEST:g} and {HIGHEST:g}")
+        check_options(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +254,7 @@ def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) ->
     begin = np.full(len(end), -(options.headroom or 0.0) / HALF_C)
     while np.mean(fits_keys(start - middle, step, begin, end, size)) < _MOST_FITTING:
         size *= 2
-        if size > _LARGEST:
+        if size > LARGEST:
             raise InputError(
                 f"{path}: its coordinates are spread over more than a grid can hold; see `wavebatch check`"
             )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,20 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.surveying.measuring.trial import Trial
+from wavebatch.tools.bench.real.agreement import (
+    LEAST,
+    Agreement,
+    Pulse,
+    compare_halves,
+    compare_models,
+    find_sensor,
+    survey_limited,
+)
 from wavebatch.tools.bench.real.false_echoes import FalseEchoes, count_false
 from wavebatch.tools.bench.real.inject import Injected, inject_echoes
 from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise
-from wavebatch.tools.bench.real.pool import Solver, read_pool
+from wavebatch.tools.bench.real.pool import Pool, Solver, read_pool
 from wavebatch.tools.bench.real.templates import TemplateSummary, learn_templates, summarize
 
 INJECTIONS = 8000
@@ -61,6 +71,8 @@ class Class:
     """Echoes found in their waveforms that neither were there before nor were injected."""
     apart: tuple[float, float] | None = None
     """Separation from the strongest echo [FWHM]."""
+    ratio: tuple[float, float, float] | None = None
+    """Error / reported error of those found, as in Calibration, where separations are classed."""
 
     @property
     def recall(self) -> float:
@@ -88,43 +100,20 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True)
-class Pulse:
-    """What a survey found, in the figures that are compared."""
-
-    waveforms: int
-    fwhm: float
-    """[ns]."""
-    noise: float
-    """[DN]."""
-    model: str
-    acceptance: float
-    """Least fall of chi2 for one more echo."""
-    digitizers: int
-    """Digitizers with another pulse or noise than the main one."""
-
-    @classmethod
-    def of(cls, solver: Solver) -> Pulse:
-        """The figures of a survey."""
-        system = solver.system
-        model = f"skewed {system.kappa:.3f}" if system.kappa else "Gaussian"
-        if len(system.components) > 1:
-            model = f"{len(system.components)} Gaussians"
-        return cls(
-            solver.survey.waveforms, solver.fwhm, system.noise.std, model, system.acceptance, len(system.digitizers)
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class RealReport:
     """How well the echoes of one strip are found."""
 
     strip: str
+    left_out: str
+    """Shipped pulse that the surveys did without, so that the sensor is a stranger; empty: none."""
     seed: int
     waveforms: int
     echoes: int
     survey: Pulse
+    agreement: list[Agreement]
     noise: QuietNoise
-    templates: TemplateSummary
+    templates: TemplateSummary | None
+    """None where too few echoes are clear to inject any."""
     quiet_by_sigma: list[Class]
     quiet_by_count: list[Class]
     near_by_separation: list[Class]
@@ -136,6 +125,11 @@ class RealReport:
     false_echoes: FalseEchoes
     seconds: dict[str, float]
 
+    @property
+    def title(self) -> str:
+        """The strip, and what its surveys did without."""
+        return f"{self.strip}, a stranger: without {self.left_out}" if self.left_out else self.strip
+
 
 def measure_real(
     path: Path | str,
@@ -144,8 +138,8 @@ def measure_real(
     injections: int = INJECTIONS,
     waveforms: int | None = None,
     say: Callable[[str], None] = lambda text: None,
-) -> RealReport:
-    """Injects echoes into a strip's waveforms, and counts false ones.
+) -> list[RealReport]:
+    """Injects echoes into a strip's waveforms, counts false ones, and compares surveys.
 
     Parameters
     ----------
@@ -155,43 +149,71 @@ def measure_real(
     waveforms : how many to read, spread over the strip; None: twice as many as a survey looks at.
     say : gets a line for each step.
 
+    Returns
+    -------
+    list of RealReport
+        One, and where the survey takes a shipped pulse another one without it.
+
     Raises
     ------
     InputError
-        Where the strip cannot be read or has too few clear echoes.
+        Where the strip cannot be read or has too few waveforms and clear echoes.
     """
+    pool = read_pool(path, waveforms)
+    if not len(pool):
+        raise InputError(f"{path}: holds no waveform to measure; `wavebatch check` says what it holds")
+    solver = Solver.of_blocks(pool.surveyed)
+    report = _measure(pool, solver, "", seed, injections, say)
+    sensor = find_sensor(solver)
+    report = replace(report, agreement=[*report.agreement, *compare_models(pool, solver, sensor)])
+    say(f"{pool.path.name}: surveys compared")
+    if not sensor:
+        return [report]
+    stranger = survey_limited(pool, Trial(sensor))
+    if stranger.survey.system == solver.survey.system:
+        return [report]
+    return [report, _measure(pool, stranger, sensor, seed, injections, say)]
+
+
+def _measure(
+    pool: Pool, solver: Solver, left_out: str, seed: int, injections: int, say: Callable[[str], None]
+) -> RealReport:
+    """The report of one survey of a strip; left_out: the shipped pulse that it did without."""
     seconds: dict[str, float] = {}
     begin = time.process_time()
 
     def note(step: str, text: str) -> None:
         seconds[step] = time.process_time() - begin - sum(seconds.values())
-        say(f"{pool.path.name}: {text}")
+        say(f"{pool.path.name}: {f'without {left_out}: ' if left_out else ''}{text}")
 
-    pool = read_pool(path, waveforms)
-    if not len(pool):
-        raise InputError(f"{path}: holds no waveform to measure; `wavebatch check` says what it holds")
-    note("read", f"{len(pool)} waveforms read")
-    solver = Solver.of_blocks(pool.surveyed)
-    note("survey", "surveyed")
     echoes = [solver.run(block) for block in pool.blocks]
     noise = measure_noise(pool, solver, echoes)
     draw = [np.random.default_rng((seed, number)) for number in range(3)]
-    templates = learn_templates(pool, solver, echoes, noise.std, draw[0])
+    try:
+        templates = learn_templates(pool, solver, echoes, noise.std, draw[0])
+    except InputError:
+        if len(pool) < 2 * LEAST:
+            raise
+        templates = []
     injected = inject_echoes(pool, solver, echoes, templates, noise, injections, draw[1])
     note("inject", f"{len(injected)} echoes injected")
     false = count_false(pool, solver, echoes, noise, draw[2])
     note("false", "residuals mirrored")
+    halves = compare_halves(pool, left_out)
+    note("agreement", "halves compared")
     quiet = ~injected.near & ~injected.clipped
     strong = _count_classes(injected, noise.std, (SPLIT,), quiet)
     clipped = _count_classes(injected, noise.std, (SPLIT,), ~injected.near & injected.clipped)
     return RealReport(
         strip=pool.path.name,
+        left_out=left_out,
         seed=seed,
         waveforms=len(pool),
         echoes=sum(map(len, echoes)),
         survey=Pulse.of(solver),
+        agreement=halves,
         noise=noise,
-        templates=summarize(templates),
+        templates=summarize(templates) if templates else None,
         quiet_by_sigma=_count_classes(injected, noise.std, SIGMAS, quiet),
         quiet_by_count=_count_classes(injected, 1.0, COUNTS, quiet),
         near_by_separation=_count_separations(injected, noise.std),
@@ -222,7 +244,7 @@ def _count_classes(injected: Injected, unit: float, borders: Sequence[float], wh
 
 
 def _count_separations(injected: Injected, noise: float) -> list[Class]:
-    """Recall near the strongest echoes by separation, before and after them, and amplitude."""
+    """Recall and errors near the strongest echoes by separation, before and after them, and amplitude."""
     rows = []
     size = injected.amplitude / noise
     for side, (near, far) in product((-1.0, 1.0), pairwise(APART)):
@@ -230,7 +252,8 @@ def _count_separations(injected: Injected, noise: float) -> list[Class]:
         inside = injected.near & (apart >= near) & (apart < far)
         for low, high in between(NEAR_SIGMAS):
             part = inside & (size >= low) & (size < high)
-            rows.append(_count(injected, part, low, high, apart=(side * near, side * far)))
+            errors = _measure_errors("near", low, high, injected, part & injected.found & ~injected.clipped)
+            rows.append(_count(injected, part, low, high, apart=(side * near, side * far), ratio=errors.ratio))
     return rows
 
 

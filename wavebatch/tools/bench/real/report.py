@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
 from wavebatch.tools.bench.plot import NO_PLOT
+from wavebatch.tools.bench.real.agreement import MOST_DIFFER, MOST_OFFSET, MOST_SCALE, Agreement
 from wavebatch.tools.bench.real.measure import APART, NEAR_SIGMAS, Calibration, Class, RealReport, between
 from wavebatch.tools.bench.report import align, write_texts
 
@@ -34,20 +35,29 @@ def format_report(report: RealReport) -> str:
     survey, noise, templates = report.survey, report.noise, report.templates
     correlation = " ".join(f"{value:.2f}" for value in noise.correlation) or "unknown"
     head = [
-        f"== {report.strip}: {report.waveforms} waveforms, {report.echoes} echoes, seed {report.seed}; ! misses a goal",
+        f"== {report.title}: {report.waveforms} waveforms, {report.echoes} echoes, seed {report.seed}; ! misses a goal",
         f"survey: FWHM {survey.fwhm:.3f} ns, noise {survey.noise:.2f} DN, {survey.model}, acceptance "
         f"{survey.acceptance:g}, digitizers that record otherwise: {survey.digitizers}",
         f"quiet samples: noise {noise.std:.2f} DN ({noise.samples} samples), correlation {correlation}",
-        f"templates: {templates.templates} of {templates.echoes} clear echoes, FWHM {templates.fwhm:.3f} ns; the chain "
-        f"finds {templates.gain:.4f} of their amplitude and {templates.widened:.4f} of their width",
     ]
+    if templates is None:
+        head.append("nothing injected: too few clear single echoes")
+        return "\n\n".join(map("\n".join, (head, _describe_false(report), _agreement_table(report.agreement))))
+    head.append(
+        f"templates: {templates.templates} of {templates.echoes} clear echoes, FWHM {templates.fwhm:.3f} ns; the chain "
+        f"finds {templates.gain:.4f} of their amplitude and {templates.widened:.4f} of their width"
+    )
+    near = report.near_by_separation
     parts = [
         head,
         _recall_table("in quiet stretches, noise std", report.quiet_by_sigma),
         _recall_table("in quiet stretches, DN", report.quiet_by_count),
-        _separation_table(report.near_by_separation),
+        _separation_table("found %", near, lambda row: f"{100 * row.recall:.0f}"),
+        _separation_table("further echoes %", near, lambda row: f"{100 * row.extra / row.injected:.0f}"),
+        _separation_table("time error / reported", near, lambda row: f"{row.ratio[0]:.2f}" if row.found else "-"),
         [*_describe_splits(report), *_describe_false(report)],
         _calibration_table(report.calibration),
+        _agreement_table(report.agreement),
     ]
     return "\n\n".join(map("\n".join, parts))
 
@@ -64,15 +74,15 @@ def _recall_table(title: str, rows: Sequence[Class]) -> list[str]:
     ])  # fmt: skip
 
 
-def _separation_table(rows: Sequence[Class]) -> list[str]:
-    """A line per separation, before and after the strongest echo."""
+def _separation_table(title: str, rows: Sequence[Class], show: Callable[[Class], str]) -> list[str]:
+    """A figure of each class: a line per separation, before and after the strongest echo."""
     cells = {(row.low, row.apart): row for row in rows}
     spans = [_span(low, high) for low, high in between(NEAR_SIGMAS)]
     heads = [f"{side} {span}" for side in ("before", "after") for span in spans]
-    lines = [["found % near the strongest echo, FWHM", *heads]]
+    lines = [[f"{title} near the strongest echo, FWHM", *heads]]
     for near, far in pairwise(APART):
         row = [cells[low, (side * near, side * far)] for side in (-1.0, 1.0) for low in NEAR_SIGMAS]
-        lines.append([_span(near, far), *(f"{100 * c.recall:.0f}" if c.injected >= LEAST_SHOWN else "-" for c in row)])
+        lines.append([_span(near, far), *(show(one) if one.injected >= LEAST_SHOWN else "-" for one in row)])
     return align(lines)
 
 
@@ -117,14 +127,37 @@ def _calibration_table(rows: Sequence[Calibration]) -> list[str]:
     return align(lines)
 
 
+def _agreement_table(rows: Sequence[Agreement]) -> list[str]:
+    """A line per pair of surveys."""
+    heads = ["waveforms", "FWHM ns", "noise DN", "model", "other count %", "dt ns", "|dt| ns", "amplitude", "width"]
+    lines = [["surveys of parts", *heads]]
+    for row in rows:
+        one, other = row.surveys
+        lines.append([
+            row.parts,
+            f"{one.waveforms}/{other.waveforms}",
+            f"{one.fwhm:.3f}/{other.fwhm:.3f}",
+            f"{one.noise:.2f}/{other.noise:.2f}",
+            one.model if one.model == other.model else f"{one.model}/{other.model}",
+            f"{100 * row.differ:.2f}{'!' * (row.differ >= MOST_DIFFER)}",
+            f"{row.offset:+.4f}{'!' * (abs(row.offset) >= MOST_OFFSET)}",
+            f"{row.apart:.4f}{'!' * (row.apart >= MOST_OFFSET)}",
+            f"{row.amplitude_ratio:.4f}{'!' * (abs(row.amplitude_ratio - 1) >= MOST_SCALE)}",
+            f"{row.width_ratio:.4f}",
+        ])  # fmt: skip
+    return align(lines)
+
+
 def write_report(report: RealReport, folder: Path) -> str:
     """Writes real-STRIP.json, .txt and, with matplotlib, .png into a folder, replacing old ones; returns a line.
 
     Raises InputError where it cannot write.
     """
-    stem = f"real-{Path(report.strip).stem}"
+    stem = f"real-{Path(report.strip).stem}{'-left-out' if report.left_out else ''}"
     document = json.dumps(without_nan(asdict(report)), indent=1, sort_keys=True, allow_nan=False)
     written = write_texts(folder, {f"{stem}.json": document, f"{stem}.txt": format_report(report)})
+    if report.templates is None:
+        return written
     if not has_matplotlib():
         return f"{written}; {NO_PLOT}"
     draw_report(report, folder / f"{stem}.png")
