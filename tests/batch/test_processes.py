@@ -13,6 +13,8 @@ from concurrent.futures import Future
 import pytest
 
 from wavebatch.batch.workers.processes import WorkerDied, Workers
+from wavebatch.batch.workers.processor import _probe_alone
+from wavebatch.tools.bench.worker import Worker
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 
@@ -158,6 +160,16 @@ def test_a_script_needs_no_main_guard(tiny_strip, tmp_path):
     done = _run_script(tmp_path, tiny_strip, _SCRIPT)
     assert done.returncode == 0 and done.stderr == "" and (tmp_path / "out" / "tiny.laz").exists()
     assert done.stdout.splitlines() == ["script runs", "BatchResult(1 strip written, 0 skipped, 0 failed)"]
+
+
+def test_no_process_runs_what_lies_in_the_current_folder(tmp_path, monkeypatch):
+    """A folder of data may hold a `signal.py`: runs with --jobs and benchmarks failed there, or ran it."""
+    (tmp_path / "signal.py").write_text("import pathlib\npathlib.Path('ran').touch()\nraise SystemExit\n")
+    monkeypatch.chdir(tmp_path)
+    with Workers(1) as workers, Worker() as worker:
+        assert workers.submit(square, 3).result() == 9 and worker.call(abs, -1) == 1
+    assert _probe_alone.__wrapped__()
+    assert [path.name for path in tmp_path.iterdir()] == ["signal.py"]
 
 
 @pytest.mark.slow

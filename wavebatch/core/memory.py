@@ -19,6 +19,10 @@ ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """Variables that keep libraries to one thread, in processes that start with them: wavebatch's arrays are too small for
 more, and the last bits of a product depend on how it is shared out."""
 
+CHILD = {**dict.fromkeys(ONE_THREAD, "1"), "PYTHONSAFEPATH": "1"}
+"""Variables of processes that wavebatch starts: one thread, and no modules from the current folder, where a `signal.py`
+that came with the data would run."""
+
 
 def keep_freed_memory() -> bool:
     """Asks glibc to keep freed arrays instead of returning them to the operating system.

@@ -30,7 +30,7 @@ from wavebatch.batch.workers.futures import end_future, settle, wait_uninterrupt
 from wavebatch.batch.workers.serve import PATIENCE, serve_calls
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
-from wavebatch.core.memory import ONE_THREAD, keep_freed_memory
+from wavebatch.core.memory import CHILD, keep_freed_memory
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 _POLL = 1.0
@@ -304,13 +304,13 @@ def _no_main() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _single_threaded() -> Iterator[None]:
-    """Libraries of processes that are started inside use one thread each."""
-    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    """Libraries of processes that are started inside use one thread each, and modules of the installation only."""
+    before = {name: os.environ[name] for name in CHILD if name in os.environ}
+    os.environ.update(CHILD)
     try:
         yield
     finally:
-        for name in ONE_THREAD:
+        for name in CHILD:
             del os.environ[name]
         os.environ.update(before)
 

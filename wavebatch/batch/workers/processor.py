@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.memory import ONE_THREAD
+from wavebatch.core.memory import CHILD
 
 _PROBE = "from wavebatch.batch.workers.processor import probe_arithmetic; print(probe_arithmetic())"
 
@@ -48,7 +48,7 @@ def describe_processor() -> dict[str, str]:
 def _probe_alone() -> str:
     root = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {**os.environ, **dict.fromkeys(ONE_THREAD, "1"), "PYTHONPATH": path}
+    environment = {**os.environ, **CHILD, "PYTHONPATH": path}
     found = subprocess.run([sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, check=True)
     return found.stdout.strip()
 

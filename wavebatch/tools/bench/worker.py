@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.core.errors import StageError
-from wavebatch.core.memory import ONE_THREAD
+from wavebatch.core.memory import CHILD
 from wavebatch.files.disk.closing import Closing
 
 _START = "from wavebatch.tools.bench.worker import serve; serve()"
@@ -31,7 +31,7 @@ class Worker(Closing):
 
     def __init__(self) -> None:
         path = [str(Path(__file__).resolve().parents[3]), *filter(None, [os.environ.get("PYTHONPATH")]), *sys.path]
-        environment = {**os.environ, **dict.fromkeys(ONE_THREAD, "1"), "PYTHONPATH": os.pathsep.join(path)}
+        environment = {**os.environ, **CHILD, "PYTHONPATH": os.pathsep.join(path)}
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
         )
