@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @shared.output_option("Calibration file to write.", "CAL.toml")
 @click.option("--reflectance-error", type=click.FloatRange(0.0, 1.0), default=0.03, show_default=True, metavar="SHARE",
               help="Relative standard deviation of the reflectances of the targets, or of the column.")
-@click.option("--attenuation", type=click.FloatRange(0.0, 100.0), metavar="DB/KM",
+@click.option("--attenuation", type=click.FloatRange(0.0, 100.0), metavar="DB_KM",
               help="Attenuation of the air, one way [dB/km].  [default: 0.22 at 1064 nm]")
 @click.option("--wavelength", type=click.FloatRange(300.0, 2500.0), default=1064.0, show_default=True, metavar="NM",
               help="Of the laser [nm]: clear air takes more of short waves where --attenuation is not given.")

@@ -132,7 +132,8 @@ def floats_option(name: str, form: str, text: str) -> Callable:
 
 def bbox_option(text: str) -> Callable:
     """`--bbox` of a picture or a raster; text: what is done with the part."""
-    return declared("bbox", f"{text} only this part: west, south, east, north [m].  [default: all]")
+    part = "west, south, east, north, in the coordinates of the clouds"
+    return declared("bbox", f"{text} only this part: {part}.  [default: all]")
 
 
 _READERS: dict[str, Callable[[str], Any]] = {
