@@ -3,6 +3,7 @@
 import errno
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -210,6 +211,15 @@ def test_permission_error_names_the_remedy(tmp_path, monkeypatch):
     monkeypatch.setattr(publish.os, "open", refuse)
     with pytest.raises(InputError, match="a: cannot be written: Permission denied; check the folder's permissions$"):
         Draft(tmp_path / "a", overwrite=False)
+
+
+def test_a_claim_that_cannot_be_made_names_the_folder(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(publish, "_lock", refuse)
+    with pytest.raises(InputError, match=f"{re.escape(str(tmp_path))}: cannot be written: Permission denied; check"):
+        publish.Claim(tmp_path, "strip")
 
 
 def test_published_files_get_the_usual_permissions(tmp_path):

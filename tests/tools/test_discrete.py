@@ -49,7 +49,7 @@ def test_receiver_without_echoes_has_no_returns():
 
 @pytest.mark.parametrize("wrong", [{"dead_zone": 0.0}, {"threshold": -1.0}, {"most": 0}, {"most": 16}])
 def test_wrong_receivers_are_refused(wrong):
-    with pytest.raises(ConfigError, match="receiver"):
+    with pytest.raises(ConfigError, match="must lie"):
         DiscreteReceiver(**wrong)
 
 

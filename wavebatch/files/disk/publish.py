@@ -194,7 +194,7 @@ class Claim:
         digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
         self._path = folder / f"{_PREFIX}lock-{digest}{_SUFFIX}"
         deadline = time.monotonic() + _CLAIM_PATIENCE
-        with uninterrupted(), reporting(folder / name):
+        with uninterrupted(), reporting(folder):
             while self._descriptor is None:
                 try:
                     self._descriptor = _lock(self._path)
