@@ -390,7 +390,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
         if len(block) < SMALL:
-            doubt = 1 - len(_find_sure(block, unsure, strong)) / max(len(echoes), 1)
+            doubt = _doubt_echoes(block, unsure, system, strong, len(echoes)) / max(len(echoes), 1)
             figures.echoes_in_doubt = max(doubt, figures.echoes_in_doubt or 0.0)
     else:
         part = thin_block(block, RESIDUAL_LOOK)
@@ -403,20 +403,26 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     return Survey(system, len(block), figures, decisions)
 
 
-def _find_sure(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> EchoTable:
-    """The echoes of a small strip that noise and misfit leave no doubt of.
+def _doubt_echoes(
+    block: WaveformBlock, unsure: SystemPulse, system: SystemPulse, strong: EchoTable, number: int
+) -> int:
+    """How many echoes of a small strip more or fewer there may be: the larger of what noise and misfit leave in doubt.
 
-    The noise is two standard errors larger, by its quiet samples. What few strong echoes miss a pulse of the strip's
-    own by is all misfit: it may change from shot to shot, and have nothing in common.
+    The noise is two standard errors larger or smaller, by its quiet samples. What few strong echoes miss a pulse of
+    the strip's own by is all misfit where it is larger: it may change from shot to shot, and have nothing in common.
+    unsure: the system before its misfit was measured. number: of the echoes that were found.
     """
     width = system.sigma_ref / block.spacing
     missing = None if block.missing is None else keep_longest(block.missing.T)
     quiet = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing).share
-    error = np.sqrt(PULSE_SAMPLES * width / (2 * max(quiet * block.samples.size, 1)))
+    error = min(2 * np.sqrt(PULSE_SAMPLES * width / (2 * max(quiet * block.samples.size, 1))), 0.5)
     if find_source(system) is None:
-        system = measure_misfit(block, system, strong, bounded=False)
-    noise = replace(system.noise, std=float(system.noise.std * (1 + 2 * error)))
-    return decompose_sample(block, replace(system, noise=noise))
+        unsure = measure_misfit(block, unsure, strong, bounded=False)
+    fewest, most = (
+        len(decompose_sample(block, replace(one, noise=replace(one.noise, std=float(one.noise.std * factor)))))
+        for one, factor in ((unsure, 1 + error), (system, 1 - error))
+    )
+    return max(number - fewest, most - number)
 
 
 def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
