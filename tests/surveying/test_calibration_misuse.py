@@ -14,11 +14,12 @@ from tests import footprints
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, path_of, write_strip, write_trajectory
 from tests.footprints import Flight, Plane
 from wavebatch.cli import main
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.physics.pulse_energies import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -300,3 +301,18 @@ def test_reflectances_that_were_measured_from_aside_get_the_hot_spot(tmp_path, c
     done = call("calibrate", calibrated / "a.las", "--targets", write_targets(tmp_path / "t.csv", "geometry=8/d"),
                 "-o", tmp_path / "d.toml")  # fmt: skip
     assert done.exit_code == 2 and "geometry must be backscatter or directional or hemispherical" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("wrong", "place"),
+    [({"divergence": 0.0}, "--divergence 0.0"), ({"reflectance_error": 1.5}, "--reflectance-error 1.5")],
+)
+def test_python_checks_the_options_of_a_calibration_as_the_command_does(wrong, place):
+    with pytest.raises(ConfigError, match=f"{place}: must lie"):
+        CalibrationOptions(**wrong)
+
+
+def test_clear_air_takes_less_of_long_waves_unless_its_attenuation_is_given():
+    assert CalibrationOptions().air == 0.22
+    assert CalibrationOptions(wavelength=1550.0).air < 0.22 < CalibrationOptions(wavelength=532.0).air
+    assert CalibrationOptions(wavelength=532.0, attenuation=0.1).air == 0.1

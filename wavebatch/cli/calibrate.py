@@ -18,11 +18,11 @@ from wavebatch.cli.messages import answer, count, format_json, talk, tell
 from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.inputs import find_files
+from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
     from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
-    from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
     from wavebatch.surveying.calibration import ChannelConstant, StripConstant, TargetResult
 
 
@@ -33,19 +33,11 @@ if TYPE_CHECKING:
                     text="Targets: GeoJSON polygons with the property reflectance, in WGS 84, in the CRS that the file "
                     "names, or in the coordinates of the strips; or CSV with reflectance and x, y, radius or vertices, "
                     "in the coordinates of the strips only.")
-@click.option("--from-column", "column", metavar="NAME",
-              help="In place of targets: an extra byte with the vendor's reflectances, in dB or as shares of 1.")
+@shared.options_of(CalibrationOptions, "column")
 @shared.output_option("Calibration file to write.", "CAL.toml")
-@click.option("--reflectance-error", type=click.FloatRange(0.0, 1.0), default=0.03, show_default=True, metavar="SHARE",
-              help="Relative standard deviation of the reflectances of the targets, or of the column.")
-@click.option("--attenuation", type=click.FloatRange(0.0, 100.0), metavar="DB_KM",
-              help="Attenuation of the air, one way [dB/km].  [default: 0.22 at 1064 nm]")
-@click.option("--wavelength", type=click.FloatRange(300.0, 2500.0), default=1064.0, show_default=True, metavar="NM",
-              help="Of the laser [nm]: clear air takes more of short waves where --attenuation is not given.")
-@click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
-              help="Full angle of the beam between the 1/e^2 points [mrad]; cross sections need it.")
-@click.option("--scan-angle", is_flag=True,
-              help="Fit how the light falls with the scan angle, where strips overlap; `run` takes it off.")
+@shared.options_of(
+    CalibrationOptions, "reflectance_error", "attenuation", "wavelength", "divergence", "scan_angle"
+)
 @shared.output_option("Also write constants, drifts and overlaps of the strips as JSON.", "FILE", "--report",
                       required=False)
 @shared.chain_options
@@ -122,17 +114,11 @@ def calibrate(
 
 def _read_options(options: dict[str, Any]) -> CalibrationOptions:
     """How to measure; pulse and chain are chosen as `wavebatch run` chooses them."""
-    from wavebatch.kernels.physics.radiometry import usual_attenuation
-    from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
     from wavebatch.tools.api.run import find_request, read_sensor
 
     asked = shared.from_options(RunOptions, options)
     chain, request = find_request(asked)
-    names = ("divergence", "reflectance_error", "direction", "energy", "scan_angle", "column")
-    figures = {name: options[name] for name in names}
-    given = options["attenuation"]
-    figures["attenuation"] = usual_attenuation(options["wavelength"]) if given is None else given
-    return CalibrationOptions(sensor=read_sensor(asked), chain=chain, request=request, **figures)
+    return shared.from_options(CalibrationOptions, options, sensor=read_sensor(asked), chain=chain, request=request)
 
 
 def _list_report(flight: FlightCalibration) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def calibrate_flight(
     docs/algorithms.md 5.3.
     """
     options = options or CalibrationOptions()
-    check_attenuation(options.attenuation)
+    check_attenuation(options.air)
     boxes = [find_box(path) for path in paths]
     strips = [read_strip(path, i, boxes, targets, options) for i, path in enumerate(paths)]
     good = [strip for strip in strips if strip.found is not None]

@@ -121,7 +121,7 @@ def read_strip(
             found=found,
             refused=refused,
             channels=tuple(describe_channel(row, source) for row in channels),
-            ranging=measure_ranging(source.sensor, distance, options.attenuation),
+            ranging=measure_ranging(source.sensor, distance, options.air),
             ties=ties,
             seen=_see_targets(on_targets),
         )

@@ -10,15 +10,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import InputError
+from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.pulse_energy import PulseEnergy, find_column, find_pulse_energy, name_columns, take_records
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
+from wavebatch.kernels.physics.radiometry import usual_attenuation
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.calibrating.setting import SCANNERS, Setting, check_energies, measure_setting
@@ -49,20 +52,38 @@ class CalibrationOptions:
     """The chain that decomposes; None: the widest that the request may choose."""
     request: Request = field(default_factory=lambda: Request(auto=True))
     """How pulse and chain are chosen: as for `wavebatch run`."""
-    attenuation: float = 0.22
-    """Of the air, one way [dB/km]."""
-    divergence: float | None = None
-    """Full angle of the beam between the 1/e^2 points [mrad]; None: that of a saved survey, if it has one."""
-    reflectance_error: float = 0.03
-    """Standard deviation of the targets' reflectances, relative."""
+    column: str | None = option(
+        None, "In place of targets: an extra byte with the vendor's reflectances, in dB or as shares of 1.",
+        form="NAME", name="from_column",
+    )
+    reflectance_error: Annotated[float, Range(0.0, 1.0)] = option(
+        0.03, "Relative standard deviation of the reflectances of the targets, or of the column.", form="SHARE"
+    )
+    attenuation: Annotated[float | None, Range(0.0, 100.0)] = option(
+        None, "Attenuation of the air, one way [dB/km].", form="DB_KM", unset="0.22 at 1064 nm"
+    )
+    wavelength: Annotated[float, Range(300.0, 2500.0)] = option(
+        1064.0, "Of the laser [nm]: clear air takes more of short waves where --attenuation is not given.", form="NM"
+    )
+    divergence: Annotated[float | None, Range(0.001, 100.0)] = option(
+        None, "Full angle of the beam between the 1/e^2 points [mrad]; cross sections need it.", form="MRAD"
+    )
+    """None: that of a saved survey, if it has one."""
+    scan_angle: bool = option(
+        False, "Fit how the light falls with the scan angle, where strips overlap; `run` takes it off."
+    )
     direction: str = "auto"
     """Where packet vectors point: auto, toward or away."""
-    scan_angle: bool = False
-    """Fit how the light depends on the scan angle, where strips overlap."""
-    column: str | None = None
-    """Extra byte with the vendor's own reflectances, in place of targets."""
     energy: str | None = None
     """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    @property
+    def air(self) -> float:
+        """Attenuation of the air [dB/km]: the given one, or that of clear air at the wavelength."""
+        return usual_attenuation(self.wavelength) if self.attenuation is None else self.attenuation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,8 +145,8 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
         chain = options.chain or widest_chain()
         setup = prepare(reader, scan, chain, options.request, sensor=options.sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
-        system = setup.system.with_radiometry(attenuation=options.attenuation, sensor_error=0.0)
-        setting = measure_setting(reader, scan, setup.sensor, options.attenuation)
+        system = setup.system.with_radiometry(attenuation=options.air, sensor_error=0.0)
+        setting = measure_setting(reader, scan, setup.sensor, options.air)
         sent = find_pulse_energy(reader, scan, options.energy)
         if options.energy is not None and sent is not None:
             check_energies(reader, scan, sent)

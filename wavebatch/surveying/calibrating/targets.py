@@ -80,7 +80,7 @@ def build_calibration(
         reasons = miss or "; ".join(f"{result.name}: {result.refused}" for result in results)
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])
-    ranging = measure_ranging(source.sensor, used["distance"], options.attenuation)
+    ranging = measure_ranging(source.sensor, used["distance"], options.air)
     channels = tuple(
         describe_channel(replace(row, relative_error=float(np.hypot(row.relative_error, ranging))), source)
         for row in _measure_channels(measured)
@@ -92,7 +92,7 @@ def build_calibration(
     return Calibration(
         constant=whole.constant,
         relative_error=float(np.hypot(np.hypot(whole.relative_error, apart), ranging)),
-        attenuation=options.attenuation,
+        attenuation=options.air,
         divergence=divergence,
         strip=source.path.name,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
