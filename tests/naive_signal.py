@@ -122,7 +122,7 @@ def find_transient(above, std):
     return 0
 
 
-def fit_slope(y, std, reach, limit=4.0, missing=None):
+def fit_slope(y, std, reach, limit=4.0, missing=None, recovery=0):
     """Slope of the baseline of one waveform and its error, by lines through the samples that are quiet about a line."""
     s = len(y)
     x = np.arange(s) - 0.5 * (s - 1)
@@ -137,7 +137,7 @@ def fit_slope(y, std, reach, limit=4.0, missing=None):
     for extra in (2.0, 1.0, 0.0):
         rest = y - level - slope * x
         width = limit * (np.sqrt(6) / 4 + extra) * std + 0.25
-        quiet = find_quiet(rest[:, None], width, reach)[:, 0] & ~missing
+        quiet = find_quiet(rest[:, None], width, reach, recovery)[:, 0] & ~missing
         line = np.polyfit(x[quiet], y[quiet], 1)
         slope, level = line
         size = np.sum((x[quiet] - x[quiet].mean()) ** 2)

@@ -111,15 +111,16 @@ def test_a_transient_is_that_of_a_loop(rng, length, height):
     assert find_transient(above[:23], 1.0) == 0
 
 
-def test_slopes_are_those_of_lines_through_quiet_samples(rng):
+@pytest.mark.parametrize("recovery", [0, 9])
+def test_slopes_are_those_of_lines_through_quiet_samples(rng, recovery):
     signal = record(rng, n=60) + (rng.uniform(-0.3, 0.3, 60) * np.arange(64)[:, None]).astype(np.float32)
     signal = signal.astype(np.float32)
     missing = np.zeros(signal.shape, bool)
     missing[40:] = rng.random((24, 60)) < 0.1
     missing[20:, 50:] = True  # only one end of these is known
-    slope, error = fit_slopes(signal, 1.25, 3, missing=missing)
+    slope, error = fit_slopes(signal, 1.25, 3, missing=missing, recovery=recovery)
     for w in range(60):
-        expected = naive_signal.fit_slope(signal[:, w].astype(float), 1.25, 3, missing=missing[:, w])
+        expected = naive_signal.fit_slope(signal[:, w].astype(float), 1.25, 3, missing=missing[:, w], recovery=recovery)
         assert slope[w] == pytest.approx(expected[0], abs=2e-5)
         assert error[w] == pytest.approx(expected[1], rel=1e-4)
     assert np.isinf(error[50:]).all() and np.isfinite(error[:50]).all()

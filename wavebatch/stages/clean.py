@@ -138,7 +138,8 @@ def find_seams(blocks: Iterable[WaveformBlock]) -> dict[int, int]:
 def _slopes(signal: np.ndarray, system: SystemPulse, spacing: float, missing: np.ndarray | None) -> np.ndarray:
     """The sloping part of each baseline (s, n), 0 in its middle: own slopes, drawn towards none by their errors."""
     reach = int(np.ceil(GUARD * system.sigma_ref / spacing))
-    slope, error = fit_slopes(signal, system.noise.quiet, reach, missing=missing)
+    recovery = _recovery(system, spacing)
+    slope, error = fit_slopes(signal, system.noise.quiet, reach, missing=missing, recovery=recovery)
     spread = system.defects.slope_spread * spacing
     slope = np.where(np.isfinite(error), slope * spread**2 / (spread**2 + np.minimum(error, 1e6) ** 2), 0.0)
     x = np.arange(len(signal), dtype=np.float32) - np.float32(0.5 * (len(signal) - 1))
@@ -168,7 +169,8 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     reach = int(np.ceil(3 * width))
     # Slopes come from runs of samples much longer than the noise is correlated.
     colour = float(np.sqrt(max(1.0 + 2.0 * sum(system.noise.correlation), 1.0)))
-    spread, defects = _slope_spread(signal, std, colour, reach, missing), Defects()
+    recovery = _recovery(system, block.spacing)
+    spread, defects = _slope_spread(signal, std, colour, reach, missing, recovery), Defects()
     if spread:
         # Everything else is measured about level baselines.
         defects = Defects(slope_spread=spread / block.spacing)
@@ -199,12 +201,19 @@ RARER = 0.1
 way."""
 
 
-def _slope_spread(signal: np.ndarray, std: float, colour: float, reach: int, missing: np.ndarray | None) -> float:
+def _recovery(system: SystemPulse, spacing: float) -> int:
+    """Samples after strong signal in which a tail would look like a slope."""
+    return int(np.ceil(system.noise.recovery / spacing))
+
+
+def _slope_spread(
+    signal: np.ndarray, std: float, colour: float, reach: int, missing: np.ndarray | None, recovery: int
+) -> float:
     """Standard deviation of the slopes of baselines [count per sample]; 0 where chance or signal explains them.
 
     colour: errors of slopes over those in white noise.
     """
-    slope, error = fit_slopes(signal, std, reach, missing=missing)
+    slope, error = fit_slopes(signal, std, reach, missing=missing, recovery=recovery)
     error = colour * error
     known = np.isfinite(error)
     if np.count_nonzero(known) < LEAST_WAVEFORMS:

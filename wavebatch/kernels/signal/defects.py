@@ -170,7 +170,12 @@ def find_seam(samples: np.ndarray) -> int:
 
 
 def fit_slopes(
-    signal: np.ndarray, std: float, reach: int, limit: float = 4.0, missing: np.ndarray | None = None
+    signal: np.ndarray,
+    std: float,
+    reach: int,
+    limit: float = 4.0,
+    missing: np.ndarray | None = None,
+    recovery: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slope of the baseline of each waveform, from its quiet samples.
 
@@ -186,6 +191,8 @@ def fit_slopes(
         A smoothed sample further from the line than this many standard deviations is signal.
     missing : bool (s, n), optional
         Samples that were not recorded.
+    recovery : int, samples
+        After strong signal, samples in which its tail would look like a slope.
 
     Returns
     -------
@@ -199,7 +206,7 @@ def fit_slopes(
     number = total = np.zeros(signal.shape[1])
     for extra in (2.0, 1.0, 0.0):
         rest = signal - (level + slope * x)
-        quiet = find_quiet(rest, np.float32(limit * (SMOOTH_GAIN + extra) * std + 0.25), reach)
+        quiet = find_quiet(rest, np.float32(limit * (SMOOTH_GAIN + extra) * std + 0.25), reach, recovery)
         if missing is not None:
             quiet &= ~missing
         number = np.maximum(quiet.sum(axis=0), 1)
