@@ -8,8 +8,9 @@ from wavebatch import surveying
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.chain import STAGES
-from wavebatch.stages.pulse_tables import error_factors
+from wavebatch.stages.pulse_tables import error_factors, pulse_shape
 
 PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
 VARIANTS = [
@@ -101,3 +102,23 @@ def test_factors_of_coloured_noise_are_bounded_for_any_spacing(spacing, kappa):
     system = SystemPulse(sigma_ref=2.0, noise=receiver, kappa=kappa)
     factors = error_factors(system, spacing, np.array([0.7, 1.0, 4.0]) * 2.0 / spacing)
     assert np.isfinite(factors).all() and (factors > 0.05).all() and (factors < 3).all()
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.4])
+@pytest.mark.parametrize("correlation", [(), (0.6, 0.3, 0.1)])
+def test_a_wrong_level_moves_echoes_as_far_as_their_errors_say(kappa, correlation):
+    n, std, wrong = 300, 100.0, 50.0
+    time = np.random.default_rng(4).uniform(20, 24, n)
+    system = SystemPulse(2.0, kappa, noise=ReceiverNoise(baseline=1000.0, std=std, correlation=correlation))
+    pulse = evaluate_pulse(pulse_shape(system, 1.0), np.arange(48.0)[:, None], time, np.full(n, 2.0))[0].T
+    block = WaveformBlock.from_samples(np.rint(1000 + 20_000 * pulse).astype(np.uint16), bits=16)
+    found = []
+    for level in (1000, 1000 - wrong):
+        noise = Noise(np.full(n, level, np.float32), np.full(n, std, np.float32))
+        candidates = STAGES["detect.maximum"].function(block, noise, system)
+        found.append(STAGES["decompose.adaptive"].function(block, noise, system, candidates))
+    plain, both = (error_factors(system, 1.0, np.full(n, 2.0), err) for err in (None, np.full(n, wrong / std)))
+    added = np.sqrt(both**2 - plain**2) / plain
+    for column, name in enumerate(("amplitude", "time", "sigma")):
+        moved = np.abs(getattr(found[1], name) - getattr(found[0], name)) / getattr(found[0], f"{name}_err")
+        assert np.median(moved) == pytest.approx(np.median(added[:, column]), rel=0.1, abs=0.04)

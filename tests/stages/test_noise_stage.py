@@ -36,4 +36,7 @@ def test_baselines_are_those_of_a_loop(rng, recovery, gaps):
         quiet &= ~missing[w]
         trust = 0.25 / (0.25 + 1.1**2 / max(quiet.sum(), 1)) if quiet.any() else 0.0
         assert noise.baseline[w] == pytest.approx(12 + trust * waveform[quiet].mean() if quiet.any() else 12, abs=1e-4)
+        assert noise.baseline_err[w] == pytest.approx(0.5 * np.sqrt(1 - trust), rel=1e-5)
     assert noise.std == pytest.approx(1.1)
+    level = replace(SYSTEM.noise, recovery=recovery, baseline_spread=0.0)
+    assert STAGES["noise.pooled"].function(block, replace(SYSTEM, noise=level)).baseline_err is None

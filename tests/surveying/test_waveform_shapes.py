@@ -192,6 +192,20 @@ def test_tails_of_both_signs_are_no_slopes(seed):
     assert system.noise.recovery > 0 and system.defects.slope_spread == 0
 
 
+@pytest.mark.parametrize("spread", [0.4, 1.5])
+def test_errors_hold_where_few_samples_show_the_level(spread):
+    """Baselines that are wrong by a part of the noise: errors of widths were 1.1 to 1.2 times too small."""
+    signal, rows, time, height = render(bell, 22, s=28, place=(0.25, 0.75), amplitude=(20, 150))
+    level = spread * np.random.default_rng(22).standard_normal((3000, 1))
+    system, echoes = decompose(digitize(signal, 22, noise=0.85, base=BASE + level))
+    _, _, match = compare(echoes, rows, time)
+    echoes, truth = echoes.take(match.found), np.lexsort((time, rows))[match.truth]
+    assert system.noise.baseline_spread == pytest.approx(spread, rel=0.1)
+    for name, true in (("time", time[truth]), ("amplitude", height[truth]), ("sigma", 2.0)):
+        ratio = (getattr(echoes, name) - true) / getattr(echoes, f"{name}_err")
+        assert 0.93 < np.std(ratio[np.abs(ratio) < 6]) < 1.07
+
+
 def two_recordings(seed, n=600):
     """Packets of two recordings that meet at sample 60, which is interpolated: .3 to .7 samples are lost there."""
     rng = np.random.default_rng(seed)

@@ -215,6 +215,8 @@ class Noise:
     """Standard deviation of one recorded sample, float32 (n,), count; never below QUANTISATION_STD."""
     of_sample: np.ndarray | None = None
     """Level at each sample, float32 (n, s), count, where recordings of one packet differ in level; else None."""
+    baseline_err: np.ndarray | None = None
+    """Standard deviation of the baseline's error, float32 (n,), count; None where levels do not differ."""
 
     def __len__(self) -> int:
         """Number of waveforms."""
@@ -232,7 +234,8 @@ class Noise:
 
     def rows(self, rows: np.ndarray) -> Noise:
         """The noise of the waveforms at `rows`."""
-        return Noise(self.baseline[rows], self.std[rows], None if self.of_sample is None else self.of_sample[rows])
+        further = (None if one is None else one[rows] for one in (self.of_sample, self.baseline_err))
+        return Noise(self.baseline[rows], self.std[rows], *further)
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,7 +71,8 @@ def pooled(
         mean, number = quiet_levels(samples, limit * np.hypot(SMOOTH_GAIN * std, spread), reach, recovery)
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.noise.baseline + trust * mean
-    noise = Noise(baseline.astype(np.float32), np.full(n, std, np.float32))
+    error = (spread * np.sqrt(1 - trust)).astype(np.float32) if spread else None
+    noise = Noise(baseline.astype(np.float32), np.full(n, std, np.float32), baseline_err=error)
     return noise if block.missing is None else _split_levels(block, noise, system, limit)
 
 

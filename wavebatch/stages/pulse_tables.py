@@ -218,8 +218,10 @@ FACTOR_WIDTHS = 12
 """Widths at which the factors of errors are tabulated."""
 
 
-def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.ndarray:
-    """Errors of echoes in the noise's colour over those that a fit in white noise of `noise.std` gives.
+def error_factors(
+    system: SystemPulse, spacing: float, width: np.ndarray, level_err: np.ndarray | None = None
+) -> np.ndarray:
+    """Errors of echoes in coloured noise over baselines with errors, over those of a fit in white noise of `noise.std`.
 
     Parameters
     ----------
@@ -229,6 +231,8 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
         Time between two samples [ns].
     width : float array, shape (m,)
         Fitted widths [samples].
+    level_err : float array, shape (m,), optional
+        Standard deviations of the baselines under the echoes [`noise.std`].
 
     Returns
     -------
@@ -241,35 +245,44 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
     `noise.std` is what coloured noise does to amplitudes; times and widths suffer less from noise that changes slowly
     (docs/algorithms.md H11).
     """
-    if not system.noise.correlation:
+    if not system.noise.correlation and level_err is None:
         return np.ones((len(width), 4))
     shape = pulse_shape(system, spacing)
-    widths, factors = _factor_table(shape, shape_limits(system, spacing), system.noise.correlation)
-    return np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
+    widths, factors, by_level = _factor_table(shape, shape_limits(system, spacing), system.noise.correlation)
+    found = np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
+    if level_err is None:
+        return found
+    return np.hypot(found, level_err[:, None] * np.stack([np.interp(width, widths, one) for one in by_level.T], axis=1))
 
 
 @lru_cache(maxsize=8)
 def _factor_table(
     shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Widths (k,) and the factors of errors there (k, 4)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Widths (k,), the factors of errors there (k, 4), and what a wrong level adds to them (k, 4)."""
     alone = max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
     widths = exp(np.linspace(log(limits.low), log(limits.high), FACTOR_WIDTHS))
-    return widths, np.stack([_factors_at(shape, limits, float(width), correlation) for width in widths]) / alone
+    found = np.stack([_factors_at(shape, limits, float(width), correlation) for width in widths])
+    return widths, found[:, 0] / alone, found[:, 1]
 
 
 def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...]) -> np.ndarray:
-    """Errors of amplitude, time, width, energy (4,) in noise of this correlation, over those in white noise."""
+    """Errors of amplitude, time, width, energy in noise of this correlation, over those in white noise (2, 4).
+
+    The second row are those by a level that is wrong by the noise of a sample.
+    """
     joint = _pulse_rows(shape, width)
     main = solve(np.einsum("is,js->ij", joint, joint), joint)
     # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
     main = np.concatenate([main, main[:1] + main[2:]])
     whole = main.copy()
+    whole[1] += _find_delay(shape, limits.ref, np.full(1, width))[1] * main[2]
     if shape.components:
         peak, by_peak = _change_with_width(pulse_measures(shape, limits), np.float64(width))
         whole[0] += by_peak / peak * width * main[2]
     variance = np.einsum("is,st,it->i", whole, correlation_matrix(correlation, joint.shape[1]), whole)
-    return np.sqrt(np.maximum(variance / np.sum(whole * whole, axis=1), LEAST_FACTOR))
+    white = np.sum(whole * whole, axis=1)
+    return np.stack([np.sqrt(np.maximum(variance / white, LEAST_FACTOR)), whole.sum(axis=1) / np.sqrt(white)])
 
 
 def _change_with_width(table: PulseMeasures, width: np.ndarray) -> list[np.ndarray]:

@@ -204,7 +204,8 @@ def describe_solution(
     flags |= np.where(solution.number[cluster] > 1, EchoFlag.OVERLAPPED, 0)
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     fitted = system if settings.shape.components else replace(system, components=(), kappa=settings.shape.kappa)
-    factors = error_factors(fitted, block.spacing, parameters[:, 2])
+    level_err = None if noise.baseline_err is None else (noise.baseline_err / noise.std)[waveform]
+    factors = error_factors(fitted, block.spacing, parameters[:, 2], level_err)
     energy_err = relative_energy_errors(parameters, errors, shared) * factors[:, 3]
     parameters, errors = describe_echoes(settings.shape, limits, parameters, errors, shared)
     errors *= factors[:, :3]
