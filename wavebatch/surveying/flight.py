@@ -69,7 +69,7 @@ SAME_WIDTH = 0.06
 """How far from the edge a width may be to count as the same, as a share of it."""
 
 SHAPE = 0.008
-"""How much worse than in the flight the common pulse may fit the better half of a strip's strong echoes, as a share of
+"""How much worse than in the flight the common pulse may fit the better quarter of a strip's strong echoes, as a share of
 the amplitude. A Gaussian misses the echoes of the shipped sensors by 0.02 to 0.06."""
 
 ALIKE_PULSES, PULSE_ERROR = 0.02, 0.3
