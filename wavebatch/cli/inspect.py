@@ -14,9 +14,8 @@ from typing import Any
 import click
 
 from wavebatch.cli.messages import answer, count, print_text, printable, talk
-from wavebatch.cli.options import common_options, declared, for_each, strip_options, strips_argument
+from wavebatch.cli.options import common_options, declared, find_inputs, for_each, strip_options, strips_argument
 from wavebatch.cli.program.completion import complete_files
-from wavebatch.files.inputs import find_files
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.inspect.file_facts import describe_file
 
@@ -44,7 +43,7 @@ def info(
 
     Exit code: 0 done, 1 a file or its packets cannot be read (the others, and its points, are shown), 2 wrong usage.
     """
-    paths, lost = find_files(strips, recursive=recursive), 0
+    paths, lost = find_inputs(strips, recursive=recursive), 0
 
     def show(path: Path) -> dict[str, Any]:
         facts = describe_file(path, **reading)
@@ -101,7 +100,7 @@ def check(
     Exit code: 0 no problems, 1 problems found, 2 wrong usage.
     """
     clean, results = True, []
-    for path in find_files(map(str, files), recursive=recursive):
+    for path in find_inputs(files, recursive=recursive):
         found = check_file(path, direction=direction, headerless=headerless)
         clean &= found.is_clean and not (strict and found.notes)
         results.append(found.to_json())

@@ -36,6 +36,7 @@ from wavebatch.cli.options import (
     declared,
     from_options,
     html_option,
+    note_input,
     strips_argument,
     together,
 )
@@ -81,7 +82,7 @@ def run(**options: Any) -> None:
         _start_processes(options)
         from wavebatch.tools.api.run import plan_run
 
-        jobs, batch_options = plan_run(options["strips"], from_options(RunOptions, options))
+        jobs, batch_options = plan_run(options["strips"], from_options(RunOptions, options), note_input)
         if options["report"] not in (None, "-"):
             _check_report(Path(options["report"]), jobs, batch_options)
         if options["html_file"] is not None:

@@ -19,6 +19,7 @@ from wavebatch.cli.options import (
     clouds_argument,
     common_options,
     declared,
+    find_inputs,
     output_option,
     where_option,
 )
@@ -27,7 +28,6 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
-from wavebatch.files.inputs import find_files
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.csv_table import format_csv
 from wavebatch.tools.return_stats.areas import RANKS, AreaStats, Grid, PolygonSet, Separation, describe_pairs
@@ -66,7 +66,7 @@ def stats(
 
     Exit code: 0 done, 1 a cloud cannot be read (the others are counted), 2 wrong usage.
     """  # fmt: skip
-    files = find_files(map(str, clouds), recursive=recursive)
+    files = find_inputs(clouds, recursive=recursive)
     if output is not None:
         check_target(output, overwrite=overwrite)
     divisions = [] if size is None else [Grid(size)]

@@ -18,6 +18,7 @@ from wavebatch.cli.options import (
     check_html,
     check_toml,
     common_options,
+    find_inputs,
     html_option,
     output_option,
     strip_options,
@@ -71,13 +72,12 @@ def survey(
     wrong usage.
     """  # fmt: skip
     from wavebatch.files.disk.publish import check_target
-    from wavebatch.files.inputs import find_files
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
 
     overwrite = options["overwrite"]
-    paths = find_files(strips, recursive=options["recursive"])
+    paths = find_inputs(strips, recursive=options["recursive"])
     for target in (output, chain_file):
         check_toml(target)
         if target is not None:

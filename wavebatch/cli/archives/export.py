@@ -15,13 +15,13 @@ import click
 from wavebatch.cli.messages import answer, count, counting, tell
 from wavebatch.cli.options import (
     common_options,
+    find_inputs,
     for_each,
     name_outputs,
     output_option,
     strip_options,
     strips_argument,
 )
-from wavebatch.files.inputs import find_files
 from wavebatch.tools.archives.export_strip import SUFFIXES, ExportSummary, export_strip
 
 
@@ -44,7 +44,7 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
     """  # fmt: skip
-    paths = find_files(strips, recursive=recursive)
+    paths = find_inputs(strips, recursive=recursive)
     targets = name_outputs(paths, output, SUFFIXES, ".las")
 
     def work(path: Path) -> ExportSummary:

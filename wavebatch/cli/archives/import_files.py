@@ -16,6 +16,7 @@ from wavebatch.cli.messages import answer, count, counting, tell
 from wavebatch.cli.options import (
     common_options,
     declared,
+    find_inputs,
     for_each,
     from_options,
     name_outputs,
@@ -23,7 +24,6 @@ from wavebatch.cli.options import (
     output_option,
 )
 from wavebatch.cli.program.completion import complete_files
-from wavebatch.files.inputs import find_files
 from wavebatch.tools.archives.import_file import SUFFIXES, ImportOptions, ImportSummary, import_file
 
 EXIT_SOME, EXIT_NONE = 3, 4
@@ -46,7 +46,7 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
 
     Exit code: 0 all written, 2 wrong usage, 3 some files failed, 4 no file was written.
     """  # fmt: skip
-    paths = find_files(files, recursive=recursive, kinds=(SUFFIXES,))
+    paths = find_inputs(files, recursive=recursive, kinds=(SUFFIXES,))
     targets = _name_strips(paths, output)
     chosen = from_options(ImportOptions, options)
     # A single file that fails is one line too, with the exit code of a batch.

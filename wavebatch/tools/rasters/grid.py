@@ -24,8 +24,9 @@ from wavebatch.tools.plots.values import Clouds, Selection, check_statistic
 from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, check_cells
 from wavebatch.tools.rasters.tiles import Placed, compute_tiles, is_inside
 
-MOST_SIDE = 2_000_000
-"""Most cells along a side: more is damage of coordinates, or a size that was meant in another unit."""
+MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
+"""Most cells along a side, and of the raster (300 km x 300 km at 1 m): more is damage of coordinates, clouds of several
+projects, or a size that was meant in another unit."""
 
 _EXACT = float(1 << 23)
 """Steps of a column that float32 holds apart; larger values are written as float64."""
@@ -159,10 +160,12 @@ def _lay_out(where: str, box: Box, options: GridOptions) -> Grid:
     """The cells of the raster; ConfigError for too many."""
     west, south, east, north = box
     size = options.size
-    if max(east - west, north - south) / size > MOST_SIDE:
+    columns, rows = (east - west) / size, (north - south) / size
+    if max(columns, rows) > MOST_SIDE or columns * rows > MOST_CELLS:
         raise ConfigError(
-            f"{where}: {(east - west) / size:.3g} x {(north - south) / size:.3g} cells of {size:g} are too many; a "
-            "coordinate may be damaged: give --bbox, or a larger --size"
+            f"{where}: {columns:.3g} x {rows:.3g} cells of {size:g} are too many (at most {MOST_CELLS:.0g}): points lie "
+            f"from {west:.10g}, {south:.10g} to {east:.10g}, {north:.10g}; clouds far apart need a raster each; if a "
+            "coordinate is damaged, give --bbox; or give a larger --size"
         )
     if options.bbox is not None:  # its cells end at a border, where no other cell begins
         first = round(west / size), round(south / size)
