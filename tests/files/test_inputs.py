@@ -43,7 +43,7 @@ def test_a_link_to_a_strip_that_was_given_is_named(folder):
     (folder / "link.las").symlink_to(folder / "b.las")
     lines = []
     assert find_strips([str(folder / "b.las"), str(folder / "link.las")], note=lines.append) == [folder / "b.las"]
-    assert lines == [f"{folder / 'link.las'}: is a link to the same file as {folder / 'b.las'}; the file is used once"]
+    assert lines == [f"{folder / 'link.las'}: is the same file as {folder / 'b.las'}; it is used once"]
     find_strips([str(folder / "b.las"), str(folder / "sub" / ".." / "b.las")], note=lines.append)
     assert len(lines) == 1
     done = CliRunner().invoke(main, ["run", str(folder / "b.las"), str(folder / "link.las"), "-o", str(folder / "o")])

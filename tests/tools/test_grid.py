@@ -152,6 +152,15 @@ def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(r
     assert "are too many (at most 1e+11)" in result.stderr and "points lie from 50000" in result.stderr
 
 
+def test_a_cloud_without_a_crs_beside_others_is_named(rasterio, rng, tmp_path):
+    _cloud(tmp_path / "a.las", rng, 500)
+    _cloud(tmp_path / "b.las", rng, 500, wkt=None)
+    result = _run(tmp_path / "*.las", "--statistic", "count", "-o", tmp_path / "x.tif")
+    assert f"warning: {tmp_path / 'b.las'}: without a CRS; taken to be in that of the other clouds" in result.stderr
+    result = _run(tmp_path / "*.las", "--statistic", "count", "--crs", "EPSG:32632", "-o", tmp_path / "y.tif")
+    assert "without a CRS" not in result.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

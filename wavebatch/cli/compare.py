@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 EXIT_VIOLATED = 1
 """A threshold was not met."""
 
+FEW_COMMON = 0.05
+"""Share of the fewer echoes in common below which two results may be of two strips; by chance they share 1 %."""
+
 _SHARE = {"type": click.FloatRange(0.0, 1.0), "metavar": "SHARE"}
 _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 
@@ -115,8 +118,10 @@ def compare(
         write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
     lines = [*list_lines(between), *(list_match(result) if strip else [])]
     print_result(as_json, result.to_json(), lines, "chains" if strip else "")
-    if not between.matched and between.echoes_a and between.echoes_b:
-        talk("warning: A and B have no echo in common; are they results of one strip, in one CRS?")
+    fewer = min(between.echoes_a, between.echoes_b)
+    if fewer and between.matched <= fewer * (FEW_COMMON if options["within"] is None else 0.0):
+        common = f"{between.matched} of {fewer} echoes" if between.matched else "no echo"
+        talk(f"warning: A and B have {common} in common; are they results of one strip, in one CRS?")
     broken = _check_thresholds(between, options)
     _write_page(html_file, result, broken)
     for line in broken:

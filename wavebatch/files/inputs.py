@@ -42,7 +42,7 @@ def find_files(
         for path in _expand(argument, Path(), recursive, kinds):
             first = files.setdefault(real_name(path), path)
             if note is not None and os.path.abspath(first) != os.path.abspath(path):
-                note(f"{path}: is a link to the same file as {first}; the file is used once")
+                note(f"{path}: is the same file as {first}; it is used once")
     if not files:
         raise ConfigError("no file given; name files, folders, patterns or @list.txt")
     protect(files.values())

@@ -51,9 +51,13 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     layout = found.layout
     if layout.crs is None:
         talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")
-    if found.filled < layout.columns * layout.rows / 1000 and layout.columns * layout.rows > FEW_CELLS:
-        share = f"{100 * found.filled / (layout.columns * layout.rows):.1g} %"
-        talk(f"warning: {output}: only {share} of the cells have a value: if clouds lie far apart, make a raster of each")
+    if found.unnamed:
+        some = f"{found.unnamed[0]}" + f" and {len(found.unnamed) - 1} more" * (len(found.unnamed) > 1)
+        talk(f"warning: {some}: without a CRS; taken to be in that of the other clouds; say so with --crs")
+    cells = layout.columns * layout.rows
+    if found.filled < cells / 1000 and cells > FEW_CELLS:
+        share = f"{100 * found.filled / cells:.1g} % of the cells have a value"
+        talk(f"warning: {output}: only {share}: if clouds lie far apart, make a raster of each")
     tell(f"{output}: {_summarise(found, columns)}")
     answer({"output": str(output), "clouds": [str(path) for path in paths], "statistic": options["statistic"],
             **_describe(found, columns)})  # fmt: skip
