@@ -9,7 +9,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
-from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
+from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes
 
 OVERLAPPED = int(EchoFlag.OVERLAPPED)
 S, N = 60, 120
@@ -95,6 +95,23 @@ def test_echoes_that_an_error_of_the_pulse_explains_are_dropped_as_by_a_loop(tab
         left = [i for i in range(len(table)) if i not in dropped]
         np.testing.assert_array_equal(kept.time, table.time[left])
         assert 10 < len(dropped) < len(table) // 2
+
+
+@pytest.mark.parametrize(("misfit", "tail"), [(0.05, ()), (0.0, ((-8.0, 0.02), (8.0, 0.05))), (0.05, ((8.0, 0.05),))])
+def test_what_the_pulse_leaves_of_echoes_is_in_the_errors_of_others_as_by_a_loop(table, misfit, tail):
+    noise = ReceiverNoise(std=1.3)
+    found = cover_misfit(table, SystemPulse(2.0, misfit=misfit, tail_misfit=tail, noise=noise), 0.5)
+    left = np.zeros(len(table))
+    for i, j, lag in pairs(table):
+        share = 0.34 * misfit if abs(lag) < 6.0 else 0.0
+        if 6.0 <= abs(lag) < 20.0 and tail and min(abs(lag - at) for at, _ in tail) <= 0.6 * 16.0 * (len(tail) > 1):
+            share = 0.5 * np.interp(lag, *np.array(tail).T)
+        left[i] += (share * table.amplitude[j]) ** 2
+    factor = np.sqrt(1 + left * np.sqrt(np.pi) * 2.0 / 0.5 / 1.3**2)
+    for name in ("time_err", "amplitude_err", "sigma_err", "relative_energy_err"):
+        np.testing.assert_allclose(getattr(found, name), getattr(table, name) * factor, rtol=1e-5)
+    assert len(tail) == 1 or factor.max() > 2
+    assert cover_misfit(table, SystemPulse(2.0), 0.5) is table
 
 
 def test_the_weaker_of_two_echoes_in_one_place_is_dropped(table):

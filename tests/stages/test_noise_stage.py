@@ -40,3 +40,14 @@ def test_baselines_are_those_of_a_loop(rng, recovery, gaps):
     assert noise.std == pytest.approx(1.1)
     level = replace(SYSTEM.noise, recovery=recovery, baseline_spread=0.0)
     assert STAGES["noise.pooled"].function(block, replace(SYSTEM, noise=level)).baseline_err is None
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_levels_of_the_last_samples_scatter_by_their_errors(rng, gaps):
+    samples = np.rint(20 + 1.5 * rng.standard_normal((4000, 60))).astype(np.uint8)
+    missing = np.zeros(samples.shape, bool)
+    missing[::2, 50:] = gaps
+    block = WaveformBlock.from_samples(samples)
+    block = replace(block, missing=missing) if gaps else block
+    noise = STAGES["noise.tail"].function(block, replace(SYSTEM, noise=ReceiverNoise(std=1.5)), samples=20)
+    assert np.std((noise.baseline - 20) / noise.baseline_err) == pytest.approx(0.93, abs=0.06)  # own noise, if larger

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.units import MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.maxima import quiet_levels
@@ -111,8 +111,7 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, R
     """Baseline and standard deviation of each waveform from its last samples.
 
     For sensors whose baseline drifts and whose waveforms end without signal. Samples that were not recorded do not
-    count. The standard deviation is never less than
-    the strip's.
+    count. The standard deviation is never less than the strip's.
 
     Parameters
     ----------
@@ -125,20 +124,21 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, R
         end = transpose_samples(block.samples[:, -samples:])
         baseline = np.median(end, axis=0)
         deviation = end - baseline
-        std = np.sqrt(sum_samples(deviation * deviation) / max(len(end) - 1, 1))
+        number = len(end)
+        std = np.sqrt(sum_samples(deviation * deviation) / max(number - 1, 1))
     else:
-        baseline, std = _tail_of_recorded(block, samples)
-    return Noise(
-        baseline.astype(np.float32), np.maximum(std, max(system.noise.std, QUANTISATION_STD)).astype(np.float32)
-    )
+        baseline, std, number = _tail_of_recorded(block, samples)
+    std = np.maximum(std, max(system.noise.std, QUANTISATION_STD)).astype(np.float32)
+    error = MEDIAN_ERROR * std / np.sqrt(np.maximum(number, 1))
+    return Noise(baseline.astype(np.float32), std, baseline_err=error.astype(np.float32))
 
 
-def _tail_of_recorded(block: WaveformBlock, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Median and standard deviation (n,) of the last recorded samples of each waveform."""
+def _tail_of_recorded(block: WaveformBlock, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Median, standard deviation and number (n,) of the last recorded samples of each waveform."""
     behind = np.cumsum(~block.missing[:, ::-1], axis=1)[:, ::-1]
     end = np.where(~block.missing & (behind <= samples), block.samples, np.float32(np.nan)).T.astype(np.float32)
     number = np.isfinite(end).sum(axis=0)
     end[:, number == 0] = block.samples[number == 0].T
     baseline = np.nanmedian(end, axis=0)
     deviation = np.nan_to_num(end - baseline)
-    return baseline, np.sqrt(sum_samples(deviation * deviation) / np.maximum(number - 1, 1))
+    return baseline, np.sqrt(sum_samples(deviation * deviation) / np.maximum(number - 1, 1)), number

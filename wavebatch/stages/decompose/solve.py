@@ -20,7 +20,7 @@ from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
 from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
 from wavebatch.stages.detect.candidates import samples_of
-from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
+from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes
 from wavebatch.stages.pulse_tables import (
     BROADEST,
     LEAST_WIDTH,
@@ -228,6 +228,7 @@ def describe_solution(
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components:
         table = drop_unproven(table, system, clip_level(block, system) - system.noise.baseline)
+    table = cover_misfit(table, system, spacing)
     if settings.grow:
         table = cover_hidden(table, system, len(block))
     return flag_echoes(block, noise, system, clear_lone(table))
