@@ -44,6 +44,12 @@ def _say(*words, code=None):
         ("stats strip.las --where echo_width<5", "`wavebatch run` writes echo_width into clouds, and this is none"),
         ("plot map strip.las --column echowidth -o m.png", "`wavebatch run` writes echo_width into clouds"),
         ("stages decomposer", "did you mean"),
+        ("run strip.las -o o --jobs 100000", "100000 is not in the range 0<=x<=1024"),
+        ("plot waveform strip.las -o w.png --seed 3", "--seed is of no use without --random"),
+        ("plot waveform strip.las -o w.png --packet 3 --most 2", "--most is for --flags, --where and the default"),
+        ("plot waveform strip.las -o w.png --times 5000:6000", "no sample lies there; the waveforms end at"),
+        ("calibrate strip.las --targets t.csv -o c.toml --attenuation .1 --wavelength 532", "exclude each other"),
+        ("compare strip.las strip.las --within 1e9", "(--within) is 1e+09 ns; it must be above 0 and below 1e6"),
     ],
 )
 def test_options_that_are_nearly_right(place, words, advice):
@@ -92,7 +98,18 @@ def test_clouds_without_an_echo_in_common_are_doubted(place):
     result = CliRunner().invoke(main, ["compare", "strip.las", "moved.las"])
     assert result.exit_code == 0 and "warning: A and B have no echo in common" in result.stderr
     result = CliRunner().invoke(main, ["compare", "strip.las", "strip.las"])
-    assert "no echo in common" not in result.stderr
+    assert "in common" not in result.stderr
+
+
+def test_strips_that_share_their_times_only_are_doubted(place):
+    """Other scenes have the GPS times of the strip: one echo in a hundred agrees by chance."""
+    for scene in ("urban", "mixed"):
+        words = ["simulate", scene, "-o", f"{scene}.las", "--pulses", "500", "-q"]
+        assert CliRunner().invoke(main, words).exit_code == 0
+    result = CliRunner().invoke(main, ["compare", "urban.las", "mixed.las"])
+    assert result.exit_code == 0 and "echoes in common; are they results of one strip" in result.stderr
+    result = CliRunner().invoke(main, ["compare", "urban.las", "mixed.las", "--within", "0.5"])
+    assert "echoes in common" not in result.stderr
 
 
 def test_a_file_of_another_kind_names_its_option(place):

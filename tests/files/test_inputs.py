@@ -39,6 +39,17 @@ def test_a_strip_counts_once(folder):
     assert _names([str(folder / "b.las"), str(folder), str(folder / "sub" / ".." / "b.las")]) == ["b.las", "a.LAZ"]
 
 
+def test_a_link_to_a_strip_that_was_given_is_named(folder):
+    (folder / "link.las").symlink_to(folder / "b.las")
+    lines = []
+    assert find_strips([str(folder / "b.las"), str(folder / "link.las")], note=lines.append) == [folder / "b.las"]
+    assert lines == [f"{folder / 'link.las'}: is the same file as {folder / 'b.las'}; it is used once"]
+    find_strips([str(folder / "b.las"), str(folder / "sub" / ".." / "b.las")], note=lines.append)
+    assert len(lines) == 1
+    done = CliRunner().invoke(main, ["run", str(folder / "b.las"), str(folder / "link.las"), "-o", str(folder / "o")])
+    assert lines[0] in done.stderr
+
+
 def test_files_of_one_name_may_be_read_together_but_not_written_into_one_folder(folder):
     (folder / "sub" / "b.laz").write_bytes(b"")
     arguments = [str(folder), str(folder / "sub")]

@@ -26,7 +26,7 @@ DECISIONS = (
     Decision("learned pulse", False, "a simpler pulse reaches the noise"),
     Decision("growth of fits", False, "says the survey"),
     Decision("width prior", False, "says the survey"),
-    Decision("echo width", True, "the system pulse is 2.00 samples wide (0.85)"),
+    Decision("echo width", True, "the system pulse is 2.00 samples wide (limit 0.85)"),
     Decision("incidence angle", False, "99 % of the clear echoes have the width of the system pulse"),
 )
 
@@ -86,7 +86,7 @@ def test_a_share_of_a_small_sample_is_at_most_all():
 
 
 def test_no_widths_of_an_undersampled_pulse():
-    decisions = (*DECISIONS[:3], Decision("echo width", False, "the system pulse is 0.64 samples wide (0.85)"))
+    decisions = (*DECISIONS[:3], Decision("echo width", False, "the system pulse is 0.64 samples wide (limit 0.85)"))
     survey = _survey(decisions)
     chain = choose_chain(survey)
     assert "attribute.echo_width" not in _stages(chain)

@@ -182,3 +182,15 @@ def test_check_takes_chain_files(tmp_path):
 
 def test_check_without_files_is_wrong_usage():
     assert run("check").exit_code == 2
+
+
+def test_packets_of_another_strip_are_a_problem(tmp_path):
+    """They fit by size; only the echoes show it. Own packets, of any sensor, match."""
+    for scene in ("urban", "mixed"):
+        run("simulate", scene, "-o", tmp_path / f"{scene}.las", "--pulses", 300, "--external", "-q")
+    for name in ("urban", "mixed"):
+        assert check_file(tmp_path / f"{name}.las").problems == ()
+    (tmp_path / "mixed.wdp").replace(tmp_path / "urban.wdp")
+    (problem,) = check_file(tmp_path / "urban.las").problems
+    assert "returns lie where their packet has an echo: urban.wdp belongs to another strip, or" in problem
+    assert check_file(data_file(RIEGL)).problems == ()

@@ -186,7 +186,7 @@ def test_systems_of_digitizers_are_saved(tmp_path):
     assert load_survey(path).survey == survey
     text = path.read_text()
     wrong = {
-        "index = 4\n": "index 4 is there already",
+        "index = 4\n": "index 4 has two tables",
         "index = 0\n": "index must lie between 1 and 255",
         "": "key 'index' is missing",
     }

@@ -242,7 +242,7 @@ def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_chan
         ("digitizer = 1\nrelative_error = 0.1", "key 'constant' is missing"),
         ("digitizer = 1\nconstant = 1e-8\nerror = 0.1", "unknown key 'error'"),
         ("digitizer = 1\nconstant = 1e-8\nrelative_error = 0.1\n[[channel]]\ndigitizer = 1\nconstant = 1e-8\n"
-         "relative_error = 0.1", "2: digitizer 1 with scanner channel 0 is there already"),
+         "relative_error = 0.1", "2: digitizer 1 with scanner channel 0 has two tables"),
     ],
 )  # fmt: skip
 def test_wrong_channels_are_one_line(table, message):

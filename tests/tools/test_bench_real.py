@@ -222,7 +222,7 @@ def test_a_stranger_has_no_shipped_pulse(strip, report):
         assert lvis not in known_systems() and len(known_systems()) == 4
         assert find_source(lvis.system) is None
     assert lvis in known_systems()
-    assert "a stranger: without nasa-lvis" in format_report(replace(report, left_out="nasa-lvis"))
+    assert "as an unknown sensor: without nasa-lvis" in format_report(replace(report, left_out="nasa-lvis"))
 
 
 def test_a_strip_without_clear_echoes_has_the_other_figures(strip, monkeypatch):

@@ -23,7 +23,7 @@ UTM = (
 )
 
 
-def _cloud(path, rng, n=4000, *, wkt=UTM, west=500_000.0, epsg=None):
+def _cloud(path, rng, n=4000, *, wkt=UTM, west=500_000.0, south=5_400_000.0, epsg=None):
     """A cloud over 700 m x 300 m; a tenth of the heights have no data."""
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales, header.offsets = (0.001,) * 3, (west, 5_400_000.0, 0.0)
@@ -35,7 +35,7 @@ def _cloud(path, rng, n=4000, *, wkt=UTM, west=500_000.0, epsg=None):
         header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", keys))
     las = laspy.LasData(header)
     las.points = laspy.ScaleAwarePointRecord.zeros(n, header=header)
-    las.x, las.y = west + rng.uniform(0, 700, n), 5_400_000 + rng.uniform(0, 300, n)
+    las.x, las.y = west + rng.uniform(0, 700, n), south + rng.uniform(0, 300, n)
     las.gps_time = 1e9 + np.arange(n) * 1e-5
     values = rng.normal(10, 3, n).astype(np.float32)
     values[::10] = -9999
@@ -140,12 +140,25 @@ def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rasterio, rng, tmp_p
 def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(rasterio, rng, tmp_path):
     _cloud(tmp_path / "a.las", rng, 500)
     _cloud(tmp_path / "b.las", rng, 500, west=600_000.0)
-    _run(tmp_path / "*.las", "--statistic", "density", "-o", tmp_path / "x.tif")
+    result = _run(tmp_path / "*.las", "--statistic", "density", "-o", tmp_path / "x.tif")
+    assert "of the cells have a value: if clouds lie far apart, make a raster of each" in result.stderr
     assert (tmp_path / "x.tif").stat().st_size < 1_000_000
     with rasterio.open(tmp_path / "x.tif") as found:
         assert found.width > 100_000 and found.units == ("1/m2",)
     result = _run(tmp_path / "*.las", "--statistic", "count", "--size", 1e-4, "-o", tmp_path / "y.tif", code=2)
     assert "are too many" in result.stderr
+    _cloud(tmp_path / "c.las", rng, 500, west=900_000.0, south=5_900_000.0)
+    result = _run(tmp_path / "*.las", "--statistic", "count", "-o", tmp_path / "y.tif", code=2)
+    assert "are too many (at most 1e+11)" in result.stderr and "points lie from 50000" in result.stderr
+
+
+def test_a_cloud_without_a_crs_beside_others_is_named(rasterio, rng, tmp_path):
+    _cloud(tmp_path / "a.las", rng, 500)
+    _cloud(tmp_path / "b.las", rng, 500, wkt=None)
+    result = _run(tmp_path / "*.las", "--statistic", "count", "-o", tmp_path / "x.tif")
+    assert f"warning: {tmp_path / 'b.las'}: without a CRS; taken to be in that of the other clouds" in result.stderr
+    result = _run(tmp_path / "*.las", "--statistic", "count", "--crs", "EPSG:32632", "-o", tmp_path / "y.tif")
+    assert "without a CRS" not in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots import raster, values
 from wavebatch.tools.plots.histogram import count_flags, count_values, place_edges
 from wavebatch.tools.plots.raster import grid_values
+from wavebatch.tools.plots.section_data import cut_section
 from wavebatch.tools.plots.values import Selection, robust_limits
 from wavebatch.tools.rasters import tiles
 
@@ -283,8 +284,11 @@ def test_clouds_far_apart_are_refused(tmp_path, cloud):
     las = laspy.read(away)
     las.x = np.array(las.x) + 3000.0
     las.write(away)
-    with pytest.raises(ConfigError, match=r"away.las: lies 3000.* from .*cloud.laz.*one by one"):
+    with pytest.raises(ConfigError, match=r"away.las: lies 3000.* from .*cloud.laz.*one by one, or give --bbox"):
         grid_values([cloud, away], Selection("z"))
+    with pytest.raises(ConfigError, match=r"away.las: lies 3000.* from .*cloud.laz.*one by one, or give --line"):
+        cut_section([cloud, away], Selection("z"))
+    assert cut_section([cloud, away], Selection("z"), line=(500_000.0, 5_400_010.0, 503_040.0, 5_400_010.0)).inside
     bounds = (500_000.0, 5_400_000.0, 500_040.0, 5_400_025.0)
     assert grid_values([cloud, away], Selection("z"), bounds=bounds).total.values == 2 * POINTS
     las.x = np.array(las.x) - 2900.0

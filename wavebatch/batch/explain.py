@@ -17,6 +17,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.stages.decompose.loops import loop_model
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
+from wavebatch.surveying.inspect_strip import doubt_packets
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.sensor import SensorSource
 from wavebatch.surveying.systems.known_systems import find_source
@@ -25,9 +26,6 @@ _ANGLE = "incidence_angle"
 
 LEAST_JUDGED = 20
 """Fewer waveforms, or returns in waveforms with echoes, are too few for a remark."""
-
-LEAST_MATCHED = 0.5
-"""Share of the returns in waveforms with echoes that an echo should match."""
 
 MOST_FAILED = 0.25
 """Share of echoes whose fit did not converge, or ended at a bound, that is far above usual: 4 % at most of a chain that
@@ -256,14 +254,7 @@ def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
 def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
     """Return locations that fit no echo."""
     matched = report.count("matched_returns")
-    near = matched + report.count("unmatched_returns")
-    if near >= LEAST_JUDGED and matched < LEAST_MATCHED * near:
-        packets = prepared.facts.packets
-        other = "" if packets.internal else f"{packets.file.name} belongs to another strip, or "
-        yield (
-            f"only {matched} of {near} returns lie where their packet has an echo: {other}the return locations (which "
-            "should be picoseconds after the first sample) are wrong, and so are the positions of added echoes"
-        )
+    yield from doubt_packets(prepared.facts, matched, matched + report.count("unmatched_returns"))
 
 
 def _doubt_units(prepared: Prepared) -> Iterator[str]:

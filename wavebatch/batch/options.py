@@ -29,16 +29,20 @@ HEADINGS = (CHAIN, READING, SENSOR, AIR, WHICH, OUTPUT, SPEED, RUNNING)
 
 EXCLUSIVE = (
     ("chain", "profile", "tolerance"), ("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"),
-    ("scheduler", "memory"), ("attenuation", "visibility"), ("trajectory", "flight_height"),
+    ("scheduler", "memory"), ("attenuation", "visibility"),
+    ("attenuation", "wavelength"), ("trajectory", "flight_height"),
 )  # fmt: skip
 """Options that exclude each other. One in wavebatch.toml replaces those that come from a weaker source."""
 
 NEEDS = {
     "force": ("system",), "lever_arm": ("trajectory",), "crs": ("trajectory",), "wavelength": ("visibility",),
-    "attenuation_error": ("attenuation", "visibility"),
+    "attenuation_error": ("attenuation", "visibility"), "seed": ("random",),
 }  # fmt: skip
 """Options that are of no use without one of others."""
 
+
+MOST_JOBS = 1024
+"""Most processes: more is a slip of the finger, and would stop the machine."""
 
 ELSEWHERE = ("output", "recursive", "jobs", "scheduler", "memory", "block_size", "overwrite", "resume")
 """Options that do not change a cloud."""
@@ -180,7 +184,7 @@ class RunOptions:
     keep_packets: bool = option(
         False, "Copy the waveforms too: point format and packets stay as they are.", OUTPUT
     )
-    jobs: Annotated[int, Range(0, float("inf"))] = option(
+    jobs: Annotated[int, Range(0, MOST_JOBS)] = option(
         1, "Processes; 0: one per processor. The result does not depend on it.", SPEED, "N", usual=True
     )
     scheduler: str | None = option(

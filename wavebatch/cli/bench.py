@@ -14,19 +14,9 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wavebatch.cli.messages import answer, one_line, print_result, talk
-from wavebatch.cli.options import (
-    check_html,
-    common_options,
-    declared,
-    from_options,
-    html_option,
-    options_of,
-    output_option,
-    seed_option,
-)
+from wavebatch.cli import options as shared
+from wavebatch.cli.messages import answer, print_result, talk
 from wavebatch.cli.program.completion import complete_scenes
-from wavebatch.core.errors import InputError
 from wavebatch.tools.bench.command import BenchOptions, run_bench
 
 _REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "log_path", "log_level", "debug")
@@ -37,16 +27,17 @@ _REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "lo
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[STRIP...] [CHAIN...]")
 @click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete_scenes,
               help="Simulate this scene: mixed, open, forest, empty, flat or stiff; may be repeated.")
-@options_of(BenchOptions, "waveforms", "pulses", "repeats")
-@seed_option("Seed of the simulated waveforms.")
-@declared("tolerance", "Name the cheapest chain whose range error of isolated echoes is at most this, e.g. 0.02m.")
-@options_of(BenchOptions, "all_methods")
+@shared.options_of(BenchOptions, "waveforms", "pulses", "repeats")
+@shared.seed_option("Seed of the simulated waveforms.")
+@shared.declared("tolerance", "Name the cheapest chain whose range error of isolated echoes is at most this, "
+                 "e.g. 0.02m.")
+@shared.options_of(BenchOptions, "all_methods")
 @click.option("--real", is_flag=True,
               help="Inject echoes into the waveforms of each STRIP and count those found, and count false echoes.")
-@output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR", required=False,
-               folder=True)
-@html_option
-@common_options("json")
+@shared.output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR",
+                      required=False, folder=True)
+@shared.html_option
+@shared.common_options("json")
 def bench(
     files: tuple[Path, ...], output: Path | None, tolerance: float | None, html_file: Path | None, **options: Any
 ) -> None:
@@ -63,7 +54,7 @@ def bench(
     """
     from wavebatch.tools.bench.report import format_document, write_outputs
 
-    check_html(html_file)
+    shared.check_html(html_file)
     strips = [path for path in files if path.suffix.lower() != ".toml"]
     silent = options["quiet"] or not sys.stderr.isatty()
     say = (lambda text: None) if silent else talk
@@ -75,7 +66,7 @@ def bench(
         return
     if len(strips) > 1:
         raise click.UsageError(f"one strip at a time, not {len(strips)}; chain files end in .toml")
-    settings = from_options(
+    settings = shared.from_options(
         BenchOptions,
         options,
         strip=strips[0] if strips else None,
@@ -110,20 +101,17 @@ def _bench_real(
     from wavebatch.tools.bench.real.measure import measure_real
     from wavebatch.tools.bench.real.report import format_report, write_report
 
-    reports, failed = [], False
-    for path in strips:
-        try:
-            found = measure_real(path, seed=options["seed"], say=say)
-        except InputError as error:
-            failed = True
-            talk(f"error: {one_line(error)}")
-            continue
-        reports += found
+    def measure(path: Path) -> list[Any]:
+        found = measure_real(path, seed=options["seed"], say=say)
         for report in found:
             if output:
                 talk(write_report(report, output))
             if not options["as_json"]:
                 click.echo(format_report(report) + "\n")
+        return found
+
+    each, failed = shared.for_each(strips, measure, debug=options["debug"], alone=True)
+    reports = sum(each, [])
     if html_file is not None and reports:
         from wavebatch.tools.html.bench_page import write_real_page
 

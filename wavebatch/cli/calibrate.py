@@ -17,7 +17,6 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, count, format_json, talk, tell
 from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
-from wavebatch.files.inputs import find_files
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ def calibrate(
 
     if (targets is None) == (options["column"] is None):
         raise click.UsageError("give --targets FILE, or --from-column NAME, and not both")
-    paths = find_files(map(str, strips), recursive=options["recursive"])
+    paths = shared.find_inputs(strips, recursive=options["recursive"])
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
         for target in filter(None, (output, options["report"], html_file)):
             refuse_input(target)

@@ -13,17 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.compare_tables import list_angles, list_lines, list_match, list_overlap
 from wavebatch.cli.messages import print_result, talk, tell
-from wavebatch.cli.options import (
-    check_html,
-    common_options,
-    file_option,
-    html_option,
-    output_option,
-    system_option,
-    where_option,
-)
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
@@ -36,6 +28,9 @@ if TYPE_CHECKING:
 EXIT_VIOLATED = 1
 """A threshold was not met."""
 
+FEW_COMMON = 0.05
+"""Share of the fewer echoes in common below which two results may be of two strips; by chance they share 1 %."""
+
 _SHARE = {"type": click.FloatRange(0.0, 1.0), "metavar": "SHARE"}
 _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 
@@ -43,17 +38,17 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 @click.command()
 @click.argument("a", type=click.Path(path_type=Path))
 @click.argument("b", type=click.Path(path_type=Path), required=False)
-@file_option("--truth", text="Compare A with this truth of a simulated strip, instead of B.")
-@file_option("--strip", metavar="STRIP", text="Run A and B on the waveforms of this strip; A and B are then chain "
-             "files, fast, balanced, accurate or auto.")
-@system_option
+@shared.file_option("--truth", text="Compare A with this truth of a simulated strip, instead of B.")
+@shared.file_option("--strip", metavar="STRIP", text="Run A and B on the waveforms of this strip; A and B are then "
+                    "chain files, fast, balanced, accurate or auto.")
+@shared.system_option
 @click.option("--limit", type=click.IntRange(1), metavar="N",
               help="With --strip: use about N waveforms, spread over the strip, instead of all.")
 @click.option("--angles", is_flag=True,
               help="Compare incidence angles from echo widths with those from normals: both of A, or of A and B.")
 @click.option("--overlap", is_flag=True,
               help="Compare brightness and height of the clouds of two strips, A and B, where they overlap.")
-@where_option("Compare at the points of both clouds, or at those of A with --truth (all true echoes count)")
+@shared.where_option("Compare at the points of both clouds, or at those of A with --truth (all true echoes count)")
 @click.option("--within", type=float, metavar="NS",
               help="Largest time difference of the same echo [ns].  [default: 1; with --truth: 1.5]")
 @click.option("--min-completeness", **_SHARE, help="Least share of B's echoes that A has.")
@@ -62,9 +57,9 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 @click.option("--max-median", **_TIME, help="Largest absolute median of the time differences [ns].")
 @click.option("--max-rmse", **_TIME, help="Largest root mean square of the time differences [ns].")
 @click.option("--max-nmad", **_TIME, help="Largest robust spread of the time differences [ns].")
-@html_option
-@output_option("Write all figures as a table, one per row.", "FILE.csv", required=False)
-@common_options("overwrite", "json", failure=2)
+@shared.html_option
+@shared.output_option("Write all figures as a table, one per row.", "FILE.csv", required=False)
+@shared.common_options("overwrite", "json", failure=2)
 def compare(
     a: Path,
     b: Path | None,
@@ -95,7 +90,7 @@ def compare(
 
     Exit code: 0 done, 1 a threshold (--min-..., --max-...) is not met, 2 wrong usage or a file cannot be read.
     """  # fmt: skip
-    check_html(html_file)
+    shared.check_html(html_file)
     if output is not None:
         if angles or overlap:
             raise click.UsageError("-o has no meaning with --angles and --overlap; --json writes their figures")
@@ -115,8 +110,10 @@ def compare(
         write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
     lines = [*list_lines(between), *(list_match(result) if strip else [])]
     print_result(as_json, result.to_json(), lines, "chains" if strip else "")
-    if not between.matched and between.echoes_a and between.echoes_b:
-        talk("warning: A and B have no echo in common; are they results of one strip, in one CRS?")
+    fewer = min(between.echoes_a, between.echoes_b)
+    if fewer and between.matched <= fewer * (FEW_COMMON if options["within"] is None else 0.0):
+        common = f"{between.matched} of {fewer} echoes" if between.matched else "no echo"
+        talk(f"warning: A and B have {common} in common; are they results of one strip, in one CRS?")
     broken = _check_thresholds(between, options)
     _write_page(html_file, result, broken)
     for line in broken:

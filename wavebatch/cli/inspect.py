@@ -13,10 +13,9 @@ from typing import Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, count, print_text, printable, talk
-from wavebatch.cli.options import common_options, declared, for_each, strip_options, strips_argument
 from wavebatch.cli.program.completion import complete_files
-from wavebatch.files.inputs import find_files
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.inspect.file_facts import describe_file
 
@@ -28,11 +27,11 @@ EXIT_PROBLEMS, EXIT_UNREADABLE = 1, 1
 
 
 @click.command()
-@strips_argument
-@strip_options
+@shared.strips_argument
+@shared.strip_options
 @click.option("-v", "--verbose", is_flag=True,
               help="Also survey the strip: its pulse, and the known sensor that it looks like.")
-@common_options("json")
+@shared.common_options("json")
 def info(
     strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool, quiet: bool, debug: bool, **reading: Any
 ) -> None:
@@ -44,7 +43,7 @@ def info(
 
     Exit code: 0 done, 1 a file or its packets cannot be read (the others, and its points, are shown), 2 wrong usage.
     """
-    paths, lost = find_files(strips, recursive=recursive), 0
+    paths, lost = shared.find_inputs(strips, recursive=recursive), 0
 
     def show(path: Path) -> dict[str, Any]:
         facts = describe_file(path, **reading)
@@ -59,7 +58,7 @@ def info(
             talk(f"error: {path}: {facts['problems'][0]}")
         return facts
 
-    results, failed = for_each(paths, show, debug=debug)
+    results, failed = shared.for_each(paths, show, debug=debug)
     answer(results[0] if len(paths) == 1 else results)
     sys.exit(EXIT_UNREADABLE if failed or lost else 0)
 
@@ -85,10 +84,10 @@ def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, A
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP_OR_CHAIN...",
                 shell_complete=complete_files)
-@declared("recursive")
-@strip_options
+@shared.declared("recursive")
+@shared.strip_options
 @click.option("--strict", is_flag=True, help="Count notes as problems.")
-@common_options("json")
+@shared.common_options("json")
 def check(
     files: tuple[Path, ...], direction: str, headerless: bool, strict: bool, as_json: bool, quiet: bool,
     debug: bool, recursive: bool,
@@ -101,7 +100,7 @@ def check(
     Exit code: 0 no problems, 1 problems found, 2 wrong usage.
     """
     clean, results = True, []
-    for path in find_files(map(str, files), recursive=recursive):
+    for path in shared.find_inputs(files, recursive=recursive):
         found = check_file(path, direction=direction, headerless=headerless)
         clean &= found.is_clean and not (strict and found.notes)
         results.append(found.to_json())

@@ -20,13 +20,14 @@ import click
 from click.core import ParameterSource
 
 from wavebatch.batch.options import OPTIONS, RunOptions, check_together
-from wavebatch.cli.messages import one_line, report_errors, talk
+from wavebatch.cli.messages import one_line, report_errors, talk, tell
 from wavebatch.cli.program.completion import complete_files, complete_flags, complete_profiles, complete_written
 from wavebatch.cli.program.log_file import LEVELS, LOG, begin_log, keep_level
 from wavebatch.cli.program.settings import READ
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
 from wavebatch.files.disk.protect import protecting, refuse_input
+from wavebatch.files.inputs import find_files
 
 _Options = TypeVar("_Options")
 
@@ -243,6 +244,16 @@ def check_html(target: Path | None, *, will_exist: bool = False) -> None:
         from wavebatch.tools.html.page import check_page
 
         check_page(target)
+
+
+def find_inputs(arguments: Iterable[Path | str], **how: Any) -> list[Path]:
+    """The files of the arguments, as `find_files` finds them; a link to a file that was given before is named."""
+    return find_files(map(str, arguments), note=note_input, **how)
+
+
+def note_input(line: str) -> None:
+    """A line about the arguments."""
+    tell(f"note: {line}")
 
 
 strip_argument = click.argument("strip", type=click.Path(path_type=Path))

@@ -16,6 +16,7 @@ from typing import Any
 import click
 
 from wavebatch.batch.options import OPTIONS, RunOptions
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import (
     EXIT_USAGE,
     Interrupted,
@@ -29,16 +30,6 @@ from wavebatch.cli.messages import (
     talk,
     tell,
 )
-from wavebatch.cli.options import (
-    OutputPath,
-    check_html,
-    common_options,
-    declared,
-    from_options,
-    html_option,
-    strips_argument,
-    together,
-)
 from wavebatch.cli.program.log_file import typed_command
 from wavebatch.cli.program.progress import Progress
 from wavebatch.core.errors import ConfigError, InputError
@@ -48,17 +39,17 @@ EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
 """All strips are written, but --report, --html or stdout could not be; some strips failed; all strips failed."""
 
 @click.command()
-@strips_argument
-@together(*(declared(name, required=True) if name == "output" else declared(name)
-            for name in OPTIONS if name != "recursive"))
+@shared.strips_argument
+@shared.together(*(shared.declared(name, required=True) if name == "output" else shared.declared(name)
+                   for name in OPTIONS if name != "recursive"))
 @click.option("--dry-run", is_flag=True, help="Print what would be done with each strip; write nothing.")
-@click.option("--report", type=OutputPath(dir_okay=False, allow_dash=True), metavar="FILE",
+@click.option("--report", type=shared.OutputPath(dir_okay=False, allow_dash=True), metavar="FILE",
               help="Write a summary of all strips as JSON; - is stdout. An existing FILE is replaced.")
-@html_option
+@shared.html_option
 @click.option("--progress", type=click.Choice(["auto", "bar", "json", "none"]), default="auto", show_default=True,
               help="auto: a bar if stderr is a terminal; json: one line per event on stdout.")
 @click.option("-v", "--verbose", is_flag=True, help="Print more about each strip.")
-@common_options("json", failure=EXIT_NOTHING)
+@shared.common_options("json", failure=EXIT_NOTHING)
 def run(**options: Any) -> None:
     """Decompose strips into enriched point clouds.
 
@@ -81,12 +72,12 @@ def run(**options: Any) -> None:
         _start_processes(options)
         from wavebatch.tools.api.run import plan_run
 
-        jobs, batch_options = plan_run(options["strips"], from_options(RunOptions, options))
+        jobs, batch_options = plan_run(options["strips"], shared.from_options(RunOptions, options), shared.note_input)
         if options["report"] not in (None, "-"):
             _check_report(Path(options["report"]), jobs, batch_options)
         if options["html_file"] is not None:
             _check_report(options["html_file"], jobs, batch_options, "--html")
-            check_html(options["html_file"], will_exist=True)
+            shared.check_html(options["html_file"], will_exist=True)
         if options["dry_run"]:
             sys.exit(_dry_run(jobs, batch_options, options))
         sys.exit(_run(jobs, batch_options, options))

@@ -21,7 +21,6 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.geojson_crs import GEOJSON_CRS, GeoJsonCrs, plan_crs
-from wavebatch.files.inputs import find_files
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import survey_blocks
@@ -118,7 +117,7 @@ def slice_(
         refuse_existing(target, options["overwrite"])
     for picture in filter(None, (png, overview)):
         check_picture(picture, overwrite=options["overwrite"])
-    paths = find_files(strips, recursive=options["recursive"])
+    paths = shared.find_inputs(strips, recursive=options["recursive"])
     if extras.targets and len(paths) > 1:
         raise ConfigError(f"{extras.targets[0]}: one file for {len(paths)} strips; make them one by one")
     targets = {} if output is None else shared.name_outputs(paths, output, SEGMENT_SUFFIXES, ".csv")

@@ -14,20 +14,13 @@ from typing import Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, print_json, print_text, printable, row, talk
-from wavebatch.cli.options import (
-    clouds_argument,
-    common_options,
-    declared,
-    output_option,
-    where_option,
-)
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
-from wavebatch.files.inputs import find_files
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.csv_table import format_csv
 from wavebatch.tools.return_stats.areas import RANKS, AreaStats, Grid, PolygonSet, Separation, describe_pairs
@@ -45,15 +38,15 @@ _COUNTED = ("by_number", "by_count")
 
 
 @click.command()
-@clouds_argument
-@declared("recursive")
+@shared.clouds_argument
+@shared.declared("recursive")
 @click.option("--area", "size", type=float, metavar="SIZE",
               help="Also count in square cells with sides of SIZE, in the unit of the coordinates.")
-@declared("polygon", "Also count in the polygons of this GeoJSON file, in WGS 84, in the CRS that the file names, or "
-          "in the coordinates of the clouds; where polygons overlap, the first one counts.")
-@where_option("Count only points")
-@output_option("Write a table with one row per cloud and area.", "FILE.csv", required=False)
-@common_options("overwrite", "json")
+@shared.declared("polygon", "Also count in the polygons of this GeoJSON file, in WGS 84, in the CRS that the file "
+                 "names, or in the coordinates of the clouds; where polygons overlap, the first one counts.")
+@shared.where_option("Count only points")
+@shared.output_option("Write a table with one row per cloud and area.", "FILE.csv", required=False)
+@shared.common_options("overwrite", "json")
 def stats(
     clouds: tuple[Path, ...], size: float | None, polygon: Path | None, output: Path | None, overwrite: bool,
     as_json: bool, quiet: bool, debug: bool, recursive: bool, where: Condition | None,
@@ -66,7 +59,7 @@ def stats(
 
     Exit code: 0 done, 1 a cloud cannot be read (the others are counted), 2 wrong usage.
     """  # fmt: skip
-    files = find_files(map(str, clouds), recursive=recursive)
+    files = shared.find_inputs(clouds, recursive=recursive)
     if output is not None:
         check_target(output, overwrite=overwrite)
     divisions = [] if size is None else [Grid(size)]

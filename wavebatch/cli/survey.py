@@ -13,16 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, one_line, print_result, talk, tell
-from wavebatch.cli.options import (
-    check_html,
-    check_toml,
-    common_options,
-    html_option,
-    output_option,
-    strip_options,
-    strips_argument,
-)
 from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
 
 if TYPE_CHECKING:
@@ -35,20 +27,20 @@ EXIT_PROBLEMS = 1
 
 
 @click.command()
-@strips_argument
-@output_option("Write the survey, for --system of other commands.", "SYSTEM.toml", required=False)
-@output_option("Write the cheapest chain that suits the strip, with a reason for each part; for `run --chain`.",
-               "CHAIN.toml", "--chain", "chain_file", required=False)
+@shared.strips_argument
+@shared.output_option("Write the survey, for --system of other commands.", "SYSTEM.toml", required=False)
+@shared.output_option("Write the cheapest chain that suits the strip, with a reason for each part; for `run --chain`.",
+                      "CHAIN.toml", "--chain", "chain_file", required=False)
 @click.option("--waveforms", type=click.IntRange(1), metavar="N",
               help="Waveforms to look at, spread over all strips.  [default: 8192, fewer if they are long]")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]: adds whether echo widths can give "
               "incidence angles; saved in SYSTEM.toml.")
-@output_option("Write which echo width means which incidence angle on this strip: .csv, or a picture.", "FILE",
-               "--angles", required=False)
-@html_option
-@strip_options
-@common_options("overwrite", "json")
+@shared.output_option("Write which echo width means which incidence angle on this strip: .csv, or a picture.", "FILE",
+                      "--angles", required=False)
+@shared.html_option
+@shared.strip_options
+@shared.common_options("overwrite", "json")
 def survey(
     strips: tuple[str, ...],
     output: Path | None,
@@ -71,18 +63,17 @@ def survey(
     wrong usage.
     """  # fmt: skip
     from wavebatch.files.disk.publish import check_target
-    from wavebatch.files.inputs import find_files
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
 
     overwrite = options["overwrite"]
-    paths = find_files(strips, recursive=options["recursive"])
+    paths = shared.find_inputs(strips, recursive=options["recursive"])
     for target in (output, chain_file):
-        check_toml(target)
+        shared.check_toml(target)
         if target is not None:
             check_target(target, overwrite=overwrite)
-    check_html(html_file)
+    shared.check_html(html_file)
     if angles is not None:
         _check_angles(angles, paths, overwrite)
     options["angles"] = angles

@@ -18,7 +18,6 @@ from wavebatch.cli.messages import answer, count, counting, talk, tell
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import format_measure
 from wavebatch.files.disk.protect import refuse_input
-from wavebatch.files.inputs import find_files
 from wavebatch.tools.voxels.profile import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions
 
@@ -94,7 +93,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     more: dict[str, Any] = {"sensor": read_sensor(asked), **{name: options[name] for name in names}}
     more["system"] = None if asked.system is None else load_survey(asked.system)
     more["calibration"] = None if asked.calibration is None else load_calibration(asked.calibration)
-    paths = find_files(strips, recursive=options["recursive"])
+    paths = shared.find_inputs(strips, recursive=options["recursive"])
     if options["profiles"] is not None:
         refuse_input(options["profiles"])
     if len(paths) > 1 and options["profiles"] is not None:

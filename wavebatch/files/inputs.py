@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from wavebatch.core.errors import ConfigError
@@ -21,7 +21,11 @@ LONGEST_PATTERN = 4096
 
 
 def find_files(
-    arguments: Iterable[str], *, recursive: bool = False, kinds: Sequence[Sequence[str]] = (SUFFIXES,)
+    arguments: Iterable[str],
+    *,
+    recursive: bool = False,
+    kinds: Sequence[Sequence[str]] = (SUFFIXES,),
+    note: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Return the files of the arguments, each once, in the order of the arguments.
 
@@ -30,24 +34,29 @@ def find_files(
     are skipped. A file that does not exist or a folder that cannot be read is kept: it fails in its turn, so that the
     other files are still processed.
     kinds: suffixes of the files that folders and patterns give, kind after kind: the first that is there is taken.
+    note: is called with a line about each link to a file that was given before.
     Raises ConfigError if a folder, pattern or list gives no file, or if there is no argument.
     """
     files: dict[str, Path] = {}
     for argument in arguments:
         for path in _expand(argument, Path(), recursive, kinds):
-            files.setdefault(real_name(path), path)
+            first = files.setdefault(real_name(path), path)
+            if note is not None and os.path.abspath(first) != os.path.abspath(path):
+                note(f"{path}: is the same file as {first}; it is used once")
     if not files:
         raise ConfigError("no file given; name files, folders, patterns or @list.txt")
     protect(files.values())
     return list(files.values())
 
 
-def find_strips(arguments: Iterable[str], *, recursive: bool = False) -> list[Path]:
+def find_strips(
+    arguments: Iterable[str], *, recursive: bool = False, note: Callable[[str], None] | None = None
+) -> list[Path]:
     """Return the strips of the arguments, as `find_files` does.
 
     Raises ConfigError if there is none, or if two strips would get outputs of the same name.
     """
-    strips = find_files(arguments, recursive=recursive)
+    strips = find_files(arguments, recursive=recursive, note=note)
     stems: dict[str, Path] = {}
     for path in strips:
         other = stems.setdefault(os.path.normcase(path.stem), path)

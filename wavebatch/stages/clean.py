@@ -1,8 +1,8 @@
-"""Spikes, patterns of the converter, transients, slopes and seams: which a strip has, and how they are taken off.
+"""Spikes, patterns of the converter, transients, slopes and seams: which a strip has, and how they are removed.
 
 The survey measures them after its first look at noise and width; `Chain.run` and the survey clean every block before
-anything else. Each defect must stand clear of chance: waveforms of other strips pass through untouched. Cleaned samples
-are float32, so that a block that was cleaned is known by its samples.
+anything else. A defect counts only if chance cannot explain it, so waveforms of other strips stay unchanged. Cleaned
+samples are float32, so that a block that was cleaned is known by its samples.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
 def mark_seam(block: WaveformBlock, seams: Mapping[int, int]) -> WaveformBlock:
     """Mark the samples of a block's seam as missing.
 
-    These are the interpolated one, its neighbours, and of the recording with less signal there FLANK more: the time
-    between both recordings is not known to a sample, so that no pulse fits an echo across the seam.
+    These are the interpolated sample, its neighbours, and FLANK more in the recording with less signal there: the time
+    between both recordings is not known to a sample, so no pulse fits an echo across the seam.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     block : WaveformBlock
         Raw waveforms of one digitizer.
     system : SystemPulse
-        Noise and width at first sight.
+        Noise and width as measured so far.
 
     References
     ----------

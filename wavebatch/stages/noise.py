@@ -34,7 +34,7 @@ def pooled(
     guard: Annotated[float, Range(0.0, 100.0)] = 3.0,
     limit: Annotated[float, Range(0.1, 1e6)] = 3.5,
 ) -> Noise:
-    """Baseline of each waveform from its quiet samples, drawn towards the strip's; standard deviation of the strip.
+    """Baseline of each waveform from its quiet samples and the strip's baseline; standard deviation of the strip.
 
     The standard deviation is that of all quiet samples of the strip, from its survey: a single waveform, rounded to
     whole counts, is too short to estimate it. The baseline is the best linear estimate from two values: the mean of the

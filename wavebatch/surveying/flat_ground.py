@@ -1,10 +1,10 @@
 """How wide the echo of a surface is that faces the sensor: the reference against which widths of slopes are compared.
 
-A survey takes the narrowest echoes for those of level ground seen from above. Few are: across a swath, rays hit level
-ground at up to half the field of view, and a hillside has none. A reference 1 % too wide turns 5 degrees into 2.
-So echoes are used whose surface is known from the points around them, whatever its slope: what the slope adds to the
-width is taken off. The same echoes show the beam's divergence, where their surfaces differ in angle (docs/algorithms.md
-1.4). `angle_limits` calls it.
+A survey assumes that the narrowest echoes are those of level ground seen from above. Few are: across a swath, rays hit
+level ground at up to half the field of view, and a hillside has no level ground. A reference 1 % too wide turns 5
+degrees into 2. So echoes are used whose surface is known from the points around them, whatever its slope: what the
+slope adds to the width is taken off. The same echoes show the beam's divergence, where their surfaces differ in angle
+(docs/algorithms.md 1.4). `angle_limits` calls it.
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
     -------
     Reference
         `widths.error` is infinite where fewer than 50 clean echoes of surfaces of known slope are found: widths then
-        mean no angle. Without a divergence the system stays as it is.
+        give no angle. Without a divergence the system stays as it is.
     """
     parts: dict[int | None, list[np.ndarray]] = {}
     for sample in samples:

@@ -1,7 +1,7 @@
 """One survey for all strips of a flight, and whether a strip belongs to it.
 
-`wavebatch survey STRIPS...` and `run --survey flight` call `survey_flight`; `batch.unit` holds every strip against the
-result with `hold_strip`. Before you change it: nothing may depend on the order in which the strips are given.
+`wavebatch survey STRIPS...` and `run --survey flight` call `survey_flight`; `batch.unit` compares every strip with
+the result (`hold_strip`). Before you change it: nothing may depend on the order in which the strips are given.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ SAME_WIDTH = 0.06
 """How far from the edge a width may be to count as the same, as a share of it."""
 
 SHAPE = 0.008
-"""How much worse than in the flight the common pulse may fit the better half of a strip's strong echoes, as a share of
-the amplitude. A Gaussian misses the echoes of the shipped sensors by 0.02 to 0.06."""
+"""How much worse than in the flight the common pulse may fit the better quarter of a strip's strong echoes, as a share
+of the amplitude. A Gaussian misses the echoes of the shipped sensors by 0.02 to 0.06."""
 
 ALIKE_PULSES, PULSE_ERROR = 0.02, 0.3
 """Difference of two pulses (`compare_pulses`) up to which surveys of single strips agree, and what is added to it, over
@@ -261,7 +261,7 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: Survey) -> str:
     Raises
     ------
     ConfigError
-        Where the survey is none of a flight.
+        If the survey is not that of a flight.
     """
     whole, kinds = read_flight(flight)
     number = min(HELD, sample_size(reader, scan))

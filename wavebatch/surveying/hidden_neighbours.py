@@ -1,4 +1,4 @@
-"""What neighbours that are too close to be found do to the times of echoes (docs/algorithms.md 2.2).
+"""The effect of neighbours that are too close to be found on the times of echoes (docs/algorithms.md 2.2).
 
 The survey calls `measure_hidden` with the echoes of its sample. Before you change it: a strip must get the same numbers
 every time, so the seed is fixed.

@@ -17,10 +17,19 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.strip.header_check import audit_header
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
-from wavebatch.stages.chain_file import load_chain
+from wavebatch.stages.chain_file import load_chain, load_profile
+from wavebatch.surveying.survey import survey_blocks
 
 _SAMPLED = 4096
 """Waveforms that are read."""
+
+_MATCHED = 1024
+"""Waveforms whose echoes are compared with the returns."""
+
+LEAST_RETURNS, LEAST_MATCHED = 20, 0.5
+"""Returns in waveforms with echoes, and share of them that an echo should match: below it the packets are doubted. Own
+packets match .85 to 1.00 of them (real and simulated strips), those of another strip .1 to .4.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +138,8 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
         _describe_samples(reader, scan)
     except InputError as error:
         problems.append(_without_name(path, error))
+    else:
+        problems += doubt_packets(facts, *_match_returns(reader, scan))
     notes = [*_note_descriptors(facts, scan), *scan.notes, *audit_header(reader, scan)]
     summary = ", ".join(f"{n} {name}{'s' * (n != 1)}" for n, name in ((scan.points, "point"), (scan.packets, "packet")))
     if scan.packets:
@@ -167,6 +178,32 @@ def _describe_samples(reader: StripReader, scan: StripScan) -> dict[str, Any]:
         "waveforms_with_gaps": sum(gaps),
         "lengths": sorted(set(lengths)),
     }
+
+
+def doubt_packets(facts: StripFacts, matched: int, returns: int) -> Iterator[str]:
+    """Say that packets do not belong to the points, if too few returns in waveforms with echoes match an echo."""
+    if returns >= LEAST_RETURNS and matched < LEAST_MATCHED * returns:
+        packets = facts.packets
+        other = "" if packets.internal else f"{packets.file.name} belongs to another strip, or "
+        yield (
+            f"only {matched} of {returns} returns lie where their packet has an echo: {other}the return locations "
+            "(which should be picoseconds after the first sample) are wrong, and so are the positions of added echoes"
+        )
+
+
+def _match_returns(reader: StripReader, scan: StripScan) -> tuple[int, int]:
+    """How many returns match an echo, and how many are in waveforms with echoes, in a sample of the strip."""
+    blocks = list(reader.sample_blocks(scan, _MATCHED)) if scan.with_waveform else []
+    if not blocks:
+        return 0, 0
+    system, chain = survey_blocks(blocks, learn=False).system, load_profile("accurate")
+    matched = returns = 0
+    for block in blocks:
+        echoes = chain.run(block, system)
+        if block.returns is not None:
+            matched += np.count_nonzero(echoes.attributes["point"] >= 0)
+            returns += np.count_nonzero(np.isin(block.returns.waveform, echoes.waveform))
+    return matched, returns
 
 
 def _describe_file(facts: StripFacts) -> dict[str, Any]:

@@ -204,8 +204,8 @@ def compare_outgoing(found: Survey, strip: Path) -> Survey:
     -----
     Echoes pass the receiver, so where both agree the pulse of the echoes is taken. Where echoes are wider, slopes and
     plants have widened them, and the outgoing pulse is the narrower truth; but only if the same receiver recorded it,
-    or if it is wider by a little only. Echoes that are narrower than what was sent show that another receiver
-    recorded that.
+    or if it is wider by a little only. Echoes narrower than the outgoing pulse show that another receiver
+    recorded the latter.
     """
     path = strip.with_suffix(SYSTEM_SUFFIX)
     sent = load_survey(path).survey if path.is_file() else None

@@ -145,7 +145,7 @@ def simulate_again(
     -------
     block : WaveformBlock
     system : SystemPulse
-        Without the defects of the strip's waveforms, which these have not.
+        Without the defects of the strip's waveforms: simulated ones have none.
     """
     n, s = block.samples.shape
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)

@@ -487,7 +487,7 @@ def _decide(system: SystemPulse, spacing: float, figures: Figures) -> tuple[Deci
         Decision(Part.PULSE, learned > 1, _explain_pulse(system, figures)),
         Decision(Part.SKEW, system.kappa != 0, _explain_skew(system, figures)),
         Decision(Part.GROWTH, share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
-        Decision(Part.PRIOR, share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (40 %)"),
+        Decision(Part.PRIOR, share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (limit 40 %)"),
         Decision(
             Part.CENSORED,
             system.saturation is not None and figures.saturated_share > 0,
@@ -502,7 +502,7 @@ def _decide(system: SystemPulse, spacing: float, figures: Figures) -> tuple[Deci
         Decision(
             Part.WIDTH,
             width >= LEAST_PULSE_WIDTH,
-            f"the system pulse is {width:.2f} samples wide ({LEAST_PULSE_WIDTH})",
+            f"the system pulse is {width:.2f} samples wide (limit {LEAST_PULSE_WIDTH})",
         ),
         Decision(
             Part.ANGLE,

@@ -12,25 +12,17 @@ from typing import Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, count, counting, tell
-from wavebatch.cli.options import (
-    common_options,
-    for_each,
-    name_outputs,
-    output_option,
-    strip_options,
-    strips_argument,
-)
-from wavebatch.files.inputs import find_files
 from wavebatch.tools.archives.export_strip import SUFFIXES, ExportSummary, export_strip
 
 
 @click.command()
-@strips_argument
-@output_option("File to write: .las or .laz with a .wdp beside it, or .npz; or a folder, which gets STEM.las for each "
-               "strip.", "FILE|DIR", folder=None)
-@strip_options
-@common_options("overwrite", "json")
+@shared.strips_argument
+@shared.output_option("File to write: .las or .laz with a .wdp beside it, or .npz; or a folder, which gets STEM.las "
+                      "for each strip.", "FILE|DIR", folder=None)
+@shared.strip_options
+@shared.common_options("overwrite", "json")
 def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: Any) -> None:
     """Write STRIPs as other programs need them: LAS with repaired packets, or waveforms as arrays.
 
@@ -44,8 +36,8 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
     """  # fmt: skip
-    paths = find_files(strips, recursive=recursive)
-    targets = name_outputs(paths, output, SUFFIXES, ".las")
+    paths = shared.find_inputs(strips, recursive=recursive)
+    targets = shared.name_outputs(paths, output, SUFFIXES, ".las")
 
     def work(path: Path) -> ExportSummary:
         with counting("waveforms", options["quiet"]) as bar:
@@ -56,7 +48,7 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
         _say(summary)
         return summary
 
-    summaries, failed = for_each(paths, work, debug=options["debug"])
+    summaries, failed = shared.for_each(paths, work, debug=options["debug"])
     answer([asdict(one) for one in summaries])
     sys.exit(1 if failed else 0)
 

@@ -12,18 +12,9 @@ from typing import Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, count, counting, tell
-from wavebatch.cli.options import (
-    common_options,
-    declared,
-    for_each,
-    from_options,
-    name_outputs,
-    options_of,
-    output_option,
-)
 from wavebatch.cli.program.completion import complete_files
-from wavebatch.files.inputs import find_files
 from wavebatch.tools.archives.import_file import SUFFIXES, ImportOptions, ImportSummary, import_file
 
 EXIT_SOME, EXIT_NONE = 3, 4
@@ -32,11 +23,11 @@ EXIT_SOME, EXIT_NONE = 3, 4
 
 @click.command("import")
 @click.argument("files", nargs=-1, required=True, metavar="FILE...", shell_complete=complete_files)
-@declared("recursive")
-@output_option("Strip to write, .las or .laz, or a folder.  [default: X.las beside each X.pls]", "FILE|DIR",
-               required=False, folder=None)
-@options_of(ImportOptions)
-@common_options("overwrite", "json")
+@shared.declared("recursive")
+@shared.output_option("Strip to write, .las or .laz, or a folder.  [default: X.las beside each X.pls]", "FILE|DIR",
+                      required=False, folder=None)
+@shared.options_of(ImportOptions)
+@shared.common_options("overwrite", "json")
 def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **options: Any) -> None:
     """Import PulseWaves FILEs (.pls with the .wvs beside it) as LAS 1.4 strips of point format 9.
 
@@ -46,11 +37,11 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
 
     Exit code: 0 all written, 2 wrong usage, 3 some files failed, 4 no file was written.
     """  # fmt: skip
-    paths = find_files(files, recursive=recursive, kinds=(SUFFIXES,))
+    paths = shared.find_inputs(files, recursive=recursive, kinds=(SUFFIXES,))
     targets = _name_strips(paths, output)
-    chosen = from_options(ImportOptions, options)
+    chosen = shared.from_options(ImportOptions, options)
     # A single file that fails is one line too, with the exit code of a batch.
-    results, failed = for_each(
+    results, failed = shared.for_each(
         paths, lambda path: _import(path, targets[path], chosen, options), debug=options["debug"], alone=True
     )
     answer({"files": [asdict(one) for one in results], "failed": failed})
@@ -62,7 +53,7 @@ def _name_strips(paths: list[Path], output: Path | None) -> dict[Path, Path]:
         return {path: path.with_suffix(".las") for path in paths}
     if output.suffix.lower() not in (".las", ".laz"):
         output.mkdir(parents=True, exist_ok=True)
-    return name_outputs(paths, output, (".las", ".laz"), ".las")
+    return shared.name_outputs(paths, output, (".las", ".laz"), ".las")
 
 
 def _import(path: Path, target: Path, chosen: ImportOptions, options: dict[str, Any]) -> ImportSummary:

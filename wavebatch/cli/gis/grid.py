@@ -17,6 +17,9 @@ from wavebatch.cli.plot.clouds import find_clouds, select
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.tools.rasters.grid import GridOptions, GridResult, write_grid
 
+FEW_CELLS = 1_000_000
+"""Cells of a raster up to which it may be nearly empty without a warning."""
+
 
 @click.command()
 @shared.clouds_argument
@@ -33,8 +36,8 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     """Write columns of CLOUDs as a GeoTIFF, of clouds of any size.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. The raster is tiled,
-    compressed and has the CRS of the clouds, a no-data value, and name and unit of every band. Memory does not grow;
-    large clouds need room in TMPDIR. Needs rasterio: pip install rasterio.
+    compressed and has the CRS of the clouds, a no-data value, and name and unit of every band; it has at most 10^11
+    cells. Memory does not grow; large clouds need room in TMPDIR. Needs rasterio: pip install rasterio.
 
     Exit code: 0 done, 1 a cloud cannot be read or the raster cannot be written, 2 wrong usage.
     """  # fmt: skip
@@ -48,6 +51,13 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     layout = found.layout
     if layout.crs is None:
         talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")
+    if found.unnamed:
+        some = f"{found.unnamed[0]}" + f" and {len(found.unnamed) - 1} more" * (len(found.unnamed) > 1)
+        talk(f"warning: {some}: without a CRS; taken to be in that of the other clouds; say so with --crs")
+    cells = layout.columns * layout.rows
+    if found.filled < cells / 1000 and cells > FEW_CELLS:
+        share = f"{100 * found.filled / cells:.1g} % of the cells have a value"
+        talk(f"warning: {output}: only {share}: if clouds lie far apart, make a raster of each")
     tell(f"{output}: {_summarise(found, columns)}")
     answer({"output": str(output), "clouds": [str(path) for path in paths], "statistic": options["statistic"],
             **_describe(found, columns)})  # fmt: skip

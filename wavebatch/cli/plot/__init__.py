@@ -82,6 +82,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
             raise ConfigError(f"--{option} chooses the waveforms; leave out --packet, --point, --gps-time and --random")
     if options["random"] and named:
         raise ConfigError("--random chooses the waveforms; leave out --packet, --point and --gps-time")
+    if options["most"] and (named or options["random"]):
+        raise ConfigError("--most is for --flags, --where and the default; leave it out, or leave out the numbers")
     if options["sheet"] and (options["show"] or options["table"]):
         raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
     tabular = output.suffix.lower() == ".csv"
@@ -109,6 +111,9 @@ def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, opti
     if shown == "all":
         last = max(float(view.time[-1] + 0.5 * view.spacing) for view in views)
         shown = (min(-0.5 * view.spacing for view in views), last)
+    if shown and all(view.time[-1] < shown[0] or shown[1] < 0 for view in views):
+        end = max(view.time[-1] for view in views)
+        raise ConfigError(f"--times {shown[0]:g}:{shown[1]:g}: no sample lies there; the waveforms end at {end:g} ns")
     if options["sheet"]:
         from wavebatch.tools.plots.draw_sheet import draw_sheet
 

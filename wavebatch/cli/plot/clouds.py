@@ -17,14 +17,13 @@ from wavebatch.cli.messages import answer, count, tell
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.figure_file import check_picture
-from wavebatch.files.inputs import find_files
 
 output_option = shared.output_option("Picture to write: .png, .svg or .pdf.")
 
 
 def find_clouds(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
     """The files that the arguments name."""
-    return find_files(map(str, clouds), recursive=options["recursive"])
+    return shared.find_inputs(clouds, recursive=options["recursive"])
 
 
 def draws_clouds(

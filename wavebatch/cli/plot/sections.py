@@ -18,7 +18,7 @@ from wavebatch.cli.plot.clouds import describe_tally, draws_clouds, list_tally, 
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.figure_file import check_picture
-from wavebatch.files.inputs import SUFFIXES, find_files
+from wavebatch.files.inputs import SUFFIXES
 
 
 def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> list[Path]:
@@ -27,7 +27,7 @@ def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool 
     from wavebatch.tools.slices.read_segments import check_alone, is_segments
 
     kinds = (SUFFIXES, SEGMENT_SUFFIXES) if or_segments else (SUFFIXES,)
-    paths = find_files(map(str, clouds), recursive=options["recursive"], kinds=kinds)
+    paths = shared.find_inputs(clouds, recursive=options["recursive"], kinds=kinds)
     segments = [path for path in paths if is_segments(path)]
     voxels = [path for path in paths if path.suffix.lower() == ".npz"]
     if segments and or_segments:

@@ -81,8 +81,8 @@ def angles_above(
 
     Notes
     -----
-    Of echoes near the threshold those are seen that noise has widened, so that their plain angles are too large: by
-    1.75 errors where a tenth is seen. These angles and errors hold for the echoes that are seen, whatever their share.
+    Near the threshold, only echoes that noise has widened are seen, so their plain angles are too large: by 1.75 errors
+    if a tenth of the echoes is seen. The angles and errors given here are right for the echoes that are seen.
     """
     bounds = []
     with np.errstate(invalid="ignore", divide="ignore"):

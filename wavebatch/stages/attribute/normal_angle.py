@@ -31,10 +31,10 @@ def incidence_angle_normals(
     is fitted to all points within the radius that are not outliers. It needs neither sensor nor divergence.
 
     No-data where there are fewer than min_points, or only two scan lines of them (any two lines are in a plane); where
-    the points are no plane (plants: less than 60 % of them in it, thicker than a fifth of its width, or the echo not in
-    it) or clearly two (a ridge, a valley or a step close by); where the angle exceeds 80 degrees (one sweep of the
-    scanner over plants makes a plane that contains its rays); and where its error exceeds max_error. The error holds
-    what two planes in place of one would change.
+    the points form no plane (plants: less than 60 % of them in it, thicker than a fifth of its width, or the echo not
+    in it) or clearly two (a ridge, a valley or a step close by); where the angle exceeds 80 degrees (one sweep of the
+    scanner over plants makes a plane that contains its rays); and where its error exceeds max_error. The error includes
+    the change that two planes instead of one would make.
 
     Parameters
     ----------

@@ -48,10 +48,9 @@ def backscatter_coefficient(block: WaveformBlock, noise: Noise, system: SystemPu
     """Cross section of each echo per illuminated area (gamma), and its error; no-data without sensor or calibration.
 
     gamma = C' R^2 A sigma / eta(R). Echoes of one pulse share its light: only the sum over the pulse is then a gamma.
-    Unreliable (saturated) amplitudes give no-data; fits that ended at a bound (AT_BOUND) an estimate with an error of
-    50 % at least, for sums over pulses. The error holds that of the fit (with
-    the covariance of amplitude and width), range, air and constant, and the energy's scatter from shot to shot that the
-    calibration measured.
+    Unreliable (saturated) amplitudes give no-data; fits that ended at a bound (AT_BOUND) give an estimate with an error
+    of 50 % at least, which sums over pulses need. The error holds that of the fit (with the covariance of amplitude and
+    width), range, air and constant, and the energy's scatter from shot to shot that the calibration measured.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""Incidence angles from echo widths, with their errors; NaN where widths cannot tell (docs/algorithms.md 1.4)."""
+"""Incidence angles from echo widths, with their errors; NaN where widths cannot give one (docs/algorithms.md 1.4)."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ def incidence_angle(
 
     No-data where the system pulse is shorter than 0.85 samples, where sensor, divergence or the width of a surface that
     faces the sensor are not known, and where the echo is too weak for max_error: with a narrow beam and a long pulse
-    that is everywhere. No-data also where the decomposer fits another pulse than the mode compares widths with:
-    Gaussians on a strip whose pulse is none, for example.
+    that is everywhere. No-data also if the decomposer fits another pulse than the mode needs, for example
+    Gaussians on a strip whose pulse is not a Gaussian.
 
     Parameters
     ----------
@@ -95,9 +95,9 @@ def incidence_angle(
         Full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
     max_error : float
         Largest standard deviation that the angle of an echo of this strength would have on a surface that faces the
-        sensor, where angles are least certain [deg]. So an echo has an angle or not by its strength, not by its own
-        width. Weaker echoes have one only where they are wider than the system pulse by four errors of the variance;
-        angle and error then allow for the echoes that noise has kept from it.
+        sensor, where angles are least certain [deg]. So only strong enough echoes get an
+        angle, whatever their width. A weaker echo gets one only if it is wider than the system pulse by four errors of
+        the variance; its angle and error are then corrected for this selection.
     reference_error : float
         Standard deviation of the system pulse's width, relative.
     alone : bool

@@ -66,9 +66,9 @@ def residual_loop(
 ) -> EchoTable:  # fmt: skip
     """Pulses of a model, with one more at the largest residual of the waveform while that exceeds a threshold.
 
-    Only their residual supports the added echoes: on pulses that are not those of the model there are many. On a real
-    strip of Leica Gaussians add an echo to most single returns, the learned pulse to few (docs/algorithms.md 1.2); so
-    the model is that of the survey unless another one is given.
+    Only the residual supports the added echoes: if the model does not fit the pulse, many are added. On a real Leica
+    strip, Gaussians add an echo to most single returns, the learned pulse to few (docs/algorithms.md 1.2). So the
+    default model is that of the survey.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ def residual_loop(
         The pulse that the survey chose (auto: learned, skewed or Gaussian); Gaussians, as in the paper; skewed pulses
         with the skew of the survey; generalized Gaussians; or the learned pulse.
     t_diff : float
-        Largest residual that adds no echo, T_diff of the paper, in the unit below; at least the noise, and the report
-        says so where it was raised.
+        Largest residual that adds no echo, T_diff of the paper, in the unit below. It is at least the noise; the report
+        says so if it was raised.
     t_unit : {"noise", "count", "amplitude"}
         Standard deviations of the noise, counts of the digitizer, or shares of the waveform's largest sample above the
         baseline.
@@ -188,8 +188,8 @@ def asdf_only(
     Parameters
     ----------
     describe : {"samples", "detector"}
-        Amplitude and width: a log-parabola through five samples at the detector's time, or what the detector says. An
-        ASDF says the width of its reference, and an amplitude that is too low for echoes that are broader.
+        Amplitude and width: from a log-parabola through five samples at the detector's time, or from the detector. An
+        ASDF gives the width of its reference, and too low an amplitude for broader echoes.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""Echoes too close to be resolved: fitted ones are merged (docs/algorithms.md H1), unseen ones are in the errors.
+"""Echoes too close to be resolved: fitted ones are merged (docs/algorithms.md H1), hidden ones enlarge the errors.
 
 Called after every fit.
 """
@@ -77,7 +77,7 @@ def merge_unresolved(table: EchoTable) -> EchoTable:
 
 
 def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
-    """Add what neighbours that were not found do to the errors of times.
+    """Enlarge the errors of times by the effect of neighbours that were not found.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
 
 
 def excess_variance(table: EchoTable, system: SystemPulse) -> np.ndarray:
-    """Compute by how much the width of each echo exceeds the system's for sure.
+    """Compute by how much the width of each echo exceeds the system's beyond its error.
 
     Parameters
     ----------

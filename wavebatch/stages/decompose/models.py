@@ -56,7 +56,7 @@ def reference(
     Parameters
     ----------
     model : {"broadened", "stretched", "given"}
-        `broadened` for the survey's pulse convolved with a Gaussian, `stretched` for it as a table stretched in time,
+        `broadened` for the survey's pulse convolved with a Gaussian, `stretched` for this pulse stretched in time,
         `given` for the pulse below, stretched.
     pulse : str
         Samples of the given pulse, separated by spaces, with the spacing of the waveform.

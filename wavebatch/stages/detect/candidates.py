@@ -54,7 +54,7 @@ def make_table(
 ) -> EchoTable:
     """Turn candidates in samples into a table in ns.
 
-    Constant waveforms have none, whatever filters make of their ends, and gaps between two recordings have none.
+    Constant waveforms and gaps between two recordings get none, whatever a filter shows at their ends.
 
     Parameters
     ----------

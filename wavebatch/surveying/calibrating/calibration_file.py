@@ -34,7 +34,7 @@ _NUMBERS: dict[str, Key] = {
     ),
     "height_m": Key("height", 0.0, 1e7, "of the sensor above the targets, median", optional=True),
     "distance_m": Key(
-        "distance", 0.0, 1e7, "from the sensor to the targets, median: runs at others are less sure", optional=True
+        "distance", 0.0, 1e7, "from the sensor to the targets, median: others are less certain", optional=True
     ),
     "pulse_rate_hz": Key("rate", 1e-3, 1e12, "by GPS times: a laser has another energy at another rate", optional=True),
     "section_constant": Key(
@@ -140,7 +140,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
         channel = _read_channel(row)
         key = (channel.digitizer, channel.scanner)
         if key in channels:
-            raise ConfigError(f"{row.where}: digitizer {key[0]} with scanner channel {key[1]} is there already")
+            raise ConfigError(f"{row.where}: digitizer {key[0]} with scanner channel {key[1]} has two tables")
         channels[key] = channel
     strips = tuple(map(_read_strip, table.tables("flight_strip")))
     swath = _read_swath(table.table("scan_angle")) if "scan_angle" in table.values else ()

@@ -45,7 +45,7 @@ def doubt_calibration(calibration: Calibration) -> Iterator[str]:
     if not any(row.is_described for row in calibration.channels):
         yield (
             "calibration: the file does not say which sensor it was measured with (an earlier version wrote it), so "
-            "that nothing shows whether it fits this strip; measure it again with `wavebatch calibrate`"
+            "it cannot be compared with this strip; measure it again with `wavebatch calibrate`"
         )
     if not min(row.relative_error for row in (calibration, *calibration.channels)):
         yield (

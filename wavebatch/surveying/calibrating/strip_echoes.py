@@ -63,14 +63,14 @@ class CalibrationOptions:
         None, "Attenuation of the air, one way [dB/km].", form="DB_KM", unset="0.22 at 1064 nm"
     )
     wavelength: Annotated[float, Range(300.0, 2500.0)] = option(
-        1064.0, "Of the laser [nm]: clear air takes more of short waves where --attenuation is not given.", form="NM"
+        1064.0, "Wavelength of the laser [nm]: it gives the attenuation if --attenuation is missing.", form="NM"
     )
     divergence: Annotated[float | None, Range(0.001, 100.0)] = option(
         None, "Full angle of the beam between the 1/e^2 points [mrad]; cross sections need it.", form="MRAD"
     )
     """None: that of a saved survey, if it has one."""
     scan_angle: bool = option(
-        False, "Fit how the light falls with the scan angle, where strips overlap; `run` takes it off."
+        False, "Fit how the light falls with the scan angle, where strips overlap; `run` corrects for it."
     )
     direction: str = "auto"
     """Where packet vectors point: auto, toward or away."""

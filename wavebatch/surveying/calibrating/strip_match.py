@@ -1,8 +1,8 @@
 """Whether a calibration fits the strip that it is used for: channel, recording, pulse, chain, day, distance.
 
 `batch.unit` and `tools.voxels` call `match_strip` once per strip. A constant belongs to one channel of one sensor with
-its settings: for anything else it is wrong by any factor. What contradicts is refused, with the reason; what only makes
-the constant less sure gives a warning and a larger error.
+its settings: for anything else it is wrong by any factor. A contradiction is an error, with the reason; what only makes
+the constant less certain gives a warning and a larger error.
 """
 
 from __future__ import annotations

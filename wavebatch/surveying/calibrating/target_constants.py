@@ -1,7 +1,7 @@
 """The constant that reference targets give, with an error that holds angle, edges, scatter and disagreement.
 
-`targets.calibrate_strip` calls `measure_target` per target and channel, and `combine_targets` per channel. A target
-that cannot say is refused with the reason, never used with a guess.
+`targets.calibrate_strip` calls `measure_target` per target and channel, and `combine_targets` per channel. An unusable
+target is rejected, with the reason; no value is guessed.
 """
 
 from __future__ import annotations

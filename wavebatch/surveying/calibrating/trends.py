@@ -1,6 +1,7 @@
 """Whether brightness depends on how a place was seen: by scan angle, incidence, range and time, in the overlaps.
 
-`calibrate_flight` calls `fit_swath` for `calibrate --scan-angle`, and `find_trend` for what no constant explains.
+`calibrate_flight` calls `fit_swath` for `calibrate --scan-angle`, and `find_trend` for scatter that no constant
+explains.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
     Raises
     ------
     InputError
-        Where the overlaps do not tell the term.
+        If the overlaps do not determine the term.
     """
     most = float(ties.view["angle"].max(initial=0.0))
     columns = swath_columns(ties.view["angle"], most or 1.0)

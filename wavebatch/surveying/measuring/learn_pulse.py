@@ -106,9 +106,9 @@ def refine_pulse(
 
     Notes
     -----
-    Pulse and echoes are found in turn: with a pulse that is too wide, its narrowest echoes are narrower than it and
-    draw it down. What other echoes of the waveform put under an echo is taken off. Times are those of fits with the
-    pulse, so that the stack is not widened by the scatter of Gaussian fits to a pulse that is none.
+    Pulse and echoes are found in turn: if the pulse is too wide, the narrowest echoes are narrower and correct it. The
+    signal of other echoes of the waveform is subtracted. Times come from fits with the pulse: Gaussian fits to a pulse
+    that is not a Gaussian would scatter and widen the stack.
     """
     clear = _find_separate(block, system, echoes)
     chosen = _nearest_to_edge(echoes.take(clear))

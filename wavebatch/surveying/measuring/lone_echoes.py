@@ -32,8 +32,8 @@ STEPS = 4
 def fit_lone(block: WaveformBlock, noise: Noise, system: SystemPulse, least: float, fraction: float = 0.2) -> EchoTable:
     """Fit Gaussians to the echoes that are the strongest by far of their waveform, not near an edge or clipped.
 
-    By far is ten to one; but where hardly any echo is alone, after-pulses of every echo are what is seen, and they may
-    be higher: targets at chance distances would not be everywhere.
+    By far means ten to one. Where hardly any echo is alone, every echo has an after-pulse, which may be higher than
+    that: second targets would not be in every waveform.
 
     Parameters
     ----------

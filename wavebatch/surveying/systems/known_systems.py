@@ -230,9 +230,9 @@ def choose_pulse(
     Notes
     -----
     A pulse is right if it explains all waveforms, not only isolated echoes, with the fewest echoes and the least misfit
-    (`measure_cost`): in a canopy isolated echoes are several, and a pulse learned from them is too wide. Nothing is
-    tried where a learned pulse leaves less than SHORT per echo; but where echoes are CROWDED or waveforms few it may be
-    a Gaussian all the same. Else the simplest and widest is taken of those that cost no more (`_drop_tail`,
+    (`measure_cost`): in a canopy an isolated echo is often several, and a pulse learned from them is too wide. Nothing
+    is tried where a learned pulse leaves less than SHORT per echo; but where echoes are CROWDED or waveforms few it may
+    be a Gaussian all the same. Else the simplest and widest is taken of those that cost no more (`_drop_tail`,
     `_draw_together`). A known pulse of the strip's spacing is taken if it costs less than the strip's, and less than it
     does when it is stretched or drawn together (SURE); if it is narrower and costs hardly more (NEARLY); or where the
     strip's must be drawn together and costs hardly less then (ALMOST).

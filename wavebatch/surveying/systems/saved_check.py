@@ -1,6 +1,6 @@
 """Whether a saved survey contradicts the strip that it is used for: another sensor, other settings, another unit.
 
-All commands with `--system` call `check_saved`. It measures what `flight` holds strips of a flight against, except the
+All commands with `--system` call `check_saved`. It compares what `flight` compares for strips of a flight, except the
 level, which the noise stage finds for every waveform. Before you change it: slopes and forest widen echoes, so a strip
 of the same sensor must never be refused for its scene. All echoes of a hillside are wider by the same: that is a doubt.
 """
@@ -81,8 +81,8 @@ def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, 
     Raises
     ------
     InputError
-        Where bits, spacing, noise or width of the strip contradict the survey; with `force`, where no sample can show
-        the saved pulse.
+        If bits, spacing, noise or width of the strip contradict the survey; with `force`, only if the saved pulse is
+        too narrow or too wide for the strip's samples.
     """
     if survey is not None and force:
         _refuse_unseen(reader, scan, survey)
@@ -119,9 +119,9 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     Returns
     -------
     reason : str
-        Empty where nothing does, or where too little is there to see.
+        Empty if nothing does, or if the strip has too few echoes.
     sure : bool
-        No scene of the survey's sensor looks so.
+        Whether no scene of the survey's sensor can explain it.
     """
     blocks = tuple(reader.sample_blocks(scan, min(HELD, sample_size(reader, scan))))
     if not blocks:

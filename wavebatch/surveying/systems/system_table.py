@@ -109,7 +109,7 @@ def read_system(table: TomlTable) -> SystemPulse:
     for row in table.tables(_DIGITIZERS, f"system.{_DIGITIZERS}"):
         index = row.integer(_INDEX, 1, 255)
         if index in own:
-            raise ConfigError(f"{row.where}: {_INDEX} {index} is there already; give each digitizer one table")
+            raise ConfigError(f"{row.where}: {_INDEX} {index} has two tables; give each digitizer one")
         own[index] = _read_pulse(row, _INDEX)
     return replace(_read_pulse(table, _DIGITIZERS), digitizers=own)
 

@@ -81,7 +81,9 @@ def _sign(function: Callable) -> None:
 _sign(run)
 
 
-def plan_run(strips: Strips, options: RunOptions) -> tuple[list[StripJob], RunOptions]:
+def plan_run(
+    strips: Strips, options: RunOptions, note: Callable[[str], None] | None = None
+) -> tuple[list[StripJob], RunOptions]:
     """Check the options of `run` and turn them into jobs; nothing is started or written.
 
     Parameters
@@ -89,6 +91,8 @@ def plan_run(strips: Strips, options: RunOptions) -> tuple[list[StripJob], RunOp
     strips : iterable of path or str, path or str
         As for `run`.
     options : RunOptions
+    note : callable, optional
+        Called with a line about each link to a strip that was given before.
 
     Returns
     -------
@@ -121,7 +125,7 @@ def plan_run(strips: Strips, options: RunOptions) -> tuple[list[StripJob], RunOp
     found = template.extend(template.chain) if shipped else template.chain
     _check_use(found, template)
     paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips),
-                        recursive=options.recursive)  # fmt: skip
+                        recursive=options.recursive, note=note)  # fmt: skip
     processes, block = plan_memory(options.jobs or os.cpu_count() or 1, options.memory)
     columns = choose_columns(found, options.columns)
     plan = [replace(template, path=path, chain=found, columns=columns) for path in paths]

@@ -49,7 +49,7 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
 
 
 def _name_source(source: str) -> str:
-    return {"strip": "This strip was surveyed.", "flight": "The flight was surveyed, all strips together."}.get(
+    return {"strip": "This strip was surveyed.", "flight": "All strips of the flight were surveyed together."}.get(
         source, "The survey comes from a file (--system)."
     )
 
@@ -68,7 +68,7 @@ def draw_sums(counts: Mapping[str, Any], points: str) -> str:
     """The sums that the counts must give, with their numbers; one that does not hold is marked."""
     rows = [(name, counts[name], _write_sum(parts), sum(parts.values()) == counts[name])
             for name, parts in list_sums(counts, points).items()]  # fmt: skip
-    return markup.sums(rows, "Sums that must hold")
+    return markup.sums(rows, "Sums that are checked")
 
 
 def _write_sum(parts: Mapping[str, int]) -> str:
@@ -102,7 +102,7 @@ def _draw_cloud(cloud: Path) -> str:
 def _list_columns(report: Mapping[str, Any]) -> str:
     written, absent = report["output"]["columns"], report["output"]["not_computed"]
     names = markup.table(["column", "name in the cloud"], [[name, stored] for name, stored in written.items()])
-    missing = markup.table(["column that is not there", "reason"], [[name, why] for name, why in absent.items()])
+    missing = markup.table(["missing column", "reason"], [[name, why] for name, why in absent.items()])
     rows = [[column, number, REASONS[NoData[reason]][0] if NoData[reason] in REASONS else reason]
             for column, reasons in sorted(report["counts"]["no_data"].items())
             for reason, number in reasons.items()]  # fmt: skip

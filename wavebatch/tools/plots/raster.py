@@ -106,7 +106,7 @@ def grid_values(
     clouds = Clouds(paths, selection)
     check_statistic(selection.column, statistic, clouds.facts, paths[0])
     crs = check_crs(paths)
-    total, sample, box = _survey(clouds, bounds)
+    total, sample, box = survey_places(clouds, bounds)
     if not sample.seen:
         where = "within the bounds" if bounds else "with finite coordinates"
         raise InputError(f"{paths[0]}: nothing to draw: no point {where} has a value")
@@ -132,8 +132,11 @@ def _fill(clouds: Clouds, statistic: str, grid: Grid, points: int) -> tuple[np.n
     return values[::-1], placed.values[0]
 
 
-def _survey(clouds: Clouds, bounds: Box | None) -> tuple[Tally, EvenSample, Box]:
-    """Counts of the points, an even sample of positions (n, 2), and the box of all positions."""
+def survey_places(clouds: Clouds, bounds: Box | None = None, option: str = "--bbox") -> tuple[Tally, EvenSample, Box]:
+    """Counts of the points, an even sample of positions (n, 2), and the box of all positions.
+
+    Raises ConfigError for clouds that lie far apart, where `option` does not choose a part.
+    """
     each = [EvenSample() for _ in clouds.paths]
 
     def pick(cloud: int, rows: np.ndarray) -> np.ndarray:
@@ -145,12 +148,12 @@ def _survey(clouds: Clouds, bounds: Box | None) -> tuple[Tally, EvenSample, Box]
         return places
 
     total, sample, box = sample_points(clouds, pick)
-    _refuse_far(clouds.paths, [one.read().get("place", np.empty((0, 2))) for one in each])
+    _refuse_far(clouds.paths, [one.read().get("place", np.empty((0, 2))) for one in each], option)
     return total, sample, bounds or tuple(box.ravel().tolist())
 
 
-def _refuse_far(paths: Sequence[Path], places: Sequence[np.ndarray]) -> None:
-    """Raises ConfigError for clouds so far apart that a map would show them as dots."""
+def _refuse_far(paths: Sequence[Path], places: Sequence[np.ndarray], option: str) -> None:
+    """Raises ConfigError for clouds so far apart that a picture would show them as dots."""
     known = [number for number, place in enumerate(places) if len(place)]
     # Percentiles, so that a single damaged point moves no cloud.
     boxes = {number: np.percentile(places[number], (1, 99), axis=0) for number in known}
@@ -166,8 +169,8 @@ def _refuse_far(paths: Sequence[Path], places: Sequence[np.ndarray]) -> None:
         middle = [boxes[number].mean(axis=0) for number in (known[0], away[0])]
         raise ConfigError(
             f"{paths[away[0]]}: lies {float(np.hypot(*(middle[1] - middle[0]))):.6g} from {paths[known[0]]}, and the "
-            f"largest cloud is {reach / FAR:.4g} long: a map of both would show neither; draw them one by one, or give "
-            "--bbox"
+            f"largest cloud is {reach / FAR:.4g} long: a picture of both would show neither; draw them one by one, or "
+            f"give {option}"
         )
 
 

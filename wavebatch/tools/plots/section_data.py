@@ -17,14 +17,13 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.las.crs import CrsWords
-from wavebatch.tools.plots.raster import check_crs
+from wavebatch.tools.plots.raster import check_crs, survey_places
 from wavebatch.tools.plots.values import (
     MARGIN,
     Clouds,
     Selection,
     Tally,
     check_statistic,
-    find_positions,
     name_paths,
     robust_limits,
     round_up,
@@ -158,7 +157,7 @@ def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
 
 def _choose_line(clouds: Clouds | VoxelFile) -> tuple[float, float, float, float]:
     """A line through the middle of the points, along their longer extent."""
-    _, sample, _ = sample_points(clouds, lambda _, rows: find_positions(rows))
+    _, sample, _ = survey_places(clouds, option="--line")
     if not sample.seen:
         raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a position")
     places = sample.read()["place"]

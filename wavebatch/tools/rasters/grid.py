@@ -24,8 +24,9 @@ from wavebatch.tools.plots.values import Clouds, Selection, check_statistic
 from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, check_cells
 from wavebatch.tools.rasters.tiles import Placed, compute_tiles, is_inside
 
-MOST_SIDE = 2_000_000
-"""Most cells along a side: more is damage of coordinates, or a size that was meant in another unit."""
+MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
+"""Most cells along a side, and of the raster (300 km x 300 km at 1 m): more is damage of coordinates, clouds of several
+projects, or a size that was meant in another unit."""
 
 _EXACT = float(1 << 23)
 """Steps of a column that float32 holds apart; larger values are written as float64."""
@@ -57,6 +58,8 @@ class GridResult(Placed):
     """What was written."""
 
     layout: RasterLayout
+    unnamed: tuple[Path, ...] = ()
+    """Clouds without a CRS, if others have one."""
     filled: int = 0
     """Cells that have a value in a band at least."""
     bands: tuple[Band, ...] = ()
@@ -70,7 +73,7 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     """
     _check(options)
     options = replace(options, bbox=_grow(options.bbox, options.size))
-    crs, unit = _find_crs(paths, options.crs)
+    crs, unit, unnamed = _find_crs(paths, options.crs)
     clouds = Clouds(paths, options.selection)
     facts = (clouds.facts, *clouds.other_facts)
     for one in facts:
@@ -85,7 +88,7 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
         west, north, grid.size, grid.rows, grid.columns, _choose_dtype(facts, largest), options.no_data, crs, unit
     )
     bands = [_describe(one, options.statistic, unit) for one in facts]
-    result = GridResult(layout=layout, bands=tuple(bands))
+    result = GridResult(layout=layout, bands=tuple(bands), unnamed=unnamed)
     tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}", "STATISTIC": options.statistic}
     with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
         for row, column, values in compute_tiles(clouds, options.statistic, grid, points, result, options.bbox):
@@ -111,22 +114,23 @@ def _grow(bounds: Box | None, size: float) -> Box | None:
     return math.floor(west) * size, math.floor(south) * size, math.ceil(east) * size, math.ceil(north) * size
 
 
-def _find_crs(paths: Sequence[Path], given: str | None) -> tuple[str | None, str]:
-    """The CRS of all clouds and its unit; ConfigError where they differ."""
+def _find_crs(paths: Sequence[Path], given: str | None) -> tuple[str | None, str, tuple[Path, ...]]:
+    """The CRS of all clouds, its unit, and the clouds that have none; ConfigError where they differ."""
     if given is not None:
-        return given, find_crs_unit(given, "--crs")
+        return given, find_crs_unit(given, "--crs"), ()
     first: tuple[Path, str] | None = None
-    unit = "m"
+    unit, unnamed = "m", []
     for path in paths:
         checked = read_checked_header(path, waveforms=False)
         found = read_crs_definition(path, checked.header)
         if found is None:
+            unnamed.append(path)
             continue
         unit = find_crs_unit(found, str(path))
         if first is not None and not same_crs(first[1], found, str(path)):
             raise ConfigError(f"{path}: has another CRS than {first[0]}; make a raster of each, or give --crs")
         first = first or (path, found)
-    return (None if first is None else first[1]), unit
+    return (None, unit, ()) if first is None else (first[1], unit, tuple(unnamed))
 
 
 def _find_extent(clouds: Clouds, options: GridOptions) -> tuple[Box, int, np.ndarray]:
@@ -159,10 +163,12 @@ def _lay_out(where: str, box: Box, options: GridOptions) -> Grid:
     """The cells of the raster; ConfigError for too many."""
     west, south, east, north = box
     size = options.size
-    if max(east - west, north - south) / size > MOST_SIDE:
+    columns, rows = (east - west) / size, (north - south) / size
+    if max(columns, rows) > MOST_SIDE or columns * rows > MOST_CELLS:
         raise ConfigError(
-            f"{where}: {(east - west) / size:.3g} x {(north - south) / size:.3g} cells of {size:g} are too many; a "
-            "coordinate may be damaged: give --bbox, or a larger --size"
+            f"{where}: {columns:.3g} x {rows:.3g} cells of {size:g} are too many (at most {MOST_CELLS:.0g}): points "
+            f"lie from {west:.10g}, {south:.10g} to {east:.10g}, {north:.10g}; clouds far apart need a raster each; if "
+            "a coordinate is damaged, give --bbox; or give a larger --size"
         )
     if options.bbox is not None:  # its cells end at a border, where no other cell begins
         first = round(west / size), round(south / size)

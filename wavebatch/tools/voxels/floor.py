@@ -1,4 +1,4 @@
-"""Map of the ground of a strip: which signal of a ray is the ground's, and which the canopy's.
+"""Map of the ground of a strip: it divides the signal of a ray into ground and canopy.
 
 `strip.voxelize_strip` makes one from the lowest returns, without any classification. Light of a ray is shared between
 canopy and ground by it, so signal that is wrongly taken for ground changes gap probabilities by the ratio of both

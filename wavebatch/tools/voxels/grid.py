@@ -53,10 +53,10 @@ class VoxelColumn:
 COLUMNS = (
     VoxelColumn("energy", "f4", "DN ns", "signal from the voxel"),
     VoxelColumn("cross_section", "f4", "m2", "backscatter cross section", -9999.0),
-    VoxelColumn("rays", "u4", "-", "rays with light that crossed"),
-    VoxelColumn("path", "f4", "m", "way of these rays in it"),
-    VoxelColumn("light", "f4", "rays", "what was left of them"),
-    VoxelColumn("share", "f4", "-", "share of it that was caught", -9999.0),
+    VoxelColumn("rays", "u4", "-", "rays that crossed with light"),
+    VoxelColumn("path", "f4", "m", "length of these rays in it"),
+    VoxelColumn("light", "f4", "rays", "light that reached it"),
+    VoxelColumn("share", "f4", "-", "share of it returned here", -9999.0),
 )
 """Values of every voxel; cross_section only with a calibration."""
 

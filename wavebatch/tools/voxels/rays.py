@@ -51,7 +51,7 @@ class LightRule:
 
     floor: Floor
     ground_height: float
-    """Signal up to this height above the ground is the ground's [m]."""
+    """Height above the ground up to which signal counts as ground [m]."""
     ratio: float = 1.0
     """Reflectance of canopy over that of ground."""
     error: float | None = None

@@ -69,7 +69,7 @@ class VoxelOptions:
     )  # fmt: skip
     all_crossed: bool = option(False, "Also write voxels that rays crossed without any signal.")
     ground_height: Annotated[float, Range(0.0, 100.0)] = option(
-        0.5, "Signal up to this height above the lowest returns is the ground's [m].", form="M"
+        0.5, "Height above the lowest returns up to which signal counts as ground [m].", form="M"
     )
     reflectance_ratio: Annotated[float | None, Range(LOWEST, HIGHEST)] = option(
         None, "Reflectance of the canopy over that of the ground.", form="RATIO", unset="estimated from the strip"
@@ -160,7 +160,7 @@ def voxelize_strip(
     keep = None if options.where is None else find_keep(strip, options.where)
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
-        raise ConfigError(f"--profiles {profiles}: is the output of the voxels too; give it another name")
+        raise ConfigError(f"--profiles {profiles}: the voxels are written to this file; choose another name")
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
         if not scan.packets:
             raise InputError(f"{strip}: holds no waveform to put into voxels; see `wavebatch check`")

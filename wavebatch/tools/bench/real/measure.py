@@ -105,7 +105,7 @@ class RealReport:
 
     strip: str
     left_out: str
-    """Shipped pulse that the surveys did without, so that the sensor is a stranger; empty: none."""
+    """Shipped pulse that the surveys did not use, as if the sensor were unknown; empty: none."""
     seed: int
     waveforms: int
     echoes: int
@@ -128,7 +128,7 @@ class RealReport:
     @property
     def title(self) -> str:
         """The strip, and what its surveys did without."""
-        return f"{self.strip}, a stranger: without {self.left_out}" if self.left_out else self.strip
+        return f"{self.strip} as an unknown sensor: without {self.left_out}" if self.left_out else self.strip
 
 
 def measure_real(

@@ -37,7 +37,7 @@ def format_report(report: RealReport) -> str:
     head = [
         f"== {report.title}: {report.waveforms} waveforms, {report.echoes} echoes, seed {report.seed}; ! misses a goal",
         f"survey: FWHM {survey.fwhm:.3f} ns, noise {survey.noise:.2f} DN, {survey.model}, acceptance "
-        f"{survey.acceptance:g}, digitizers that record otherwise: {survey.digitizers}",
+        f"{survey.acceptance:g}, other digitizers: {survey.digitizers}",
         f"quiet samples: noise {noise.std:.2f} DN ({noise.samples} samples), correlation {correlation}",
     ]
     if templates is None:
