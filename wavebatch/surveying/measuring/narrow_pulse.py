@@ -102,29 +102,26 @@ def draw_together(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tupl
     the widest is taken that explains them as well as the best.
     """
     if cost.is_narrower:
-        cost, system = _fit_narrowest(block, system, cost)
-        return system, cost
-    tried = [(cost, system), *_try_widths(block, system, TRIED[1:])]
-    if _widest(tried)[1] is not system:
-        finer = np.arange(1 - STEP, TRIED[-1] + STEP / 2, -STEP)
-        tried = [*tried[:1], *_try_widths(block, system, finer), tried[-1]]
-    cost, system = _widest(tried)
-    return system, cost
+        return _fit_narrowest(block, system, cost)
+    tried = [(system, cost), *_try_widths(block, system, TRIED[1:])]
+    if _widest(tried)[0] is not system:
+        tried[1:] = _try_widths(block, system, np.arange(1 - STEP, TRIED[-1] - STEP / 2, -STEP))
+    return _widest(tried)
 
 
-def _try_widths(block: WaveformBlock, system: SystemPulse, scales: Iterable[float]) -> list[tuple[Cost, SystemPulse]]:
+def _try_widths(block: WaveformBlock, system: SystemPulse, scales: Iterable[float]) -> list[tuple[SystemPulse, Cost]]:
     """The pulse at other widths, and their costs."""
     pulses = [scale_pulse(system, float(scale)) for scale in scales]
-    return [(measure_cost(block, pulse), pulse) for pulse in pulses]
+    return [(pulse, measure_cost(block, pulse)) for pulse in pulses]
 
 
-def _widest(tried: list[tuple[Cost, SystemPulse]]) -> tuple[Cost, SystemPulse]:
+def _widest(tried: list[tuple[SystemPulse, Cost]]) -> tuple[SystemPulse, Cost]:
     """The first pulse that costs as little as the cheapest."""
-    least = min((cost for cost, _ in tried), key=lambda cost: cost.typical)
-    return next(one for one in tried if one[0].exceeds(least) < BEYOND)
+    least = min((cost for _, cost in tried), key=lambda cost: cost.typical)
+    return next(one for one in tried if one[1].exceeds(least) < BEYOND)
 
 
-def _fit_narrowest(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[Cost, SystemPulse]:
+def _fit_narrowest(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
     """The pulse as wide as the narrowest echoes, and its cost; the same where that costs more, or fits do not agree.
 
     A scene widens a pulse by a variance, but a stack of sums may have another shape than that. So the pulse is both
@@ -134,10 +131,10 @@ def _fit_narrowest(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tup
     fits = (decompose_sample(block, scale_pulse(system, scale), width_prior=0.0) for scale in TRIED)
     width = float(np.median([_find_narrowest(echoes) for echoes in fits]))
     if not 0 < width < (1 - REPEAT_SPAN) * system.sigma_ref:
-        return cost, system
+        return system, cost
     pulses = scale_pulse(system, width / system.sigma_ref), _sharpen(system, width, block.spacing)
-    best = min(((measure_cost(block, pulse), pulse) for pulse in pulses), key=lambda one: one[0].typical)
-    return best if best[0].exceeds(cost) < BEYOND else (cost, system)
+    best = min(((pulse, measure_cost(block, pulse)) for pulse in pulses), key=lambda one: one[1].typical)
+    return best if best[1].exceeds(cost) < BEYOND else (system, cost)
 
 
 def _find_narrowest(echoes: EchoTable) -> float:
@@ -153,11 +150,9 @@ def _sharpen(system: SystemPulse, width: float, spacing: float) -> SystemPulse:
     if not system.components:
         return scale_pulse(system, width / system.sigma_ref)
     table = pulse_measures(pulse_shape(system, spacing), shape_limits(system, spacing))
-    full = np.clip(width * FWHM_PER_SIGMA / spacing, table.half_width[0], None)
-    ref = system.components[0][2]
-    variance = ref**2 - (float(np.interp(full, table.half_width, table.width)) * spacing) ** 2
-    parts = [(w * s, d, float(np.sqrt(s * s - variance))) for w, d, s in system.components]
-    main = parts[0][0] / parts[0][2]
-    reached = float(full) * spacing / FWHM_PER_SIGMA
-    sharp = replace(system, sigma_ref=reached, components=tuple((a / s / main, d, s) for a, d, s in parts))
+    full = max(width * FWHM_PER_SIGMA / spacing, float(table.half_width[0]))
+    main, ref = float(np.interp(full, table.half_width, table.width)) * spacing, system.components[0][2]
+    narrow = [(w * s / ref, d, float(np.sqrt(s * s - ref * ref + main * main))) for w, d, s in system.components]
+    reached = full * spacing / FWHM_PER_SIGMA
+    sharp = replace(system, sigma_ref=reached, components=tuple((w * main / s, d, s) for w, d, s in narrow))
     return scale_pulse(sharp, width / reached)

@@ -230,7 +230,8 @@ def choose_pulse(
     than the narrowest echoes (`_drop_tail`, `draw_together`). Where the learned one leaves more, a known pulse of the
     strip's spacing is taken if it costs less than the strip's, and less than it does when it is stretched or drawn
     together (SURE); if it is narrower and costs hardly more (NEARLY); or where the strip's must be drawn together and
-    costs hardly less then (ALMOST).
+    costs hardly less then (ALMOST). A pulse learned from few waveforms has their noise: there a known pulse is taken
+    too if the learned one looks like it (ALIKE) and waveforms do not cost more with it beyond chance.
     """
     part = _spread(block, COMPARED)
     own = cost = measure_cost(part, system)
@@ -245,7 +246,6 @@ def choose_pulse(
     if narrower or (learned and not clear):
         pulse, cost = draw_together(part, pulse, cost)
     if not clear:
-        # One learned from few echoes has their noise, and loses to any other.
         certain = learned and len(block) >= SMALL
         pulse, cost = _compare_known(part, (system, own), (pulse, cost), certain=certain)
     if pulse is not system:
@@ -270,7 +270,8 @@ def _compare_known(
         if abs(part.spacing / known.spacing - 1) < SAME_SPACING and WIDTHS[0] < ratio < WIDTHS[1]:
             taken = with_pulse(system, known.system)
             found = measure_cost(part, taken)
-            if found.typical < NEARLY * own_cost.typical and (
+            alike = not certain and compare_pulses(system, known.system) < ALIKE and found.exceeds(own_cost) < BEYOND
+            if alike or found.typical < NEARLY * own_cost.typical and (
                 (drawn and found.typical < ALMOST * cost.typical)
                 or _is_sure(part, taken, found.typical, own_cost.typical, learned=certain, narrower=ratio < 1)
             ):
