@@ -19,7 +19,9 @@ INSIDE = {
         {"counts", "options", "output_rows", "workers"}, {"selection"}, {"job"}, {"unit"},
         {"explain", "neighbour_pass"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
     ],
-    "surveying/measuring": [{"lone_echoes", "trial"}, {"noise_and_width"}, {"residuals"}, {"misfit", "learn_pulse"}],
+    "surveying/measuring": [
+        {"lone_echoes", "trial"}, {"noise_and_width"}, {"residuals"}, {"misfit", "learn_pulse", "narrow_pulse"},
+    ],
     "batch/workers": [
         {"processor"}, {"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"},
     ],

@@ -58,12 +58,24 @@ def naive_runs(waveform, value):
         least = min((edge[3] for edge, is_sure in zip(edges, sure, strict=True) if is_sure), default=np.inf)
         for (number, known, first, *_), is_sure in zip(edges, sure, strict=True):
             good[number] &= (is_sure or (known and first >= 0.75 * least)) and 2 * sum(sure) >= len(edges)
-        if not all(good) or any(waveform[k] < LEAST_LEVEL for k in range(s) if k not in inside):
+        if any(waveform[k] < LEAST_LEVEL for k in range(s) if k not in inside):
+            good = [stands_out(waveform, *run) for run in runs]
+        elif not all(good):
             return set()
     else:
         for number, known, first, level, _ in edges:
             good[number] &= known and value - first >= 15 / 16 * (value - level) and first <= value / 2
     return {place for (start, end), fits in zip(runs, good, strict=True) if fits for place in range(start, end)}
+
+
+def stands_out(waveform, start, end):
+    """Zeros after a low, steady level, in a waveform with few other zeros."""
+    if start < LEAST_RECORDED or len(waveform) - LEAST_RECORDED < end < len(waveform):
+        return False
+    before = sorted(int(value) for value in waveform[start - LEAST_RECORDED : start])
+    middle = before[LEAST_RECORDED // 2]
+    others = [value for k, value in enumerate(waveform) if not start <= k < end]
+    return 1 <= middle < 2 * LEAST_LEVEL and before[-3] <= middle + LEAST_LEVEL and others.count(0) <= 0.1 * len(others)
 
 
 def naive_fill(samples, top):
@@ -91,6 +103,12 @@ def test_fill_is_what_a_loop_over_samples_finds(rng, dtype):
     expected = naive_fill(samples, top)
     assert np.array_equal(find_fill(samples, top), expected)
     assert 100 < expected[:400].any(axis=1).sum() < 400 and not expected[400:][:, :][samples[400:] == 0].any()
+    low = (rng.normal(1.9, 0.9, (300, 90)).clip(0, top) + 0.5).astype(dtype)
+    low[:, 30:] += np.rint(9 * np.exp(-0.5 * ((time[30:] - rng.uniform(30, 90, (300, 1))) / 2) ** 2)).astype(dtype)
+    for row in range(300):
+        low[row, rng.integers(0, 80) :][: rng.integers(6, 40)] = 0
+    found = find_fill(low, top)
+    assert np.array_equal(found, naive_fill(low, top)) and 100 < found.any(axis=1).sum() < 200
     assert find_fill(samples[:, :20], top) is None and find_fill(samples[:0], top) is None
     quiet = quiet_fill(samples, expected)
     assert np.array_equal(quiet[~expected], samples[~expected])

@@ -201,7 +201,8 @@ def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
 
 
 def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """A pulse or noise that is a guess: too few echoes to learn a pulse from, or echoes that another one does not find.
+    """A pulse or noise that is a guess: too few echoes to learn a pulse from, echoes that another one does not find, or
+    no samples to measure noise in.
     """
     figures, system = prepared.choice.survey.figures, prepared.system
     alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
@@ -212,9 +213,13 @@ def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
     reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
     if alone < FEW and not (known or system.components):
         reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
+    measured = system.noise.by_kind
+    unseen = measured.get("quiet") == 0 and "outside" not in measured
+    if unseen and not reason:
+        reason = "too few samples without signal"
     if reason:
         guess = f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
-        guess = f"noise is a guess, of {system.noise.std:.3g} DN" if known else guess
+        guess = f"noise is a guess, of {system.noise.std:.3g} DN" if known or unseen else guess
         yield (
             f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
             "give --system, a survey of a longer strip of this sensor"

@@ -21,6 +21,9 @@ LEAST_PADDING, LEAST_RECORDED, LEAST_LEVEL = 8, 16, 3
 samples that are all at least LEAST_LEVEL.
 """
 
+RARE_ZEROS = 0.1
+"""Share of zeros among recorded samples up to which LEAST_PADDING zeros in a row are fill, not noise of a low level."""
+
 STEP_FROM_ZERO, STEP_FROM_TOP = 3 / 4, 15 / 16
 """Share of the way from fill to the level of the next recording that the first recorded sample must go. From the
 largest count it is more: a clipped echo of 8 samples falls by up to three quarters from one sample to the next.
@@ -100,12 +103,7 @@ def _rows_with_runs(samples: np.ndarray, value: int) -> np.ndarray:
     at = np.flatnonzero(seen == value) * LEAST_PADDING + first
     after = np.minimum(at + half, len(flat) - 1)
     at = at[(flat[at - half] == value) | (flat[after] == value)]
-    rows = np.zeros(len(samples), bool)
-    rows[at // s] = True
-    if value == 0 and len(at):
-        low = np.flatnonzero(seen - 1 < LEAST_LEVEL - 1) * LEAST_PADDING + first
-        rows[low // s] = False
-    return np.flatnonzero(rows)
+    return np.unique(at // s)
 
 
 def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:
@@ -120,9 +118,26 @@ def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:
     good = (good[: len(row)] & good[len(row) :]) & ((start > 0) | (end < s))
     if value == 0:
         low = ((samples < LEAST_LEVEL) & ~marks).any(axis=1)
-        low[row[~good]] = True
-        good &= ~low[row]
+        doubtful = low.copy()
+        doubtful[row[~good]] = True
+        good &= ~doubtful[row]
+        good |= low[row] & _stand_out(samples, row, start, end)
     return _mark_runs(row[good], start[good], end[good], n, s)
+
+
+def _stand_out(samples: np.ndarray, row: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Whether zeros from start to end (k,) are none of a level near zero, bool (k,).
+
+    Before them the level is low and steady, so that no echo falls, and zeros are rare elsewhere in the waveform.
+    """
+    s = samples.shape[1]
+    inner = (start >= LEAST_RECORDED) & ((end <= s - LEAST_RECORDED) | (end == s))
+    before = samples[row[:, None], np.maximum(start[:, None] - 1 - np.arange(LEAST_RECORDED), 0)].astype(np.int64)
+    ordered = np.sort(before, axis=1)
+    middle = ordered[:, LEAST_RECORDED // 2]
+    steady = (middle >= 1) & (middle < 2 * LEAST_LEVEL) & (ordered[:, -3] - middle <= LEAST_LEVEL)
+    others = (samples == 0).sum(axis=1)[row] - (end - start)
+    return inner & steady & (others <= RARE_ZEROS * (s - (end - start)))
 
 
 class _Edges(NamedTuple):

@@ -53,10 +53,10 @@ COLOURED, MOST_COLOURED = 1.2, 10.0
 fits leave at no signal."""
 
 
-def decompose_sample(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+def decompose_sample(block: WaveformBlock, system: SystemPulse, **options: float) -> EchoTable:
     block = clean_block(block, system)
     noise = pooled_noise(block, system)
-    return adaptive(block, noise, system, matched_filter(block, noise, system))
+    return adaptive(block, noise, system, matched_filter(block, noise, system), **options)
 
 
 def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:

@@ -20,7 +20,6 @@ from wavebatch.core.units import MEDIAN_ERROR, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
-from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.flags import RINGING_REACH
@@ -28,8 +27,9 @@ from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
 from wavebatch.surveying.measuring.misfit import measure_misfit
+from wavebatch.surveying.measuring.narrow_pulse import BEYOND, Cost, draw_together, measure_cost, scale_pulse
 from wavebatch.surveying.measuring.noise_and_width import FEW, SMALL
-from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
+from wavebatch.surveying.measuring.residuals import subtract_echoes
 from wavebatch.surveying.measuring.trial import TRIAL
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.system_table import read_system
@@ -52,14 +52,8 @@ of these widths, from which it is taken: a pulse that serves as well stretched i
 right one in strips of all sizes. Where the strip's is a guess, the second factor alone must be STEEP: any pulse with a
 tail serves better than a guess."""
 
-SHRUNK = 0.85, 0.7
-"""Widths, over that of the isolated echoes, at which a strip's pulse is tried where isolated echoes are canopies."""
-
 CROWDED = 1.5
 """Echoes per waveform from which a learned pulse may have taken neighbours for a tail, however well it fits."""
-
-BEYOND = 3.0
-"""Standard errors by which waveforms must cost more with one pulse than with another for it to be worse."""
 
 NEARLY = 1.03
 """Cost of a narrower known pulse, over that of a learned one, up to which it is taken where it is STEEP: slopes within
@@ -230,24 +224,28 @@ def choose_pulse(
     Notes
     -----
     A pulse is right if it explains all waveforms, not only isolated echoes, with the fewest echoes and the least misfit
-    (`measure_cost`): in a canopy an isolated echo is often several, and a pulse learned from them is too wide. Nothing
-    is tried where a learned pulse leaves less than SHORT per echo; but where echoes are CROWDED or waveforms few it may
-    be a Gaussian all the same. Else the simplest and widest is taken of those that cost no more (`_drop_tail`,
-    `_draw_together`). A known pulse of the strip's spacing is taken if it costs less than the strip's, and less than it
-    does when it is stretched or drawn together (SURE); if it is narrower and costs hardly more (NEARLY); or where the
-    strip's must be drawn together and costs hardly less then (ALMOST).
+    (`measure_cost`): in a canopy an isolated echo is often several, and their pulse too wide. Nothing is
+    tried where a learned pulse leaves less than SHORT per echo and no echoes are narrower; but where echoes are CROWDED
+    or waveforms few it may be a Gaussian all the same. Else the simplest is taken of those that cost no more, no wider
+    than the narrowest echoes (`_drop_tail`, `draw_together`). Where the learned one leaves more, a known pulse of the
+    strip's spacing is taken if it costs less than the strip's, and less than it does when it is stretched or drawn
+    together (SURE); if it is narrower and costs hardly more (NEARLY); or where the strip's must be drawn together and
+    costs hardly less then (ALMOST). A pulse learned from few waveforms has their noise: there a known pulse is taken
+    too if the learned one looks like it (ALIKE) and waveforms do not cost more with it beyond chance.
     """
     part = _spread(block, COMPARED)
     own = cost = measure_cost(part, system)
     clear = learned and own.misfit < SHORT * own.echoes
-    if own.echoes < LEAST_ECHOES or (clear and own.echoes < CROWDED * len(part) and len(block) >= SMALL):
+    narrower = learned and own.is_narrower
+    enough = own.echoes < CROWDED * len(part) and len(block) >= SMALL
+    if own.echoes < LEAST_ECHOES or (clear and enough and not narrower):
         return system
     pulse = _drop_tail(block, system, strong) if learned else system
     if pulse is not system:
         cost = measure_cost(part, pulse)
+    if narrower or (learned and not clear):
+        pulse, cost = draw_together(part, pulse, cost)
     if not clear:
-        pulse, cost = _draw_together(part, pulse, cost) if learned else (pulse, cost)
-        # One learned from few echoes has their noise, and loses to any other.
         certain = learned and len(block) >= SMALL
         pulse, cost = _compare_known(part, (system, own), (pulse, cost), certain=certain)
     if pulse is not system:
@@ -272,7 +270,8 @@ def _compare_known(
         if abs(part.spacing / known.spacing - 1) < SAME_SPACING and WIDTHS[0] < ratio < WIDTHS[1]:
             taken = with_pulse(system, known.system)
             found = measure_cost(part, taken)
-            if found.typical < NEARLY * own_cost.typical and (
+            alike = not certain and compare_pulses(system, known.system) < ALIKE and found.exceeds(own_cost) < BEYOND
+            if alike or found.typical < NEARLY * own_cost.typical and (
                 (drawn and found.typical < ALMOST * cost.typical)
                 or _is_sure(part, taken, found.typical, own_cost.typical, learned=certain, narrower=ratio < 1)
             ):
@@ -299,17 +298,6 @@ def _drop_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> 
     return plain if missed**2 * energy < system.acceptance else system
 
 
-def _draw_together(part: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
-    """The widest of the learned pulse and narrower ones that explains waveforms as well, and its cost.
-
-    In a canopy sums of close echoes widen the learned pulse.
-    """
-    narrower = (scale_pulse(system, scale) for scale in SHRUNK)
-    tried = [(cost, system), *((measure_cost(part, pulse), pulse) for pulse in narrower)]
-    least = min((cost for cost, _ in tried), key=lambda cost: cost.typical)
-    return next((pulse, cost) for cost, pulse in tried if cost.exceeds(least) < BEYOND)
-
-
 def _is_sure(
     part: WaveformBlock, taken: SystemPulse, cost: float, own: float, *, learned: bool, narrower: bool
 ) -> bool:
@@ -317,43 +305,6 @@ def _is_sure(
     rest = min(measure_cost(part, scale_pulse(taken, scale)).typical for scale in SCALES)
     steep = rest > STEEP * cost
     return (learned and narrower and steep) or (cost < own and own * rest > SURE * cost**2 and (learned or steep))
-
-
-class Cost(NamedTuple):
-    """What a pulse leaves unexplained of waveforms, as a fall of chi2."""
-
-    misfit: float
-    """Sum of squares left beyond the noise of quiet samples, over the noise of a pulse squared."""
-    echoes: int
-    logarithm: np.ndarray
-    """Of each waveform's cost: its misfit, and for each echo what it has to explain (n,)."""
-
-    @property
-    def typical(self) -> float:
-        """Geometric mean of the waveforms, so that the few that no pulse explains do not decide."""
-        return float(exp(np.mean(self.logarithm)))
-
-    def exceeds(self, other: Cost) -> float:
-        """Standard errors by which waveforms cost more than with another pulse; 0 for the same."""
-        more = self.logarithm - other.logarithm
-        return float(np.mean(more) / max(np.std(more) / np.sqrt(len(more)), 1e-12))
-
-
-def measure_cost(block: WaveformBlock, system: SystemPulse) -> Cost:
-    """Measure how well a pulse explains waveforms, all echoes fitted together."""
-    echoes = decompose_sample(block, system)
-    left = np.nan_to_num(subtract_echoes(block, system, echoes)).astype(np.float64)
-    noise = system.noise.quiet
-    samples = left.shape[1] if block.missing is None else (~block.missing).sum(axis=1)
-    misfit = (np.einsum("ns,ns->n", left, left) - samples * noise**2) / system.noise.std**2
-    cost = np.maximum(misfit, 0.0) + system.acceptance * (1 + echoes.count(len(block)))
-    return Cost(max(float(np.sum(misfit)), 0.0), len(echoes), log(cost))
-
-
-def scale_pulse(system: SystemPulse, ratio: float) -> SystemPulse:
-    """Return a system with its pulse stretched in time."""
-    components = tuple((weight, delay * ratio, sigma * ratio) for weight, delay, sigma in system.components)
-    return replace(system, sigma_ref=system.sigma_ref * ratio, components=components)
 
 
 def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:

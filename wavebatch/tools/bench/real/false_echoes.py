@@ -13,7 +13,7 @@ from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.bench.real.inject import TOLERANCE
 from wavebatch.tools.bench.real.noise import QuietNoise, unround
-from wavebatch.tools.bench.real.pool import Pool, Solver, each_echo, find_fill
+from wavebatch.tools.bench.real.pool import Pool, Solver, each_echo, find_gaps
 from wavebatch.tools.bench.real.templates import bare_block
 
 STRONG = 8.0
@@ -92,7 +92,7 @@ def _mirror(
     expected = solver.expect(block, table)
     turned = np.rint(2.0 * expected - unround(block.samples, expected, noise, rng))
     turned = np.clip(turned, 0, min(limit, np.iinfo(block.samples.dtype).max))
-    keep = find_fill(block.samples) | (block.samples >= limit)
+    keep = find_gaps(block) | (block.samples >= limit)
     samples = np.where(keep, block.samples, turned).astype(block.samples.dtype)
     found = solver.run(bare_block(block, samples))
     match = match_echoes(found, table, 2 * TOLERANCE * solver.fwhm)
@@ -124,7 +124,7 @@ def _count_stretches(
     block: WaveformBlock, table: EchoTable, new: EchoTable, first: np.ndarray, last: np.ndarray, fwhm: float
 ) -> np.ndarray:
     """Length, echoes and mirrored echoes of the stretches before and after the signal, (2, 3)."""
-    known = np.isfinite(first) & ~find_fill(block.samples).any(axis=1)
+    known = np.isfinite(first) & ~find_gaps(block).any(axis=1)
     end = (block.samples.shape[1] - 1) * block.spacing
     until = np.where(known, np.clip(first - CLEAR_BEFORE * fwhm, 0.0, end), 0.0)
     since = np.where(known, np.clip(last + CLEAR_AFTER * fwhm, 0.0, end), end)

@@ -16,7 +16,7 @@ from wavebatch.files.strip.shared_packets import expand
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.bench.real.noise import QuietNoise, unround
-from wavebatch.tools.bench.real.pool import ROWS, Pool, Solver, each_echo, find_fill, find_strongest
+from wavebatch.tools.bench.real.pool import ROWS, Pool, Solver, each_echo, find_fill, find_gaps, find_strongest
 from wavebatch.tools.bench.real.templates import Template, bare_block, digitizer_kind
 
 LEAST = 2.5
@@ -174,7 +174,7 @@ def _is_clear(
 
 def _touches_fill(block: WaveformBlock, row: np.ndarray, time: np.ndarray, fwhm: float) -> np.ndarray:
     """Whether a gap between two recordings lies under the echo or next to it."""
-    fill = find_fill(block.samples)
+    fill = find_gaps(block)
     if not fill.any():
         return np.zeros(len(row), bool)
     before = np.concatenate([np.zeros((len(fill), 1), np.int64), np.cumsum(fill, axis=1)], axis=1)

@@ -13,7 +13,7 @@ from scipy.special import ndtr, ndtri
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.tools.bench.real.pool import Pool, Solver, each_echo, find_fill
+from wavebatch.tools.bench.real.pool import Pool, Solver, each_echo, find_gaps
 
 LAGS = 4
 """Lags at which the covariance is measured [samples]; beyond them it counts as none."""
@@ -98,7 +98,7 @@ def measure_noise(pool: Pool, solver: Solver, echoes: Sequence[EchoTable]) -> Qu
 
 def _find_quiet(block: WaveformBlock, table: EchoTable, sigma: float) -> np.ndarray:
     """Recorded samples far from every echo, bool (n, s)."""
-    quiet = ~find_fill(block.samples)
+    quiet = ~find_gaps(block)
     time = np.arange(block.samples.shape[1]) * block.spacing
     for rows, echo in each_echo(table, np.arange(len(block))):
         lag = (time - table.time[echo][:, None]) / sigma

@@ -129,3 +129,9 @@ def find_fill(samples: np.ndarray, shortest: int = 12, gap: int = 3) -> np.ndarr
     for place, start, end in zip(*find_stretches(at_low[rows]), strict=True):
         fill[rows[place], start:end] = end - start >= shortest
     return fill
+
+
+def find_gaps(block: WaveformBlock) -> np.ndarray:
+    """The same of a block, and what its reader found to be no sample, bool (n, s)."""
+    fill = find_fill(block.samples)
+    return fill if block.missing is None else fill | block.missing

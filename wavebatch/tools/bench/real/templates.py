@@ -18,7 +18,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, MAD_TO_STD
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill, find_strongest
+from wavebatch.tools.bench.real.pool import Pool, Solver, find_gaps, find_strongest
 
 BEFORE, AFTER = 4.5, 12.5
 """What a template covers before and after its peak, in sigmas of the system pulse: after-pulses are part of it."""
@@ -144,7 +144,7 @@ def learn_templates(
 def _find_donors(block: WaveformBlock, table: EchoTable, solver: Solver, noise: float) -> Iterator[_Donor]:
     """The clear echoes of a block."""
     sigma, spacing, s = solver.system.sigma_ref, block.spacing, block.samples.shape[1]
-    fill = find_fill(block.samples)
+    fill = find_gaps(block)
     limit = clip_level(block, solver.system.of(block))
     time = np.arange(s) * spacing
     rows = find_clear(table, solver, noise)
