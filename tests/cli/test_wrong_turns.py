@@ -147,6 +147,8 @@ def test_strips_without_points_pass_through_every_stage(place):
     columns = "+range,+incidence_angle_normals,+amplitude_normalized"
     done = CliRunner().invoke(main, ["run", str(empty), "-o", "o", "--columns", columns])
     assert done.exit_code == 0, done.stderr
+    quiet = CliRunner().invoke(main, ["run", str(empty), "-o", "q", "-q"])
+    assert "warning: the strip has no points, so its cloud has none" in quiet.stderr and quiet.exit_code == 0
     assert CliRunner().invoke(main, ["check", str(empty)]).stdout.endswith("ok (0 points, 0 packets)\n")
     one = cut_strip(place / "strip.las", place / "one.las", 1)
     assert "ok (1 point, 1 packet, " in CliRunner().invoke(main, ["check", str(one)]).stdout
