@@ -164,12 +164,14 @@ def find_level(y, std, reach, limit=4.0, recovery=0):
 def measure_covariance(signal, quiet, lags):
     """Sill, and what is left of it at lags 1, 2, ...: half the mean square steps of quiet samples so far apart."""
     half, pairs = [], []
-    for lag in range(1, lags + 1):
+    for lag in range(1, min(noise.MOST_LAGS, len(signal) - 1) + 1):
+        if lag > lags and min(half[-4:]) <= max(half[-8:-4]):
+            break
         steps = [y[i + lag] - y[i] for y, used in zip(signal.T, quiet.T, strict=True)
                  for i in range(len(y) - lag) if used[i] and used[i + lag]]  # fmt: skip
         half.append(0.5 * np.mean(np.square(steps)))
         pairs.append(len(steps))
-    far = lags // 2
+    far = len(half) // 2
     sill = np.average(half[far:], weights=pairs[far:])
     rest = sill - np.array(half)
     return np.r_[sill, np.where(np.abs(rest) > noise.CHANCE * sill / np.sqrt(pairs), rest, 0.0)]

@@ -173,6 +173,10 @@ def test_correlations_are_those_of_pairs(rng, monkeypatch):
     quiet[15:, :10] = False  # too few
     found = measure_covariance(signal, quiet, lags=6)
     assert found == pytest.approx(naive_signal.measure_covariance(signal, quiet, 6), rel=1e-4, abs=1e-4)
+    slow = np.cumsum(white[3:], axis=0).astype(np.float32)
+    found = measure_covariance(slow, quiet, lags=12)
+    assert len(found) > 20
+    assert found == pytest.approx(naive_signal.measure_covariance(slow, quiet, 12), rel=1e-4, abs=1e-3)
     assert measure_covariance(signal, quiet & False) is None
     residual, used = signal.T - 12, quiet.T
     residual = residual + 30 * (rng.random(residual.shape) < 0.01)  # echoes that nobody fitted

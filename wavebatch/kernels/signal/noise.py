@@ -55,9 +55,9 @@ MOST_LEAST = 0.05
 BEFORE_SIGNAL = 3
 """Part of the reach that is left out before a signal: a pulse rises faster than its tail falls."""
 
-LAGS = 12, 20
-"""Lags of the noise's covariance that are measured, for narrow and for wide pulses: beyond them a drift of the baseline
-takes over, and each lag adds its own error to the noise of a pulse."""
+LAGS, MOST_LAGS, RISE = (12, 20), 48, 4
+"""Lags of the noise's covariance that are measured, for narrow and for wide pulses: each adds its error to the noise of
+a pulse. Up to MOST_LAGS follow while the variogram is higher at each of the last RISE lags than at those before."""
 
 CLIPPED = 3.5
 """Robust standard deviations at which residuals are cut off."""
@@ -285,16 +285,18 @@ def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0
     quiet : bool (s, n)
         Samples without signal.
     lags : int, samples
-        Largest lag.
+        Largest lag of noise that forgets itself so soon; of slow noise MOST_LAGS.
 
     Returns
     -------
     float64 (k,) or None
-        k <= 1 + lags. None where fewer than LEAST_QUIET_PAIRS neighbours are quiet.
+        k <= 1 + MOST_LAGS. None where fewer than LEAST_QUIET_PAIRS neighbours are quiet.
     """
     used = quiet.astype(np.float32)
     half, pairs = [], []
-    for lag in range(1, min(lags, len(signal) - 1) + 1):
+    for lag in range(1, min(MOST_LAGS, len(signal) - 1) + 1):
+        if lag > lags and not _rises(half):
+            break
         both = used[lag:] * used[:-lag]
         number = float(np.sum(both, dtype=np.float64))
         if number < (LEAST_SHARE * pairs[0] if pairs else LEAST_QUIET_PAIRS):
@@ -311,6 +313,11 @@ def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0
     rest = sill - np.array(half)
     chance = CHANCE * sill / np.sqrt(pairs)
     return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
+
+
+def _rises(half: list[float]) -> bool:
+    """Whether a variogram is higher at each of its last lags than at those before, as in slow noise."""
+    return min(half[-RISE:]) > max(half[-2 * RISE : -RISE])
 
 
 def _smoothed_std(covariance: np.ndarray) -> float:
