@@ -49,7 +49,7 @@ def _say(*words, code=None):
         ("plot waveform strip.las -o w.png --packet 3 --most 2", "--most is for --flags, --where and the default"),
         ("plot waveform strip.las -o w.png --times 5000:6000", "no sample lies there; the waveforms end at"),
         ("calibrate strip.las --targets t.csv -o c.toml --attenuation .1 --wavelength 532", "exclude each other"),
-        ("compare strip.las strip.las --within 1e9", "(--within) is 1e+09 ns; it must be above 0 and below 1e6"),
+        ("compare strip.las strip.las --within 1e9", "tolerance 1e+09 ns (--within): must be above 0 and below 1e6"),
     ],
 )
 def test_options_that_are_nearly_right(place, words, advice):
@@ -126,7 +126,6 @@ def test_a_file_of_another_kind_names_its_option(place):
 
 
 def test_a_trajectory_that_is_missing_is_one_line_for_all_strips(place):
-    shutil.copy("strip.las", "other.las")
     line = _say("run", "strip.las", "other.las", "-o", "o", "--trajectory", "none.txt", code=2)
     assert "none.txt: trajectory cannot be read: No such file" in line
 
@@ -148,6 +147,8 @@ def test_strips_without_points_pass_through_every_stage(place):
     columns = "+range,+incidence_angle_normals,+amplitude_normalized"
     done = CliRunner().invoke(main, ["run", str(empty), "-o", "o", "--columns", columns])
     assert done.exit_code == 0, done.stderr
+    quiet = CliRunner().invoke(main, ["run", str(empty), "-o", "q", "-q"])
+    assert "warning: the strip has no points, so its cloud has none" in quiet.stderr and quiet.exit_code == 0
     assert CliRunner().invoke(main, ["check", str(empty)]).stdout.endswith("ok (0 points, 0 packets)\n")
     one = cut_strip(place / "strip.las", place / "one.las", 1)
     assert "ok (1 point, 1 packet, " in CliRunner().invoke(main, ["check", str(one)]).stdout
@@ -162,3 +163,11 @@ def test_a_full_stdout_is_named(place, words):
         done = subprocess.run([sys.executable, "-m", "wavebatch", *words.split()], stdout=full, stderr=subprocess.PIPE,
                               text=True, check=False)  # fmt: skip
     assert (done.returncode, done.stderr) == (1, "error: stdout: cannot be written: No space left on device\n")
+
+
+def test_a_cloud_without_permission_is_one_of_those_that_cannot_be_read(place, monkeypatch):
+    """Not wrong usage: the others are counted. Root may read everything, so click's question is answered with no."""
+    monkeypatch.setattr(os, "access", lambda *_, **__: False)
+    (place / "other.las").write_bytes(b"no permission")
+    result = CliRunner().invoke(main, ["stats", "strip.las", "other.las"])
+    assert result.exit_code == 1 and "strip.las" in result.stdout and "not a LAS or LAZ file" in result.stderr

@@ -185,9 +185,11 @@ def _miss_all(prepared: Prepared, report: RunReport) -> Iterator[str]:
 
 
 def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """A strip without any waveform, or without any echo: its cloud has no attributes."""
+    """A strip without any point, waveform or echo: its cloud is empty, or has no attributes."""
     points, waveforms, echoes = (report.count(name) for name in ("points_in", "waveforms", "echoes"))
-    if points and not waveforms:
+    if not points:
+        yield "the strip has no points, so its cloud has none; if it should have some, get the file again"
+    elif not waveforms:
         yield f"none of {points} points has a waveform: all are written unchanged, without attributes"
     elif waveforms >= LEAST_JUDGED and not echoes:
         figures, noise = prepared.choice.survey.figures, prepared.system.noise

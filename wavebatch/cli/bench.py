@@ -24,7 +24,7 @@ _REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "lo
 
 
 @click.command()
-@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[STRIP...] [CHAIN...]")
+@click.argument("files", nargs=-1, type=shared.INPUT, metavar="[STRIP...] [CHAIN...]")
 @click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete_scenes,
               help="Simulate this scene: mixed, open, forest, empty, flat or stiff; may be repeated.")
 @shared.options_of(BenchOptions, "waveforms", "pulses", "repeats")

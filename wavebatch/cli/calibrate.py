@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("strips", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP...")
+@click.argument("strips", nargs=-1, required=True, type=shared.INPUT, metavar="STRIP...")
 @shared.declared("recursive")
 @shared.file_option("--targets",
                     text="Targets: GeoJSON polygons with the property reflectance, in WGS 84, in the CRS that the file "

@@ -36,8 +36,8 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 
 
 @click.command()
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path), required=False)
+@click.argument("a", type=shared.INPUT)
+@click.argument("b", type=shared.INPUT, required=False)
 @shared.file_option("--truth", text="Compare A with this truth of a simulated strip, instead of B.")
 @shared.file_option("--strip", metavar="STRIP", text="Run A and B on the waveforms of this strip; A and B are then "
                     "chain files, fast, balanced, accurate or auto.")

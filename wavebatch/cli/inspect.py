@@ -82,7 +82,7 @@ def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, A
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP_OR_CHAIN...",
+@click.argument("files", nargs=-1, required=True, type=shared.INPUT, metavar="STRIP_OR_CHAIN...",
                 shell_complete=complete_files)
 @shared.declared("recursive")
 @shared.strip_options

@@ -256,14 +256,17 @@ def note_input(line: str) -> None:
     tell(f"note: {line}")
 
 
-strip_argument = click.argument("strip", type=click.Path(path_type=Path))
+INPUT = click.Path(path_type=Path, readable=False)
+"""The type of an argument that is a file to read: the command says what is wrong with it, and reads the others."""
+
+strip_argument = click.argument("strip", type=INPUT)
 
 
 strips_argument = together(
     click.argument("strips", nargs=-1, required=True, metavar="STRIP...", shell_complete=complete_files),
     declared("recursive"),
 )
-clouds_argument = click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...",
+clouds_argument = click.argument("clouds", nargs=-1, required=True, type=INPUT, metavar="CLOUD...",
                                 shell_complete=complete_files)  # fmt: skip
 
 strip_options = together(declared("direction"), declared("headerless"))

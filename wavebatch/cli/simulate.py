@@ -13,8 +13,8 @@ from typing import Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, counting, print_summary
-from wavebatch.cli.options import common_options, from_options, given_options, options_of, output_option, seed_option
 from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.tools.simulate import (
     CANOPIES,
@@ -45,29 +45,29 @@ _SCENE_LINES = "\n\n".join(
     + [f"canopy.{name}: {meaning}." for name, (meaning, _) in CANOPIES.items()]
 )
 
-_output = output_option("Strip to write: .las or .laz.")
+_output = shared.output_option("Strip to write: .las or .laz.")
 
 def _changes(kind: type, *names: str) -> Callable:
     """Options that are not given unless the user gives them."""
-    return options_of(kind, *names, default=None)
+    return shared.options_of(kind, *names, default=None)
 
 
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
 @click.argument("scene", shell_complete=complete_scenes)
 @_output
-@output_option("Write the true echoes to this .npz file.", "FILE", "--truth", required=False)
+@shared.output_option("Write the true echoes to this .npz file.", "FILE", "--truth", required=False)
 @click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Number of pulses.")
-@seed_option("Seed of the random numbers; pulse k of a scene and a seed is always the same.")
+@shared.seed_option("Seed of the random numbers; pulse k of a scene and a seed is always the same.")
 @_changes(Recording, "bits", *_RECORDING)
 @click.option("--pulse", type=click.Choice(list(PULSES)), help="Shape of the system pulse.  [default: gaussian]")
 @click.option("--sigma", type=float, help="Standard deviation of the pulse's main lobe [ns].  [default: the scene's]")
 @click.option("--kappa", type=float, help="Skew of the main lobe.  [default: 0]")
 @click.option("--ringing", default=0.0, help="Share of the amplitude in lobes 4 and 8 sigma after the peak.")
-@options_of(StripOptions)
+@shared.options_of(StripOptions)
 @click.option("--sensor", type=click.Choice(["waveform", "discrete"]), default="waveform", show_default=True,
               help="waveform: record every waveform; discrete: record only returns, by a receiver with a dead zone.")
 @_changes(DiscreteReceiver, *_RECEIVER)
-@common_options("overwrite", "json")
+@shared.common_options("overwrite", "json")
 def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | None, **options: Any) -> None:
     """Simulate a full-waveform strip of a SCENE with known echoes.
 
@@ -84,7 +84,7 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
     common = {
         "pulses": pulses,
         "seed": seed,
-        "options": from_options(StripOptions, options),
+        "options": shared.from_options(StripOptions, options),
         "overwrite": options["overwrite"],
         "progress": bar.update,
     }
@@ -106,28 +106,29 @@ def _build_receiver(truth: Path | None, options: dict[str, Any]) -> DiscreteRece
             raise click.UsageError("--truth holds the echoes of waveforms; simulate them with --sensor waveform")
         if not options["internal"]:
             raise click.UsageError("--external is about packets; --sensor discrete writes none")
-        return from_options(DiscreteReceiver, options)
-    if given_options(options, _RECEIVER):
+        return shared.from_options(DiscreteReceiver, options)
+    if shared.given_options(options, _RECEIVER):
         raise click.UsageError("--dead-zone, --threshold and --most-returns need --sensor discrete")
     return None
 
 
 def _shape_scene(scene: Scene, options: dict[str, Any]) -> Scene:
     """The scene with the recording of the options."""
-    given = given_options(options, ("bits", *_RECORDING))
+    given = shared.given_options(options, ("bits", *_RECORDING))
     shape = {name: options[name] for name in ("pulse", "sigma", "kappa", "ringing")}
     pulse = shape_pulse(scene.recording.pulse, **shape)
     return replace(scene, recording=replace(scene.recording, pulse=pulse, **given))
 
 
 @click.command()
-@click.argument("cloud", type=click.Path(path_type=Path))
+@click.argument("cloud", type=shared.INPUT)
 @_output
-@options_of(SynthesisOptions, "intensity", "gain", "width", "widths", "shares", "spacing", "bits", "baseline", "noise")
-@seed_option("Seed of the noise and of the first sample's time.")
-@options_of(SynthesisOptions, "internal")
+@shared.options_of(SynthesisOptions, "intensity", "gain", "width", "widths", "shares", "spacing", "bits", "baseline",
+                   "noise")
+@shared.seed_option("Seed of the noise and of the first sample's time.")
+@shared.options_of(SynthesisOptions, "internal")
 @_changes(Radar, *_LIGHT)
-@common_options("overwrite", "json")
+@shared.common_options("overwrite", "json")
 def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     """Model waveforms from the discrete returns of CLOUD: one Gaussian per return, from its range and intensity.
 
@@ -137,7 +138,7 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
 
     Exit code: 0 done, 1 the cloud cannot be read or the strip cannot be written, 2 wrong usage.
     """  # fmt: skip
-    settings = from_options(SynthesisOptions, options, radar=_build_radar(options))
+    settings = shared.from_options(SynthesisOptions, options, radar=_build_radar(options))
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
     lines = _list_lines(output, summary, settings)
@@ -147,12 +148,12 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
 def _build_radar(options: dict[str, Any]) -> Radar | None:
     """The figures of the lidar equation; None if intensities are peaks."""
     if options["intensity"] == "peak":
-        if given_options(options, (*_LIGHT, "shares")):
+        if shared.given_options(options, (*_LIGHT, "shares")):
             raise click.UsageError("the options of the lidar equation and --shares need --intensity reflectance")
         return None
     if options["height"] is None:
         raise click.UsageError("--intensity reflectance needs --sensor-height")
-    return from_options(Radar, options)
+    return shared.from_options(Radar, options)
 
 
 def _list_lines(output: Path, summary: SynthesisSummary, settings: SynthesisOptions) -> Iterator[str]:

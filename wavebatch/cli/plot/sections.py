@@ -112,7 +112,7 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
 
 
 @click.command()
-@click.argument("cube_file", type=click.Path(path_type=Path), metavar="CUBE.npz")
+@click.argument("cube_file", type=shared.INPUT, metavar="CUBE.npz")
 @output_option
 @click.option("--x", type=click.IntRange(0), metavar="N", help="Slice across the lines at pulse N of each.")
 @click.option("--y", type=click.IntRange(0), metavar="N", help="Slice along scan line N.")

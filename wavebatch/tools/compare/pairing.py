@@ -230,7 +230,7 @@ def _list_crowded(
 def check_tolerance(tolerance_ns: float) -> float:
     """The tolerance; ConfigError if it is not above 0, or longer than any waveform."""
     if not 0 < tolerance_ns < 1e6:
-        raise ConfigError(f"the tolerance (--within) is {tolerance_ns:g} ns; it must be above 0 and below 1e6")
+        raise ConfigError(f"tolerance {tolerance_ns:g} ns (--within): must be above 0 and below 1e6")
     return tolerance_ns
 
 

@@ -108,7 +108,7 @@ def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
         rest = [pulses.take(np.arange(edges[-2], len(pulses)))]
     if 0 < total < LEAST_PULSES:
         need = f"a scan line to find surfaces in needs {LEAST_PULSES}"
-        raise InputError(f"{reader.facts.path}: has {total} pulses, {need}")
+        raise InputError(f"{reader.facts.path}: has {total} pulse{'s' * (total > 1)}, {need}")
     if lost > total / 2:
         raise InputError(
             f"{reader.facts.path}: {lost} of {total} pulses lie in scan lines of fewer than {LEAST_PULSES} pulses; "
