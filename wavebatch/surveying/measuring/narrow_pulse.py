@@ -78,8 +78,8 @@ def scale_pulse(system: SystemPulse, ratio: float) -> SystemPulse:
     return replace(system, sigma_ref=system.sigma_ref * ratio, components=components)
 
 
-def fit_narrowest(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
-    """Make a learned pulse as wide as the narrowest echoes.
+def draw_together(block: WaveformBlock, system: SystemPulse, cost: Cost, *, clear: bool) -> tuple[SystemPulse, Cost]:
+    """Draw a learned pulse together, as far as the narrowest echoes and what waveforms cost with it say.
 
     Parameters
     ----------
@@ -88,18 +88,35 @@ def fit_narrowest(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tupl
         With the pulse of the isolated echoes.
     cost : Cost
         Of it.
+    clear : bool
+        Whether it explains the waveforms: then only narrower echoes show that it is too wide.
 
     Returns
     -------
     SystemPulse, Cost
-        The same ones where fits with narrower pulses do not agree, or waveforms cost more.
+        The same ones where neither says so.
 
     Notes
     -----
     In a canopy, and in a large footprint on a slope, isolated echoes are sums of close ones, and a stack of them is too
-    wide; echoes of waveforms with several are not (docs/algorithms.md R2). A scene widens a pulse by a variance, but a
-    stack of sums may have another shape than that. So the pulse is both sharpened and stretched, and the cheaper one
-    taken. Fits have no prior on widths: it holds close echoes at the width of the pulse that is tried.
+    wide; echoes of waveforms with several are not (docs/algorithms.md R2). Where hardly a width is known well enough to
+    show it, the widest pulse is taken that explains the waveforms as well as the best.
+    """
+    narrow = _fit_narrowest(block, system, cost) if cost.is_narrower else (system, cost)
+    if clear or narrow[0] is not system:
+        return narrow
+    tried = [(system, cost), *_try_widths(block, system, TRIED[1:])]
+    if _widest(tried)[0] is not system:
+        tried[1:] = _try_widths(block, system, np.arange(1 - STEP, TRIED[-1] - STEP / 2, -STEP))
+    return _widest(tried)
+
+
+def _fit_narrowest(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
+    """The pulse as wide as the narrowest echoes, and its cost; the same where that costs more, or fits do not agree.
+
+    A scene widens a pulse by a variance, but a stack of sums may have another shape than that. So the pulse is both
+    sharpened and stretched, and the cheaper one taken. Fits have no prior on widths: it holds close echoes at the width
+    of the pulse that is tried.
     """
     fits = (decompose_sample(block, scale_pulse(system, scale), width_prior=0.0) for scale in TRIED)
     width = float(np.median([_find_narrowest(echoes) for echoes in fits]))
@@ -108,17 +125,6 @@ def fit_narrowest(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tupl
     pulses = scale_pulse(system, width / system.sigma_ref), _sharpen(system, width, block.spacing)
     best = min(((pulse, measure_cost(block, pulse)) for pulse in pulses), key=lambda one: one[1].typical)
     return best if best[1].exceeds(cost) < BEYOND else (system, cost)
-
-
-def draw_together(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
-    """Find the widest of a learned pulse and narrower ones that explains waveforms as well as the best, and its cost.
-
-    For waveforms that the pulse does not explain, though hardly a width is known well enough to say so.
-    """
-    tried = [(system, cost), *_try_widths(block, system, TRIED[1:])]
-    if _widest(tried)[0] is not system:
-        tried[1:] = _try_widths(block, system, np.arange(1 - STEP, TRIED[-1] - STEP / 2, -STEP))
-    return _widest(tried)
 
 
 def _try_widths(block: WaveformBlock, system: SystemPulse, scales: Iterable[float]) -> list[tuple[SystemPulse, Cost]]:
