@@ -35,6 +35,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     SETTLED,
     SMALL,
     find_saturation,
+    measure_again,
     measure_gaussian,
     thin_block,
 )
@@ -361,8 +362,8 @@ def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlo
 
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
-    """As survey_block, from noise and width as `measure_gaussian` finds them."""
-    figures = Figures()
+    """As survey_block, from noise and width by `measure_gaussian`; once more where noise grows with the signal."""
+    first, figures = system, Figures()
     if learn:
         clear = find_clear(block, system)
         main = find_isolated(block, system, clear)
@@ -383,6 +384,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = choose_pulse(block, system, strong, learned=learned, figures=figures)
         before, echoes = system, decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
+        if system.noise.gain > 0 and not first.noise.gain:
+            return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
         # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its
         # misfit; a few echoes of a small strip, full of neighbours, do not know better.
         strong = strong if find_source(system) is None else find_strong(clear, 0)

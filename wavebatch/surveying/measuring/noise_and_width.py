@@ -91,6 +91,15 @@ def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
     return _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
 
 
+def measure_again(block: WaveformBlock, system: SystemPulse, gain: float) -> SystemPulse:
+    """The system with a growth of its noise [count], and the width that echoes repeat by errors that hold it.
+
+    By those of white noise the narrowest of scattered widths are taken for it: a fifth too narrow at a growth of 0.2.
+    """
+    system = replace(system, noise=replace(system.noise, gain=gain))
+    return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
+
+
 def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
     """About `number` waveforms spread over the block, at least as many where it has them."""
     return block.rows(slice(None, None, max(len(block) // number, 1)))

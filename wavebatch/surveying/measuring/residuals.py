@@ -117,6 +117,11 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
         system = _measure_outside(block, system, echoes)
     alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
     alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise.std))
+    if system.noise.gain and len(alone):  # what a fit takes away is known for one without weights
+        white, part = replace(system, noise=replace(system.noise, gain=0.0)), block.rows(alone.waveform)
+        rows = np.arange(len(part), dtype=np.int32)
+        again = adaptive(part, pooled_noise(part, white), white, replace(alone, waveform=rows), max_echoes=1)
+        alone = replace(again, waveform=alone.waveform[again.waveform])
     if len(alone) < ENOUGH_TO_LEARN:
         return system
     time, width = alone.time / block.spacing, alone.sigma / block.spacing
