@@ -78,7 +78,7 @@ def scale_pulse(system: SystemPulse, ratio: float) -> SystemPulse:
     return replace(system, sigma_ref=system.sigma_ref * ratio, components=components)
 
 
-def draw_together(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
+def draw_together(block: WaveformBlock, system: SystemPulse, cost: Cost, *, clear: bool) -> tuple[SystemPulse, Cost]:
     """Draw a learned pulse together, as far as the narrowest echoes and what waveforms cost with it say.
 
     Parameters
@@ -88,6 +88,8 @@ def draw_together(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tupl
         With the pulse of the isolated echoes.
     cost : Cost
         Of it.
+    clear : bool
+        Whether it explains the waveforms: then only narrower echoes show that it is too wide.
 
     Returns
     -------
@@ -97,28 +99,16 @@ def draw_together(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tupl
     Notes
     -----
     In a canopy, and in a large footprint on a slope, isolated echoes are sums of close ones, and a stack of them is too
-    wide. The pulse is no wider than the narrowest echoes of waveforms with several (docs/algorithms.md R2). Where these
-    do not show it, since no echo of a waveform is known well, a narrower pulse must explain the waveforms better: then
-    the widest is taken that explains them as well as the best.
+    wide; echoes of waveforms with several are not (docs/algorithms.md R2). Where hardly a width is known well enough to
+    show it, the widest pulse is taken that explains the waveforms as well as the best.
     """
-    if cost.is_narrower:
-        return _fit_narrowest(block, system, cost)
+    narrow = _fit_narrowest(block, system, cost) if cost.is_narrower else (system, cost)
+    if clear or narrow[0] is not system:
+        return narrow
     tried = [(system, cost), *_try_widths(block, system, TRIED[1:])]
     if _widest(tried)[0] is not system:
         tried[1:] = _try_widths(block, system, np.arange(1 - STEP, TRIED[-1] - STEP / 2, -STEP))
     return _widest(tried)
-
-
-def _try_widths(block: WaveformBlock, system: SystemPulse, scales: Iterable[float]) -> list[tuple[SystemPulse, Cost]]:
-    """The pulse at other widths, and their costs."""
-    pulses = [scale_pulse(system, float(scale)) for scale in scales]
-    return [(pulse, measure_cost(block, pulse)) for pulse in pulses]
-
-
-def _widest(tried: list[tuple[SystemPulse, Cost]]) -> tuple[SystemPulse, Cost]:
-    """The first pulse that costs as little as the cheapest."""
-    least = min((cost for _, cost in tried), key=lambda cost: cost.typical)
-    return next(one for one in tried if one[1].exceeds(least) < BEYOND)
 
 
 def _fit_narrowest(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
@@ -135,6 +125,18 @@ def _fit_narrowest(block: WaveformBlock, system: SystemPulse, cost: Cost) -> tup
     pulses = scale_pulse(system, width / system.sigma_ref), _sharpen(system, width, block.spacing)
     best = min(((pulse, measure_cost(block, pulse)) for pulse in pulses), key=lambda one: one[1].typical)
     return best if best[1].exceeds(cost) < BEYOND else (system, cost)
+
+
+def _try_widths(block: WaveformBlock, system: SystemPulse, scales: Iterable[float]) -> list[tuple[SystemPulse, Cost]]:
+    """The pulse at other widths, and their costs."""
+    pulses = [scale_pulse(system, float(scale)) for scale in scales]
+    return [(pulse, measure_cost(block, pulse)) for pulse in pulses]
+
+
+def _widest(tried: list[tuple[SystemPulse, Cost]]) -> tuple[SystemPulse, Cost]:
+    """The first pulse that costs as little as the cheapest."""
+    least = min((cost for _, cost in tried), key=lambda cost: cost.typical)
+    return next(one for one in tried if one[1].exceeds(least) < BEYOND)
 
 
 def _find_narrowest(echoes: EchoTable) -> float:

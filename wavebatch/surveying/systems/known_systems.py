@@ -226,25 +226,25 @@ def choose_pulse(
     A pulse is right if it explains all waveforms, not only isolated echoes, with the fewest echoes and the least misfit
     (`measure_cost`): in a canopy an isolated echo is often several, and their pulse too wide. Nothing is
     tried where a learned pulse leaves less than SHORT per echo and no echoes are narrower; but where echoes are CROWDED
-    or waveforms few it may be a Gaussian all the same. Else the simplest is taken of those that cost no more, no wider
-    than the narrowest echoes (`_drop_tail`, `draw_together`). Where the learned one leaves more, a known pulse of the
-    strip's spacing is taken if it costs less than the strip's, and less than it does when it is stretched or drawn
-    together (SURE); if it is narrower and costs hardly more (NEARLY); or where the strip's must be drawn together and
-    costs hardly less then (ALMOST). A pulse learned from few waveforms has their noise: there a known pulse is taken
-    too if the learned one looks like it (ALIKE) and waveforms do not cost more with it beyond chance.
+    or waveforms few it may be a Gaussian all the same. Else the simplest is taken of those that cost no more, as wide
+    as the narrowest echoes; where these do not show it, the widest that costs no more (`_drop_tail`, `draw_together`).
+    Where the learned one leaves more, a known pulse of the strip's spacing is taken if it costs less
+    than the strip's, and less than it does when it is stretched or drawn together (SURE); if it is narrower and costs
+    hardly more (NEARLY); or where the strip's must be drawn together and costs hardly less then (ALMOST). A pulse
+    learned from few waveforms has their noise: there a known pulse is taken too if the learned one looks like it
+    (ALIKE) and waveforms do not cost more with it beyond chance.
     """
     part = _spread(block, COMPARED)
     own = cost = measure_cost(part, system)
     clear = learned and own.misfit < SHORT * own.echoes
-    narrower = learned and own.is_narrower
     enough = own.echoes < CROWDED * len(part) and len(block) >= SMALL
-    if own.echoes < LEAST_ECHOES or (clear and enough and not narrower):
+    if own.echoes < LEAST_ECHOES or (clear and enough and not own.is_narrower):
         return system
     pulse = _drop_tail(block, system, strong) if learned else system
     if pulse is not system:
         cost = measure_cost(part, pulse)
-    if narrower or (learned and not clear):
-        pulse, cost = draw_together(part, pulse, cost)
+    if learned:
+        pulse, cost = draw_together(part, pulse, cost, clear=clear)
     if not clear:
         certain = learned and len(block) >= SMALL
         pulse, cost = _compare_known(part, (system, own), (pulse, cost), certain=certain)
