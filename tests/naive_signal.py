@@ -164,7 +164,8 @@ def find_level(y, std, reach, limit=4.0, recovery=0):
 def measure_covariance(signal, quiet, lags):
     """Sill, and what is left of it at lags 1, 2, ...: half the mean square steps of quiet samples so far apart."""
     half, pairs = [], []
-    for lag in range(1, min(noise.MOST_LAGS, len(signal) - 1) + 1):
+    most = 48 if signal.shape[1] >= 100 else lags
+    for lag in range(1, min(most, len(signal) - 1) + 1):
         if lag > lags and min(half[-4:]) <= max(half[-8:-4]):
             break
         steps = [y[i + lag] - y[i] for y, used in zip(signal.T, quiet.T, strict=True)

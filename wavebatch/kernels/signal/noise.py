@@ -285,7 +285,7 @@ def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0
     quiet : bool (s, n)
         Samples without signal.
     lags : int, samples
-        Largest lag of noise that forgets itself so soon; of slow noise MOST_LAGS.
+        Largest lag; where noise is slow, and waveforms are not few, MOST_LAGS.
 
     Returns
     -------
@@ -294,7 +294,9 @@ def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0
     """
     used = quiet.astype(np.float32)
     half, pairs = [], []
-    for lag in range(1, min(MOST_LAGS, len(signal) - 1) + 1):
+    # In fewer waveforms than `measure_recovery` needs a tail of echoes looks like slow noise.
+    most = MOST_LAGS if signal.shape[1] >= 2 * LEAST_WAVEFORMS else lags
+    for lag in range(1, min(most, len(signal) - 1) + 1):
         if lag > lags and not _rises(half):
             break
         both = used[lag:] * used[:-lag]
