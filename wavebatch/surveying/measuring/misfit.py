@@ -35,7 +35,8 @@ COMMON_QUANTILE = 0.95
 """The same share of what echoes of about one height have in common: the strongest miss the pulse most."""
 
 CLIPPED = 0.1
-"""Share of clipped waveforms from which no such bound holds: what is clipped misses the pulse by more than the rest."""
+"""Share of clipped waveforms from which the bound is what a Gaussian leaves in common, and no learned pulse can exceed:
+what is clipped misses the pulse by more than the rest."""
 
 NOISE_PROMISE = 8.0
 """Fall of chi2 that noise alone promises: the best of some twenty places, exceeded by a fifth of right fits."""
@@ -97,8 +98,10 @@ def measure_misfit(
         energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
         every = (_promise(part, samples_of(part, noise), system, fitted, reach) - NOISE_PROMISE) / energy
         share = np.quantile(every, MISFIT_QUANTILE)
-        if bounded and np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) < CLIPPED:
-            common = _common_promise(part, noise, system, fitted, reach) / energy
+        if bounded:
+            clipped = np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) >= CLIPPED
+            pulse = replace(system, kappa=0.0, components=()) if clipped else system
+            common = _common_promise(part, noise, pulse, fitted, reach) / energy
             share = min(share, np.quantile(common, COMMON_QUANTILE))
         misfit = SCATTERED * float(np.sqrt(max(share, 0.0)))
     # A known sensor's pulse changes from shot to shot: of that echoes of a strip have nothing in common.
