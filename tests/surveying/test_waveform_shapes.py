@@ -119,6 +119,19 @@ def test_clipped_echoes_stay_one(seed):
     assert (number[clipped] == 1).mean() > 0.95 and (number[~clipped] == 1).mean() > 0.97
 
 
+def test_close_pairs_are_found_where_many_echoes_are_clipped():
+    """Second echoes near the strongest passed for misfit of the pulse: clipped pairs 3 to 4 widths apart became one."""
+    rng = np.random.default_rng(26)
+    time = rng.uniform(20, 50, (3000, 1)) + np.array([0, 1]) * rng.uniform(2.5, 7.5, (3000, 1))
+    height = np.exp(rng.uniform(*np.log([20, 500]), time.shape))
+    signal = (height[:, :, None] * bell((np.arange(80) - time[:, :, None]) / 1.9)).sum(axis=1)
+    block = digitize(signal, 26, noise=1.0)
+    system, echoes = decompose(block)
+    clipped = (block.samples == 255).any(axis=1) & (np.diff(time)[:, 0] > 5)
+    assert clipped.mean() > 0.15 and system.misfit < 0.02
+    assert (echoes.count(3000)[clipped] == 2).mean() > 0.98
+
+
 def scores(block, rows, time):
     """The survey's system, and completeness and correctness of the default chain."""
     system, echoes = decompose(block)
