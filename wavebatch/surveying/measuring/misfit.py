@@ -35,10 +35,8 @@ COMMON_QUANTILE = 0.95
 """The same share of what echoes of about one height have in common: the strongest miss the pulse most."""
 
 CLIPPED = 0.1
-"""Share of clipped waveforms from which what is clipped, and misses the pulse by more than the rest, needs ..."""
-
-CLIPPED_MORE = 16.0
-"""... so many times this bound."""
+"""Share of clipped waveforms from which the bound is what a Gaussian leaves in common, and no learned pulse can exceed:
+what is clipped misses the pulse by more than the rest."""
 
 NOISE_PROMISE = 8.0
 """Fall of chi2 that noise alone promises: the best of some twenty places, exceeded by a fifth of right fits."""
@@ -102,8 +100,9 @@ def measure_misfit(
         share = np.quantile(every, MISFIT_QUANTILE)
         if bounded:
             clipped = np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) >= CLIPPED
-            common = _common_promise(part, noise, system, fitted, reach) / energy
-            share = min(share, (CLIPPED_MORE if clipped else 1) * np.quantile(common, COMMON_QUANTILE))
+            pulse = replace(system, kappa=0.0, components=()) if clipped else system
+            common = _common_promise(part, noise, pulse, fitted, reach) / energy
+            share = min(share, np.quantile(common, COMMON_QUANTILE))
         misfit = SCATTERED * float(np.sqrt(max(share, 0.0)))
     # A known sensor's pulse changes from shot to shot: of that echoes of a strip have nothing in common.
     return replace(system, misfit=max(misfit, system.misfit), tail_misfit=_measure_tail(part, system, fitted))

@@ -22,7 +22,7 @@ from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.maximum import matched_filter
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.noise_and_width import DITHERED, ENOUGH_TO_LEARN, FEW, UNDITHERED
 
 WEAK = 60.0
@@ -74,11 +74,13 @@ def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable
     Returns
     -------
     float32 (n, s)
-        Samples above the baseline less the echoes [count]; NaN where a sample was not recorded.
+        Samples above the baseline less the echoes [count]; NaN where a sample was not recorded, 0 where it is clipped
+        and the echoes are higher: it shows no more than that they are.
     """
     noise = pooled_noise(block, system)
     residual = block.samples - noise.level
     residual -= render_own(block, system, echoes, echoes.waveform, len(block))
+    residual[(block.samples >= clip_level(block, system)) & (residual < 0)] = 0.0
     if block.missing is not None:
         residual[block.missing] = np.nan
     return residual
