@@ -26,6 +26,10 @@ APART, MARGIN = 4.0, 0.5
 times the noise, as much as the foot of an echo can raise its quiet samples."""
 
 
+FOOT = 2.0
+"""Error of a level that only the lowest samples show, over the noise: the foot of an echo may lie there."""
+
+
 @stage("noise")
 def pooled(
     block: WaveformBlock,
@@ -65,13 +69,16 @@ def pooled(
         if block.missing is not None:
             quiet &= ~block.missing.T
             mean, number = quiet_mean(signal, quiet)
+        least = np.where(number > 0, 0.0, FOOT * std)
+        mean, number = np.where(number > 0, mean, _lowest_levels(signal, std)), np.maximum(number, 1)
     else:
         level = np.full(n, system.noise.baseline, np.float32)
         samples = Samples(block.samples, level, np.ones(n, np.float32), block.missing)
         mean, number = quiet_levels(samples, limit * np.hypot(SMOOTH_GAIN * std, spread), reach, recovery)
+        least = 0.0
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.noise.baseline + trust * mean
-    error = (spread * np.sqrt(1 - trust)).astype(np.float32) if spread else None
+    error = np.maximum(spread * np.sqrt(1 - trust), least).astype(np.float32) if spread else None
     noise = Noise(baseline.astype(np.float32), np.full(n, std, np.float32), baseline_err=error)
     return noise if block.missing is None else _split_levels(block, noise, system, limit)
 
@@ -93,8 +100,7 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit
     std = float(noise.std[0])
     level, quiet, _ = find_levels(signal, std, int(np.ceil(system.sigma_ref / block.spacing)), limit)
     number = (quiet & (np.arange(s)[:, None] < length)).sum(axis=0)
-    lowest = np.partition(signal, s // 10, axis=0)[s // 10] + np.float32(LOWEST_TENTH * std)
-    level = np.where(number >= LEAST_QUIET, level, lowest)
+    level = np.where(number >= LEAST_QUIET, level, _lowest_levels(signal, std))
     # The mean of correlated samples scatters more than that of as many independent ones.
     spread = std * np.sqrt(max(1.0, 1.0 + 2.0 * float(np.sum(system.noise.correlation))))
     apart = np.abs(level - noise.baseline[row]) > APART * spread / np.sqrt(np.maximum(number, 1)) + MARGIN * std
@@ -104,6 +110,12 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit
     run, place = list_samples(*((row * s + edge)[apart] for edge in (start, end)))
     of_sample.reshape(-1)[place] = level[apart][run]
     return replace(noise, of_sample=of_sample)
+
+
+def _lowest_levels(signal: np.ndarray, std: float) -> np.ndarray:
+    """Level (n,) of waveforms (s, n) by their lowest samples, where echoes leave no quiet ones."""
+    at = len(signal) // 10
+    return np.partition(signal, at, axis=0)[at] + np.float32(LOWEST_TENTH * std)
 
 
 @stage("noise")

@@ -234,7 +234,7 @@ def choose_pulse(
     learned from few waveforms has their noise: there a known pulse is taken too if the learned one looks like it
     (ALIKE) and waveforms do not cost more with it beyond chance.
     """
-    part = _spread(block, COMPARED)
+    part = _spread(_with_level(block, system), COMPARED)
     own = cost = measure_cost(part, system)
     clear = learned and own.misfit < SHORT * own.echoes
     enough = own.echoes < CROWDED * len(part) and len(block) >= SMALL
@@ -277,6 +277,15 @@ def _compare_known(
             ):
                 tried.append((found.typical, known.name, taken, found))
     return min(tried, key=lambda one: one[:2])[2:] if tried else best
+
+
+def _with_level(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
+    """The waveforms whose level is known to the noise, or all: a wrong level passes for a narrow pulse and an echo."""
+    error = pooled_noise(block, system).baseline_err
+    if error is None:
+        return block
+    known = np.flatnonzero(error <= system.noise.std)
+    return block.rows(known) if len(known) >= FEW else block
 
 
 def _spread(block: WaveformBlock, number: int) -> WaveformBlock:
