@@ -99,6 +99,7 @@ def test_a_small_strip_has_the_echoes_of_the_whole_strip(riegl, tmp_path, points
         assert small.figures.pulse_cost < small.figures.isolated_pulse_cost
 
 
+@pytest.mark.quick_cases("317")
 @pytest.mark.parametrize("first", [317, 528])
 def test_a_small_strip_takes_the_known_pulse_that_its_own_looks_like(first):
     """Fifty packets learned a pulse with the noise of a few echoes, and found 2 and 6 % more."""

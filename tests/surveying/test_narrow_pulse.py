@@ -45,6 +45,7 @@ def _widen_single_echoes(seed, sigma, tail, share):
     return WaveformBlock.from_samples(np.clip(counts, 0, 255).astype(np.uint8)), np.where(slope, 1, 2)
 
 
+@pytest.mark.quick_cases("1-2.0-0.06-0.6", "1-5.0-0.0-0.8")
 @pytest.mark.parametrize(
     ("seed", "sigma", "tail", "share"),
     [(1, 2.0, 0.06, 0.6), (2, 2.0, 0.0, 0.6), (1, 3.5, 0.06, 0.4), (1, 5.0, 0.0, 0.8)],
@@ -74,6 +75,7 @@ def test_strangers_have_the_width_of_their_measured_pulses(strip, name, width):
     assert _half_width(survey.system) == pytest.approx(width, rel=0.05)
 
 
+@pytest.mark.quick_cases("1")
 @pytest.mark.parametrize("part", [0, 1])
 def test_parts_of_a_stranger_have_one_width(part):
     """Halves of LVIS had 8.51 and 8.24 ns."""

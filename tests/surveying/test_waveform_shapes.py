@@ -217,6 +217,7 @@ def test_sloping_baselines_hide_no_echo():
     assert found > 0.99 and true > 0.99
 
 
+@pytest.mark.quick_cases("20")
 @pytest.mark.parametrize("seed", [20, 21])
 def test_tails_of_both_signs_are_no_slopes(seed):
     """Tails of strong echoes seemed to be slopes: taken off, they lifted the end of each GeoLas packet by .8 DN."""
@@ -227,6 +228,7 @@ def test_tails_of_both_signs_are_no_slopes(seed):
     assert system.noise.recovery > 0 and system.defects.slope_spread == 0
 
 
+@pytest.mark.quick_cases("1.5")
 @pytest.mark.parametrize("spread", [0.4, 1.5])
 def test_errors_hold_where_few_samples_show_the_level(spread):
     """Baselines that are wrong by a part of the noise: errors of widths were 1.1 to 1.2 times too small."""
@@ -241,6 +243,7 @@ def test_errors_hold_where_few_samples_show_the_level(spread):
         assert 0.93 < np.std(ratio[np.abs(ratio) < 6]) < 1.07
 
 
+@pytest.mark.quick_cases("16-24")
 @pytest.mark.parametrize(("s", "seed"), [(16, 24), (20, 25)])
 def test_wandering_levels_that_echoes_hide_make_no_echoes(s, seed):
     """In 40 % of such packets no sample is quiet: by the strip's level 12 % of the echoes were false, widths .75."""
@@ -305,6 +308,7 @@ def test_errors_hold_in_coloured_noise_that_grows_with_the_signal(rho, gain):
     assert true > 0.995
 
 
+@pytest.mark.quick_cases("0.3")
 @pytest.mark.parametrize("gain", [0.05, 0.3])
 def test_noise_that_grows_with_the_signal_makes_no_narrow_pulse(gain):
     """By errors of white noise the narrowest of scattered widths were the pulse: a fifth too narrow, g a fifth low."""
