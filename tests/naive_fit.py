@@ -76,10 +76,27 @@ def is_resolved(p, errors):
 
 def decompose(y, std, start, s, clip=np.inf, **shape):
     """Parameters (3, k), errors and chi2 of one window; s: Settings, whose widths, gates and acceptance count."""
+    first = grow(y, std, start, s, (s.width_low, s.width_high), clip, **shape)
+    fall = least_fall(first[0], std, s)
+    if not s.grow or first[2] - len(y) < fall:
+        return first
+    narrow = grow(y, std, start, s, (max(s.width_low, s.width_ref / 1.1), min(s.width_high, s.width_ref * 1.1)), clip, **shape)
+    second = grow(y, std, narrow[0], s, (s.width_low, s.width_high), clip, **shape)
+    better = second[2] + fall * (second[0].shape[1] - first[0].shape[1]) < first[2]
+    return second if better else first
+
+
+def least_fall(p, std, s):
+    """Fall of chi2 that one more echo needs."""
+    return s.acceptance + s.misfit**2 * np.sqrt(np.pi) * np.sum(p[0] ** 2 * p[2]) / std**2
+
+
+def grow(y, std, start, s, widths, clip, **shape):
+    """The same from one start, with widths within these two."""
     x = np.arange(float(len(y)))
     clipped = y >= clip
-    low = np.array([0.0, -3.0, s.width_low])[:, None]
-    high = np.array([1e12, len(y) + 2.0, s.width_high])[:, None]
+    low = np.array([0.0, -3.0, widths[0]])[:, None]
+    high = np.array([1e12, len(y) + 2.0, widths[1]])[:, None]
     best, target = None, np.inf
     for _ in range(20):
         prior = (s.width_ref, s.prior_spread) if s.prior_spread and start.shape[1] > 1 else None
@@ -101,7 +118,7 @@ def decompose(y, std, start, s, clip=np.inf, **shape):
         if not s.grow or p.shape[1] >= s.max_echoes or not is_misfit(p, x, residual, std, s):
             return best
         start, promise = propose(p, x, residual, std, s, shape)
-        fall = s.acceptance + s.misfit**2 * np.sqrt(np.pi) * np.sum(p[0] ** 2 * p[2]) / std**2
+        fall = least_fall(p, std, s)
         if not promise > 0.5 * fall:
             return best
         target = chi2 - fall

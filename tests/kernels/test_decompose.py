@@ -63,6 +63,18 @@ def test_a_flat_top_is_split_into_two(second):
     np.testing.assert_allclose(np.median(times, axis=0), [20.5, 23.5], atol=0.2)
 
 
+def test_no_broad_echo_bridges_two_others():
+    """Strong echoes beside each other: chi2 has minima in which one broad echo stands for two, and its neighbours
+    make up for it. No further echo leaves them (docs/algorithms.md 2.3)."""
+    rng, m = np.random.default_rng(2), 300
+    times = 8 + np.cumsum(rng.uniform(1.8, 6.0, (m, 4)) * 2, axis=1) * 0.9
+    amplitudes = np.exp(rng.uniform(np.log(50), np.log(20000), (m, 4)))
+    y = np.stack([sum(bell(t, a) for t, a in zip(*row, strict=True)) for row in zip(times, amplitudes, strict=True)])
+    start = np.stack([amplitudes, times, np.full((m, 4), 2.0)], axis=1)[:, :, rng.permutation(4)[:2]]
+    found = decompose(np.rint(y + rng.standard_normal(y.shape)), start, std=1.04, grow=True)
+    assert np.mean(found.misfit > 2) <= 0.01
+
+
 def test_candidates_of_nothing_are_left_out():
     found = repeat(bell(20, 100) - bell(30, 8, 3.0), [20.0, 30.0], [100.0, 4.0])
     assert np.count_nonzero(found.number == 1) > 160
@@ -82,11 +94,18 @@ def draw_stiff(rng):
     return np.stack([np.array([rng.uniform(100, 230), np.exp(rng.uniform(1, 5))]), time, rng.uniform(1.5, 4.0, 2)])
 
 
+def draw_crowd(rng):
+    """Four echoes, some of them bridged by one at first."""
+    return np.stack([np.exp(rng.uniform(4, 9, 4)), 8 + np.cumsum(rng.uniform(3.0, 9.0, 4)), np.full(4, 2.0)])
+
+
 @pytest.mark.parametrize("shape", [GAUSSIAN, LEARNED], ids=["gaussian", "learned"])
-@pytest.mark.parametrize("draw", [draw_random, draw_stiff])
-@pytest.mark.parametrize("clip", [np.inf, 200.0])
+@pytest.mark.parametrize(
+    ("draw", "clip"),
+    [(draw_random, np.inf), (draw_random, 200.0), (draw_stiff, np.inf), (draw_stiff, 200.0), (draw_crowd, np.inf)],
+)
 def test_clusters_grow_as_those_of_the_twin(shape, draw, clip):
-    rng, m = np.random.default_rng(5), 50
+    rng, m = np.random.default_rng(5), 20 if draw is draw_crowd else 50  # its twin takes long
     truth = [draw(rng) for _ in range(m)]
     y = np.stack([naive_fit.naive.model(p, np.arange(float(LENGTH)), components=shape.components) for p in truth])
     y = np.minimum(np.rint(y + rng.standard_normal(y.shape)), clip)

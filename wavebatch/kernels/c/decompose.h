@@ -5,6 +5,7 @@ static const double UNRESOLVED = 0.25;         /* distance, in its errors, below
 static const double FAINT = 1;                 /* height in the window, in noise, at which a fit found no echo */
 static const double MOST_SKEW = 0.6;           /* the half after the peak is then twice as wide as the half before it */
 static const double MOST_AMPLITUDE = 1e12;     /* above any count of 32 bits, also of the peak of a clipped echo */
+static const double BREATH = 1.1;              /* widths of the second try, over or under that of the pulse */
 static const double ROOT_PI = 1.7724538509055161;
 
 /* Amplitudes from 0, times within 3 samples of the window, widths and skews as set. */
@@ -48,19 +49,23 @@ static int is_resolved(const Solution *s) {
 }
 
 /* Fall of chi2 that one more echo needs: the acceptance, and what a misfit of the pulse model may explain (R3). */
-static double least_fall(const Settings *s, const Fit *fit, double std) {
-    const double *amplitude = fit->parameters, *width = fit->parameters + 2 * fit->k;
+static double least_fall(const Settings *s, int64_t k, const double *parameters, double std) {
+    const double *amplitude = parameters, *width = parameters + 2 * k;
     double energy = 0;
-    for (int64_t j = 0; j < fit->k; j++) energy += amplitude[j] * amplitude[j] * width[j];
+    for (int64_t j = 0; j < k; j++) energy += amplitude[j] * amplitude[j] * width[j];
     return s->acceptance + s->misfit * s->misfit * ROOT_PI * energy / (std * std);
 }
 
-/* The echoes of the window from the starts in work->next, into work->best; 0, or -1 where there is no memory.
+static void exchange(Solution *one, Solution *other) {
+    Solution kept = *one;
+    *one = *other; *other = kept;
+}
+
+/* Echoes from the starts in work->next, into work->best; 0, or -1 where there is no memory.
 
    A larger fit is kept if it lowers chi2 below the target and its echoes are resolved; else the one before it stands.
    The number of rounds is bounded, because each echo that is left out must have been there or been added. */
-static int decompose_window(const Settings *s, Work *work) {
-    const Limits limits = limits_of(s, &work->window);
+static int grow_window(const Settings *s, const Limits *limits, Work *work) {
     const Prior width_prior = {s->width_ref, s->prior_spread, 0, 0}, none = {0};
     double target = INFINITY;
     int64_t rounds = 4 * (work->next.k + s->max_echoes);
@@ -68,21 +73,56 @@ static int decompose_window(const Settings *s, Work *work) {
     for (; rounds > 0; rounds--) {
         const int64_t k = work->next.k;
         memcpy(work->fit.parameters, work->next.parameters, 3 * k * sizeof(double));
-        fit_window(k, 3, s, &limits, k > 1 ? &width_prior : &none, target, work);
+        fit_window(k, 3, s, limits, k > 1 ? &width_prior : &none, target, work);
         if (work->fit.hopeless || (target < INFINITY && !(work->fit.cost < target))) return 0;
         if (leave_out_faint(work)) continue;
-        describe_fit(&limits, work, &work->trial);
+        describe_fit(limits, work, &work->trial);
         if (target < INFINITY && !is_resolved(&work->trial)) return 0;
-        Solution better = work->trial;
-        work->trial = work->best; work->best = better;
+        exchange(&work->trial, &work->best);
         if (!work->fit.converged || !s->grow || k >= s->max_echoes) return 0;
         hermite_moments(work, &work->fit);
         if (!is_misfit(s, work, &work->fit)) return 0;
         if (!reserve(work, k + 1, work->window.vectors)) return -1;
-        double promise = propose_echo(s, work, &work->fit, &limits, &work->next), fall = least_fall(s, &work->fit, work->window.std);
+        double promise = propose_echo(s, work, &work->fit, limits, &work->next), fall = least_fall(s, k, work->fit.parameters, work->window.std);
         if (!(promise > 0.5 * fall)) return 0;
         target = work->fit.cost - fall;
     }
+    return 0;
+}
+
+/* Puts candidates first .. first + k - 1 into the starts, in samples of the window; false without memory. */
+static int set_starts(const Clusters *c, int64_t cluster, Work *work) {
+    const int64_t k = c->number[cluster], first = c->first[cluster], n = c->high[cluster] - c->low[cluster];
+    if (!reserve(work, k, VECTORS(n))) return 0;
+    work->next.k = k;
+    for (int64_t j = 0; j < k; j++) {
+        work->next.parameters[j] = c->amplitude[first + j];
+        work->next.parameters[k + j] = c->time[first + j] - c->low[cluster];
+        work->next.parameters[2 * k + j] = c->width[first + j];
+    }
+    return 1;
+}
+
+/* The echoes of a cluster, into work->best; 0, or -1 where there is no memory.
+
+   An echo too broad that bridges two, with its neighbours shifted to make up for it, is a minimum that no further echo
+   leaves. So where more is left than noise and the pulse's misfit explain, there is a second try: it grows with echoes
+   of the pulse's width, which bridge nothing, and then frees their widths. The better one stands. */
+static int decompose_window(const Settings *s, const Clusters *clusters, int64_t cluster, Work *work) {
+    const Limits limits = limits_of(s, &work->window);
+    Limits narrow = limits;
+    if (!set_starts(clusters, cluster, work) || grow_window(s, &limits, work) < 0) return -1;
+    const int64_t k = work->best.k;
+    const double cost = work->best.cost, fall = least_fall(s, k, work->best.parameters, work->window.std);
+    if (!s->grow || cost - work->window.used < fall) return 0;
+    exchange(&work->best, &work->spare);
+    narrow.low[2] = fmax(limits.low[2], s->width_ref / BREATH);
+    narrow.high[2] = fmin(limits.high[2], s->width_ref * BREATH);
+    if (!set_starts(clusters, cluster, work) || grow_window(s, &narrow, work) < 0) return -1;
+    work->next.k = work->best.k;
+    memcpy(work->next.parameters, work->best.parameters, 3 * work->best.k * sizeof(double));
+    if (grow_window(s, &limits, work) < 0) return -1;
+    if (!(work->best.cost + fall * (work->best.k - k) < cost)) exchange(&work->best, &work->spare);
     return 0;
 }
 
@@ -109,19 +149,6 @@ static void tied_skews(double origin, Solution *s) {
     s->per = 4;
 }
 
-/* Puts candidates first .. first + k - 1 into the starts, in samples of the window; false without memory. */
-static int set_starts(const Clusters *c, int64_t cluster, Work *work) {
-    const int64_t k = c->number[cluster], first = c->first[cluster], n = c->high[cluster] - c->low[cluster];
-    if (!reserve(work, k, VECTORS(n))) return 0;
-    work->next.k = k;
-    for (int64_t j = 0; j < k; j++) {
-        work->next.parameters[j] = c->amplitude[first + j];
-        work->next.parameters[k + j] = c->time[first + j] - c->low[cluster];
-        work->next.parameters[2 * k + j] = c->width[first + j];
-    }
-    return 1;
-}
-
 static void write_echoes(const Solution *s, int64_t begin, int64_t cluster, int64_t at, const Echoes *out) {
     out->number[cluster] = s->k; out->converged[cluster] = s->converged;
     out->misfit[cluster] = s->misfit; out->cost[cluster] = s->cost;
@@ -144,9 +171,9 @@ EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, 
     int64_t i = make_taps(&work, s, block->length) ? from : -1;
     *found = 0;
     for (; i >= 0 && i < clusters->n; i++) {
-        if (!set_starts(clusters, i, &work)) { i = -1; break; }
+        if (!reserve(&work, clusters->number[i], VECTORS(clusters->high[i] - clusters->low[i]))) { i = -1; break; }
         cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
-        if (decompose_window(s, &work) < 0) { i = -1; break; }
+        if (decompose_window(s, clusters, i, &work) < 0) { i = -1; break; }
         if (s->skew_spread > 0 && s->pulse.kind != LOG_NORMAL) free_skews(s, &work);
         if (s->pulse.kind == LOG_NORMAL) tied_skews(origin_of(s, &work.window), &work.best);
         if (*found + work.best.k > out->room) break;

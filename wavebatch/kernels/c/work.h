@@ -31,7 +31,7 @@ typedef struct {
     Window window;
     lanes *rows, *about, *padded, *energy;     /* of the fit; correlated with a new pulse */
     Fit fit, next;
-    Solution trial, best;
+    Solution trial, best, spare;
     double *kept, *products, *matrix, *pivot, *step, *column, *h3, *h4;
     uint8_t *frozen;
     float *taps;
@@ -60,10 +60,10 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
         && enlarge(&w->kept, p * number) && enlarge(&w->products, p * p * number) && enlarge(&w->matrix, p * p * number)
         && enlarge(&w->pivot, p * number) && enlarge(&w->step, p * number) && enlarge(&w->column, p * p * number)
         && enlarge(&w->h3, p * number) && enlarge(&w->h4, p * number) && enlarge(&w->frozen, p);
-    Solution *both[] = {&w->trial, &w->best};
-    for (int i = 0; i < 2 && good; i++)
-        good = enlarge(&both[i]->parameters, p * number) && enlarge(&both[i]->errors, p * number)
-            && enlarge(&both[i]->shared, p * number) && enlarge(&both[i]->at_bound, p);
+    Solution *all[] = {&w->trial, &w->best, &w->spare};
+    for (int i = 0; i < 3 && good; i++)
+        good = enlarge(&all[i]->parameters, p * number) && enlarge(&all[i]->errors, p * number)
+            && enlarge(&all[i]->shared, p * number) && enlarge(&all[i]->at_bound, p);
     if (good) { w->room = k; w->vectors = vectors; }
     return good;
 }
@@ -72,6 +72,6 @@ static void free_work(Work *w) {
     void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->rows, w->about, w->padded, w->energy,
         w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->h3, w->h4,
         w->frozen, w->taps, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
-        w->best.errors, w->best.shared, w->best.at_bound};
+        w->best.errors, w->best.shared, w->best.at_bound, w->spare.parameters, w->spare.errors, w->spare.shared, w->spare.at_bound};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++) free(all[i]);
 }
