@@ -80,7 +80,8 @@ def decompose(y, std, start, s, clip=np.inf, **shape):
     fall = least_fall(first[0], std, s)
     if not s.grow or first[2] - len(y) < fall:
         return first
-    narrow = grow(y, std, start, s, (max(s.width_low, s.width_ref / 1.1), min(s.width_high, s.width_ref * 1.1)), clip, **shape)
+    widths = max(s.width_low, s.width_ref / 1.1), min(s.width_high, s.width_ref * 1.1)
+    narrow = grow(y, std, start, s, widths, clip, **shape)
     second = grow(y, std, narrow[0], s, (s.width_low, s.width_high), clip, **shape)
     better = second[2] + fall * (second[0].shape[1] - first[0].shape[1]) < first[2]
     return second if better else first

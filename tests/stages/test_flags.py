@@ -9,9 +9,10 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
-from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes
+from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, find_unexplained, flag_echoes
 
 OVERLAPPED = int(EchoFlag.OVERLAPPED)
+ERRORS = "time_err", "amplitude_err", "sigma_err", "relative_energy_err"
 S, N = 60, 120
 
 
@@ -108,10 +109,28 @@ def test_what_the_pulse_leaves_of_echoes_is_in_the_errors_of_others_as_by_a_loop
             share = 0.5 * np.interp(lag, *np.array(tail).T)
         left[i] += (share * table.amplitude[j]) ** 2
     factor = np.sqrt(1 + left * np.sqrt(np.pi) * 2.0 / 0.5 / 1.3**2)
-    for name in ("time_err", "amplitude_err", "sigma_err", "relative_energy_err"):
+    for name in ERRORS:
         np.testing.assert_allclose(getattr(found, name), getattr(table, name) * factor, rtol=1e-5)
     assert len(tail) == 1 or factor.max() > 2
     assert cover_misfit(table, SystemPulse(2.0), 0.5) is table
+
+
+@pytest.mark.parametrize("misfit", [0.0, 0.05])
+def test_errors_grow_where_a_fit_misses_its_samples(table, rng, misfit):
+    table = replace(table, residual=rng.uniform(0.7, 6, len(table)).astype(np.float32))
+    system = SystemPulse(2.0, misfit=misfit, noise=ReceiverNoise(std=1.3))
+    samples, factor = 8 * 2.0 / 0.5, np.ones(len(table))
+    for i in range(len(table)):
+        own = np.flatnonzero(table.waveform == table.waveform[i])
+        energy = sum(table.amplitude[j] ** 2 * table.sigma[j] for j in own) * np.sqrt(np.pi) / 0.5 / 1.3**2
+        chi2 = table.residual[i] ** 2 / (1 + misfit**2 * energy / samples)
+        factor[i] = chi2 if chi2 > 1 + 4 * np.sqrt(2 / samples) else 1.0
+    np.testing.assert_allclose(find_unexplained(table, system, 0.5), factor, rtol=1e-5)
+    sure = cover_misfit(replace(table, residual=np.ones_like(table.residual)), system, 0.5)
+    found = cover_misfit(table, system, 0.5)
+    for name in ERRORS:
+        np.testing.assert_allclose(getattr(found, name), getattr(sure, name) * np.sqrt(factor), rtol=1e-5)
+    assert 0.2 < np.mean(factor > 1) < 0.9
 
 
 def test_the_weaker_of_two_echoes_in_one_place_is_dropped(table):

@@ -33,6 +33,12 @@ CORE_STD, TAIL_STD = 0.34, 0.5
 """Standard deviation of what is left of an echo, over its misfit: that is 1.4 times the 0.8 quantile of the best of six
 places, 2.9 for normal values; and over its tail: mean and two standard deviations (`surveying/measuring/misfit.py`)."""
 
+SPAN = 8.0
+"""Length of the window in which an echo is fitted [system widths]."""
+
+BEYOND_CHANCE = 4.0
+"""Standard deviations of chi2 per sample beyond which it is no chance."""
+
 CLIPPED_TAIL = 0.005
 """Share of a clipped echo that an echo must exceed anywhere in its waveform: tails of echoes beyond the digitizer's
 range were never measured, and 0.2 % of four times the range is many times the noise.
@@ -111,7 +117,7 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
 
 
 def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:
-    """Add what the pulse leaves unexplained of an echo to the errors of those beside it.
+    """Add to the errors what the pulse leaves unexplained, of the echo itself and of those beside it.
 
     Parameters
     ----------
@@ -125,25 +131,49 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
     Returns
     -------
     EchoTable
-        The same echoes. What is left of a neighbour counts as noise that moves an amplitude as far.
+        The same echoes. What is left of a neighbour counts as noise that moves an amplitude as far; errors of a fit
+        that is `find_unexplained` grow with the root of chi2.
 
     References
     ----------
     docs/algorithms.md R3.
     """
-    if not (system.misfit or system.tail_misfit):
+    factor = np.sqrt(find_unexplained(table, system, spacing))
+    if system.misfit or system.tail_misfit:
+        left = np.zeros(len(table))
+        for row, other, lag in _neighbours(table):
+            near = np.abs(lag) < BESIDE * system.sigma_ref
+            row, other, lag = row[near], other[near], lag[near]
+            core = np.abs(lag) < CORE * system.sigma_ref
+            share = np.where(core, CORE_STD * system.misfit, TAIL_STD * _tail_share(system, lag))
+            left[row] += np.square(share * table.amplitude[other])
+        energy = SQRT_PI * system.sigma_ref / spacing
+        factor *= np.sqrt(1 + left * energy / system.noise.std**2)
+    if (factor == 1).all():
         return table
-    left = np.zeros(len(table))
-    for row, other, lag in _neighbours(table):
-        near = np.abs(lag) < BESIDE * system.sigma_ref
-        row, other, lag = row[near], other[near], lag[near]
-        core = np.abs(lag) < CORE * system.sigma_ref
-        share = np.where(core, CORE_STD * system.misfit, TAIL_STD * _tail_share(system, lag))
-        left[row] += np.square(share * table.amplitude[other])
-    energy = SQRT_PI * system.sigma_ref / spacing
-    factor = np.sqrt(1 + left * energy / system.noise.std**2).astype(np.float32)
+    factor = factor.astype(np.float32)
     errors = ("time_err", "amplitude_err", "sigma_err", "relative_energy_err")
     return replace(table, **{name: getattr(table, name) * factor for name in errors})
+
+
+def find_unexplained(table: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:
+    """Find fits that miss their samples by more than noise and the pulse's misfit explain.
+
+    Parameters
+    ----------
+    table, system, spacing
+        As for `cover_misfit`.
+
+    Returns
+    -------
+    float64 array, shape (m,)
+        chi2 per sample of the echo's fit, over what is expected; 1 where chance explains it.
+    """
+    samples = SPAN * system.sigma_ref / spacing
+    energy = table.amplitude.astype(np.float64) ** 2 * table.sigma
+    energy = np.bincount(table.waveform, energy)[table.waveform] * SQRT_PI / spacing / system.noise.std**2
+    chi2 = np.nan_to_num(table.residual).astype(np.float64) ** 2 / (1 + system.misfit**2 * energy / samples)
+    return np.where(chi2 > 1 + BEYOND_CHANCE * np.sqrt(2 / samples), chi2, 1.0)
 
 
 def _tail_share(system: SystemPulse, lag: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from wavebatch.kernels.elementary import log
 from wavebatch.kernels.signal.noise import estimate_noise, find_levels, keep_longest
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
+from wavebatch.stages.flags import find_unexplained
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.hidden_neighbours import measure_hidden
 from wavebatch.surveying.measuring.learn_pulse import (
@@ -392,8 +393,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         unsure, system = system, measure_misfit(block, system, strong)
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
+        doubt = _unexplained_share(system, echoes, block.spacing)
         if len(block) < SMALL:
-            doubt = _doubt_echoes(block, unsure, system, strong, len(echoes)) / max(len(echoes), 1)
+            doubt = max(doubt, _doubt_echoes(block, unsure, system, strong, len(echoes)) / max(len(echoes), 1))
+        if len(block) < SMALL or doubt > 0:
             figures.echoes_in_doubt = max(doubt, figures.echoes_in_doubt or 0.0)
     else:
         part = thin_block(block, RESIDUAL_LOOK)
@@ -426,6 +429,13 @@ def _doubt_echoes(
         for one, factor in ((unsure, 1 + error), (system, 1 - error))
     )
     return max(number - fewest, most - number)
+
+
+def _unexplained_share(system: SystemPulse, echoes: EchoTable, spacing: float) -> float:
+    """Share of the clear echoes whose samples the pulse and the noise do not explain; 0 with too few of them."""
+    clear = echoes.amplitude > MIN_SNR * system.noise.std
+    unexplained = find_unexplained(echoes, system, spacing)[clear] > 1
+    return float(np.mean(unexplained)) if len(unexplained) >= FEW else 0.0
 
 
 def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:

@@ -76,7 +76,7 @@ class Figures:
     """What waveforms cost with the chosen pulse, where it is not the one of the isolated echoes; and with that."""
     isolated_pulse_cost: float | None = None
     echoes_in_doubt: float | None = None
-    """Share of the echoes of a small strip that another pulse, misfit or noise, as likely, does not find."""
+    """Share of the echoes that another pulse, misfit or noise, as likely, does not find, or whose samples it misses."""
     spacing_ns: float | None = None
     n_samples: float | None = None
     bits: float | None = None
