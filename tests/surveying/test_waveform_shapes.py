@@ -328,3 +328,11 @@ def test_coloured_noise_is_no_slope(riegl):
     pool = read_pool(riegl)
     system = survey_blocks([block.rows(slice(1, None, 2)) for block in pool.blocks]).system
     assert system.defects.slope_spread == 0
+
+
+@pytest.mark.parametrize("early", [-6.0, -9.0])
+def test_what_comes_before_every_echo_is_none(early):
+    """3 % of the pulse: a third of the echoes was false, because no pulse is learned that far before its peak."""
+    signal, rows, time, _ = render(lambda x: bell(x) + 0.03 * bell(x - early), 5, n=1000, second=0.3)
+    found, correct, _ = compare(decompose(digitize(signal, 5))[1], rows, time)
+    assert found > 0.99 and correct > 0.96

@@ -87,14 +87,14 @@ def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: 
 
 
 def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) -> EchoTable:
-    """Drop echoes that are so faint next to a stronger one that an error of the learned pulse explains them.
+    """Drop echoes that are so faint next to a stronger one that an error of its pulse, or of its tail, explains them.
 
     Parameters
     ----------
     table : EchoTable
         Fitted echoes.
     system : SystemPulse
-        With the components of the learned pulse.
+        With the components of the learned pulse, and the misfit of its tail.
     top : float
         Height above the baseline from which echoes are clipped [count].
 
@@ -103,12 +103,12 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
     EchoTable
         The remaining echoes.
     """
-    delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
-    reach = max([4 * system.sigma_ref, *delays])
-    faint = _faint_beside(table, LEAST_RATIO, 0.0, reach, before=True)
-    if (table.amplitude >= top).any():
+    faint = np.zeros(len(table), bool)
+    if system.components:
+        delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
+        faint = _faint_beside(table, LEAST_RATIO, 0.0, max([4 * system.sigma_ref, *delays]), before=True)
         clipped = np.where(table.amplitude >= top, CLIPPED_TAIL * table.amplitude, 0)
-        for row, other, _ in _neighbours(table):
+        for row, other, _ in _neighbours(table) if clipped.any() else ():
             faint[row] |= table.amplitude[row] < clipped[other]
     if system.tail_misfit:
         for row, other, lag in _neighbours(table):
@@ -149,6 +149,26 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
             left[row] += np.square(share * table.amplitude[other])
         energy = SQRT_PI * system.sigma_ref / spacing
         factor *= np.sqrt(1 + left * energy / system.noise.std**2)
+    return _scale_errors(table, factor)
+
+
+def use_noise_errors(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:
+    """Take back the errors of what a fit misses: while a pulse is looked for, that says nothing about an echo.
+
+    Parameters
+    ----------
+    table, system, spacing
+        As for `cover_misfit`, which grew them.
+
+    Returns
+    -------
+    EchoTable
+        The same echoes.
+    """
+    return _scale_errors(table, 1 / np.sqrt(find_unexplained(table, system, spacing)))
+
+
+def _scale_errors(table: EchoTable, factor: np.ndarray) -> EchoTable:
     if (factor == 1).all():
         return table
     factor = factor.astype(np.float32)
@@ -179,13 +199,12 @@ def find_unexplained(table: EchoTable, system: SystemPulse, spacing: float) -> n
 def _tail_share(system: SystemPulse, lag: np.ndarray) -> np.ndarray:
     """Share of an echo (k,) that its tail leaves unexplained at these lags [ns].
 
-    Between two lags that were measured side by side it is a line; elsewhere nothing is left.
+    It was measured in steps of the pulse's width: a line between two lags side by side; elsewhere nothing is left.
     """
     if not system.tail_misfit:
         return np.zeros(len(lag))
     lags, shares = np.array(system.tail_misfit).T
-    width = np.min(np.diff(lags)) if len(lags) > 1 else 0.0
-    near = np.abs(lag[:, None] - lags).min(axis=1) <= 0.6 * width
+    near = np.abs(lag[:, None] - lags).min(axis=1) <= 0.6 * system.sigma_ref
     return np.where(near, np.interp(lag, lags, shares), 0.0)
 
 

@@ -226,7 +226,7 @@ def describe_solution(
         attributes={name: values[keep] for name, values in given.items()},
     )  # fmt: skip
     table = merge_unresolved(drop_twins(table))
-    if settings.shape.components:
+    if settings.shape.components or not system.components:
         table = drop_unproven(table, system, clip_level(block, system) - system.noise.baseline)
     table = cover_misfit(table, system, spacing)
     if settings.grow:

@@ -11,6 +11,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.decompose.fit import closed_form
 from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.flags import use_noise_errors
 
 ALONE = 0.1
 """Share of an echo up to which others of its waveform are no disturbance ..."""
@@ -61,6 +62,7 @@ def fit_lone(block: WaveformBlock, noise: Noise, system: SystemPulse, least: flo
     hopeful[candidates.waveform[strongest]] = (LOOSE * amplitude > floor) & (second < LOOSE * share * amplitude)
     candidates = candidates.take(np.flatnonzero(hopeful[candidates.waveform]))
     echoes = closed_form(block, noise, system, candidates, fraction=fraction, steps=STEPS)
+    echoes = use_noise_errors(echoes, system, block.spacing)
     strongest, second = find_strongest(echoes, n)
     echoes = echoes.take(strongest)
     good = (echoes.amplitude > floor) & (second < share * echoes.amplitude)

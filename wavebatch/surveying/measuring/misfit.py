@@ -47,8 +47,12 @@ NORMAL_BELOW = 0.0228, 0.1587
 CORE_REACH = 4.0
 """Widths of the pulse around an echo in which its misfit is looked for; beyond them it is the tail's."""
 
-TAIL_BEFORE, TAIL_AFTER = 6, 40
+TAIL_BEFORE, TAIL_AFTER = 15, 40
 """Widths of the pulse before and after an echo in which its tail is measured."""
+
+CONSTANT = 2.0
+"""What comes before or after a Gaussian belongs to it where its mean share is so many times its scatter: else it is
+neighbours too weak to be found. A pulse with components was learned, so all that is left of its tail counts."""
 
 LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says."""
@@ -163,7 +167,8 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
         # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
         lowest, low = np.quantile(here, NORMAL_BELOW)
         spread = max(low - lowest, expected)
-        share = abs(low + spread) + 2 * np.sqrt(spread**2 - expected**2)
-        if share > LEAST_TAIL:
+        common, scatter = abs(low + spread), 2 * np.sqrt(spread**2 - expected**2)
+        share = common + scatter
+        if share > LEAST_TAIL and (system.components or common > CONSTANT * scatter):
             profile.append((float(place * system.sigma_ref), float(share)))
     return tuple(profile)

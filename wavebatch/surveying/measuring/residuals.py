@@ -21,6 +21,7 @@ from wavebatch.kernels.signal.noise import residual_noise
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.maximum import matched_filter
+from wavebatch.stages.flags import use_noise_errors
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.noise_and_width import DITHERED, ENOUGH_TO_LEARN, FEW, UNDITHERED
@@ -56,7 +57,8 @@ fits leave at no signal."""
 def decompose_sample(block: WaveformBlock, system: SystemPulse, **options: float) -> EchoTable:
     block = clean_block(block, system)
     noise = pooled_noise(block, system)
-    return adaptive(block, noise, system, matched_filter(block, noise, system), **options)
+    echoes = adaptive(block, noise, system, matched_filter(block, noise, system), **options)
+    return use_noise_errors(echoes, system, block.spacing)
 
 
 def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
