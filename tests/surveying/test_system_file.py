@@ -44,6 +44,7 @@ SYSTEM = SystemPulse(
     acceptance=18.0,
     defects=Defects(pattern=(0.1, -0.1 / 3), slope_spread=1 / 7, spikes=0.08, transient=2.0),
     tail_misfit=((-9.3, 0.0021), (5.574348636365153, 0.1 + 0.2)),
+    beside=((-9.3, 0.25), (5.574348636365153, 0.1 + 0.7)),
     misfit=0.1 / 3,
     hidden=((0.035, 1 / 7, 0.0), (0.07, 0.1 + 0.2, 1e-9)),
 )
@@ -145,11 +146,12 @@ def test_without_saturation_nothing_clips():
 
 
 def test_files_of_earlier_versions_are_read():
-    """They have no correlation, no tail, no misfit and nothing of hidden neighbours."""
-    text = re.sub(r"^(correlation|tail_misfit|misfit|hidden) = .*\n", "", TEXT, flags=re.M)
-    assert text.count("\n") == TEXT.count("\n") - 4
+    """They have no correlation, no tail, no misfit and nothing of what is left beside echoes."""
+    text = re.sub(r"^(correlation|tail_misfit|beside|misfit|hidden) = .*\n", "", TEXT, flags=re.M)
+    assert text.count("\n") == TEXT.count("\n") - 5
     system = parse_survey(text, "x").survey.system
-    assert system == replace(SYSTEM, noise=replace(SYSTEM.noise, correlation=()), tail_misfit=(), misfit=0.0, hidden=())
+    noise = replace(SYSTEM.noise, correlation=())
+    assert system == replace(SYSTEM, noise=noise, tail_misfit=(), beside=(), misfit=0.0, hidden=())
 
 
 @pytest.mark.parametrize(

@@ -336,3 +336,19 @@ def test_what_comes_before_every_echo_is_none(early):
     signal, rows, time, _ = render(lambda x: bell(x) + 0.03 * bell(x - early), 5, n=1000, second=0.3)
     found, correct, _ = compare(decompose(digitize(signal, 5))[1], rows, time)
     assert found > 0.99 and correct > 0.96
+
+
+@pytest.mark.parametrize("height", [0.0, 2.5])
+def test_targets_too_weak_to_be_found_are_measured_beside_strong_echoes(height):
+    """Targets of up to `height` DN from 4 to 8 widths after each echo: they count as noise there, and nowhere else."""
+    rng = np.random.default_rng(6)
+    signal, rows, time, _ = render(bell, 6, n=2000, amplitude=(60, 200))
+    x, late = np.arange(80), time[:, None] + 2.0 * rng.uniform(4, 8, (2000, 3))
+    weak = height * rng.random((2000, 3))
+    for at, high in zip(late.T, weak.T, strict=True):
+        signal[rows] += high[:, None] * bell((x - at[:, None]) / 2.0)
+    system = survey_block(digitize(signal, 6)).system
+    lags, variance = np.array(system.beside).T
+    late = (lags > 9) & (lags < 15)
+    assert variance[~late & (lags < 5)].max() < 0.3
+    assert variance[late].min() > 1.5 if height else variance[late].max() < 0.3

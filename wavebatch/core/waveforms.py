@@ -268,6 +268,8 @@ class SystemPulse:
     """
     tail_misfit: tuple[tuple[float, float], ...] = ()
     """(lag after the peak [ns], share of the amplitude): what the pulse leaves unexplained around strong echoes."""
+    beside: tuple[tuple[float, float], ...] = ()
+    """(lag after a strong echo [ns], variance of what a pulse sees there beyond noise, over that of the noise)."""
     hidden: tuple[tuple[float, float, float], ...] = ()
     """What neighbours that were not found do to times: variance of an echo over that of the pulse, less 1; and the
     variance of its time over that excess, of lone echoes and of others (docs/algorithms.md 2.2). Empty for none.

@@ -25,13 +25,12 @@ RINGING_FACTOR = 1.2
 TAIL_FACTOR = 1.5
 """An echo must be so many times as high as the measured misfit of a stronger echo's tail at its place."""
 
-CORE, BESIDE = 3.0, 10.0
-"""Distances up to which the misfit of an echo, and then its tail, adds to the errors of others [system widths]. Farther
-off, what the tail scatters by is that of the baseline, which their errors hold."""
+CORE, CORE_STD = 4.0, 0.34
+"""Distance up to which the misfit of an echo adds to the errors of others [system widths], and standard deviation of
+what it leaves, over it: the misfit is 1.4 times the 0.8 quantile of the best of six places, 2.9 for normal values."""
 
-CORE_STD, TAIL_STD = 0.34, 0.5
-"""Standard deviation of what is left of an echo, over its misfit: that is 1.4 times the 0.8 quantile of the best of six
-places, 2.9 for normal values; and over its tail: mean and two standard deviations (`surveying/measuring/misfit.py`)."""
+CLEAR, BESIDE = 20.0, 10.5
+"""Amplitude, over the noise, of an echo beside which others have larger errors, up to so many system widths away."""
 
 SPAN = 8.0
 """Length of the window in which an echo is fitted [system widths]."""
@@ -117,7 +116,7 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
 
 
 def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:
-    """Add to the errors what the pulse leaves unexplained, of the echo itself and of those beside it.
+    """Add to the errors what fits leave unexplained, of the echo itself and of those beside it.
 
     Parameters
     ----------
@@ -131,24 +130,22 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
     Returns
     -------
     EchoTable
-        The same echoes. What is left of a neighbour counts as noise that moves an amplitude as far; errors of a fit
-        that is `find_unexplained` grow with the root of chi2.
+        The same echoes. What is left beside a strong one, and of its core, counts as noise that moves an amplitude as
+        far; errors of a fit that is `find_unexplained` grow with the root of chi2.
 
     References
     ----------
     docs/algorithms.md R3.
     """
-    factor = np.sqrt(find_unexplained(table, system, spacing))
-    if system.misfit or system.tail_misfit:
-        left = np.zeros(len(table))
-        for row, other, lag in _neighbours(table):
-            near = np.abs(lag) < BESIDE * system.sigma_ref
-            row, other, lag = row[near], other[near], lag[near]
-            core = np.abs(lag) < CORE * system.sigma_ref
-            share = np.where(core, CORE_STD * system.misfit, TAIL_STD * _tail_share(system, lag))
-            left[row] += np.square(share * table.amplitude[other])
-        energy = SQRT_PI * system.sigma_ref / spacing
-        factor *= np.sqrt(1 + left * energy / system.noise.std**2)
+    variance = np.zeros(len(table))
+    lags, beside = np.array(system.beside or ((0.0, 0.0),)).T
+    energy = SQRT_PI * system.sigma_ref / spacing / system.noise.std**2
+    for row, other, lag in _neighbours(table) if system.misfit or system.beside else ():
+        core = np.where(np.abs(lag) < CORE * system.sigma_ref, CORE_STD * system.misfit * table.amplitude[other], 0.0)
+        strong = (table.amplitude[other] > CLEAR * system.noise.std) & (np.abs(lag) < BESIDE * system.sigma_ref)
+        more = energy * core**2 + np.where(strong, np.interp(lag, lags, beside), 0.0)
+        variance[row] = np.maximum(variance[row], more)
+    factor = np.sqrt(find_unexplained(table, system, spacing) * (1 + variance))
     return _scale_errors(table, factor)
 
 

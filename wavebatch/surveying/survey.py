@@ -27,7 +27,7 @@ from wavebatch.surveying.measuring.learn_pulse import (
     refine_pulse,
 )
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import measure_misfit
+from wavebatch.surveying.measuring.misfit import measure_beside, measure_misfit
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
@@ -402,7 +402,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
     widths = LevelWidths(scatter=_measure_scatter(part, system, echoes))
-    system = replace(measure_hidden(part, system, echoes), widths=widths)
+    system = replace(measure_hidden(part, measure_beside(part, system, echoes), echoes), widths=widths)
     system = measure_skew(part, system, echoes) if learn else system
     figures = _describe(part, system, echoes, figures)
     decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system.defects))

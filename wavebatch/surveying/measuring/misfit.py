@@ -21,7 +21,7 @@ from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
-from wavebatch.surveying.measuring.lone_echoes import find_strongest
+from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, find_strongest
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW
 from wavebatch.surveying.measuring.residuals import find_common, render_own, subtract_echoes
 
@@ -49,6 +49,12 @@ CORE_REACH = 4.0
 
 TAIL_BEFORE, TAIL_AFTER = 15, 40
 """Widths of the pulse before and after an echo in which its tail is measured."""
+
+BESIDE, NOT_ABSORBED = 10, 3
+"""Widths of the pulse beside an echo up to which what is left is measured, and from which."""
+
+ONE_SIGMA = 0.6827
+"""Share of normal values within one standard deviation."""
 
 CONSTANT = 2.0
 """What comes before or after a Gaussian belongs to it where its mean share is so many times its scatter: else it is
@@ -110,6 +116,50 @@ def measure_misfit(
         misfit = SCATTERED * float(np.sqrt(max(share, 0.0)))
     # A known sensor's pulse changes from shot to shot: of that echoes of a strip have nothing in common.
     return replace(system, misfit=max(misfit, system.misfit), tail_misfit=_measure_tail(part, system, fitted))
+
+
+def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
+    """The system with what fits leave beside strong echoes: of their pulse, and of targets too weak to be found.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+    echoes : EchoTable
+        The block decomposed with it.
+
+    Returns
+    -------
+    SystemPulse
+        `beside`: by lag, the variance of a pulse's amplitude there beyond that of noise, over that of noise.
+
+    Notes
+    -----
+    Around the strongest echo of each waveform, where no other echo was found (docs/algorithms.md R3). Nearer than
+    NOT_ABSORBED its own fit takes what is left.
+    """
+    strongest, _ = find_strongest(echoes, len(block))
+    strong = echoes.take(strongest[echoes.amplitude[strongest] > MIN_SNR * system.noise.std])
+    if len(strong) < FEW:
+        return system
+    ref = system.sigma_ref / block.spacing
+    taps = gaussian_taps(ref)
+    left = np.nan_to_num(subtract_echoes(block, system, echoes))[strong.waveform]
+    seen = filter_symmetric(left.T, taps).T / (np.sqrt(filter_energy(taps)) * system.noise.std)
+    lag = (np.arange(left.shape[1]) - (strong.time / block.spacing)[:, None]) / ref
+    free = np.ones(lag.shape, bool)
+    owner = np.full(len(block), -1)
+    owner[strong.waveform] = np.arange(len(strong))
+    others = echoes.take(np.flatnonzero((owner[echoes.waveform] >= 0) & ~np.isin(np.arange(len(echoes)), strongest)))
+    for row, time in zip(owner[others.waveform], others.time / block.spacing, strict=True):
+        free[row, max(int(time - NOT_ABSORBED * ref), 0) : int(time + NOT_ABSORBED * ref) + 2] = False
+    profile = []
+    for place in range(-BESIDE, BESIDE + 1):
+        here = np.abs(seen[free & (lag >= place - 0.5) & (lag < place + 0.5)])
+        if abs(place) >= NOT_ABSORBED and len(here) >= ENOUGH_TO_LEARN:
+            variance = float(np.quantile(here, ONE_SIGMA)) ** 2 - 1
+            profile.append((float(place * system.sigma_ref), max(variance, 0.0)))
+    return replace(system, beside=tuple(profile))
 
 
 def _promise(

@@ -64,6 +64,10 @@ ROWS: dict[str, Rows] = {
         "tail_misfit", ((-1e5, 1e5), (0.0, 10.0)), "[lag, share]",
         "(lag [ns], share of the amplitude) that the pulse leaves before and after strong echoes",
     ),
+    "beside": Rows(
+        "beside", ((-1e5, 1e5), (0.0, 1e4)), "[lag, variance]",
+        "(lag [ns], variance over that of the noise) of what fits leave beside strong echoes", optional=True,
+    ),
     "seams": Rows(
         "seams", ((3, 1e9), (1, 1e9)), "[samples, sample]",
         "(samples of a packet, sample of it that was interpolated between two recordings)", kind=int, optional=True,
