@@ -141,19 +141,12 @@ def estimate_noise(
 
 
 def _estimate_from(
-    signal: np.ndarray,
-    reach: int,
-    limit: float,
-    missing: np.ndarray | None,
-    recovery: int,
-    room: float = 1.0,
-    *,
-    cut: bool = False,
+    signal: np.ndarray, reach: int, limit: float, missing: np.ndarray | None, recovery: int, room: float = 1.0
 ) -> PooledNoise:
     """The noise of quiet samples, found from each other from the quiet edges on.
 
-    room: standard deviations by which the first level, that of few samples, may be wrong. cut: whether the limit is
-    already that of noise that is cut off at 0.
+    room: standard deviations by which the first level, that of few samples, may be wrong; 0 with a limit that comes
+    from such noise.
     """
     level, std = quiet_edges(signal, missing)
     covariance = np.array([std**2])
@@ -184,9 +177,9 @@ def _estimate_from(
     if spread <= DRIFT * std:
         seen = std
         middle, std, spread, correlation = undo_floor(signal[quiet], middle, std, spread, correlation)
-        if std > MUCH_CUT * seen and not cut:  # a limit of what is left of the noise cuts off its top too
+        if room and std > MUCH_CUT * seen:  # a limit of what is left of the noise cuts off its top too
             wider = limit * float(np.sqrt(std / seen))  # half way: weak echoes must not come in
-            return _estimate_from(signal, reach, wider, missing, recovery, room, cut=True)
+            return _estimate_from(signal, reach, wider, missing, recovery, room=0.0)
     return PooledNoise(middle, std, spread, float(quiet.mean()), correlation, recovery)
 
 
