@@ -138,6 +138,15 @@ def test_a_noise_without_quiet_samples_is_a_guess(tmp_path):
     assert "found too few samples without signal: the noise is a guess" in line and "--system" in line
 
 
+def test_a_noise_below_the_first_count_is_a_guess(tiny_strip, tmp_path):
+    system = tmp_path / "system.toml"
+    assert CliRunner().invoke(main, ["survey", str(tiny_strip), "-o", str(system)]).exit_code == 0
+    text = system.read_text()
+    system.write_text(re.sub("baseline_dn = .*", "baseline_dn = -1.5", text))
+    lines = warn_quietly(tiny_strip, tmp_path / "sunk", "--system", str(system))
+    assert any("most of the noise below count 0: the noise is a guess" in line for line in lines)
+
+
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_a_good_strip_is_no_guess(strip, request, tmp_path):
     short = cut_strip(request.getfixturevalue(strip), tmp_path / "short.las", 120)

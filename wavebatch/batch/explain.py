@@ -19,6 +19,7 @@ from wavebatch.stages.decompose.loops import loop_model
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.inspect_strip import doubt_packets
 from wavebatch.surveying.measuring.noise_and_width import FEW
+from wavebatch.surveying.measuring.residuals import hides_noise
 from wavebatch.surveying.sensor import SensorSource
 from wavebatch.surveying.systems.known_systems import find_source
 
@@ -219,12 +220,16 @@ def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
     unseen = measured.get("quiet") == 0 and "outside" not in measured
     if unseen and not reason:
         reason = "too few samples without signal"
+    remedy = "give --system, a survey of a longer strip of this sensor"
+    hidden = hides_noise(system.noise)
+    if hidden and not reason:
+        reason, remedy = "most of the noise below count 0", "raise the level of the digitizer in the next flight"
     if reason:
         guess = f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
-        guess = f"noise is a guess, of {system.noise.std:.3g} DN" if known or unseen else guess
+        guess = f"noise is a guess, of {system.noise.std:.3g} DN" if known or unseen or hidden else guess
         yield (
             f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
-            "give --system, a survey of a longer strip of this sensor"
+            f"{remedy}"
         )
 
 

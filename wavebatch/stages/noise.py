@@ -11,6 +11,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.library import Samples
+from wavebatch.kernels.signal.floor import MOST_CUT, MOST_LEAST, floor_response, floor_share
 from wavebatch.kernels.signal.maxima import quiet_levels
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
 from wavebatch.kernels.signal.runs import find_stretches, list_samples
@@ -61,14 +62,14 @@ def pooled(
     std = max(system.noise.std, QUANTISATION_STD)
     reach = int(np.ceil(guard * system.sigma_ref / block.spacing))
     recovery = int(np.ceil(min(system.noise.recovery / block.spacing, block.samples.shape[1])))
-    spread = system.noise.baseline_spread
+    spread, quiet = system.noise.baseline_spread, max(system.noise.quiet, QUANTISATION_STD)
     if spread > DRIFT * std:
         signal = transpose_samples(block.samples)
         signal -= np.float32(system.noise.baseline)
-        mean, quiet, number = find_levels(signal, std, reach, limit, recovery)
+        mean, used, number = find_levels(signal, std, reach, limit, recovery)
         if block.missing is not None:
-            quiet &= ~block.missing.T
-            mean, number = quiet_mean(signal, quiet)
+            used &= ~block.missing.T
+            mean, number = quiet_mean(signal, used)
         least = np.where(number > 0, 0.0, FOOT * std)
         mean, number = np.where(number > 0, mean, _lowest_levels(signal, std)), np.maximum(number, 1)
     else:
@@ -76,6 +77,9 @@ def pooled(
         samples = Samples(block.samples, level, np.ones(n, np.float32), block.missing)
         mean, number = quiet_levels(samples, limit * np.hypot(SMOOTH_GAIN * std, spread), reach, recovery)
         least = 0.0
+        if MOST_LEAST < floor_share(system.noise.baseline, quiet) <= MOST_CUT:
+            offset, response, _ = floor_response(system.noise.baseline, quiet)
+            mean = (mean - offset) / response
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.noise.baseline + trust * mean
     error = np.maximum(spread * np.sqrt(1 - trust), least).astype(np.float32) if spread else None

@@ -12,6 +12,7 @@ import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.kernels.elementary import solve
+from wavebatch.kernels.signal.floor import MOST_LEAST, undo_floor
 from wavebatch.kernels.signal.signal import (
     SMOOTH_GAIN,
     STRONG,
@@ -49,8 +50,8 @@ TIGHTER, LEAST_LIMIT = 0.8, 2.6
 """Factor by which the limit of signal then falls, and the limit up to which it does: at 2.56 a few per cent of noise
 are cut off."""
 
-MOST_LEAST = 0.05
-"""Share of the quiet samples with the least count of all from which noise is cut off there."""
+MUCH_CUT = 1.05
+"""Noise before a digitizer cut it off at 0, over what is left of it, from which quiet samples are found once more."""
 
 BEFORE_SIGNAL = 3
 """Part of the reach that is left out before a signal: a pulse rises faster than its tail falls."""
@@ -144,7 +145,8 @@ def _estimate_from(
 ) -> PooledNoise:
     """The noise of quiet samples, found from each other from the quiet edges on.
 
-    room: standard deviations by which the first level, that of few samples, may be wrong.
+    room: standard deviations by which the first level, that of few samples, may be wrong; 0 with a limit that comes
+    from such noise.
     """
     level, std = quiet_edges(signal, missing)
     covariance = np.array([std**2])
@@ -172,6 +174,12 @@ def _estimate_from(
     middle, spread = _spread_of_levels(level[known].astype(np.float64), number[known], covariance)
     std = max(float(np.sqrt(covariance[0])), QUANTISATION_STD)
     correlation = covariance[1:] / std**2
+    if spread <= DRIFT * std:
+        seen = std
+        middle, std, spread, correlation = undo_floor(signal[quiet], middle, std, spread, correlation)
+        if room and std > MUCH_CUT * seen:  # a limit of what is left of the noise cuts off its top too
+            wider = limit * float(np.sqrt(std / seen))  # half way: weak echoes must not come in
+            return _estimate_from(signal, reach, wider, missing, recovery, room=0.0)
     return PooledNoise(middle, std, spread, float(quiet.mean()), correlation, recovery)
 
 

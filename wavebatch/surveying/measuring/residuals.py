@@ -12,12 +12,14 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.order import group_medians
+from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
-from wavebatch.kernels.signal.noise import residual_noise
+from wavebatch.kernels.signal.floor import MOST_LEAST, floor_share
+from wavebatch.kernels.signal.noise import DRIFT, residual_noise
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.maximum import matched_filter
@@ -52,6 +54,23 @@ and the third one, times 2 / sqrt(2) as it enters the sum."""
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
 fits leave at no signal."""
+
+
+SUNK = 0.6
+"""Depth of the level below count 0, over the noise, from which amplitudes are wrong by more than their errors."""
+
+BRIGHTER = 1.3
+"""Noise under weak echoes, over that of rounding, from which the noise outside of them is not so small as it seems."""
+
+
+def hides_noise(noise: ReceiverNoise) -> bool:
+    """Whether so much of the noise is recorded as 0 that its level and size are a guess (docs/algorithms.md H10)."""
+    share = floor_share(noise.baseline, noise.quiet)
+    if noise.quiet < UNDITHERED:
+        return share > MOST_LEAST and noise.by_kind.get("weak_echoes", 0.0) > BRIGHTER * DITHERED
+    if noise.baseline_spread > DRIFT * noise.quiet:
+        return share > MOST_LEAST
+    return noise.baseline < -SUNK * noise.quiet
 
 
 def decompose_sample(block: WaveformBlock, system: SystemPulse, **options: float) -> EchoTable:
