@@ -393,7 +393,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         unsure, system = system, measure_misfit(block, system, strong)
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
-        doubt = _unexplained_share(system, echoes, block.spacing)
+        doubt = max(_unexplained_share(system, echoes, block.spacing), _misfit_share(part, system, len(echoes)))
         if len(block) < SMALL:
             doubt = max(doubt, _doubt_echoes(block, unsure, system, strong, len(echoes)) / max(len(echoes), 1))
         if len(block) < SMALL or doubt > 0:
@@ -436,6 +436,16 @@ def _unexplained_share(system: SystemPulse, echoes: EchoTable, spacing: float) -
     clear = echoes.amplitude > MIN_SNR * system.noise.std
     unexplained = find_unexplained(echoes, system, spacing)[clear] > 1
     return float(np.mean(unexplained)) if len(unexplained) >= FEW else 0.0
+
+
+def _misfit_share(block: WaveformBlock, system: SystemPulse, number: int) -> float:
+    """Share of the echoes that are there or not by the misfit of a learned pulse: halves of a strip measure it twice or
+    half as large.
+    """
+    if not system.misfit or find_source(system) is not None:
+        return 0.0
+    fewest, most = (len(decompose_sample(block, replace(system, misfit=system.misfit * by))) for by in (2.0, 0.5))
+    return max(most - fewest, 0) / (2 * max(number, 1))
 
 
 def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
