@@ -110,6 +110,9 @@ NO_TWIN = {
     "find_fill": "tests of damaged recordings with a known gap",
     "quiet_fill": "tests of damaged recordings with a known gap",
     "transpose_samples": "a copy",
+    "floor_share": "normal noise in a table",
+    "floor_response": "the same; tests of noise that is cut off at a known level",
+    "undo_floor": "tests of noise that is cut off at a known level",
     "b3_gain": "the norm of b3_detail of one sample",
     "b3_level": "tests of known widths",
 }
