@@ -95,13 +95,43 @@ def test_coloured_noise_shows_in_the_covariance(rho, factor):
 @pytest.mark.parametrize(("rho", "s"), [(0.8, 60), (0.9, 60), (0.9, 120), (0.93, 200)])
 def test_slow_noise_is_no_drift_of_the_baseline(rng, rho, s):
     """With 12 lags noise of .9 was 17 % too small, and errors of widths 1.4 times."""
-    steps = rng.standard_normal((s + 100, 2000))
-    noise = steps.copy()
-    for i in range(1, len(noise)):
-        noise[i] = rho * noise[i - 1] + np.sqrt(1 - rho * rho) * steps[i]
-    pooled = estimate_noise(np.rint(40 + 3 * noise[100:]).astype(np.float32), 6)
+    pooled = estimate_noise(np.rint(40 + 3 * slow_noise(rng, rho, s, 2000)).astype(np.float32), 6)
     assert pooled.std == pytest.approx(3.0, rel=0.07)
     assert pooled.correlation[:3] == pytest.approx(rho ** np.arange(1, 4), abs=0.04)
+
+
+def slow_noise(rng, rho, s, n):
+    """Noise (s, n) of standard deviation 1 with the correlation rho^k."""
+    noise = rng.standard_normal((s + 100, n))
+    for i in range(1, len(noise)):
+        noise[i] = rho * noise[i - 1] + np.sqrt(1 - rho * rho) * noise[i]
+    return noise[100:]
+
+
+@pytest.mark.parametrize(("rho", "s"), [(0.5, 20), (0.7, 24), (0.9, 30), (0.9, 40)])
+@pytest.mark.parametrize("spread", [0.0, 2.0])
+def test_slow_noise_of_short_packets_is_not_taken_for_levels(rng, rho, s, spread):
+    """Runs of four to ten quiet samples do not see all of it: at .9 it was half as large, and the rest was spread."""
+    y = 60 + spread * rng.standard_normal(3000) + 2 * slow_noise(rng, rho, s, 3000)
+    y += 90 * np.exp(-0.5 * ((np.arange(s)[:, None] - rng.uniform(6, s - 6, 3000)) / 1.9) ** 2)
+    pooled = estimate_noise(np.rint(y).astype(np.float32), 6)
+    assert pooled.std == pytest.approx(2.0, rel=0.12)
+    assert pooled.spread == pytest.approx(spread, abs=0.45)
+    assert pooled.correlation[:2] == pytest.approx([rho, rho * rho], abs=0.08)
+
+
+@pytest.mark.parametrize("spread", [1.0, 4.0])
+@pytest.mark.parametrize("kind", ["white", "smooth"])
+def test_levels_are_not_taken_for_slow_noise(rng, kind, spread):
+    """Smooth noise rises faster than its variogram begins: it is none that is known beyond the lags that are seen."""
+    noise = rng.standard_normal((30 + 8, 3000))
+    taps = np.exp(-0.5 * (np.arange(-4, 5) / 1.5) ** 2)
+    if kind == "smooth":
+        noise = sum(tap * noise[i : i + 30] for i, tap in enumerate(taps / np.sqrt(np.sum(taps**2))))
+    y = 60 + spread * rng.standard_normal(3000) + 2 * noise[:30]
+    y += 90 * np.exp(-0.5 * ((np.arange(30)[:, None] - rng.uniform(6, 24, 3000)) / 1.9) ** 2)
+    pooled = estimate_noise(np.rint(y).astype(np.float32), 6)
+    assert pooled.std < 2.1 and pooled.spread == pytest.approx(spread, rel=0.1, abs=0.2)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.5, 2.0, 6.0])
@@ -160,10 +190,7 @@ def test_noise_that_is_a_little_lopsided_keeps_its_limit():
 def test_noise_that_is_cut_at_zero_is_that_before_the_cut(level, std, rho):
     """As recorded, level 0 and noise 1 were 0.38 and 0.63: 4 % of the echoes were noise, errors 1.8 times too small."""
     rng = np.random.default_rng(10)
-    noise = rng.standard_normal((180, 2000))
-    for i in range(1, len(noise)):
-        noise[i] = rho * noise[i - 1] + np.sqrt(1 - rho * rho) * noise[i]
-    y = level + std * noise[100:]
+    y = level + std * slow_noise(rng, rho, 80, 2000)
     y += 60 * std * np.exp(-0.5 * ((np.arange(80)[:, None] - rng.uniform(20, 60, 2000)) / 2.0) ** 2)
     pooled = estimate_noise(np.maximum(np.rint(y), 0), 6)
     assert pooled.std == pytest.approx(np.hypot(std, QUANTISATION_STD), rel=0.07)
@@ -202,15 +229,16 @@ def test_baselines_at_count_0_are_recovered(rng, level):
     assert abs(np.mean(error)) < 0.05 and np.std(error) < 0.3
 
 
-@pytest.mark.parametrize(("level", "rho"), [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5)])
-def test_echoes_over_noise_that_is_cut_have_right_errors(rng, level, rho):
-    """Before: 4 % false echoes, rms error over reported error 1.9 for widths and 1.7 for amplitudes."""
-    n, s = 1500, 80
-    time, height = rng.uniform(20, 60, n), np.exp(rng.uniform(np.log(10), np.log(200), n))
-    noise = rng.standard_normal((n, s + 50))
-    for i in range(1, s + 50):
-        noise[:, i] = rho * noise[:, i - 1] + np.sqrt(1 - rho * rho) * noise[:, i]
-    y = level + noise[:, 50:] + height[:, None] * np.exp(-0.5 * ((np.arange(s) - time[:, None]) / 2.0) ** 2)
+@pytest.mark.parametrize(
+    ("level", "rho", "s", "edge"),
+    [(0.0, 0.0, 80, 20), (0.5, 0.0, 80, 20), (0.0, 0.5, 80, 20), (40.0, 0.9, 24, 7), (40.0, 0.9, 40, 10)],
+)
+def test_echoes_over_noise_that_is_not_seen_whole_have_right_errors(rng, level, rho, s, edge):
+    """Cut off at 0, or slow in short packets. Before: 4 % false echoes, rms error over reported error to 1.9."""
+    n = 1500
+    time, height = rng.uniform(edge, s - edge, n), np.exp(rng.uniform(np.log(10), np.log(200), n))
+    y = level + slow_noise(rng, rho, s, n).T
+    y += height[:, None] * np.exp(-0.5 * ((np.arange(s) - time[:, None]) / 2.0) ** 2)
     block = WaveformBlock.from_samples(np.clip(np.rint(y), 0, 255).astype(np.uint8))
     system = surveying.survey_block(block).system
     echoes = load_chain("accurate").run(block, system)
@@ -222,7 +250,7 @@ def test_echoes_over_noise_that_is_cut_have_right_errors(rng, level, rho):
         (echoes.sigma - 2.0, echoes.sigma_err),
         (echoes.time - time[echoes.waveform], echoes.time_err),
     ):
-        assert 0.85 < np.sqrt(np.mean((off / error)[near] ** 2)) < 1.1
+        assert 0.85 < np.sqrt(np.mean((off / error)[near] ** 2)) < 1.12
 
 
 @pytest.mark.parametrize(

@@ -64,14 +64,17 @@ CLIPPED = 3.5
 """Robust standard deviations at which residuals are cut off."""
 
 LEAST_PAIRS = 2000
-"""Pairs of residuals from which a correlation is measured."""
+"""Pairs of residuals from which a correlation is measured, or of quiet samples from which its shape is."""
 
 LEAST_QUIET_PAIRS = 100
 """Pairs of quiet neighbours from which a covariance is measured: their variance is then known to a seventh."""
 
-
 CHANCE = 3.0
 """Standard errors up to which a covariance is none: those of many lags add up in the noise of a wide pulse."""
+
+MOST_SLOW, ALIKE_SHAPE = 0.92, 2.5
+"""Most correlation of neighbours in noise that is followed beyond the lags that are seen; and how far its variogram may
+be from that shape, over the last value and the root of the pairs."""
 
 LEAST_SHARE = 0.25
 """Pairs at a lag, over those of neighbours, from which it counts: the few longest runs are not like the others."""
@@ -322,7 +325,30 @@ def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0
     sill = float(np.average(half[far:], weights=pairs[far:]))
     rest = sill - np.array(half)
     chance = CHANCE * sill / np.sqrt(pairs)
+    if len(half) >= RISE and pairs[-1] >= LEAST_PAIRS:
+        most = float(np.var(signal[quiet], dtype=np.float64))
+        slow = _extend(np.array(half), np.array(pairs), max(lags, len(half)), most)
+        if slow is not None and slow[0] > (1 + SETTLED) * sill:
+            return slow
     return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
+
+
+def _extend(half: np.ndarray, pairs: np.ndarray, lags: int, most: float) -> np.ndarray | None:
+    """Covariance (1 + lags,) of noise that forgets itself by one factor a sample, from a variogram that is too short.
+
+    Its sill is what the variogram tends to, and at most the variance of all quiet samples, with that of their levels.
+    None where no such noise has this variogram.
+    """
+    factor = np.linspace(0.0, MOST_SLOW, 50)
+    power = np.cumprod(np.repeat(factor[:, None], lags, axis=1), axis=1)
+    shape, slow = 1 - power[:, : len(half)], half - QUANTISATION_STD**2
+    size = np.einsum("fk,k->f", shape, slow * pairs) / np.einsum("fk,fk,k->f", shape, shape, pairs)
+    rest = slow - size[:, None] * shape
+    best = int(np.argmin(np.einsum("fk,fk,k->f", rest, rest, pairs)))
+    if (np.abs(rest[best]) > ALIKE_SHAPE / np.sqrt(pairs) * slow[-1]).any():
+        return None
+    sill = min(float(size[best]) + QUANTISATION_STD**2, most)
+    return np.r_[sill, sill - half, max(sill - half[-1], 0.0) * power[best, : lags - len(half)]]
 
 
 def _rises(half: list[float]) -> bool:
