@@ -114,6 +114,8 @@ def find_transient(above, std):
         return 0
     spread = max(np.median([high - low for low, _, high in usual]), 2 * std)
     centre = np.median([middle for _, middle, _ in usual])
+    if max(abs(middle - centre) for _, middle, _ in usual) > 0.5 * std + 0.5:
+        return 0
     for i in range(8):
         low, high = np.quantile(above[i], [0.05, 0.95])
         mean = np.mean([min(max(y, low), high) for y in above[i]])

@@ -111,6 +111,14 @@ def test_a_transient_is_that_of_a_loop(rng, length, height):
     assert find_transient(above[:23], 1.0) == 0
 
 
+def test_feet_of_echoes_after_the_first_samples_are_no_transient(rng):
+    """Packets that begin 8 to 16 samples before the first echo, as those of NEON: their first 7 samples were lost."""
+    above = rng.normal(0, 3, (64, 200)).astype(np.float32)
+    mean = np.array([4, 4, 4, 5, 5, 6, 6, 7, 6, 7, 7, 8, 9, 11, 15, 19, *[40] * 48], np.float32)  # of NEON
+    above += mean[:, None]
+    assert find_transient(above, 3.0) == naive_signal.find_transient(above, 3.0) == 0
+
+
 @pytest.mark.parametrize("recovery", [0, 9])
 def test_slopes_are_those_of_lines_through_quiet_samples(rng, recovery):
     signal = record(rng, n=60) + (rng.uniform(-0.3, 0.3, 60) * np.arange(64)[:, None]).astype(np.float32)

@@ -119,9 +119,10 @@ def find_transient(above: np.ndarray, std: float) -> int:
         return 0
     usual = above[LOOK : 2 * LOOK]
     low, middle, high = np.quantile(usual, [0.05, 0.5, 0.95], axis=1)
-    if np.mean(np.abs(usual - middle[:, None]) < 4 * std + 0.5) < 0.8:
-        return 0
     spread, centre = max(float(np.median(high - low)), 2 * std), float(np.median(middle))
+    rises = np.abs(middle - centre).max() > OFF * std + 0.5
+    if rises or np.mean(np.abs(usual - middle[:, None]) < 4 * std + 0.5) < 0.8:
+        return 0
     first_low, first_high = np.quantile(above[:LOOK], [0.05, 0.95], axis=1)
     inner = np.clip(above[:LOOK], first_low[:, None], first_high[:, None]).mean(axis=1)
     jumps = (first_high - first_low > WILD * spread) | (np.abs(inner - centre) > max(OFF * std, 0.3))
