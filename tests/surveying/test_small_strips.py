@@ -92,3 +92,13 @@ def test_echoes_that_a_smaller_noise_would_find_are_in_doubt_too():
         part = [block.rows(slice(4, None, 5)) for block in read_sample(reader, scan)]
     survey = survey_blocks(part)
     assert find_source(survey.system) and survey.figures.echoes_in_doubt > 2 * MOST_DOUBTED_KNOWN
+
+
+def test_quiet_samples_are_looked_for_again_with_a_narrower_pulse():
+    """Half of that forest: its isolated echoes are so wide that no sample was quiet, and the noise 2.4 DN, not 6.8."""
+    with StripReader(data_file("neon/neon_harv_a.las")) as reader, reader.scan() as scan:
+        blocks = list(read_sample(reader, scan))
+    middle = np.median(np.concatenate([block.point for block in blocks]))
+    parts = [block.rows(np.flatnonzero(block.point > middle)) for block in blocks]
+    noise = survey_blocks([part for part in parts if len(part)]).system.noise
+    assert 2.5 < noise.by_kind["quiet"] < 3.7 and 5 < noise.std < 8

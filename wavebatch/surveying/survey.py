@@ -38,6 +38,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     find_saturation,
     measure_again,
     measure_gaussian,
+    measure_quiet,
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
@@ -59,6 +60,10 @@ LEAST_LEVELS = 5
 
 SAME_THRESHOLD = 1.03
 """Ratio of two noises up to which the sample is not decomposed again."""
+
+NARROWER = 0.85
+"""Width of the chosen pulse, over that of isolated echoes, below which quiet samples are looked for once more if there
+were none: those next to signal are not quiet, by widths of the pulse."""
 
 STRANGE, STRANGE_NOISE = 6.0, 1.3
 """Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
@@ -383,6 +388,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         learned |= len(chosen) >= ENOUGH_TO_LEARN
         strong = find_strong(clear)
         system = choose_pulse(block, system, strong, learned=learned, figures=figures)
+        if not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref:
+            noise = measure_quiet(block, system.sigma_ref / block.spacing).noise
+            system = replace(system, noise=replace(noise, gain=first.noise.gain))
         before, echoes = system, decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
