@@ -73,6 +73,37 @@ def test_samples_that_no_pulse_explains_leave_echoes_in_doubt(change, doubted, r
     assert (doubt or 0.0) > MOST_DOUBTED if doubted else doubt is None
 
 
+def _broad_echoes(rng, places, heights, most):
+    """Fifty waveforms of a Gaussian pulse that targets widen by up to `most` samples; places, heights: (k, 50, 1)."""
+    y = 100 + rng.standard_normal((50, 80))
+    for place, height in zip(places, heights, strict=True):
+        width = np.hypot(1.9, rng.uniform(0, most, (50, 1)))
+        y += height * np.exp(-0.5 * ((np.arange(80.0) - place) / width) ** 2)
+    return WaveformBlock.from_samples(np.rint(y).astype(np.uint16))
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_echoes_that_repeat_stronger_ones_leave_fifty_packets_in_doubt(alike):
+    """A pre-pulse of 5 %, or as many targets at any distance and of any height."""
+    rng = np.random.default_rng(9)
+    time, height = rng.uniform(35, 45, (50, 1)), np.exp(rng.uniform(np.log(80), np.log(600), (50, 1)))
+    lag, ratio = (10.0, 0.05) if alike else (rng.uniform(9, 20, (50, 1)), rng.uniform(0.04, 0.5, (50, 1)))
+    survey = survey_block(_broad_echoes(rng, (time, time - lag), (height, ratio * height), 2.0))
+    assert (survey.figures.echoes_in_doubt > MOST_DOUBTED) == alike
+
+
+@pytest.mark.parametrize("seed", [21, 63])
+def test_fifty_widened_echoes_make_no_odd_pulse_of_a_gaussian(seed):
+    """They gave one with a negative part, and 1.12 and 1.19 times the echoes."""
+    rng = np.random.default_rng(seed)
+    first, two = rng.uniform(12, 20, (50, 1)), rng.random((50, 1)) < 0.6
+    heights = np.exp(rng.uniform(np.log(8), np.log(300), (2, 50, 1))) * np.stack([np.ones((50, 1)), two])
+    block = _broad_echoes(rng, (first, first + rng.uniform(4, 23, (50, 1))), heights, 3.0)
+    survey = survey_block(block)
+    assert not survey.system.components
+    assert len(choose_chain(survey).run(block, survey.system)) == pytest.approx(50 + np.count_nonzero(two), rel=0.05)
+
+
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_fifty_packets_of_level_ground_are_sure(strip, request, tmp_path):
     survey = _survey(cut_strip(request.getfixturevalue(strip), tmp_path / "cut.las", 120))

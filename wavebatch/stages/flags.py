@@ -107,10 +107,10 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
         delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
         faint = _faint_beside(table, LEAST_RATIO, 0.0, max([4 * system.sigma_ref, *delays]), before=True)
         clipped = np.where(table.amplitude >= top, CLIPPED_TAIL * table.amplitude, 0)
-        for row, other, _ in _neighbours(table) if clipped.any() else ():
+        for row, other, _ in list_neighbours(table) if clipped.any() else ():
             faint[row] |= table.amplitude[row] < clipped[other]
     if system.tail_misfit:
-        for row, other, lag in _neighbours(table):
+        for row, other, lag in list_neighbours(table):
             faint[row] |= table.amplitude[row] < TAIL_FACTOR * _tail_share(system, lag) * table.amplitude[other]
     return table.take(np.flatnonzero(~faint))
 
@@ -140,7 +140,7 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
     variance = np.zeros(len(table))
     lags, beside = np.array(system.beside or ((0.0, 0.0),)).T
     energy = SQRT_PI * system.sigma_ref / spacing / system.noise.std**2
-    for row, other, lag in _neighbours(table) if system.misfit or system.beside else ():
+    for row, other, lag in list_neighbours(table) if system.misfit or system.beside else ():
         core = np.where(np.abs(lag) < CORE * system.sigma_ref, CORE_STD * system.misfit * table.amplitude[other], 0.0)
         strong = (table.amplitude[other] > CLEAR * system.noise.std) & (np.abs(lag) < BESIDE * system.sigma_ref)
         more = energy * core**2 + np.where(strong, np.interp(lag, lags, beside), 0.0)
@@ -205,8 +205,21 @@ def _tail_share(system: SystemPulse, lag: np.ndarray) -> np.ndarray:
     return np.where(near, np.interp(lag, lags, shares), 0.0)
 
 
-def _neighbours(table: EchoTable) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Rows of echoes, of another echo of their waveforms, and how much later they are than it [ns], each (k,)."""
+def list_neighbours(table: EchoTable) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """List the echoes that have others in their waveform.
+
+    Parameters
+    ----------
+    table : EchoTable
+        By waveform and time.
+
+    Yields
+    ------
+    row, other : int64 arrays, shape (k,)
+        An echo, and another one of its waveform, up to NEIGHBOURS away.
+    lag : float64 array, shape (k,)
+        How much later it is than the other [ns].
+    """
     for step in range(1, min(NEIGHBOURS, len(table) - 1) + 1):
         first = np.flatnonzero(table.waveform[step:] == table.waveform[:-step])
         lag = table.time[first + step] - table.time[first]
@@ -240,7 +253,7 @@ def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: floa
     before: also of an echo that follows within this distance.
     """
     faint = np.zeros(len(table), bool)
-    for row, other, lag in _neighbours(table):
+    for row, other, lag in list_neighbours(table):
         gap = np.abs(lag) if before else lag
         near = (gap >= nearest) & (gap <= furthest)
         faint[row] |= near & (table.amplitude[row] < ratio * table.amplitude[other])

@@ -13,10 +13,9 @@ from wavebatch.core.system import Defects, LevelWidths
 from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
-from wavebatch.kernels.signal.noise import estimate_noise, find_levels, keep_longest
+from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
-from wavebatch.stages.flags import find_unexplained
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.hidden_neighbours import measure_hidden
 from wavebatch.surveying.measuring.learn_pulse import (
@@ -42,6 +41,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
+from wavebatch.surveying.systems.doubt import measure_doubt
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import choose_pulse, find_source, guess_pulse
 from wavebatch.surveying.systems.skew import measure_skew
@@ -70,10 +70,6 @@ STRANGE, STRANGE_NOISE = 6.0, 1.3
 
 COUNTED = 256
 """Samples of a waveform that count where the main digitizer is chosen."""
-
-
-PULSE_SAMPLES = 2.5
-"""Quiet samples, in widths of the pulse, that say as much of the noise of a pulse as one value."""
 
 
 class Part(StrEnum):
@@ -401,9 +397,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         unsure, system = system, measure_misfit(block, system, strong)
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
-        doubt = max(_unexplained_share(system, echoes, block.spacing), _misfit_share(part, system, len(echoes)))
-        if len(block) < SMALL:
-            doubt = max(doubt, _doubt_echoes(block, unsure, system, strong, len(echoes)) / max(len(echoes), 1))
+        doubt = measure_doubt(block, part, (unsure, system), strong, echoes)
         if len(block) < SMALL or doubt > 0:
             figures.echoes_in_doubt = max(doubt, figures.echoes_in_doubt or 0.0)
     else:
@@ -415,45 +409,6 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     figures = _describe(part, system, echoes, figures)
     decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system.defects))
     return Survey(system, len(block), figures, decisions)
-
-
-def _doubt_echoes(
-    block: WaveformBlock, unsure: SystemPulse, system: SystemPulse, strong: EchoTable, number: int
-) -> int:
-    """How many echoes of a small strip more or fewer there may be: the larger of what noise and misfit leave in doubt.
-
-    The noise is two standard errors larger or smaller, by its quiet samples. What few strong echoes miss a pulse of
-    the strip's own by is all misfit where it is larger: it may change from shot to shot, and have nothing in common.
-    unsure: the system before its misfit was measured. number: of the echoes that were found.
-    """
-    width = system.sigma_ref / block.spacing
-    missing = None if block.missing is None else keep_longest(block.missing.T)
-    quiet = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing).share
-    error = min(2 * np.sqrt(PULSE_SAMPLES * width / (2 * max(quiet * block.samples.size, 1))), 0.5)
-    if find_source(system) is None:
-        unsure = measure_misfit(block, unsure, strong, bounded=False)
-    fewest, most = (
-        len(decompose_sample(block, replace(one, noise=replace(one.noise, std=float(one.noise.std * factor)))))
-        for one, factor in ((unsure, 1 + error), (system, 1 - error))
-    )
-    return max(number - fewest, most - number)
-
-
-def _unexplained_share(system: SystemPulse, echoes: EchoTable, spacing: float) -> float:
-    """Share of the clear echoes whose samples the pulse and the noise do not explain; 0 with too few of them."""
-    clear = echoes.amplitude > MIN_SNR * system.noise.std
-    unexplained = find_unexplained(echoes, system, spacing)[clear] > 1
-    return float(np.mean(unexplained)) if len(unexplained) >= FEW else 0.0
-
-
-def _misfit_share(block: WaveformBlock, system: SystemPulse, number: int) -> float:
-    """Share of the echoes that are there or not by the misfit of a learned pulse: halves of a strip measure it twice or
-    half as large.
-    """
-    if not system.misfit or find_source(system) is not None:
-        return 0.0
-    fewest, most = (len(decompose_sample(block, replace(system, misfit=system.misfit * by))) for by in (2.0, 0.5))
-    return max(most - fewest, 0) / (2 * max(number, 1))
 
 
 def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:

@@ -245,6 +245,8 @@ def choose_pulse(
         cost = measure_cost(part, pulse)
     if learned:
         pulse, cost = draw_together(part, pulse, cost, clear=clear)
+        if len(block) < SMALL:
+            pulse, cost = _prefer_gaussian(part, pulse, cost)
     if not clear:
         certain = learned and len(block) >= SMALL
         pulse, cost = _compare_known(part, (system, own), (pulse, cost), certain=certain)
@@ -300,11 +302,25 @@ def _drop_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> 
     """
     if len(strong) < FEW or not (system.components or system.kappa):
         return system
-    plain = replace(system, components=(), kappa=0.0, ringing=0.0)
+    plain = _make_plain(system)
     missed = measure_misfit(block, plain, strong, reach=RINGING_REACH).misfit
     ratio = float(np.median(strong.amplitude)) / system.noise.std
     energy = SQRT_PI * ratio**2 * system.sigma_ref / block.spacing
     return plain if missed**2 * energy < system.acceptance else system
+
+
+def _prefer_gaussian(part: WaveformBlock, pulse: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
+    """A plain Gaussian and its cost where waveforms cost clearly less with it: few wide echoes make odd pulses."""
+    if not (pulse.components or pulse.kappa):
+        return pulse, cost
+    plain = _make_plain(pulse)
+    plain, found = draw_together(part, plain, measure_cost(part, plain), clear=False)
+    return (plain, found) if found.exceeds(cost) < -BEYOND else (pulse, cost)
+
+
+def _make_plain(system: SystemPulse) -> SystemPulse:
+    """The system with a Gaussian as wide as its pulse."""
+    return replace(system, components=(), kappa=0.0, ringing=0.0)
 
 
 def _is_sure(
