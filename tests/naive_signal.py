@@ -163,17 +163,28 @@ def find_level(y, std, reach, limit=4.0, recovery=0):
     return level, quiet
 
 
-def measure_covariance(signal, quiet, lags):
-    """Sill, and what is left of it at lags 1, 2, ...: half the mean square steps of quiet samples so far apart."""
+def measure_covariance(signal, quiet, lags, mirrored=None):
+    """Sill, and what is left of it at lags 1, 2, ...: half the mean square steps of quiet samples so far apart.
+
+    mirrored: pairs at places of its first mask do not count, those at places of its second one twice; those at both
+    as the pairs at places of the second mask alone over those at places of the first one alone.
+    """
     half, pairs = [], []
     most = 48 if signal.shape[1] >= 100 else lags
     for lag in range(1, min(most, len(signal) - 1) + 1):
         if lag > lags and min(half[-4:]) <= max(half[-8:-4]):
             break
-        steps = [y[i + lag] - y[i] for y, used in zip(signal.T, quiet.T, strict=True)
-                 for i in range(len(y) - lag) if used[i] and used[i + lag]]  # fmt: skip
-        half.append(0.5 * np.mean(np.square(steps)))
-        pairs.append(len(steps))
+        found = [(w, i) for w in range(signal.shape[1]) for i in range(len(signal) - lag)
+                 if quiet[i, w] and quiet[i + lag, w]]  # fmt: skip
+        kinds = [(False, False)] * len(found)
+        if mirrored is not None:
+            kinds = [tuple(bool(mask[i, w] or mask[i + lag, w]) for mask in mirrored) for w, i in found]
+        share = min(kinds.count((False, True)) / max(kinds.count((True, False)), 1), 1.0)
+        counts = {(False, False): 1.0, (True, False): 0.0, (False, True): 2.0, (True, True): share}
+        weights = np.array([counts[kind] for kind in kinds])
+        steps = np.array([signal[i + lag, w] - signal[i, w] for w, i in found], np.float64)
+        half.append(0.5 * np.average(np.square(steps), weights=weights))
+        pairs.append(weights.sum())
     far = len(half) // 2
     sill = np.average(half[far:], weights=pairs[far:])
     rest = sill - np.array(half)

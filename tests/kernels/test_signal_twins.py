@@ -181,6 +181,9 @@ def test_correlations_are_those_of_pairs(rng, monkeypatch):
     quiet[15:, :10] = False  # too few
     found = measure_covariance(signal, quiet, lags=6)
     assert found == pytest.approx(naive_signal.measure_covariance(signal, quiet, 6), rel=1e-4, abs=1e-4)
+    beyond = signal > 13.5, signal < 11
+    expected = naive_signal.measure_covariance(signal, quiet, 6, beyond)
+    assert measure_covariance(signal, quiet, 6, beyond) == pytest.approx(expected, rel=1e-4, abs=1e-4)
     slow, twice = np.tile(np.cumsum(white[3:], axis=0), 2).astype(np.float32), np.tile(quiet, 2)
     for columns, most in ((50, 13), (100, 49)):
         found = measure_covariance(slow[:, :columns], twice[:, :columns], lags=12)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from helpers_scenes import CANOPY_NOISE, CANOPY_SIGMA, grow_canopy
 
-from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.auto_chain import choose_chain
 
@@ -31,6 +32,29 @@ def test_echoes_of_a_canopy_are_found_with_the_survey_of_any_tile(surveys):
     counts = [choose_chain(one).run(block, one.system).count(len(block)) for one in found]
     assert min(number.mean() for number in counts) > 2.65
     assert np.mean(counts[0] != counts[1]) < 0.025
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_leaves_that_are_too_weak_to_be_seen_are_no_noise(seed):
+    """They stand below the limit in every seventh packet: the noise of a pulse was 24 and 32 % too large."""
+    noise = survey_block(grow_canopy(seed, n=3000, density=0.2)).system.noise
+    assert noise.std == pytest.approx(np.hypot(CANOPY_NOISE, QUANTISATION_STD), rel=0.1)
+
+
+def test_scatter_of_neighbours_is_no_tail_of_a_learned_pulse():
+    """Shares of .1 at 13 widths before and after echoes: every tenth echo was lost."""
+    rng = np.random.default_rng(7)
+    n, s, true = 1500, 80, 0
+    y, x = 150 + rng.standard_normal((n, s)), np.arange(float(s))
+    number, time = rng.integers(2, 6, n), 5 + rng.random(n)
+    for k in range(5):
+        there, width = (number > k) & (time < s - 7), np.hypot(1.9, rng.uniform(0, 1.5, n))
+        height = np.where(there, np.exp(rng.uniform(np.log(8), np.log(300), n)), 0.0)
+        y += height[:, None] * np.exp(-0.5 * ((x - time[:, None]) / width[:, None]) ** 2)
+        true, time = true + there.sum(), time + rng.uniform(2.5, 7, n) * 1.9
+    block = WaveformBlock.from_samples(np.rint(y).astype(np.uint16))
+    survey = survey_block(block)
+    assert len(choose_chain(survey).run(block, survey.system)) == pytest.approx(true, rel=0.04)
 
 
 @pytest.mark.parametrize(("seed", "density"), [(2, 0.3), (2, 0.8)])

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
-from wavebatch.kernels.elementary import solve
+from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.signal.floor import MOST_LEAST, undo_floor
 from wavebatch.kernels.signal.signal import (
     SMOOTH_GAIN,
@@ -21,6 +21,7 @@ from wavebatch.kernels.signal.signal import (
     quiet_mean,
     smooth_121,
     sum_samples,
+    widen,
 )
 
 ROUNDS, SETTLED = 6, 0.01
@@ -75,6 +76,16 @@ CHANCE = 3.0
 MOST_SLOW, ALIKE_SHAPE = 0.92, 2.5
 """Most correlation of neighbours in noise that is followed beyond the lags that are seen; and how far its variogram may
 be from that shape, over the last value and the root of the pairs."""
+
+HIGH, SKEWED = 2.0, 1.15
+"""Standard deviations above the level from which quiet samples may be an echo, and how much larger than by samples
+below the level the variance of noise may be: it may be skewed."""
+
+DITHER = np.float32([0.75487767, 0.56984029])
+"""Steps along samples and waveforms, modulo 1, that fill the unit interval evenly: powers of the plastic number."""
+
+ROUNDED, ENOUGH = 0.5, 500
+"""Noise [count] below which rounding makes it lopsided, and quiet samples from which it is known not to be."""
 
 LEAST_SHARE = 0.25
 """Pairs at a lag, over those of neighbours, from which it counts: the few longest runs are not like the others."""
@@ -162,7 +173,11 @@ def _estimate_from(
             quiet &= ~missing
         above = signal - np.nan_to_num(level)
         mean, number = quiet_mean(above, quiet)
-        measured = measure_covariance(signal, quiet & _find_calm(above - mean, quiet), int(np.clip(2 * reach, *LAGS)))
+        used, lags = quiet & _find_calm(above - mean, quiet), int(np.clip(2 * reach, *LAGS))
+        measured = measure_covariance(signal, used, lags)
+        if measured is not None and not _may_be_lopsided(signal, used, measured):
+            own = _common_level(np.nan_to_num(level) + mean, number, measured)
+            measured = _leave_signal_out(signal, own, used, measured, lags, last if turn else _smoothed_std(measured))
         if measured is None:
             known = level[np.isfinite(level)].astype(np.float64)
             middle = float(np.mean(known)) if len(known) else float(np.median(signal))
@@ -286,7 +301,61 @@ def _find_calm(deviation: np.ndarray, quiet: np.ndarray) -> np.ndarray:
     return ~enough | (power <= ALIKE * max(typical, QUANTISATION_STD**2))
 
 
-def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0]) -> np.ndarray | None:
+def _common_level(own: np.ndarray, number: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Level of each waveform (n,) [count]: that of most, or where these scatter by more than the noise its own."""
+    _, spread = _spread_of_levels(own[number > 0].astype(np.float64), number[number > 0], covariance)
+    return own if spread**2 > covariance[0] else np.full_like(own, np.median(own[number > 0]))
+
+
+def _may_be_lopsided(signal: np.ndarray, quiet: np.ndarray, covariance: np.ndarray) -> bool:
+    """Whether noise is not as often above its level as below it, rounded off or cut off; or too few samples show it."""
+    cut = np.count_nonzero(quiet) < ENOUGH or float(np.mean(signal[quiet] == signal.min())) > MOST_LEAST
+    return cut or covariance[0] < ROUNDED**2
+
+
+def _leave_signal_out(
+    signal: np.ndarray, level: np.ndarray, quiet: np.ndarray, plain: np.ndarray, lags: int, std: float
+) -> np.ndarray:
+    """The covariance without echoes that are too weak to be seen as signal: they only add to noise.
+
+    Noise is as often so far above the level as below it. So what is near a high place does not count, and what is
+    near a low one counts twice. Skewed noise looks the same, so only what is more than it by SKEWED is taken off.
+
+    level: of each waveform (n,); plain: the covariance of all quiet samples; std: of the noise after the [1 2 1]/4
+    filter.
+    """
+    s, n = signal.shape
+    above = np.where(quiet, signal - level, np.float32(0))
+    # Smoothed counts are multiples of 1/4: without a dither of it one of the limits is nearer than the other.
+    dither = (DITHER[0] * np.arange(s, dtype=np.float32)[:, None] + DITHER[1] * np.arange(n, dtype=np.float32)) % 1
+    smoothed = smooth_121(above) + np.float32(0.25) * (dither - np.float32(0.5))
+    limit, reach, number = np.float32(HIGH * std), -(-lags // 6), quiet.sum(axis=0)
+    calm = ~(quiet & (np.abs(smoothed) > limit)).any(axis=0) & (number > 0)
+    if calm.any():
+        smoothed -= np.float32(np.median((sum_samples(above) / np.maximum(number, 1))[calm]))
+    beyond = tuple(widen(quiet & (side > limit), reach) for side in (smoothed, -smoothed))
+    mirrored = measure_covariance(signal, quiet, lags, beyond)
+    if mirrored is None:
+        return plain
+    least, most = _pulse_variance(mirrored, lags), _pulse_variance(plain, lags)
+    if most <= SKEWED * least:
+        return plain
+    share, size = (SKEWED - 1) * least / (most - least), max(len(plain), len(mirrored))
+    return sum(w * np.pad(one, (0, size - len(one))) for w, one in ((share, plain), (1 - share, mirrored)))
+
+
+def _pulse_variance(covariance: np.ndarray, lags: int) -> float:
+    """Variance of noise to a pulse a sixth as wide as the lags, over that of white noise, or that of a sample."""
+    k = np.arange(1, len(covariance))
+    return float(covariance[0] + max(2 * covariance[1:] @ exp(-0.25 * (k * 6 / lags) ** 2), 0.0))
+
+
+def measure_covariance(
+    signal: np.ndarray,
+    quiet: np.ndarray,
+    lags: int = LAGS[0],
+    mirrored: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray | None:
     """Covariance of quiet samples 0, 1, 2, ... apart, from their differences.
 
     Parameters
@@ -297,6 +366,9 @@ def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0
         Samples without signal.
     lags : int, samples
         Largest lag; where noise is slow, and waveforms are not few, MOST_LAGS.
+    mirrored : pair of bool (s, n), optional
+        Pairs with a sample of the first mask do not count, those with one of the second count twice in their place;
+        pairs with both count as far as the first ones are noise.
 
     Returns
     -------
@@ -311,12 +383,15 @@ def measure_covariance(signal: np.ndarray, quiet: np.ndarray, lags: int = LAGS[0
         if lag > lags and not _rises(half):
             break
         both = used[lag:] * used[:-lag]
+        if mirrored is not None:
+            high, low = (both * (mask[lag:] | mask[:-lag]) for mask in mirrored)
+            noise = min(float(np.sum(low - low * high)) / max(float(np.sum(high - low * high)), 1.0), 1.0)
+            both += low - high - (1 - noise) * low * high
         number = float(np.sum(both, dtype=np.float64))
         if number < (LEAST_SHARE * pairs[0] if pairs else LEAST_QUIET_PAIRS):
             break
         step = signal[lag:] - signal[:-lag]
-        step *= both
-        half.append(0.5 * float(np.einsum("sn,sn->", step, step, dtype=np.float64)) / number)
+        half.append(0.5 * float(np.einsum("sn,sn,sn->", step, step, both, dtype=np.float64)) / number)
         pairs.append(number)
     if not half:
         return None

@@ -57,8 +57,8 @@ ONE_SIGMA = 0.6827
 """Share of normal values within one standard deviation."""
 
 CONSTANT = 2.0
-"""What comes before or after a Gaussian belongs to it where its mean share is so many times its scatter: else it is
-neighbours too weak to be found. A pulse with components was learned, so all that is left of its tail counts."""
+"""What comes before or after a pulse belongs to it where its mean share is so many times its scatter: else it is
+neighbours, too weak to be found or taken for a part of the pulse."""
 
 LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says."""
@@ -219,6 +219,6 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
         spread = max(low - lowest, expected)
         common, scatter = abs(low + spread), 2 * np.sqrt(spread**2 - expected**2)
         share = common + scatter
-        if share > LEAST_TAIL and (system.components or common > CONSTANT * scatter):
+        if share > LEAST_TAIL and common > CONSTANT * scatter:
             profile.append((float(place * system.sigma_ref), float(share)))
     return tuple(profile)
