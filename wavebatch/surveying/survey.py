@@ -17,23 +17,21 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.surveying.choose_pulse import choose_pulse, settle
 from wavebatch.surveying.hidden_neighbours import measure_hidden
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
     find_isolated,
     find_strong,
     learn_pulse,
-    refine_pulse,
 )
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import measure_beside, measure_misfit
+from wavebatch.surveying.measuring.misfit import measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,
     RESIDUAL_LOOK,
-    SETTLED,
-    SMALL,
     find_saturation,
     measure_again,
     measure_gaussian,
@@ -41,9 +39,8 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
-from wavebatch.surveying.systems.doubt import measure_doubt
 from wavebatch.surveying.systems.figures import Figures, Level
-from wavebatch.surveying.systems.known_systems import choose_pulse, find_source, guess_pulse
+from wavebatch.surveying.systems.known_systems import find_source, list_known
 from wavebatch.surveying.systems.skew import measure_skew
 
 SAMPLE = 8192
@@ -370,36 +367,24 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         clear = find_clear(block, system)
         main = find_isolated(block, system, clear)
         figures.isolated_echoes = len(main)
-        learned = len(main) >= ENOUGH_TO_LEARN
-        if learned:
-            system = learn_pulse(block, system, main, figures)
-        else:
-            system = guess_pulse(block, system, guess=len(main) < FEW)
+        starts = {"gaussian": system}
+        if len(main) >= ENOUGH_TO_LEARN:
+            starts["lone echoes"] = learn_pulse(block, system, main, figures)
+        choice = choose_pulse(block, starts, list_known(block, system))
+        figures.candidates = tuple(choice.tried)
+        system = choice.best.system
         part = thin_block(block, RESIDUAL_LOOK)
-        for _ in range(REFINEMENTS):
-            last = system.sigma_ref
-            system, chosen = refine_pulse(part, system, decompose_sample(part, system), figures)
-            if len(chosen) < ENOUGH_TO_LEARN or abs(system.sigma_ref / last - 1) < SETTLED:
-                break
-        learned |= len(chosen) >= ENOUGH_TO_LEARN
-        strong = find_strong(clear)
-        system = choose_pulse(block, system, strong, learned=learned, figures=figures)
         if not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref:
             noise = measure_quiet(block, system.sigma_ref / block.spacing).noise
             system = replace(system, noise=replace(noise, gain=first.noise.gain))
-        before, echoes = system, decompose_sample(part, system)
+        echoes = decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
-        # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its
-        # misfit; a few echoes of a small strip, full of neighbours, do not know better.
-        strong = strong if find_source(system) is None else find_strong(clear, 0)
-        unsure, system = system, measure_misfit(block, system, strong)
-        if not _finds_alike(before, system):
-            echoes = decompose_sample(part, system)
-        doubt = measure_doubt(block, part, (unsure, system), strong, echoes)
-        if len(block) < SMALL or doubt > 0:
-            figures.echoes_in_doubt = max(doubt, figures.echoes_in_doubt or 0.0)
+        system = measure_tail(block, system, find_strong(clear))
+        system, figures.mirror = settle(block, system)
+        echoes = decompose_sample(part, system)
+        figures.echoes_in_doubt = choice.doubt
     else:
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)

@@ -134,7 +134,8 @@ def adaptive(
         gate_residual=gate_residual,
         gate_hermite=gate_hermite,
     )
-    return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
+    significance = max(fit.significance, system.significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
 def _start_closed_form(

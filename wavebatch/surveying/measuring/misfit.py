@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import MEDIAN_ERROR, SQRT_PI
+from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import promise_echoes
@@ -18,7 +18,6 @@ from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, find_strongest
@@ -64,37 +63,8 @@ LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says."""
 
 
-def measure_misfit(
-    block: WaveformBlock, system: SystemPulse, strong: EchoTable, *, bounded: bool = True, reach: float = CORE_REACH
-) -> SystemPulse:
-    """The system with what its pulse leaves unexplained of strong single echoes, as shares of their amplitude.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-    system : SystemPulse
-        Its misfit is the least: 0, or that of a known sensor.
-    strong : EchoTable
-        The strongest single echoes that no target has widened, one per waveform.
-    bounded : bool
-        The misfit is at most what the echoes have in common.
-    reach : float
-        How far from an echo its misfit is looked for [widths of the pulse].
-
-    Returns
-    -------
-    SystemPulse
-        `misfit`: an echo that is added to a strong one must explain more than this share of its energy.
-        `tail_misfit`: by lag, the share of a strong echo that is left before and after it.
-
-    Notes
-    -----
-    Each strong echo is fitted alone; a score test says how much chi2 one more echo would gain. A wrong pulse promises
-    the same share of the energy for all of them, a second target for a few: the share that MISFIT_QUANTILE of them
-    stay below is the pulse's. In a canopy most of them have a second target, but at another lag in every waveform. So
-    the misfit is at most what echoes of about one height leave in common at every lag. Receivers compress high
-    amplitudes, so that echoes of middle strength fit better than strong ones (docs/algorithms.md R3, R5).
-    """
+def measure_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
+    """The system with what its pulse leaves before and after strong single echoes: `tail_misfit`, as shares of them."""
     if len(strong) < FEW:
         return system
     rows = np.arange(len(strong), dtype=np.int32)
@@ -102,20 +72,7 @@ def measure_misfit(
     noise = pooled_noise(part, system)
     fitted = adaptive(part, noise, system, replace(strong, waveform=rows), max_echoes=1, significance=0.0)
     fitted = fitted.take(find_strongest(fitted, len(part))[0])
-    misfit = 0.0
-    if len(fitted) >= FEW:
-        ratio = fitted.amplitude.astype(np.float64) / system.noise.std
-        energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
-        every = (_promise(part, samples_of(part, noise), system, fitted, reach) - NOISE_PROMISE) / energy
-        share = np.quantile(every, MISFIT_QUANTILE)
-        if bounded:
-            clipped = np.mean(block.samples.max(axis=1) >= (system.saturation or np.inf)) >= CLIPPED
-            pulse = replace(system, kappa=0.0, components=()) if clipped else system
-            common = _common_promise(part, noise, pulse, fitted, reach) / energy
-            share = min(share, np.quantile(common, COMMON_QUANTILE))
-        misfit = SCATTERED * float(np.sqrt(max(share, 0.0)))
-    # A known sensor's pulse changes from shot to shot: of that echoes of a strip have nothing in common.
-    return replace(system, misfit=max(misfit, system.misfit), tail_misfit=_measure_tail(part, system, fitted))
+    return replace(system, tail_misfit=_measure_tail(part, system, fitted))
 
 
 def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:

@@ -77,6 +77,8 @@ class Figures:
     isolated_pulse_cost: float | None = None
     echoes_in_doubt: float | None = None
     """Share of the echoes that another pulse, misfit or noise, as likely, does not find, or whose samples it misses."""
+    candidates: tuple = ()
+    mirror: object = None
     spacing_ns: float | None = None
     n_samples: float | None = None
     bits: float | None = None
@@ -140,6 +142,8 @@ def describe_figures(figures: Figures) -> dict[str, float]:
         elif name == "kinds":
             for index, kind in value.items():
                 found |= {f"flight_descriptor_{index}_{part}": number for part, number in kind._asdict().items()}
+        elif name in ("candidates", "mirror"):
+            pass
         elif name != "look":
             found[name] = value
         elif value is not None:

@@ -1,0 +1,208 @@
+"""Candidates for the system pulse, then one judge: the length of a description of waveforms (docs/algorithms.md R2).
+
+`survey` calls `choose_pulse` with the noise and the Gaussian of the isolated echoes, and `settle` with what it chose.
+Before you change it: no sensor's name and no threshold of one strip decides here; a candidate wins because waveforms
+that it was not learned from are shorter to describe with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.surveying.joint_pulse import learn_jointly
+from wavebatch.surveying.judge import STRICT, describe_waveforms, explain
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
+from wavebatch.surveying.mirror import Mirror, look_in_mirror
+
+SAMPLES, MOST, LEAST = 60_000, 384, 96
+"""Samples that candidates are judged on, as many waveforms at most, and as many at least where they are long."""
+
+SMALL = 120
+"""Waveforms below which halves are too few to learn a pulse from: then the judge sees what the pulse was learned from."""
+
+CHANGES = (0.0, 0.003, 0.01, 0.03)
+"""Changes of the pulse from shot to shot that are tried, as shares of the amplitude: in steps of a factor 3, since the
+length changes little within a factor 2 of the best."""
+
+COVERED = 3.2
+"""Misfit over the change from shot to shot: two directions of change promise more than this squared to one echo in
+200 (chi2 with two degrees of freedom exceeds 10.6 so often)."""
+
+SURE, HOPELESS = 3.0, 8.0
+"""Standard errors by which a description must be shorter to be better; and by which it is longer where no change of
+shape is worth trying."""
+
+FEWEST = 48
+"""Waveforms on which each candidate is judged first."""
+
+FALSE_BESIDE, FALSE_QUIET = 0.005, 0.0075
+"""Mirrored echoes that are borne: per main echo beside it, and per echo elsewhere. A survey's user loses more points to
+a higher threshold than these add: echoes of 4 to 6 noises are some 2 % of a scene's."""
+
+STEP, LARGEST = 1.25, 0.1
+"""Factor by which the misfit grows at a time, and its largest value: what exceeds it is no pulse of this strip."""
+
+SIGNIFICANCE, FINER, MOST_SIGNIFICANT = 4.5, 0.25, 6.5
+"""Least energy of an echo to begin with, step by which it grows, and where it ends [standard deviations]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A pulse with its noise and its change from shot to shot, and what waveforms cost with it."""
+
+    name: str
+    system: SystemPulse
+    change: float
+    """Of the shape, from shot to shot, as a share of the amplitude."""
+    length: np.ndarray
+    """Of the description of each waveform [nats], float64 (n,)."""
+    echoes: int
+
+    @property
+    def typical(self) -> float:
+        """Mean length of a waveform's description; one in twenty, which no pulse explains, counts as the next lower."""
+        return float(np.minimum(self.length, np.quantile(self.length, 0.95)).mean())
+
+    def exceeds(self, other: Candidate) -> float:
+        """Standard errors by which descriptions are longer than with another candidate."""
+        more = self.length - other.length
+        more = np.clip(more, *np.quantile(more, (0.02, 0.98)))
+        return float(more.mean() / max(more.std() / np.sqrt(len(more)), 1e-9))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """The candidate that was taken, and those that lost."""
+
+    best: Candidate
+    tried: tuple[Candidate, ...]
+    doubt: float
+    """Share by which the number of echoes differs between candidates that cost the same."""
+
+
+def choose_pulse(
+    block: WaveformBlock, starts: Mapping[str, SystemPulse], given: Mapping[str, SystemPulse] | None = None
+) -> Choice:
+    """Choose the pulse that describes waveforms in the fewest words.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        Cleaned waveforms.
+    starts : mapping of SystemPulse by name
+        Pulses learned from lone echoes. From the best of them pulses are learned from all echoes: first with one echo
+        per cluster, so that false echoes do not eat the pulse's tail, then with as many as it needs.
+    given : mapping of SystemPulse by name
+        Pulses known from elsewhere: shipped ones, the strip's outgoing pulse.
+
+    Returns
+    -------
+    Choice
+
+    Notes
+    -----
+    Pulses are learned on one half of the waveforms and judged on the other. Of those that cost the same, by SURE
+    standard errors, the one with the fewest echoes is taken: an echo must be proven.
+    """
+    number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
+    part = thin_block(block, 2 * number)
+    part = part.rows(np.arange(min(len(part), 2 * number)))
+    small = len(part) < SMALL
+    learn, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
+    few = thin_block(held, FEWEST)
+    looked = [_judge(few, name, system, 0.003) for name, system in {**starts, **(given or {})}.items()]
+    leader = min(looked, key=lambda one: one.typical)
+    found = [_try_changes(held, one) for one in looked if one.exceeds(leader) < HOPELESS]
+    begin = min(found, key=lambda one: one.typical)
+    found += [_try_changes(held, _judge(few, name, system, begin.change)) for name, system in _learn(learn, begin)]
+    return _decide(found, len(held))
+
+
+def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
+    """Pulses learned from one echo per cluster and from all echoes, two rounds each."""
+    system = _bear(begin.system, begin.change)
+    for name, options in (("one echo per cluster", {"max_echoes": 1}), ("all echoes", {})):
+        for _ in range(2):
+            explained = explain(block, system, **options)
+            if len(explained.echoes) < ENOUGH_TO_LEARN:
+                return
+            system = learn_jointly(block, system, explained, begin.change)
+        yield name, system
+
+
+def _bear(system: SystemPulse, change: float) -> SystemPulse:
+    """The system with the misfit that a change of the pulse from shot to shot asks for."""
+    return replace(system, misfit=COVERED * change, tail_misfit=(), beside=(), hidden=())
+
+
+def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float) -> Candidate:
+    """A pulse judged on waveforms; echoes narrower than the pulse are forbidden: nothing reflects so."""
+    system = _bear(system, change)
+    explained = explain(block, system, least_width=STRICT, width_prior=0.0)
+    length = describe_waveforms(block, system, explained, change)
+    return Candidate(name, system, change, length, len(explained.echoes))
+
+
+def _try_changes(block: WaveformBlock, one: Candidate) -> Candidate:
+    """The candidate with the change of shape that costs least."""
+    return min((_judge(block, one.name, one.system, change) for change in CHANGES), key=lambda tried: tried.typical)
+
+
+def _decide(found: list[Candidate], number: int) -> Choice:
+    """The candidate with the fewest echoes that no other one beats surely."""
+    ordered = sorted(found, key=lambda one: (one.echoes, one.name))
+    best = ordered[0]
+    for one in ordered[1:]:
+        if best.exceeds(one) > SURE:
+            best = one
+    tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
+    doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
+    return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
+
+
+def settle(block: WaveformBlock, system: SystemPulse) -> tuple[SystemPulse, Mirror]:
+    """Raise misfit and significance until mirrored residuals hold no more echoes than may be false.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        Cleaned waveforms.
+    system : SystemPulse
+        With the misfit that the judge chose.
+
+    Returns
+    -------
+    system : SystemPulse
+        With `misfit` and `significance`.
+    mirror : Mirror
+        What is left.
+
+    Notes
+    -----
+    Near strong echoes the pulse's misfit, which echoes absorb, shows in the mirror; in quiet stretches noise does. A
+    step is kept only if it takes away more than it should by chance: where mirrored echoes do not follow, what they
+    show is not cured so.
+    """
+    part = thin_block(block, int(np.clip(4 * SAMPLES // block.samples.shape[1], 2 * LEAST, 2048)))
+    mirror = look_in_mirror(part, system)
+    for _ in range(20):
+        beside = mirror.beside > bound(FALSE_BESIDE, mirror.mains) and system.misfit < LARGEST
+        quiet = mirror.quiet > bound(FALSE_QUIET, mirror.echoes) and system.significance < MOST_SIGNIFICANT
+        if not beside and not quiet:
+            break
+        harder = replace(
+            system,
+            misfit=min(max(STEP * system.misfit, 0.001), LARGEST) if beside else system.misfit,
+            significance=max(system.significance, SIGNIFICANCE) + FINER if quiet else system.significance,
+        )
+        system, mirror = harder, look_in_mirror(part, harder)
+    return system, mirror
+
+
+def bound(share: float, number: int) -> float:
+    """Events of this probability that `number` tries show without being more than chance: one standard deviation."""
+    return share * number + np.sqrt(share * number)
