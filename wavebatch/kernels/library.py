@@ -19,7 +19,7 @@ _POINTER = ctypes.c_void_p
 
 FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
-    "logarithms", "solve_equations", "decode_packets",
+    "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse", "render_pulses",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -85,6 +85,19 @@ class Echoes(ctypes.Structure):
     _fields_ = [
         *_fields(ctypes.c_int64, "room"),
         *_fields(_POINTER, "number converged misfit cost parameters errors shared at_bound"),
+    ]
+
+
+class Described(ctypes.Structure):
+    """`Described` of kernels/c/describe.h."""
+
+    _fields_ = [
+        *_fields(ctypes.c_int64, "n length"),
+        *_fields(_POINTER, "left model used first amplitude time width"),
+        ("pulse", Pulse),
+        *_fields(ctypes.c_double, "variance gain change"),
+        ("ahead", ctypes.c_double * 2),
+        ("left_over", ctypes.c_double),
     ]
 
 

@@ -14,9 +14,13 @@ import numpy as np
 
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.surveying.joint_pulse import learn_jointly
-from wavebatch.surveying.judge import STRICT, describe_waveforms, explain
+from wavebatch.surveying.judge import describe_waveforms, explain
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
 from wavebatch.surveying.mirror import Mirror, look_in_mirror
+
+STRICT = 0.92
+"""Least width of an echo where a pulse is judged, over the pulse's: nothing reflects narrower, and widths scatter by up
+to 4 %."""
 
 SAMPLES, MOST, LEAST = 60_000, 384, 96
 """Samples that candidates are judged on, as many waveforms at most, and as many at least where they are long."""
@@ -45,6 +49,9 @@ a higher threshold than these add: echoes of 4 to 6 noises are some 2 % of a sce
 
 STEP, LARGEST = 1.25, 0.1
 """Factor by which the misfit grows at a time, and its largest value: what exceeds it is no pulse of this strip."""
+
+WORTH = 0.5
+"""Share of the echoes that a step takes away which must have been false, by the mirror."""
 
 SIGNIFICANCE, FINER, MOST_SIGNIFICANT = 4.5, 0.25, 6.5
 """Least energy of an echo to begin with, step by which it grows, and where it ends [standard deviations]."""
@@ -117,17 +124,17 @@ def choose_pulse(
     looked = [_judge(few, name, system, 0.003) for name, system in {**starts, **(given or {})}.items()]
     leader = min(looked, key=lambda one: one.typical)
     found = [_try_changes(held, one) for one in looked if one.exceeds(leader) < HOPELESS]
-    begin = min(found, key=lambda one: one.typical)
-    found += [_try_changes(held, _judge(few, name, system, begin.change)) for name, system in _learn(learn, begin)]
+    begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
+    found += [_try_changes(held, Candidate(name, system, 0.0, begin.length, 0)) for name, system in _learn(learn, begin)]
     return _decide(found, len(held))
 
 
 def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
     """Pulses learned from one echo per cluster and from all echoes, two rounds each."""
-    system = _bear(begin.system, begin.change)
+    system = begin.system
     for name, options in (("one echo per cluster", {"max_echoes": 1}), ("all echoes", {})):
         for _ in range(2):
-            explained = explain(block, system, **options)
+            explained = explain(block, _bear(system, begin.change), **options)
             if len(explained.echoes) < ENOUGH_TO_LEARN:
                 return
             system = learn_jointly(block, system, explained, begin.change)
@@ -135,21 +142,23 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
 
 
 def _bear(system: SystemPulse, change: float) -> SystemPulse:
-    """The system with the misfit that a change of the pulse from shot to shot asks for."""
-    return replace(system, misfit=COVERED * change, tail_misfit=(), beside=(), hidden=())
+    """The system with the misfit that a change of the pulse from shot to shot asks for, or what its model misses."""
+    return replace(system, misfit=max(COVERED * change, system.misfit), tail_misfit=(), beside=(), hidden=())
 
 
 def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float) -> Candidate:
     """A pulse judged on waveforms; echoes narrower than the pulse are forbidden: nothing reflects so."""
-    system = _bear(system, change)
-    explained = explain(block, system, least_width=STRICT, width_prior=0.0)
-    length = describe_waveforms(block, system, explained, change)
+    borne = _bear(system, change)
+    explained = explain(block, borne, least_width=STRICT, width_prior=0.0)
+    length = describe_waveforms(block, borne, explained, change)
     return Candidate(name, system, change, length, len(explained.echoes))
 
 
 def _try_changes(block: WaveformBlock, one: Candidate) -> Candidate:
-    """The candidate with the change of shape that costs least."""
-    return min((_judge(block, one.name, one.system, change) for change in CHANGES), key=lambda tried: tried.typical)
+    """The candidate with the least change of shape that no other one beats surely."""
+    tried = [_judge(block, one.name, one.system, change) for change in CHANGES]
+    best = min(tried, key=lambda one: one.typical)
+    return next(one for one in tried if one.exceeds(best) < SURE)
 
 
 def _decide(found: list[Candidate], number: int) -> Choice:
@@ -160,6 +169,7 @@ def _decide(found: list[Candidate], number: int) -> Choice:
         if best.exceeds(one) > SURE:
             best = one
     tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
+    best = replace(best, system=_bear(best.system, best.change))
     doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
 
@@ -199,7 +209,11 @@ def settle(block: WaveformBlock, system: SystemPulse) -> tuple[SystemPulse, Mirr
             misfit=min(max(STEP * system.misfit, 0.001), LARGEST) if beside else system.misfit,
             significance=max(system.significance, SIGNIFICANCE) + FINER if quiet else system.significance,
         )
-        system, mirror = harder, look_in_mirror(part, harder)
+        seen = look_in_mirror(part, harder)
+        fewer = mirror.beside + mirror.quiet - seen.beside - seen.quiet
+        if fewer < WORTH * (mirror.echoes - seen.echoes):
+            break
+        system, mirror = harder, seen
     return system, mirror
 
 

@@ -28,7 +28,7 @@ class Mirror:
 
 def look_in_mirror(block: WaveformBlock, system: SystemPulse) -> Mirror:
     e = explain(block, system)
-    mirrored = replace(block, samples=np.ascontiguousarray((block.samples - 2 * e.left).astype(np.float32)))
+    mirrored = replace(block, samples=np.ascontiguousarray((block.samples - 2 * e.sums.left).astype(np.float32)))
     echoes, other = e.echoes, explain(mirrored, system).echoes
     fwhm = system.sigma_ref * FWHM_PER_SIGMA
     left, right = list_pairs(other.waveform, other.time, echoes.waveform, echoes.time, fwhm)
@@ -44,4 +44,7 @@ def look_in_mirror(block: WaveformBlock, system: SystemPulse) -> Mirror:
     time = np.full(n, np.inf)
     time[echoes.waveform[main]] = echoes.time[main]
     beside = np.abs(rest.time - time[rest.waveform]) <= ZONE * fwhm
-    return Mirror(len(main), int(beside.sum()), len(echoes), int((~beside).sum()))
+    near, _ = list_pairs(rest.waveform, rest.time, echoes.waveform, echoes.time, ZONE * fwhm)
+    quiet = np.ones(len(rest), bool)
+    quiet[near] = False
+    return Mirror(len(main), int(beside.sum()), len(echoes), int((quiet & ~beside).sum()))

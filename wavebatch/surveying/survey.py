@@ -34,6 +34,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     RESIDUAL_LOOK,
     find_saturation,
     measure_again,
+    list_widths,
     measure_gaussian,
     measure_quiet,
     thin_block,
@@ -370,6 +371,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         starts = {"gaussian": system}
         if len(main) >= ENOUGH_TO_LEARN:
             starts["lone echoes"] = learn_pulse(block, system, main, figures)
+        else:
+            starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in list_widths(block)}
         choice = choose_pulse(block, starts, list_known(block, system))
         figures.candidates = tuple(choice.tried)
         system = choice.best.system

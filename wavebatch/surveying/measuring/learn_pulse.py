@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
+from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
@@ -251,7 +251,9 @@ def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float
     width = system.sigma_ref / spacing
     far = np.abs(stack.lag - fit.datum) > 4 * width
     ringing = float(np.abs(stack.value[far]).max(initial=0.0))
-    system = replace(system, ringing=ringing, kappa=fit.kappa, components=())
+    # rms over the stack, in the kernel's terms: as if all of it lay within the stack's span
+    misfit = fit.rms * float(np.sqrt((stack.lag[-1] - stack.lag[0]) / (SQRT_PI * width)))
+    system = replace(system, ringing=ringing, kappa=fit.kappa, components=(), misfit=misfit)
     if len(fit.components) > 1:
         components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
         system = replace(system, components=components)
