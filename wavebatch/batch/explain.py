@@ -211,7 +211,7 @@ def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
     alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
     if not report.count("echoes") or alone is None:
         return
-    known = figures.pulse_cost is not None and find_source(system) is not None
+    known = find_source(system) is not None
     most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
     reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
     if alone < FEW and not (known or system.components):

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.surveying.joint_pulse import learn_jointly
 from wavebatch.surveying.judge import describe_waveforms, explain
@@ -26,7 +28,7 @@ SAMPLES, MOST, LEAST = 60_000, 384, 96
 """Samples that candidates are judged on, as many waveforms at most, and as many at least where they are long."""
 
 SMALL = 120
-"""Waveforms below which halves are too few to learn a pulse from: then the judge sees what the pulse was learned from."""
+"""Waveforms below which halves are too few to learn a pulse from: the judge then sees what it was learned from."""
 
 CHANGES = (0.0, 0.003, 0.01, 0.03)
 """Changes of the pulse from shot to shot that are tried, as shares of the amplitude: in steps of a factor 3, since the
@@ -81,6 +83,22 @@ class Candidate:
         return float(more.mean() / max(more.std() / np.sqrt(len(more)), 1e-9))
 
 
+class Tried(NamedTuple):
+    """A candidate in a line of `survey -v`."""
+
+    name: str
+    fwhm_ns: float
+    gaussians: int
+    """Of its sum; 1 also for a skewed pulse."""
+    change: float
+    """Of the shape, from shot to shot, as a share of the amplitude."""
+    nats: float
+    """That describe a waveform; and standard errors by which they are more than with the chosen pulse."""
+    longer_by: float
+    echoes_per_waveform: float
+    chosen: bool
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
     """The candidate that was taken, and those that lost."""
@@ -89,6 +107,16 @@ class Choice:
     tried: tuple[Candidate, ...]
     doubt: float
     """Share by which the number of echoes differs between candidates that cost the same."""
+
+    def describe(self) -> tuple[Tried, ...]:
+        """Return the candidates for people, the best first."""
+        return tuple(
+            Tried(
+                one.name, one.system.sigma_ref * FWHM_PER_SIGMA, max(len(one.system.components), 1), one.change,
+                one.typical, one.exceeds(self.best), one.echoes / len(one.length), one.name == self.best.name,
+            )
+            for one in self.tried
+        )  # fmt: skip
 
 
 def choose_pulse(
@@ -123,9 +151,9 @@ def choose_pulse(
     few = thin_block(held, FEWEST)
     looked = [_judge(few, name, system, 0.003) for name, system in {**starts, **(given or {})}.items()]
     leader = min(looked, key=lambda one: one.typical)
-    found = [_try_changes(held, one) for one in looked if one.exceeds(leader) < HOPELESS]
+    found = [_try_changes(held, one.name, one.system) for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
-    found += [_try_changes(held, Candidate(name, system, 0.0, begin.length, 0)) for name, system in _learn(learn, begin)]
+    found += [_try_changes(held, name, system) for name, system in _learn(learn, begin)]
     return _decide(found, len(held))
 
 
@@ -133,11 +161,11 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
     """Pulses learned from one echo per cluster and from all echoes, two rounds each."""
     system = begin.system
     for name, options in (("one echo per cluster", {"max_echoes": 1}), ("all echoes", {})):
-        for _ in range(2):
+        for last in (False, True):
             explained = explain(block, _bear(system, begin.change), **options)
             if len(explained.echoes) < ENOUGH_TO_LEARN:
                 return
-            system = learn_jointly(block, system, explained, begin.change)
+            system = learn_jointly(block, system, explained, begin.change, last=last)
         yield name, system
 
 
@@ -154,9 +182,9 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float) 
     return Candidate(name, system, change, length, len(explained.echoes))
 
 
-def _try_changes(block: WaveformBlock, one: Candidate) -> Candidate:
-    """The candidate with the least change of shape that no other one beats surely."""
-    tried = [_judge(block, one.name, one.system, change) for change in CHANGES]
+def _try_changes(block: WaveformBlock, name: str, system: SystemPulse) -> Candidate:
+    """The pulse with the least change of shape that no other one beats surely."""
+    tried = [_judge(block, name, system, change) for change in CHANGES]
     best = min(tried, key=lambda one: one.typical)
     return next(one for one in tried if one.exceeds(best) < SURE)
 

@@ -14,7 +14,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.describe import gather_pulse
-from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians
+from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, refine_gaussians
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.judge import Explained, find_own_width, sample_noise
 from wavebatch.surveying.measuring.trial import TRIAL
@@ -52,7 +52,9 @@ ALIKE = 1.1
 """Misfit of a sum of Gaussians, over that of the best, at which a simpler one is taken."""
 
 
-def learn_jointly(block: WaveformBlock, system: SystemPulse, explained: Explained, change: float) -> SystemPulse:
+def learn_jointly(
+    block: WaveformBlock, system: SystemPulse, explained: Explained, change: float, *, last: bool
+) -> SystemPulse:
     """Learn the pulse that describes all waveforms best, given where their echoes are.
 
     Parameters
@@ -64,11 +66,13 @@ def learn_jointly(block: WaveformBlock, system: SystemPulse, explained: Explaine
         The block decomposed with it.
     change : float
         Of the pulse from shot to shot, as a share of its amplitude.
+    last : bool
+        Whether the pulse is final; else it only has to separate echoes, and few Gaussians serve.
 
     Returns
     -------
     SystemPulse
-        With the new pulse and its ringing.
+        With the new pulse, its ringing, and as misfit what the Gaussians miss of it.
 
     Notes
     -----
@@ -80,7 +84,10 @@ def learn_jointly(block: WaveformBlock, system: SystemPulse, explained: Explaine
     stack = stack_jointly(system, explained, change, spacing)
     half = stack.lag[stack.value > 0.5]
     width = float(half[-1] - half[0]) / FWHM_PER_SIGMA
-    fits = fit_gaussians(stack, width, TRIAL.get().most_components, 0.0)
+    if len(system.components) > 1 and not last:
+        fits = [refine_gaussians(stack, np.array(system.components) / [1, spacing, spacing])]
+    else:
+        fits = fit_gaussians(stack, width, min(TRIAL.get().most_components, MOST_COMPONENTS if last else 3), 0.0)
     missed = [float(np.mean(_miss(fit, stack) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
@@ -93,7 +100,8 @@ def learn_jointly(block: WaveformBlock, system: SystemPulse, explained: Explaine
     system = replace(system, components=components, ringing=float(np.abs(stack.value[far]).max(initial=0.0)))
     limits = shape_limits(system, spacing)
     table = pulse_measures(pulse_shape(system, spacing), limits)
-    return replace(system, sigma_ref=float(np.interp(limits.ref, table.width, table.half_width)) / FWHM_PER_SIGMA * spacing)
+    full = float(np.interp(limits.ref, table.width, table.half_width))
+    return replace(system, sigma_ref=full / FWHM_PER_SIGMA * spacing)
 
 
 def misfit_of(left: np.ndarray, step: float, width: float) -> float:

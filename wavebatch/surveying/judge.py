@@ -152,7 +152,7 @@ def _measure_widths(explained: Explained, ref: float) -> tuple[np.ndarray, np.nd
 
 
 def _describe_widths(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Cost of each width (m,) by the density of those that are known, and the scatter that serves best; 0 of too few."""
+    """Cost of each width (m,) by the density of those that are known, with the scatter that serves best; 0 for few."""
     if np.count_nonzero(known) < LEAST_KNOWN:
         return np.zeros(len(ratio))
     costs = [_describe_scattered(ratio, np.hypot(error, scatter), known) for scatter in SCATTERS]
@@ -171,7 +171,7 @@ def _describe_scattered(ratio: np.ndarray, error: np.ndarray, known: np.ndarray)
 
 
 def _laws(ratio: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Density of each width (m,) by each law, seen through its error (m, k): the pulse's own width, and uniform ones."""
+    """Density of each width (m,) by each law through its error (m, k): the pulse's own width, and uniform ones."""
     from_own = _normal((ratio - 1.0) / error)
     uniform = (from_own[:, None] - _normal((ratio[:, None] - WIDER) / error[:, None])) / (WIDER - 1.0)
     own = exp(-0.5 * np.minimum(((ratio - 1.0) / error) ** 2, 1400.0)) / (SQRT_2PI * error)

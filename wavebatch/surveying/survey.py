@@ -17,7 +17,7 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.choose_pulse import choose_pulse, settle
+from wavebatch.surveying.choose_pulse import Tried, choose_pulse, settle
 from wavebatch.surveying.hidden_neighbours import measure_hidden
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
@@ -33,15 +33,15 @@ from wavebatch.surveying.measuring.noise_and_width import (
     FIRST_WIDTH,
     RESIDUAL_LOOK,
     find_saturation,
-    measure_again,
     list_widths,
+    measure_again,
     measure_gaussian,
     measure_quiet,
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.systems.figures import Figures, Level
-from wavebatch.surveying.systems.known_systems import find_source, list_known
+from wavebatch.surveying.systems.known_systems import list_known
 from wavebatch.surveying.systems.skew import measure_skew
 
 SAMPLE = 8192
@@ -103,6 +103,8 @@ class Survey:
     waveforms: int
     figures: Figures = field(default_factory=Figures)
     decisions: tuple[Decision, ...] = ()
+    candidates: tuple[Tried, ...] = ()
+    """Pulses that were tried, that which describes waveforms best first; empty for a survey from a file."""
 
 
 def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
@@ -309,7 +311,8 @@ def _add_digitizers(
     whole = {name: float(np.average([getattr(scene, name) for scene in scenes], weights=counts)) for name in names}
     figures = replace(found.figures, **whole)
     system = replace(found.system, digitizers=systems)
-    return Survey(system, sum(counts), figures, (*_decide(system, main.spacing, figures), *decisions))
+    kept = (*_decide(system, main.spacing, figures, found.candidates), *decisions)
+    return Survey(system, sum(counts), figures, kept, found.candidates)
 
 
 def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock) -> bool:
@@ -363,7 +366,7 @@ def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlo
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
     """As survey_block, from noise and width by `measure_gaussian`; once more where noise grows with the signal."""
-    first, figures = system, Figures()
+    first, figures, candidates = system, Figures(), ()
     if learn:
         clear = find_clear(block, system)
         main = find_isolated(block, system, clear)
@@ -374,8 +377,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         else:
             starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in list_widths(block)}
         choice = choose_pulse(block, starts, list_known(block, system))
-        figures.candidates = tuple(choice.tried)
-        system = choice.best.system
+        system, candidates = choice.best.system, choice.describe()
+        figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change
+        figures.gaussian_nats = min(one.typical for one in choice.tried if one.name.startswith("gaussian"))
         part = thin_block(block, RESIDUAL_LOOK)
         if not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref:
             noise = measure_quiet(block, system.sigma_ref / block.spacing).noise
@@ -385,7 +389,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
         system = measure_tail(block, system, find_strong(clear))
-        system, figures.mirror = settle(block, system)
+        system, mirror = settle(block, system)
+        figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
+        figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
         figures.echoes_in_doubt = choice.doubt
     else:
@@ -395,8 +401,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     system = replace(measure_hidden(part, measure_beside(part, system, echoes), echoes), widths=widths)
     system = measure_skew(part, system, echoes) if learn else system
     figures = _describe(part, system, echoes, figures)
-    decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system.defects))
-    return Survey(system, len(block), figures, decisions)
+    decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
+    return Survey(system, len(block), figures, decisions, candidates)
 
 
 def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
@@ -449,7 +455,9 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figu
     )
 
 
-def _decide(system: SystemPulse, spacing: float, figures: Figures) -> tuple[Decision, ...]:
+def _decide(
+    system: SystemPulse, spacing: float, figures: Figures, candidates: tuple[Tried, ...]
+) -> tuple[Decision, ...]:
     """The table of docs/algorithms.md 4.4: what this scene needs, and the reason for each part left out."""
     width = system.sigma_ref / spacing
     share = figures.overlapped_share
@@ -458,7 +466,7 @@ def _decide(system: SystemPulse, spacing: float, figures: Figures) -> tuple[Deci
     inverted = "the signal goes down from its baseline: counts are mirrored when they are read"
     return (
         *((Decision(Part.INVERTED, True, inverted),) if figures.inverted else ()),
-        Decision(Part.PULSE, learned > 1, _explain_pulse(system, figures)),
+        Decision(Part.PULSE, learned > 1, _explain_pulse(candidates)),
         Decision(Part.SKEW, system.kappa != 0, _explain_skew(system, figures)),
         Decision(Part.GROWTH, share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
         Decision(Part.PRIOR, share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (limit 40 %)"),
@@ -507,22 +515,14 @@ def _decide_seams(seams: Mapping[int, int]) -> Iterator[Decision]:
         yield Decision("seam left out", True, reason)
 
 
-def _explain_pulse(system: SystemPulse, figures: Figures) -> str:
-    """Why the pulse is, or is not, a sum of Gaussians."""
-    if figures.pulse_cost is not None:
-        source, cost, isolated = find_source(system), figures.pulse_cost, figures.isolated_pulse_cost
-        name = f"the shipped {source.name}" if source else "the isolated echoes, drawn together"
-        return f"pulse from {name}: echoes and misfit of a waveform cost {cost:.0f} with it, {isolated:.0f} without"
-    if not figures.misfit_gaussians:
-        few = f"{int(figures.isolated_echoes or 0)} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
-        ringing = f"after-pulses of {100 * system.ringing:.1f} % that strong echoes show are flagged"
-        return f"{few}; {ringing}" if system.ringing else few
-    one = figures.misfit_gaussians[1]
-    number = len(system.components)
-    if number > 1:
-        best = figures.misfit_gaussians.get(number, 0.0)
-        return f"{number} Gaussians miss the stacked echoes by {best:.4f} of the amplitude, one by {one:.4f}"
-    return f"one Gaussian misses the stacked echoes by {one:.4f} of the amplitude; a simple pulse is enough"
+def _explain_pulse(candidates: tuple[Tried, ...]) -> str:
+    """Why the pulse is the one that it is."""
+    if not candidates:
+        return "no pulse was looked for"
+    chosen = next(one for one in candidates if one.chosen)
+    others = [one for one in candidates if not one.chosen]
+    text = f"{chosen.name}: {chosen.nats:.1f} nats describe a waveform"
+    return text + "".join(f", {one.nats:.1f} with {one.name}" for one in others[:2])
 
 
 def _explain_skew(system: SystemPulse, figures: Figures) -> str:

@@ -269,3 +269,24 @@ EXPORT int64_t render_pulses(const Described *w, float *out) {
     clear_desk(&d);
     return good ? 0 : -1;
 }
+
+/* Pairs of quiet samples `lag` apart of waveforms in columns, signal (s, n): number, and sum of squared differences, of
+   all pairs, of those with a sample of `high`, of `low`, and of both: out (4, 2). Without masks only the first. */
+EXPORT int64_t pair_differences(int64_t s, int64_t n, const float *signal, const uint8_t *quiet, const uint8_t *high,
+                                const uint8_t *low, int64_t lag, double *out) {
+    memset(out, 0, 8 * sizeof(double));
+    for (int64_t t = 0; t + lag < s; t++) {
+        const int64_t a = t * n, b = (t + lag) * n;
+        for (int64_t i = 0; i < n; i++) {
+            if (!(quiet[a + i] & quiet[b + i])) continue;
+            const double step = signal[b + i] - signal[a + i], square = step * step;
+            out[0] += 1; out[1] += square;
+            if (!high) continue;
+            const int is_high = high[a + i] | high[b + i], is_low = low[a + i] | low[b + i];
+            if (is_high) { out[2] += 1; out[3] += square; }
+            if (is_low) { out[4] += 1; out[5] += square; }
+            if (is_high & is_low) { out[6] += 1; out[7] += square; }
+        }
+    }
+    return 0;
+}

@@ -135,7 +135,7 @@ def gather_pulse(
 
 
 def _as_structure(sums: Sums, noise: SampleNoise, change: float) -> library.Described:
-    """The structure, which points into arrays that it holds; raises ValueError where the library would misuse memory."""
+    """The structure, which holds its arrays; raises ValueError where the library would misuse memory."""
     n, s = sums.left.shape
     first = np.ascontiguousarray(sums.first, np.int64)
     columns = np.ascontiguousarray(np.asarray(sums.main, np.float64).T.reshape(3, -1))
