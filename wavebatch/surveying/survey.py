@@ -379,7 +379,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         choice = choose_pulse(block, starts, list_known(block, system))
         system, candidates = choice.best.system, choice.describe()
         figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change
-        figures.gaussian_nats = min(one.typical for one in choice.tried if one.name.startswith("gaussian"))
+        gaussians = (one.typical for one in choice.tried if one.name.startswith("gaussian"))
+        figures.gaussian_nats = min(gaussians, default=None)
         part = thin_block(block, RESIDUAL_LOOK)
         if not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref:
             noise = measure_quiet(block, system.sigma_ref / block.spacing).noise
