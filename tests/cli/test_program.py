@@ -80,8 +80,8 @@ def test_run_has_the_options_of_runoptions_and_python_the_same():
         assert name in keywords and names[name].help.startswith(one.told.help.split("  [")[0])
         if name != "output":
             assert f"{name} : " in wb.run.__doc__ and keywords[name].default == getattr(RunOptions(), name)
-    extra = {"strips", "dry_run", "report", "html_file", "progress", "verbose", "as_json", "quiet", "log_path",
-             "log_level", "config", "debug"}  # fmt: skip
+    extra = {"strips", "dry_run", "fail_on", "report", "html_file", "progress", "verbose", "as_json", "quiet",
+             "log_path", "log_level", "config", "debug"}  # fmt: skip
     assert names.keys() - OPTIONS.keys() == extra and keywords.keys() - OPTIONS.keys() == {"strips", "on_event"}
 
 
