@@ -7,13 +7,13 @@ Before you change it: `a + b` must be exact and independent of order, so histogr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.errors import StageError
+from wavebatch.core.errors import StageError, StripWarning
 from wavebatch.core.units import FWHM_PER_SIGMA
 
 COUNTS: dict[str, str] = {
@@ -100,6 +100,8 @@ class RunReport:
     """Echoes that reflect more than a white matt surface, level or facing the sensor."""
     remarks: tuple[str, ...] = ()
     """Lines about the strip as a whole, from `explain`."""
+    warnings: tuple[StripWarning, ...] = ()
+    """What makes the results doubtful, from `explain`."""
     echoes_per_waveform: np.ndarray = _zeros(OVERFLOW + 1)
     amplitude: np.ndarray = _zeros(AMPLITUDE_BINS.number)
     """Echoes per bin of AMPLITUDE_BINS."""
@@ -178,6 +180,7 @@ class RunReport:
                 },
             },
             "remarks": list(self.remarks),
+            "warnings": [asdict(one) for one in self.warnings],
             "quality": {
                 "echoes_per_waveform": [int(n) for n in self.echoes_per_waveform],
                 "reflectance_above_one": self.above_one,
@@ -199,6 +202,7 @@ class RunReport:
                 column: {name: int(n) for name, n in reasons.items()} for column, reasons in counts["no_data"].items()
             },
             remarks=tuple(str(line) for line in document["remarks"]),
+            warnings=tuple(StripWarning(str(one["code"]), str(one["text"])) for one in document["warnings"]),
             above_one=int(quality.get("reflectance_above_one", 0)),
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
             amplitude=amplitude,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -122,8 +122,6 @@ def build_document(
     report: RunReport,
     cloud: Path,
     size: int,
-    dropped: Mapping[str, str],
-    serious: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Build the report of a strip whose cloud is complete.
 
@@ -136,10 +134,6 @@ def build_document(
     cloud : Path
     size : int
         Of the cloud [bytes].
-    dropped : mapping of str to str
-        Records of the input that the cloud does not have, and why.
-    serious : sequence of str
-        Warnings about wrong results, which come first.
 
     Returns
     -------
@@ -172,13 +166,6 @@ def build_document(
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [
-            *serious,
-            *facts.warnings,
-            *prepared.scan.warnings,
-            *prepared.doubts,
-            *map(": ".join, dropped.items()),
-        ],
     }
     return {**found, "checksum": _sum_up(found), "timing": build_timing(report)}
 

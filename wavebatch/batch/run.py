@@ -85,15 +85,12 @@ class BatchResult:
     def to_json(self) -> dict[str, Any]:
         """Return the summary of the batch as plain values; all but `timing` is the same for every run."""
         report = self.report
-        strips = [
-            {
-                "strip": str(outcome.job.path),
-                "status": outcome.status,
-                "error": None if outcome.error is None else " ".join(str(outcome.error).split()),
-                "counts": outcome.report.to_json()["counts"],
-            }
-            for outcome in self.outcomes
-        ]
+        strips = []
+        for outcome in self.outcomes:
+            error = None if outcome.error is None else " ".join(str(outcome.error).split())
+            found = outcome.report.to_json()
+            parts = {name: found[name] for name in ("counts", "warnings")}
+            strips.append({"strip": str(outcome.job.path), "status": outcome.status, "error": error, **parts})
         timing = {**build_timing(report), "elapsed_seconds": round(self.seconds, 3)}
         head = {"schema": BATCH_SCHEMA, "version": __version__, "strips": strips}
         advice = self.advice
@@ -314,10 +311,8 @@ class _Batch:
             self._tell({**event, "error": outcome.error, "again": again})
         else:
             report = outcome.report.to_json()
-            more = {"counts": report["counts"], "remarks": report["remarks"], "warnings": strip.warnings}
-            more["serious"] = list(strip.serious)
+            more = {name: report[name] for name in ("counts", "remarks", "warnings")}
             if strip.prepared is not None:
-                lost = [*strip.prepared.scan.losses, *strip.prepared.doubts]
-                more |= {"sensor": strip.prepared.sensor.describe(), "doubts": lost}
+                more["sensor"] = strip.prepared.sensor.describe()
                 more["decisions"] = [asdict(decision) for decision in strip.prepared.choice.decisions]
             self._tell({**event, **more})

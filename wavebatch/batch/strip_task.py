@@ -12,6 +12,7 @@ import pickle
 import time
 from collections import deque
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,9 +51,6 @@ class StripTask:
         self.facts: StripFacts | None = None
         self.prepared: Prepared | None = None
         self.written = 0
-        self.warnings: list[str] = []
-        self.serious: tuple[str, ...] = ()
-        """Those of the warnings that are about wrong results; they are printed with --quiet too."""
         self._options = options
         self._submitted = 0
         self._blob = b""
@@ -195,11 +193,9 @@ class StripTask:
         replaces = options.overwrite or options.resume
         size = self._writer.complete()
         self._report += RunReport(timing={"publish": time.perf_counter() - start})
-        dropped = self._writer.dropped
-        self.serious = find_warnings(self.prepared, self._report)
-        document = report_file.build_document(
-            self.prepared, self._described, self._report, cloud, size, dropped, self.serious
-        )
+        warnings = find_warnings(self.prepared, self._report, self._writer.dropped)
+        self._report = replace(self._report, warnings=warnings)
+        document = report_file.build_document(self.prepared, self._described, self._report, cloud, size)
         draft = draft_text(report, report_file.format_json(document), overwrite=replaces)
         try:
             if replaces:
@@ -207,7 +203,6 @@ class StripTask:
             self._writer.publish(draft)
         finally:
             draft.discard()
-        self.warnings = document["warnings"]
         self._close()
         return self._report
 

@@ -19,7 +19,7 @@ from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.selection import RowSelector
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
@@ -67,7 +67,7 @@ class Prepared:
     stranger: str = ""
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
     pulse_energy: PulseEnergy | None = None
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[StripWarning, ...] = ()
     """Warnings about inputs that do not quite fit the strip, such as its calibration or the beam's divergence."""
     forced: str = ""
     """What contradicts the saved survey with which the strip is run, by --force or in doubt; empty for nothing."""
@@ -119,7 +119,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             scanned = time.perf_counter()
             setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, calibration=job.calibration,
                             air=job.attenuation and job.attenuation[0], extend=job.extend)  # fmt: skip
-            sensor, doubts = setup.sensor, setup.doubts
+            sensor, doubts = setup.sensor, StripWarning.of("calibration", setup.doubts)
             if setup.stranger:
                 job = replace(job, request=replace(job.request, system=None))
             choice = try_chain(reader, scan, setup.choice, job.request)
@@ -128,10 +128,11 @@ def prepare_strip(job: StripJob) -> Prepared:
             surveyed = time.perf_counter()
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
-            doubts += judge_scale(reader, scan) if job.options.points == "echoes" else ()
+            if job.options.points == "echoes":
+                doubts += StripWarning.of("units", judge_scale(reader, scan))
             _hold_height(reader, job.sensor, sensor)
             choice, more = _see_level(reader, scan, job, choice, sensor)
-            doubts += more
+            doubts += StripWarning.of("beam", more)
             job = replace(job, chain=_set_parameters(reader, scan, job.chain))
             energy = find_pulse_energy(reader, scan, job.energy) if needs_sensor(job.chain) else None
             if job.energy is not None and energy is not None:

@@ -29,7 +29,7 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
     """The sections of a strip, from its report; pictures that cannot be made say why."""
     found, survey = report["strip"], report["strip"]["survey"]
     read = read_survey(found)
-    warnings = markup.bullets([*report["warnings"], *report["remarks"]], "warning")
+    warnings = markup.bullets([*(one["text"] for one in report["warnings"]), *report["remarks"]], "warning")
     choice = report["choice"]
     parts = [
         warnings,
