@@ -27,7 +27,7 @@ APART, MARGIN = 4.0, 0.5
 times the noise, as much as the foot of an echo can raise its quiet samples."""
 
 MOST_RECORDINGS = 8
-"""Waveforms with more keep one level: sensors join two or three, and each is looked at in the length of the waveform."""
+"""Waveforms with more keep one level: sensors join two or three, and each takes as long as a whole waveform."""
 
 FOOT = 2.0
 """Error of a level that only the lowest samples show, over the noise: the foot of an echo may lie there."""
