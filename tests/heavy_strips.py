@@ -8,6 +8,7 @@ prints what broke a promise and the dearest runs.
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import re
 import resource
@@ -136,7 +137,9 @@ class Done(NamedTuple):
     memory: int
     """Most that was resident [byte]."""
     code: int
+    """Exit code."""
     said: str
+    """What it wrote."""
 
 
 def run_limited(command: str, strip: Path, out: Path) -> Done:
@@ -146,20 +149,21 @@ def run_limited(command: str, strip: Path, out: Path) -> Done:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     process = subprocess.Popen(
         [sys.executable, "-c", _LIMITED, str(MEMORY), str(SECONDS), *words],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={**_plain_environment()},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )  # fmt: skip
     said, _ = process.communicate()
-    *_, last = [line for line in said.splitlines() if line.startswith("peak ")] or ["peak 0"]
+    *_, last = [line for line in said.splitlines() if line.startswith("peak ")] or [""]
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     wrong = ""
-    if process.returncode not in range(5):
+    if process.returncode not in range(5) or not last:
         wrong = f"exit code {process.returncode}: {said[-300:]!r}"
     elif found := re.search(r"this is a bug|Traceback|\w*Warning\b|not enough memory|MemoryError", said):
         wrong = f"says {found[0]}: {said[-600:]!r}"
     elif any(path.name.startswith(".") for path in out.rglob("*")):
         wrong = "leaves temporary files"
-    return Done(command, wrong, seconds, int(last.split()[1]), process.returncode, said)
+    return Done(command, wrong, seconds, int(last[5:] or 0), process.returncode, said)
 
 
 _LIMITED = """
@@ -172,12 +176,6 @@ from wavebatch.__main__ import main
 atexit.register(lambda: print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, flush=True))
 main()
 """
-
-
-def _plain_environment() -> dict[str, str]:
-    import os
-
-    return {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONDEVMODE": ""}
 
 
 def attack(folder: Path, plan: Plan, commands: list[str]) -> list[Done]:
