@@ -2,12 +2,13 @@
 
 `draw_plan` is the only source of chance and takes plain numbers from a `random.Random` (hypothesis has one:
 `st.randoms`). `.venv/bin/python tests/heavy_strips.py --strips 200 --seed 1` runs all commands on random strips and
-prints what broke a promise and the dearest runs.
+prints what broke a promise and the dearest runs, also after Ctrl-C.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import random
 import re
@@ -190,19 +191,21 @@ def _start() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--tools", action="store_true", help="also a random one of the other commands")
     options = parser.parse_args()
-    dearest, largest, failures = (0.0, None), (0, None), 0
-    for number in range(options.strips):
-        rng = random.Random(f"{options.seed} {number}")
-        plan = draw_plan(rng)
-        commands = [*COMMANDS, *([rng.choice(TOOLS)] if options.tools else [])]
-        with tempfile.TemporaryDirectory() as folder:
-            for done in attack(Path(folder), plan, commands):
-                if done.wrong:
-                    failures += 1
-                    print(f"{plan}\n    {done.command}: {done.wrong}", flush=True)
-                dearest = max(dearest, (done.seconds, (done.command, plan)), key=lambda kept: kept[0])
-                largest = max(largest, (done.memory, (done.command, plan)), key=lambda kept: kept[0])
-    print(f"{options.strips} strips, {failures} failures")
+    dearest, largest, failures, strips = (0.0, None), (0, None), 0, 0
+    with contextlib.suppress(KeyboardInterrupt):
+        for number in range(options.strips):
+            rng = random.Random(f"{options.seed} {number}")
+            plan = draw_plan(rng)
+            commands = [*COMMANDS, *([rng.choice(TOOLS)] if options.tools else [])]
+            with tempfile.TemporaryDirectory() as folder:
+                for done in attack(Path(folder), plan, commands):
+                    if done.wrong:
+                        failures += 1
+                        print(f"{plan}\n    {done.command}: {done.wrong}", flush=True)
+                    dearest = max(dearest, (done.seconds, (done.command, plan)), key=lambda kept: kept[0])
+                    largest = max(largest, (done.memory, (done.command, plan)), key=lambda kept: kept[0])
+            strips += 1
+    print(f"{strips} strips, {failures} failures")
     print(f"dearest: {dearest[0]:.1f} s of a processor: {dearest[1]}")
     print(f"largest: {largest[0] >> 20} MB: {largest[1]}")
     return failures > 0
