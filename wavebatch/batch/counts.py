@@ -14,6 +14,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StageError, StripWarning
+from wavebatch.core.timing import Seconds
 from wavebatch.core.units import FWHM_PER_SIGMA
 
 COUNTS: dict[str, str] = {
@@ -107,8 +108,8 @@ class RunReport:
     """Echoes per bin of AMPLITUDE_BINS."""
     echo_width: np.ndarray = _zeros(WIDTH_BINS.number)
     """Echoes per bin of WIDTH_BINS."""
-    timing: Mapping[str, float] = field(default_factory=dict)
-    """Seconds by task, summed over all processes."""
+    timing: Mapping[str, Seconds] = field(default_factory=dict)
+    """By task, summed over all processes."""
 
     def __add__(self, other: RunReport) -> RunReport:
         return RunReport(**{f.name: _add(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)})

@@ -20,6 +20,7 @@ from wavebatch.batch.explain import explain_absence
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import without_nan
+from wavebatch.core.timing import Seconds
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
@@ -178,11 +179,15 @@ def _sum_up(document: Mapping[str, Any]) -> str:
 
 
 def build_timing(report: RunReport) -> dict[str, Any]:
-    """Return seconds by task, rounded, and waveforms per second of process time."""
-    total = sum(report.timing.values())
-    seconds = {name: round(value, 6) for name, value in report.timing.items()}
-    rate = round(report.count("waveforms") / total) if total > 0 else None
-    return {"seconds": seconds, "process_seconds": round(total, 6), "waveforms_per_process_second": rate}
+    """Return processor and wall time by task, rounded, their sums, and waveforms per second of a processor."""
+    total = sum(report.timing.values(), Seconds())
+    by_task = {
+        f"{kind}_seconds": {name: round(getattr(seconds, kind), 6) for name, seconds in report.timing.items()}
+        for kind in ("processor", "wall")
+    }
+    rate = round(report.count("waveforms") / total.processor) if total.processor > 0 else None
+    sums = {f"total_{kind}_seconds": round(getattr(total, kind), 6) for kind in ("processor", "wall")}
+    return {**by_task, **sums, "waveforms_per_processor_second": rate}
 
 
 def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
-import time
 from collections import deque
 from concurrent.futures import Future
 from dataclasses import replace
@@ -26,6 +25,7 @@ from wavebatch.batch.unit import Prepared, prepare_strip, process_unit
 from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
+from wavebatch.core.timing import Seconds
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target
@@ -135,7 +135,7 @@ class StripTask:
     def take(self, workers: Workers | Cluster) -> None:
         """Use the oldest result: open the output, or write rows."""
         result = self.pending.popleft().result()
-        start = time.perf_counter()
+        start = Seconds.now()
         if self.prepared is None:
             self.prepared = result
             self._report += result.report
@@ -152,7 +152,7 @@ class StripTask:
             else:
                 self._second.add(*rows)
             self.written += 1
-            self._report += report + RunReport(timing={"write": time.perf_counter() - start})
+            self._report += report + RunReport(timing={"write": Seconds.now() - start})
         if self.written == self.prepared.units and self._second is not None:
             self._report += self._second.cut()
 
@@ -183,7 +183,7 @@ class StripTask:
             Where counts do not add up.
         """
         options, job = self._options, self.job
-        start = time.perf_counter()
+        start = Seconds.now()
         self._report.check(job.options.points, str(job.path))
         self._report += RunReport(remarks=(*_name_stranger(self.prepared), *find_remarks(self.prepared, self._report)))
         if self._stat() != self._state:
@@ -192,7 +192,7 @@ class StripTask:
         report = report_file.report_path(job, options.folder)
         replaces = options.overwrite or options.resume
         size = self._writer.complete()
-        self._report += RunReport(timing={"publish": time.perf_counter() - start})
+        self._report += RunReport(timing={"publish": Seconds.now() - start})
         warnings = find_warnings(self.prepared, self._report, self._writer.dropped)
         self._report = replace(self._report, warnings=warnings)
         document = report_file.build_document(self.prepared, self._described, self._report, cloud, size)

@@ -144,8 +144,8 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
         result = run_batch(jobs, batch_options, progress.show)
     if level > 0:
         timing = result.to_json()["timing"]
-        parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["seconds"].items()))
-        talk(f"{timing['elapsed_seconds']:.1f} s elapsed" + (f"; of the processes' time: {parts}" if parts else ""))
+        parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["processor_seconds"].items()))
+        talk(f"{timing['elapsed_seconds']:.1f} s elapsed" + (f"; processor time: {parts}" if parts else ""))
         if advice := result.advice:
             talk(advice)
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written

@@ -39,6 +39,10 @@ UNIT_BYTES = 1 << 26
 _SAMPLED_UNITS = 16
 """Units that a sample is read from: enough to cover the strip, few enough to be fast."""
 
+LONG, LONG_SAMPLES = 2048, 1 << 17
+"""Of waveforms with more samples than LONG a sample of the strip has at most LONG_SAMPLES samples. No sensor records so
+much of one pulse; where all of it is echoes, a survey takes 50 us per sample, twenty times as long as the chain."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketTable:
@@ -202,8 +206,12 @@ class StripReader(Closing):
             for block, _ in self.read_blocks(unit, size, owned_only=True):
                 yield block
 
-    def sample_blocks(self, scan: StripScan, n_waveforms: int, size: int = 4096) -> Iterator[WaveformBlock]:
+    def sample_blocks(
+        self, scan: StripScan, n_waveforms: int, size: int = 4096, *, long_samples: int = LONG_SAMPLES
+    ) -> Iterator[WaveformBlock]:
         """Yield about `n_waveforms` waveforms spread evenly over the strip, the same ones every time.
+
+        Fewer of those longer than LONG, so that they have at most `long_samples` samples together.
 
         Within a unit the packets are taken in the order of their bytes, and blocks come in that order: a survey of the
         strip does not change where its points are sorted in another way.
@@ -219,6 +227,8 @@ class StripReader(Closing):
             share = -(-left // (len(chosen) - position))
             rows = rows[even_places(len(rows), share)]
             left -= len(rows)
+            rows, taken = _thin_long(rows, unit.packets.n_samples[rows], long_samples // (len(chosen) - position))
+            long_samples -= taken
             for block, _ in self.read_rows(unit, rows, size):
                 yield block
             if left <= 0:
@@ -267,6 +277,15 @@ class StripReader(Closing):
                 chosen = same[begin : begin + step]
                 samples = read_samples(self._packets, table.offset[chosen], n_samples, stored, packed, form)
                 yield samples, digitizer, chosen
+
+
+def _thin_long(rows: np.ndarray, length: np.ndarray, room: int) -> tuple[np.ndarray, int]:
+    """Rows without so many of those longer than LONG that the others have at most `room` samples; and these samples."""
+    long = np.flatnonzero(length > LONG)
+    if length[long].sum() <= room:
+        return rows, int(length[long].sum())
+    kept = long[even_places(len(long), room // int(length.max()))]
+    return rows[np.union1d(np.flatnonzero(length <= LONG), kept)], int(length[kept].sum())
 
 
 class _Geometry:

@@ -182,6 +182,6 @@ def _figure_cell(strip: _Strip, key: str, marks: dict[str, str]) -> markup.Cell:
 def _provenance(result: BatchResult, command: str) -> str:
     timing = result.to_json()["timing"]
     rows = {"wavebatch": __version__, "elapsed": f"{timing['elapsed_seconds']:.1f} s"}
-    if timing["waveforms_per_process_second"]:
-        rows["waveforms per second of the processes"] = f"{timing['waveforms_per_process_second']:,}"
+    if timing["waveforms_per_processor_second"]:
+        rows["waveforms per second of a processor"] = f"{timing['waveforms_per_processor_second']:,}"
     return markup.section("Run", markup.facts(rows), markup.code(command) if command else "", mark="run")
