@@ -151,6 +151,7 @@ def build_document(
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
     found = {
         "schema": STRIP_SCHEMA,
+        "status": "incomplete" if report.is_incomplete else "complete",
         **described,
         **describe_chain(prepared),
         "strip": {

@@ -36,7 +36,8 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
 
 EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
-"""All strips are written, but --report, --html or stdout could not be; some strips failed; all strips failed."""
+"""All strips are written, but --report, --html or stdout could not be; some strips failed or lack packets; all failed.
+"""
 
 @click.command()
 @shared.strips_argument
@@ -61,7 +62,7 @@ def run(**options: Any) -> None:
       0    all strips are written
       1    all strips are written, but --report, --html or stdout cannot be written
       2    wrong usage or chain file, nothing was started; or no chain meets the tolerance
-      3    some strips failed, the others are written
+      3    some strips failed, the others are written; or packets of some are missing (see docs/reliability.md)
       4    all strips failed
       130  interrupted; --resume continues
     """  # fmt: skip
@@ -139,7 +140,11 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     is_reported = _write_page(result, batch_options.folder, options) and is_reported
-    return find_exit_code([outcome.error for outcome in result.outcomes]) or (0 if is_reported else EXIT_UNREPORTED)
+    if code := find_exit_code([outcome.error for outcome in result.outcomes]):
+        return code
+    if any(outcome.status == "incomplete" for outcome in result.outcomes):
+        return EXIT_SOME_FAILED
+    return 0 if is_reported else EXIT_UNREPORTED
 
 
 def _report(document: dict[str, Any], target: str | None) -> bool:

@@ -7,7 +7,7 @@ exactly one of them; results must not depend on blocks or processes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
+from wavebatch.files.strip.packet_owner import find_stranger
 from wavebatch.files.strip.packet_vectors import OPTIONS, Decision, read_toward
 from wavebatch.files.strip.packets import PacketFile, block_rows
 from wavebatch.files.strip.sample_form import PLAIN, SampleForm, read_samples
@@ -128,12 +129,16 @@ class StripReader(Closing):
         self._points.close()
         self._packets.close()
 
-    def scan(self, *, tolerant: bool = False) -> StripScan:
-        """Return the result of one pass over the point records; samples of a few packets are read.
+    def scan(self, *, tolerant: bool = False, force: bool = False) -> StripScan:
+        """Return the result of one pass over the point records; samples of some packets are read.
 
-        tolerant: put reasons against processing into `problems` instead of raising InputError.
+        tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
+        packets of another strip.
         """
         scan = scan_strip(self.facts, self._points, self._packets, self._unit_points())
+        if not scan.problems and (stranger := find_stranger(self, scan)):
+            remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
+            scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
         if scan.problems and not tolerant:
             scan.close()
             raise InputError(f"{self.facts.path}: {scan.problems[0]}")
@@ -210,6 +215,12 @@ class StripReader(Closing):
         """
         if n_waveforms <= 0:
             return
+        for unit, rows in self.sample_units(scan, n_waveforms):
+            for block, _ in self.read_rows(unit, rows, size):
+                yield block
+
+    def sample_units(self, scan: StripScan, n_waveforms: int) -> Iterator[tuple[Unit, np.ndarray]]:
+        """Yield units, each with its rows (k,) of unit.packets that `sample_blocks` reads."""
         chosen = even_places(self.unit_count(), _SAMPLED_UNITS).tolist()
         left = n_waveforms
         for position, number in enumerate(chosen):
@@ -219,8 +230,7 @@ class StripReader(Closing):
             share = -(-left // (len(chosen) - position))
             rows = rows[even_places(len(rows), share)]
             left -= len(rows)
-            for block, _ in self.read_rows(unit, rows, size):
-                yield block
+            yield unit, rows
             if left <= 0:
                 return
 
