@@ -8,15 +8,11 @@ all zero are no proof; `doubt_packets` in surveying/inspect_strip.py warns of th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from wavebatch.files.strip.scan_result import StripScan
-
-if TYPE_CHECKING:
-    from wavebatch.files.strip.reader import StripReader
+from wavebatch.core.waveforms import WaveformBlock
 
 _WAVEFORMS, _SAMPLES = 1024, 1 << 20
 """Most waveforms that are compared with their returns, and about the most samples of them."""
@@ -44,23 +40,13 @@ _HIGHEST, _WHERE, _LOCATION, _INTENSITY, _OWN, _OTHERS, _DEPTH = range(7)
 """Columns of a table of returns."""
 
 
-def find_stranger(reader: StripReader, scan: StripScan) -> str:
-    """Return why the packets of a strip's .wdp are certainly those of another strip; empty where they may be its own."""
-    if not scan.with_waveform or reader.facts.packets.internal:
-        return ""
-    used = scan.by_descriptor.keys() & reader.facts.digitizers
-    longest = max(reader.facts.digitizers[index].n_samples for index in used)
-    table = _read_table(reader, scan, int(np.clip(_SAMPLES // longest, _SHORTEST, _WAVEFORMS)))
-    if not is_strange(table):
-        return ""
-    return (
-        f"{reader.facts.packets.file.name} belongs to another strip: in a sample of {len(table)} packets, returns lie "
-        "on echoes no more often than by chance, and are not as strong as these"
-    )
+def sample_size(longest: int) -> int:
+    """Return how many waveforms are looked at where the longest has so many samples."""
+    return int(np.clip(_SAMPLES // max(longest, 1), _SHORTEST, _WAVEFORMS))
 
 
 def is_strange(table: np.ndarray) -> bool:
-    """Return whether nothing ties returns, f8 (m, 7) from `_read_table`, to their packets, though own ones would."""
+    """Return whether nothing ties returns, f8 (m, 7) of `compare_returns`, to their packets, though own ones would."""
     # In a packet of noise the highest sample is as far above the median as the lowest one below it.
     table = table[table[:, _HIGHEST] > 2.0 * np.median(table[:, _DEPTH])] if len(table) else table
     if len(table) < LEAST_PACKETS:
@@ -87,21 +73,28 @@ def _correlate(a: np.ndarray, b: np.ndarray) -> float:
     return float(ranks[0] @ ranks[1] / scale) if scale > 0 else 0.0
 
 
-def _read_table(reader: StripReader, scan: StripScan, n_waveforms: int) -> np.ndarray:
-    """A sample of packets, f8 (m, 7), each with its strongest return: height above the median and place of the packet's
-    highest sample; location, in samples, and intensity of the return; how high the packet is there, as a share of its
-    highest sample, and at the locations of the returns of others; depth of the lowest sample below the median."""
+def compare_returns(blocks: Iterable[tuple[WaveformBlock, np.ndarray]]) -> np.ndarray:
+    """Compare packets with their strongest returns.
+
+    Parameters
+    ----------
+    blocks : iterable of WaveformBlock and array
+        A sample of the strip, with the intensities of the returns of each block.
+
+    Returns
+    -------
+    f8 (m, 7)
+        A row per packet with signal: height above the median and place of its highest sample; location, in samples, and
+        intensity of the return; how high the packet is there, as a share of its highest sample, and at the locations of
+        the returns of others; depth of its lowest sample below the median.
+    """
     groups: dict[int, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
-    for unit, rows in reader.sample_units(scan, n_waveforms):
-        for block, _ in reader.read_rows(unit, rows, n_waveforms):
-            returns = block.returns
-            # The few returns that stand in another unit get the intensity of a point of this one.
-            near = np.clip(returns.point - unit.start, 0, len(unit.points) - 1)
-            strength = unit.points["intensity"][near].astype(float)
-            order = np.lexsort((-strength, returns.waveform))
-            strongest = order[np.unique(returns.waveform[order], return_index=True)[1]]
-            part = block.samples, returns.time[strongest] / block.spacing, strength[strongest]
-            groups.setdefault(block.digitizer.index, []).append(part)
+    for block, strength in blocks:
+        returns = block.returns
+        order = np.lexsort((-strength, returns.waveform))
+        strongest = order[np.unique(returns.waveform[order], return_index=True)[1]]
+        part = block.samples, returns.time[strongest] / block.spacing, strength[strongest]
+        groups.setdefault(block.digitizer.index, []).append(part)
     return np.concatenate([np.empty((0, 7)), *(part for group in groups.values() for part in _compare(group))])
 
 
