@@ -92,3 +92,5 @@ def test_packets_of_another_strip_are_refused_by_every_command_and_taken_by_forc
         arguments = [str(tmp_path / one) if "." in one else one for one in command]
         done = CliRunner().invoke(main, [*arguments, str(other)])
         assert done.exit_code == 1 and "other.wdp belongs to another strip" in done.output, command
+        if command[0] in ("voxelize", "plot"):
+            assert CliRunner().invoke(main, [*arguments, str(other), "--force"]).exit_code == 0, command
