@@ -8,7 +8,7 @@ import pytest
 from wavebatch.batch.counts import AMPLITUDE_BINS, COUNTS, OVERFLOW, WIDTH_BINS, RunReport, count_flags
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StageError
-from wavebatch.core.timing import Seconds
+from wavebatch.core.process import Seconds
 from wavebatch.core.units import FWHM_PER_SIGMA
 
 

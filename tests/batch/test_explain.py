@@ -59,9 +59,21 @@ def test_packets_of_another_strip_warn_in_cron_too(riegl, tmp_path):
     strip = tmp_path / "mixed.las"
     shutil.copy(riegl, strip)
     shutil.copy(data_file("lvis/lvis1.wdp"), strip.with_suffix(".wdp"))
-    line, doubt = warn_quietly(strip, tmp_path)
+    line, doubt = warn_quietly(strip, tmp_path, "--force")
     assert "the system pulse is a guess" in doubt
-    assert "returns lie where their packet has an echo: mixed.wdp belongs to another strip, or" in line
+    assert "--force: mixed.wdp belongs to another strip" in line
+
+
+def test_locations_that_fit_no_echo_warn_in_cron_too(tmp_path, edit_points):
+    def forget(points):
+        points["return_point_wave_location"] = 0
+        return points
+
+    source = data_file("lvis/lvis1.las")
+    strip = edit_points(source, tmp_path / "zero.las", forget)
+    shutil.copy(source.with_suffix(".wdp"), strip.with_suffix(".wdp"))
+    (line,) = warn_quietly(strip, tmp_path)
+    assert "returns lie where their packet has an echo: zero.wdp belongs to another strip, or" in line
 
 
 def test_inverted_and_empty_waveforms_are_told(tiny_strip, tmp_path):
@@ -70,10 +82,10 @@ def test_inverted_and_empty_waveforms_are_told(tiny_strip, tmp_path):
     assert "the signal goes down, its counts are mirrored" in line
 
 
-def warn_quietly(strip, folder, *options):
+def warn_quietly(strip, folder, *options, code=0):
     """Lines of `run --quiet` on stderr; the strip is written."""
     done = CliRunner().invoke(main, ["run", str(strip), "-o", str(folder), "--quiet", *options])
-    assert done.exit_code == 0, done.stderr
+    assert done.exit_code == code, done.stderr
     lines = done.stderr.splitlines()
     report = json.loads((folder / f"{strip.stem}.report.json").read_text())
     for line in lines:
@@ -100,8 +112,8 @@ def test_points_whose_packets_are_lost_warn_in_cron_too(tiny_strip, tmp_path, ed
         points["wavepacket_offset"][::3] = 1 << 40
         return points
 
-    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "cut.las", break_some), tmp_path)
-    assert "have a packet outside the waveform data" in line
+    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "cut.las", break_some), tmp_path, code=3)
+    assert "have a packet past the end of the waveform data" in line
 
 
 def test_a_pulse_that_is_a_guess_warns_in_cron_too(tiny_strip, tmp_path):

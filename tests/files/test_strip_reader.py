@@ -215,7 +215,7 @@ def test_unusable_packets_are_flagged_and_the_rest_is_read(tmp_path):
         assert (scan.with_waveform, scan.without_waveform, scan.broken) == (29, 2, 9)
         assert scan.packets == 29
         assert sum(count for count, _ in scan.reasons.values()) == 9
-        assert len(scan.warnings) == 4
+        assert len(scan.warnings) == 5
         assert [len(block) for block, _ in reader.read_blocks(unit, 100, True)] == [29]
 
 

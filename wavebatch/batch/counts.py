@@ -14,7 +14,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StageError, StripWarning
-from wavebatch.core.timing import Seconds
+from wavebatch.core.process import Seconds
 from wavebatch.core.units import FWHM_PER_SIGMA
 
 COUNTS: dict[str, str] = {
@@ -22,6 +22,7 @@ COUNTS: dict[str, str] = {
     "points_with_waveform": "points whose packet can be read",
     "points_without_waveform": "points without a packet (descriptor index 0 or packet size 0)",
     "points_broken": "points whose packet lies outside the file or does not fit its descriptor",
+    "points_cut": "those of points_broken whose packet lies past the end of the file, which is incomplete",
     "waveforms": "packets that went through the chain, each once however many points share it",
     "echoes": "echoes found in them",
     "matched_returns": "points whose echo was found",
@@ -139,6 +140,11 @@ class RunReport:
     def count(self, name: str) -> int:
         """Return the count of a name in COUNTS."""
         return self.counts.get(name, 0)
+
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether packets were missing: the cloud is to be made again once their file is whole."""
+        return self.count("points_cut") > 0
 
     def check(self, points: str, where: str) -> None:
         """Check that every point and every echo is accounted for.

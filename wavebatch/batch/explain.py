@@ -232,7 +232,10 @@ def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
 
 
 def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """Return locations that fit no echo."""
+    """Packets of another strip, by --force, and return locations that fit no echo."""
+    if prepared.scan.stranger:
+        yield f"--force: {prepared.scan.stranger}"
+        return
     matched = report.count("matched_returns")
     yield from doubt_packets(prepared.facts, matched, matched + report.count("unmatched_returns"))
 

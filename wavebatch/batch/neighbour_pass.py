@@ -27,7 +27,7 @@ from wavebatch.batch.output_rows import Assembled, UnitEchoes, spread
 from wavebatch.batch.unit import Prepared, SolvedBlocks, solve_unit, unpack
 from wavebatch.core.echoes import COLUMNS, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
-from wavebatch.core.timing import Seconds
+from wavebatch.core.process import Seconds
 from wavebatch.files.disk.row_file import RowStore
 from wavebatch.files.disk.spool import Spool
 from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, thin_out

@@ -20,7 +20,7 @@ from wavebatch.batch.explain import explain_absence
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import without_nan
-from wavebatch.core.timing import Seconds
+from wavebatch.core.process import Seconds
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
@@ -146,6 +146,7 @@ def build_document(
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
     found = {
         "schema": STRIP_SCHEMA,
+        "status": "incomplete" if report.is_incomplete else "complete",
         **described,
         **describe_chain(prepared),
         "strip": {

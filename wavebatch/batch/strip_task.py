@@ -25,7 +25,7 @@ from wavebatch.batch.unit import Prepared, prepare_strip, process_unit
 from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
-from wavebatch.core.timing import Seconds
+from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target

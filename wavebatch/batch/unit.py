@@ -19,7 +19,7 @@ from wavebatch.batch.job import StripJob, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.selection import RowSelector
 from wavebatch.core.errors import InputError, StripWarning
-from wavebatch.core.timing import Seconds
+from wavebatch.core.process import Seconds
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
@@ -62,7 +62,7 @@ class Prepared:
     choice: Choice
     layout: OutputLayout
     report: RunReport
-    """Timing of the preparation."""
+    """Timing of the preparation, and how many points have lost their packets."""
     sensor: SensorSource = UNKNOWN
     stranger: str = ""
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
@@ -114,7 +114,7 @@ def prepare_strip(job: StripJob) -> Prepared:
         facts = reader.facts
         job = replace(job, selection=job.selection.place(facts))
         RowSelector.plan(job.selection, job.chain, plan_layout(job, facts))
-        scan = reader.scan()
+        scan = reader.scan(force=job.request.force)
         try:
             scanned = Seconds.now()
             setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, calibration=job.calibration,
@@ -144,7 +144,8 @@ def prepare_strip(job: StripJob) -> Prepared:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": Seconds.now() - surveyed}
-    found = choice, layout, RunReport(timing=timing), sensor, setup.stranger, energy, doubts, setup.forced
+    report = RunReport(counts={"points_cut": scan.cut}, timing=timing)
+    found = choice, layout, report, sensor, setup.stranger, energy, doubts, setup.forced
     return Prepared(job, facts, scan, units, *found)
 
 

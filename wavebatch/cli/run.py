@@ -37,7 +37,8 @@ from wavebatch.core.suggest import nearest
 from wavebatch.files.disk.protect import refuse_input
 
 EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
-"""All strips are written, but --report, --html or stdout could not be; some strips failed; all strips failed."""
+"""All strips are written, but --report, --html or stdout could not be; some strips failed or lack packets; all failed.
+"""
 
 
 def _parse_codes(text: str) -> tuple[str, ...]:
@@ -73,7 +74,8 @@ def run(**options: Any) -> None:
       0    all strips are written
       1    all strips are written, but --report, --html or stdout cannot be written
       2    wrong usage or chain file, nothing was started; or no chain meets the tolerance
-      3    some strips failed, the others are written; or a strip has a warning of --fail-on
+      3    some strips failed, the others are written; or packets of some are missing (see docs/reliability.md), or
+           a strip has a warning of --fail-on
       4    all strips failed
       130  interrupted; --resume continues
     """  # fmt: skip
@@ -152,6 +154,8 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     is_reported = _write_page(result, batch_options.folder, options) and is_reported
     code = find_exit_code([outcome.error for outcome in result.outcomes]) or _find_warned(result, options["fail_on"])
+    if not code and any(outcome.status == "incomplete" for outcome in result.outcomes):
+        code = EXIT_SOME_FAILED
     return code or (0 if is_reported else EXIT_UNREPORTED)
 
 

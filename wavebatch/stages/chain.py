@@ -19,8 +19,8 @@ import numpy as np
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
 from wavebatch.core.no_data import SUFFIX
+from wavebatch.core.process import Seconds
 from wavebatch.core.schema import Range, read_hint
-from wavebatch.core.timing import Seconds
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.stages.clean import clean_block

@@ -139,7 +139,7 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
     except InputError as error:
         problems.append(_without_name(path, error))
     else:
-        problems += doubt_packets(facts, *_match_returns(reader, scan))
+        problems += () if scan.stranger else doubt_packets(facts, *_match_returns(reader, scan))
     notes = [*_note_descriptors(facts, scan), *scan.notes, *audit_header(reader, scan)]
     summary = ", ".join(f"{n} {name}{'s' * (n != 1)}" for n, name in ((scan.points, "point"), (scan.packets, "packet")))
     if scan.packets:

@@ -63,7 +63,11 @@ class Progress:
             if self._debug:
                 self._say("".join(traceback.format_exception(error)).rstrip())
             self._say(f"error: {_place(printable(strip), one_line(error))}")
-        elif kind == "written":
+        elif kind == "incomplete" and "decisions" not in event:
+            cut = count(event["counts"]["points_cut"], "point")
+            remedy = "get its waveform data again, whole"
+            self._say(printable(f"{strip}: is incomplete as before: the packets of {cut} are missing; {remedy}"))
+        elif kind in ("written", "incomplete"):
             self._tell(_summary(event, self._level > 0))
             for one in event["warnings"]:
                 say = self._say if StripWarning(**one).is_loud else self._tell

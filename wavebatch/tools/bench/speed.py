@@ -16,7 +16,7 @@ from typing import NamedTuple
 from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.core.timing import Seconds
+from wavebatch.core.process import Seconds
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import Chain
 from wavebatch.tools.bench.worker import Worker, peak_memory

@@ -107,7 +107,7 @@ def match_sides(
     if clouds and limit is not None:
         raise ConfigError(f"{clouds[0].name}: a cloud has the echoes of all waveforms; leave --limit out")
     check_tolerance(tolerance_ns)
-    with StripReader(strip) as reader, reader.scan() as scan:
+    with StripReader(strip) as reader, reader.scan(force=force) as scan:
         saved = None if survey is None else SavedSurvey(survey)
         request = Request(auto=True, system=saved, force=force)
         choice = prepare(reader, scan, widest_chain(), request, positions=Positions.NONE).choice

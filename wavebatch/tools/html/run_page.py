@@ -116,7 +116,7 @@ def _summary(result: BatchResult, counts: dict[str, Any]) -> str:
     passed = sum(counts["passed_through"].values())
     states = [outcome.status for outcome in result.outcomes]
     cards = [
-        ("strips written", f"{states.count('written') + states.count('skipped')} of {len(states)}"),
+        ("strips written", f"{len(states) - result.failed} of {len(states)}"),
         ("with warnings", f"{sum(bool(outcome.report.warnings) for outcome in result.outcomes)}"),
         ("points in", f"{counts['points_in']:,}"),
         ("waveforms", f"{counts['waveforms']:,}"),
@@ -129,6 +129,8 @@ def _summary(result: BatchResult, counts: dict[str, Any]) -> str:
     cards[-1:-1] = [("left out", f"{left:,}")] if left else []
     body = "".join(f'<div class="card"><b>{markup.text(value)}</b>{markup.text(name)}</div>' for name, value in cards)
     lines = [f"{states.count('skipped')} of the strips were up to date (--resume)."] if "skipped" in states else []
+    if "incomplete" in states:
+        lines.append(f"{states.count('incomplete')} of the strips are incomplete: packets are missing.")
     if advice := result.advice:
         lines.append(advice)
     return markup.section("Summary", f'<div class="cards">{body}</div>', *map(markup.paragraph, lines))

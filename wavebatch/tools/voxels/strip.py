@@ -161,7 +161,7 @@ def voxelize_strip(
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: the voxels are written to this file; choose another name")
-    with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
+    with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan(force=force) as scan:
         if not scan.packets:
             raise InputError(f"{strip}: holds no waveform to put into voxels; see `wavebatch check`")
         positions = Positions.IF_KNOWN if calibration is None else Positions.REQUIRED

@@ -2,7 +2,7 @@
 
 import time
 
-from wavebatch.core.timing import Seconds
+from wavebatch.core.process import Seconds
 
 
 def test_waiting_is_no_time_of_a_processor(monkeypatch):
