@@ -53,7 +53,7 @@ class LightRule:
         ground = np.where(rays.samples["time"] < known[owner], self.ratio * rays.samples["ground"], 0.0)
         light = ground + np.where(rays.samples["time"] < known[owner], rays.samples["canopy"], 0.0)
         whole = np.bincount(owner, light, minlength=len(known))
-        whole = np.where(np.isfinite(known), np.maximum(whole, self.usual), whole)
+        whole = np.where(known < np.inf, np.maximum(whole, self.usual), whole)
         whole = np.where(whole > 0, whole, 1.0)[owner]
         return light / whole, ground / whole
 
@@ -63,7 +63,7 @@ def find_rule(sample: Iterable[Rays], given: float | None) -> LightRule:
     pulses, packets = [np.zeros((2, 0))], [np.zeros((4, 0))]
     for rays in sample:
         owner, n = rays.owner, len(rays.table)
-        complete = np.isinf(rays.table["known"])
+        complete = rays.table["known"] == np.inf
         whole = np.stack([np.bincount(owner, rays.samples[name], n) for name in ("canopy", "ground")])
         pulses.append(whole[:, complete])
         # Packets of a ray follow each other.

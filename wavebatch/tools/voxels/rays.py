@@ -142,8 +142,7 @@ def join_packets(packets: np.ndarray, samples: np.ndarray, lost: np.ndarray) -> 
     some = np.flatnonzero(table["count"])
     final = samples[table["first"][some] + table["count"][some] - 1]
     last[some] = final["time"] + 0.5 * final["spacing"]
-    lossy = np.isfinite(table["known"])
-    table["end"] = np.where(lossy, np.maximum(last, table["known"]), last)
+    table["end"] = np.where(table["known"] < np.inf, np.maximum(last, table["known"]), last)
     return Rays(table, samples)
 
 

@@ -214,7 +214,7 @@ def voxelize_strip(
                 counts.update({name: int(np.count_nonzero(table[name])) for name in ("anchored", "clipped")})
                 counts.update(waveforms=packets, pulses=len(table), with_signal=int(np.count_nonzero(table["count"])))
                 counts["several_packets"] += int(np.count_nonzero(table["packets"] > 1))
-                counts["lost_packets"] += int(np.count_nonzero(np.isfinite(table["known"])))
+                counts["lost_packets"] += int(np.count_nonzero(table["known"] < np.inf))
                 if progress is not None:
                     progress(sum(len(rows) for _, rows, *_ in batch.parts), scan.packets)
             grid.measure_spread()
