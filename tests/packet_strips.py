@@ -5,6 +5,7 @@ samples and returns: what is computed from both must agree.
 """
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Digitizer
@@ -91,18 +92,26 @@ def write_recorded(path, counts, begin, xy, echoes, packets=None, *, time=None, 
     return path
 
 
+def _cover(rng, xy, density, radius):
+    """Share of the footprints of .1 m at `xy` that discs cover, of which `density` of the area is under any."""
+    low, high = xy.min() - 1, xy.max() + 1
+    number = rng.poisson(-np.log(1 - density) / (np.pi * radius**2) * (high - low) ** 2)
+    distance, _ = cKDTree(rng.uniform(low, high, (number, 2))).query(xy)
+    return np.clip((radius - distance) / 0.1 + 0.5, 0, 1)
+
+
 def draw_canopy(rng, n, *, layers=(122.0, 116.0, 110.0), density=0.25, leaf=0.5, soil=0.25, full=900.0, width=20.0,
-                field=None):  # fmt: skip
+                clumps=None):  # fmt: skip
     """Echoes (m, 3), positions (n, 2), and the light that each layer and the ground catch, (n, layers + 1).
 
-    A layer catches a beta-distributed part of a pulse's light; field: scales its mean by position.
+    A layer catches a beta-distributed part of a pulse's light; with clumps, all of it in discs of that radius [m],
+    whose edges are as wide as a footprint.
     """
     xy = rng.uniform(0, width, (n, 2))
     left, caught, echoes = np.ones(n), [], []
     energy = full * np.exp(0.05 * rng.standard_normal(n))
     for layer in layers:
-        mean = np.clip(density * (1.0 if field is None else field(xy)), 0.01, 0.97)
-        part = left * rng.beta(mean, 1 - mean, n)
+        part = left * (rng.beta(density, 1 - density, n) if clumps is None else _cover(rng, xy, density, clumps))
         part[part < 0.02] = 0.0
         caught.append(part)
         left = left - part

@@ -209,3 +209,39 @@ def test_batches_hold_whole_pulses_and_stay_small(strips):
 def test_packets_of_nothing_are_rays_of_nothing():
     rays = join_packets(np.zeros(0, PACKET), np.zeros(0, SAMPLE), np.zeros(0, LOST))
     assert len(rays.table) == len(rays.samples) == 0
+
+
+@pytest.mark.parametrize(("clumps", "density"), [(None, 0.25), (0.35, 0.3), (0.35, 0.7)])
+def test_errors_of_shares_cover_the_truth(tmp_path, clumps, density):
+    """Leaves spread evenly, and in clumps of .35 m that cover a part of each voxel: two of three within an error."""
+    rng = np.random.default_rng(3)
+    parts = []
+    for _ in range(2):
+        echoes, xy, _ = draw_canopy(rng, 3000, layers=(119.0, 113.0), density=density, width=28.0, clumps=clumps)
+        counts = render(echoes, np.full(3000, 122.0), 170, rng)
+        strip = write_recorded(tmp_path / "s.las", counts, np.full(3000, 122.0), xy, echoes)
+        _, found = voxelize(strip, tmp_path, size=2.0, ratio=None)
+        centre = found["origin"] + (found["index"] + 0.5) * 2.0
+        used = (np.abs(centre[:, 2, None] - (119.0, 113.0)) < 0.5).any(axis=1) & (found["light"] > 2)
+        parts.append((found["share"][used] - density) / found["share_error"][used])
+        (tmp_path / "s.las").unlink()
+    off = np.concatenate(parts)
+    assert 0.6 < np.mean(np.abs(off) < 1) < 0.8 and len(off) > 600 and abs(np.mean(off)) < 0.25
+
+
+def test_a_wrong_ratio_is_within_the_errors(tmp_path):
+    """Two kinds of soil: the ratio is that of one of them, and its error says how much the other differs."""
+    rng = np.random.default_rng(4)
+    echoes, xy, caught = draw_canopy(rng, 3000, density=0.3)
+    low, bright = echoes[:, 1] < 102, xy[:, 0] % 8 < 4
+    echoes[low, 2] *= np.where(bright, 1.5, 0.5)[echoes[low, 0].astype(int)]
+    begin = np.full(3000, 128.0)
+    strip = write_recorded(tmp_path / "s.las", render(echoes, begin, 224, rng), begin, xy, echoes)
+    summary, found = voxelize(strip, tmp_path, ratio=None)
+    assert summary.reflectance_ratio_source == "strip"
+    assert abs(summary.reflectance_ratio - 2.0) < 2 * summary.reflectance_ratio_err
+    assert abs(shares(found, LAYERS)[3] / caught.mean(axis=0)[3] - 1) > 0.02
+    _, given = voxelize(strip, tmp_path, ratio=summary.reflectance_ratio)
+    assert (found["share_error"] >= given["share_error"] - 1e-7).all()
+    partly = (found["share"] > 0.1) & (found["share"] < 0.9)
+    assert np.mean(found["share_error"][partly] - given["share_error"][partly]) > 1e-3

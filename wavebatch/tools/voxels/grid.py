@@ -220,9 +220,10 @@ class VoxelGrid(Closing):
     def _finish(self, sums: np.ndarray, log_error: float) -> dict[str, np.ndarray]:
         lit = sums[:, _LIGHT] > 0
         share, rays, light = _list_shares(sums).T
-        # Without light or shade in it, a voxel's own share states no error: half a ray of each is added.
-        near = (share * light + 0.5) / (light + 1.0)
-        spread = self.spread[_classify(rays)] * near * (1.0 - near) / rays
+        rays = rays / self.spread[_classify(rays)]
+        # A share of 0 or 1 alone states no error: half a ray of light and of shade are added.
+        near = (share * rays + 0.5) / (rays + 1.0)
+        spread = near * (1.0 - near) / rays
         by_ratio = (sums[:, _CAUGHT_BY_RATIO] - share * sums[:, _LIGHT_BY_RATIO]) * LIGHT_UNIT / light
         columns = {
             "energy": sums[:, _ENERGY] * self._unit,
