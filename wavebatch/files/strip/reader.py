@@ -360,7 +360,7 @@ class _Geometry:
             returns=ReturnTable(
                 np.repeat(np.arange(len(rows), dtype=np.int32), counts), location / PS_PER_NS, self._index[place], xyz
             ),
-            scanner=_read_scanner(lead),
+            scanner=read_scanner(lead),
             missing=missing,
         )
 
@@ -373,7 +373,7 @@ class _Geometry:
         return take_records(self._all, entries)
 
 
-def _read_scanner(records: np.ndarray) -> np.ndarray | None:
+def read_scanner(records: np.ndarray) -> np.ndarray | None:
     """Scanner channels of records (n,), u1 (n,); None for point formats 4 and 5."""
     if "classification_flags" not in records.dtype.names:
         return None
