@@ -78,7 +78,7 @@ def decompose(y, std, start, s, clip=np.inf, **shape):
     """Parameters (3, k), errors and chi2 of one window; s: Settings, whose widths, gates and acceptance count."""
     first = grow(y, std, start, s, (s.width_low, s.width_high), clip, **shape)
     fall = least_fall(first[0], std, s)
-    if not s.grow or first[2] - len(y) < fall:
+    if not may_grow(y, s) or first[2] - len(y) < fall:
         return first
     widths = max(s.width_low, s.width_ref / 1.1), min(s.width_high, s.width_ref * 1.1)
     narrow = grow(y, std, start, s, widths, clip, **shape)
@@ -90,6 +90,10 @@ def decompose(y, std, start, s, clip=np.inf, **shape):
 def least_fall(p, std, s):
     """Fall of chi2 that one more echo needs."""
     return s.acceptance + s.misfit**2 * np.sqrt(np.pi) * np.sum(p[0] ** 2 * p[2]) / std**2
+
+
+def may_grow(y, s):
+    return s.grow and len(y) <= s.max_echoes * 10 * s.width_high
 
 
 def grow(y, std, start, s, widths, clip, **shape):
@@ -116,7 +120,7 @@ def grow(y, std, start, s, widths, clip, **shape):
         if best is not None and not is_resolved(p, errors):
             return best
         best = p, errors, chi2
-        if not s.grow or p.shape[1] >= s.max_echoes or not is_misfit(p, x, residual, std, s):
+        if not may_grow(y, s) or p.shape[1] >= s.max_echoes or not is_misfit(p, x, residual, std, s):
             return best
         start, promise = propose(p, x, residual, std, s, shape)
         fall = least_fall(p, std, s)

@@ -20,6 +20,30 @@ def find_pulses(gps_time, longest=64):
     return first
 
 
+def group_times(gps_time, longest=64):
+    """First row of equal time of each packet; rows of a time of many packets, or of time 0 or NaN, are alone."""
+    times = [float(time) for time in gps_time]
+    alone = [not time or time != time or times.count(time) >= longest for time in times]
+    return [row if alone[row] else times.index(time) for row, time in enumerate(times)]
+
+
+def find_rays(group, scanner, start, step, aligned=1e-4, beside=0.1):
+    """First row of the ray of each packet: of one group and scanner, of one direction, on one line."""
+    heads = []
+    for row in range(len(group)):
+        for head in sorted(set(heads)):
+            away = start[row] - start[head]
+            way = step[head] * (away @ step[head]) / (step[head] @ step[head])
+            near = np.linalg.norm(away - way) <= beside + aligned * np.linalg.norm(way)
+            turned = np.linalg.norm(step[row] - step[head]) > aligned * np.linalg.norm(step[head])
+            if group[head] == group[row] and scanner[head] == scanner[row] and near and not turned:
+                heads.append(head)
+                break
+        else:
+            heads.append(row)
+    return heads
+
+
 def group_pulses(time, number):
     """Rows at which the time changes or the return number does not rise."""
     return [i for i in range(len(time)) if i == 0 or time[i] != time[i - 1] or number[i] <= number[i - 1]]
@@ -54,11 +78,6 @@ def find_nearest(echo_waveform, echo_time, return_waveform, return_time):
         gaps = [(abs(u - t), u, j) for j, (v, u) in enumerate(zip(return_waveform, return_time, strict=True)) if v == w]
         rows.append(min(gaps)[2] if gaps else -1)
     return rows
-
-
-def total_until(profile, time, spacing):
-    """Sum of one profile before a time; a sample lies evenly half a spacing to both sides of its time."""
-    return sum(y * min(max(time / spacing - i + 0.5, 0.0), 1.0) for i, y in enumerate(profile))
 
 
 def _runs_of(values):

@@ -207,8 +207,10 @@ def estimate_canopy_ratio(canopy, ground):
         return None
     light = [math.log(c + math.exp(found) * g) for c, g in pulses]
     scatter = 1.482602 * median([abs(value - median(light)) for value in light])
-    error = math.sqrt(9 * np.var(others) + 0.03**2 + scatter**4)
-    return (math.exp(found), math.exp(found) * error) if error < 0.25 else None
+    off = [abs(value - median(light)) for value in light]
+    unlike = sum(value**2 for value in off if 4 * scatter < value < math.log(4)) / len(off)
+    error = math.sqrt(9 * np.var(others) + 0.03**2 + scatter**4 + unlike)
+    return (math.exp(found), math.exp(found) * error) if error < 0.5 else None
 
 
 def energy_slope(light, energy):

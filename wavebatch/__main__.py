@@ -15,7 +15,7 @@ def _run() -> None:
     import os
 
     _open_closed_streams()
-    from wavebatch.core.memory import ONE_THREAD
+    from wavebatch.core.process import ONE_THREAD
 
     for name in ONE_THREAD:  # before NumPy is imported; what the user has set stays
         os.environ.setdefault(name, "1")

@@ -8,6 +8,7 @@ import pytest
 from wavebatch.batch.counts import AMPLITUDE_BINS, COUNTS, OVERFLOW, WIDTH_BINS, RunReport, count_flags
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StageError
+from wavebatch.core.process import Seconds
 from wavebatch.core.units import FWHM_PER_SIGMA
 
 
@@ -62,9 +63,9 @@ def test_reasons_for_no_data_merge_survive_being_written_and_must_add_up():
 
 
 def test_timing_is_kept_apart():
-    timed = _report() + RunReport(timing={"read": 2.0})
+    timed = _report() + RunReport(timing={"read": Seconds(2.0, 3.0)})
     assert timed.to_json() == _report().to_json()
-    assert (timed + timed).timing == {"read": 4.0}
+    assert (timed + timed).timing == {"read": Seconds(4.0, 6.0)}
 
 
 def test_quantiles_are_those_of_the_values_to_the_width_of_a_bin(rng):

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from click.testing import CliRunner
 from strips import cut_strip
 from writer_tools import data_file
 
+import wavebatch
 from wavebatch.cli import main
+from wavebatch.core.errors import WARNINGS, StripWarning
 from wavebatch.files.las.header import read_header
 
 
@@ -56,9 +59,21 @@ def test_packets_of_another_strip_warn_in_cron_too(riegl, tmp_path):
     strip = tmp_path / "mixed.las"
     shutil.copy(riegl, strip)
     shutil.copy(data_file("lvis/lvis1.wdp"), strip.with_suffix(".wdp"))
-    line, doubt = warn_quietly(strip, tmp_path)
+    line, doubt = warn_quietly(strip, tmp_path, "--force")
     assert "the system pulse is a guess" in doubt
-    assert "returns lie where their packet has an echo: mixed.wdp belongs to another strip, or" in line
+    assert "--force: mixed.wdp belongs to another strip" in line
+
+
+def test_locations_that_fit_no_echo_warn_in_cron_too(tmp_path, edit_points):
+    def forget(points):
+        points["return_point_wave_location"] = 0
+        return points
+
+    source = data_file("lvis/lvis1.las")
+    strip = edit_points(source, tmp_path / "zero.las", forget)
+    shutil.copy(source.with_suffix(".wdp"), strip.with_suffix(".wdp"))
+    (line,) = warn_quietly(strip, tmp_path)
+    assert "returns lie where their packet has an echo: zero.wdp belongs to another strip, or" in line
 
 
 def test_inverted_and_empty_waveforms_are_told(tiny_strip, tmp_path):
@@ -67,14 +82,15 @@ def test_inverted_and_empty_waveforms_are_told(tiny_strip, tmp_path):
     assert "the signal goes down, its counts are mirrored" in line
 
 
-def warn_quietly(strip, folder, *options):
+def warn_quietly(strip, folder, *options, code=0):
     """Lines of `run --quiet` on stderr; the strip is written."""
     done = CliRunner().invoke(main, ["run", str(strip), "-o", str(folder), "--quiet", *options])
-    assert done.exit_code == 0, done.stderr
+    assert done.exit_code == code, done.stderr
     lines = done.stderr.splitlines()
     report = json.loads((folder / f"{strip.stem}.report.json").read_text())
     for line in lines:
-        assert line.startswith(f"{strip}: warning: ") and line.split(": warning: ")[1] in report["warnings"]
+        texts = [one["text"] for one in report["warnings"]]
+        assert line.startswith(f"{strip}: warning: ") and line.split(": warning: ")[1] in texts
     return [line.split(": warning: ")[1] for line in lines]
 
 
@@ -96,8 +112,8 @@ def test_points_whose_packets_are_lost_warn_in_cron_too(tiny_strip, tmp_path, ed
         points["wavepacket_offset"][::3] = 1 << 40
         return points
 
-    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "cut.las", break_some), tmp_path)
-    assert "have a packet outside the waveform data" in line
+    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "cut.las", break_some), tmp_path, code=3)
+    assert "have a packet past the end of the waveform data" in line
 
 
 def test_a_pulse_that_is_a_guess_warns_in_cron_too(tiny_strip, tmp_path):
@@ -166,3 +182,57 @@ def test_a_residual_threshold_below_the_noise_is_said(tiny_strip, tmp_path):
         assert done.exit_code == 0, done.stderr
         told = json.loads((folder / f"{tiny_strip.stem}.report.json").read_text())["remarks"]
         assert any("lies below the noise of" in line and "raised" in line for line in told) == raised
+
+
+def test_every_warning_has_a_listed_code():
+    """Codes are for programs: those of the code, of the list and of the documentation are the same."""
+    package = Path(wavebatch.__file__).parent
+    text = "\n".join(path.read_text() for path in package.rglob("*.py") if path.name != "errors.py")
+    used = re.findall(r'(?:StripWarning|StripWarning\.of|warn)\(\s*"([^"]+)"|code, guess = "([^"]+)"', text)
+    used = {one or other for one, other in used} | {"lost-packets", "packets"}
+    page = (package.parent / "docs" / "json.md").read_text()
+    listed = dict(re.findall(r"(?m)^\| `([a-z-]+)` \| ([^|]+) \|$", page.split("### Codes of warnings")[1]))
+    assert used == set(WARNINGS) and {code: listed[code] for code in WARNINGS} == WARNINGS
+    with pytest.raises(ValueError, match="no code"):
+        StripWarning("nonsense", "")
+
+
+@pytest.fixture
+def many(tiny_strip, tmp_path):
+    """Five strips, the fourth without any echo, and the name of their folder."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name in "abce":
+        shutil.copy(tiny_strip, folder / f"{name}.las")
+    change_packets(tiny_strip, folder / "d.las", lambda samples: 0 * samples + 12)
+    return folder
+
+
+def test_summary_and_page_have_the_warnings_of_every_strip(many, tmp_path):
+    page, out = tmp_path / "page.html", tmp_path / "out"
+    task = ["run", str(many), "-o", str(out), "-q", "--profile", "fast", "--json", "--html", str(page)]
+    first = CliRunner().invoke(main, [*task, "--fail-on", "nothing-selected"])
+    assert first.exit_code == 0
+    again = CliRunner().invoke(main, [*task, "--resume", "--fail-on", "lost-packets,empty"])
+    assert again.exit_code == 3 and "--fail-on" in again.stderr and "d.las" in again.stderr
+    before, after = (json.loads(done.stdout)["strips"] for done in (first, again))
+    assert {one["status"] for one in after} == {"skipped"}
+    assert [one["warnings"] for one in before] == [one["warnings"] for one in after]
+    found = {Path(one["strip"]).stem: one["warnings"] for one in after}
+    assert "empty" in [one["code"] for one in found["d"]]
+    text = page.read_text().split('id="strips"')[1]
+    rows = re.findall(r"<tr><td[^>]*>(?:<a[^>]*>)?([a-e]).las", text)
+    doubted = sum(map(bool, found.values()))
+    assert {*rows[:doubted]} == {name for name, warnings in found.items() if warnings}
+    for one in found["d"]:
+        assert one["code"] in text and one["text"][:30] in text
+    wrong = CliRunner().invoke(main, [*task, "--resume", "--fail-on", "emtpy"])
+    assert wrong.exit_code == 2 and "did you mean 'empty'?" in wrong.stderr
+
+
+def test_survey_prints_the_doubts_of_a_run(many):
+    shown = CliRunner().invoke(main, ["survey", str(many / "d.las"), "--json"])
+    (one,) = [one for one in json.loads(shown.stdout)["warnings"] if one["code"] == "pulse-guess"]
+    assert f"warning           {one['text']}" in CliRunner().invoke(main, ["survey", str(many / "d.las")]).stdout
+    together = CliRunner().invoke(main, ["survey", str(many / "a.las"), str(many / "b.las"), "--json"])
+    assert all("warnings" in strip for strip in json.loads(together.stdout)["strips"])

@@ -104,7 +104,7 @@ def test_evlrs_of_a_hole_take_no_memory_in_a_run(hole, tmp_path):
     peak, _ = measure("run", hole, "-o", tmp_path / "out", "--profile", "fast", "--format", "las")
     assert peak < 400
     report = json.loads((tmp_path / "out" / "a.report.json").read_text())
-    assert any("EVLRs" in line and str(MAX_EVLRS) in line for line in report["warnings"])
+    assert any("EVLRs" in one["text"] and str(MAX_EVLRS) in one["text"] for one in report["warnings"])
 
 
 @pytest.mark.parametrize("text", [".".join(["a"] * 20_000) + " = 1", "[" + ".".join(['"a"'] * 20_000) + "]"])

@@ -97,7 +97,11 @@ def test_report_and_provenance_say_how_the_cloud_was_made(riegl, tmp_path):
     assert document["strip"]["system"]["sigma_ref_ns"] == pytest.approx(1.9, abs=0.2)
     assert document["output"]["size"] == (tmp_path / f"{riegl.stem}.laz").stat().st_size
     assert document["output"]["columns"]["echo_time"] == "echo_time"
-    assert document["timing"]["process_seconds"] > 0
+    timing = document["timing"]
+    for kind in ("processor", "wall"):
+        assert {"scan", "survey", "decompose.closed_form", "write"} <= set(timing[f"{kind}_seconds"])
+        assert timing[f"total_{kind}_seconds"] == pytest.approx(sum(timing[f"{kind}_seconds"].values()), abs=1e-4)
+    assert timing["waveforms_per_processor_second"] > 0
     made = read_provenance(tmp_path / f"{riegl.stem}.laz")[-1]
     for key in ("chain", "input", "options", "version", "system", "direction"):
         expected = document.get(key, document["strip"].get(key))

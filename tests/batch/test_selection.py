@@ -107,7 +107,7 @@ def test_a_point_counts_for_the_first_reason_that_leaves_it_out(riegl, full, tmp
     expected = {"drop_flags": weak.sum(), "bbox": (~weak & ~inside).sum(), "where": (~weak & inside).sum()}
     assert {name: n for name, n in report["counts"]["left_out"].items() if n} == expected
     assert len(some.points) == 0
-    assert any("no point is written" in line for line in report["warnings"])
+    assert any("no point is written" in one["text"] for one in report["warnings"])
     _check_sums(report, 0)
 
 
@@ -222,7 +222,7 @@ def test_resume_redoes_a_cloud_of_another_selection(riegl, tmp_path):
 
 def test_an_area_in_another_crs_is_named(riegl, tmp_path):
     _, report = _run(riegl, tmp_path, bbox=(9, 47, 10, 48))
-    assert any("outside the strip" in line and "another CRS" in line for line in report["warnings"])
+    assert any("outside the strip" in one["text"] and "another CRS" in one["text"] for one in report["warnings"])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at any instant of any command: exit code 130, one line, no temporary file, nothing half done."""
+"""Ctrl-C, SIGTERM and SIGXCPU at any instant: exit code 130, one line, no temporary file, nothing half done."""
 
 import os
 import random
@@ -63,7 +63,8 @@ def _commands(strip, folder):
 @pytest.mark.quick_cases("run", "run-2")
 @pytest.mark.parametrize("name", list(_commands(Path(), Path())))
 def test_a_signal_at_any_instant_of_any_command_gives_130_and_leaves_nothing(strip, tmp_path, name):
-    for number, second in [(signal.SIGTERM, None), (signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)]:
+    pairs = [(signal.SIGTERM, None), (signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)]
+    for number, second in [*pairs, (signal.SIGXCPU, None), (signal.SIGXCPU, signal.SIGXCPU)]:
         folder = tmp_path / f"{number}{second}"
         folder.mkdir()
         process = _start(_commands(strip, folder)[name])
@@ -82,6 +83,33 @@ def test_a_signal_at_any_instant_of_any_command_gives_130_and_leaves_nothing(str
         *before, last = said.splitlines()
         assert process.returncode == 130 and last.startswith("interrupted"), said
         assert all(line.startswith((str(strip), str(folder))) for line in before), said
+
+
+_LIMITED = """
+import resource
+resource.setrlimit(resource.RLIMIT_CPU, (2, 30))
+from wavebatch.__main__ import main
+main()
+"""
+_COUNTING = """
+from wavebatch.batch import run
+begin = run.StripTask.start
+def count(self):
+    begin(self)
+    while True:
+        pass
+run.StripTask.start = count
+"""
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_run_that_reaches_its_limit_of_processor_time_leaves_nothing(strip, tmp_path, jobs):
+    """The parent process counts in vain until its limit; the limit holds for each process."""
+    busy = _LIMITED.replace("from wavebatch", _COUNTING + "from wavebatch", 1)
+    process = _start(["run", strip, "-o", tmp_path, "--profile", "fast", "--jobs", jobs], code=busy)
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 130 and said.startswith("interrupted: finished clouds are complete"), said
+    assert list(tmp_path.iterdir()) == []
 
 
 _IN_COMPRESSOR = """

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.memory import ONE_THREAD
+from wavebatch.core.process import ONE_THREAD
 from wavebatch.tools.bench.report import write_texts
 from wavebatch.tools.bench.scenes import find_bench_scene
 from wavebatch.tools.simulate import simulate_strip

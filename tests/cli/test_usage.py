@@ -39,10 +39,6 @@ def invoke(*arguments):
          "--chain and --profile exclude each other"),
         *((["plot", "waveform", "a.las", "-o", "w.csv", *words], f"{words[0]} is for pictures")
           for words in (["--sheet"], ["--show", "detector"], ["--times", "all"])),
-        *(([*words, "--force"], "--force is of no use without --system") for words in (
-            ["run", "a.las", "-o", "d"], ["plot", "waveform", "a.las", "-o", "w.png"],
-            ["voxelize", "a.las", "--size", "1", "-o", "v.npz"], ["compare", "fast", "--strip", "a.las"],
-        )),
         (["calibrate", "a.las", "--targets", "t", "-o", "c", "--chain", "c", "--profile", "auto"],
          "--chain and --profile exclude each other"),
         (["voxelize", "a.las", "--size", "1", "-o", "v.npz", "--trajectory", "t", "--flight-height", "9"],

@@ -331,3 +331,15 @@ def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
 def test_noise_without_gaps_has_one_level():
     noise = Noise(np.arange(3, dtype=np.float32), np.ones(3, np.float32))
     assert noise.of_sample is None and noise.level.shape == (3, 1) and noise.for_fits is noise.baseline
+
+
+@pytest.mark.parametrize(("number", "apart"), [(8, True), (9, False)])
+def test_waveforms_of_many_recordings_keep_one_level(number, apart):
+    """Each recording is looked at in the length of the waveform: thousands of them would take all memory."""
+    length = 20
+    level = np.where(np.arange(number) == 1, 40.0, 12.0).repeat(length)
+    samples = np.random.default_rng(2).normal(level, 1.0, (5, number * length)).round().astype(np.uint8)
+    missing = np.broadcast_to(np.arange(number * length) % length < 4, samples.shape)
+    block = replace(WaveformBlock.from_samples(samples), missing=missing)
+    noise = pooled(block, SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0)))
+    assert (noise.of_sample is not None) == apart

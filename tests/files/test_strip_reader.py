@@ -16,7 +16,7 @@ from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.las import laz_decode
 from wavebatch.files.strip import reader as reader_module
 from wavebatch.files.strip import scanner, shared_packets
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.reader import LONG_SAMPLES, StripReader
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 LEICA = "leica-als/simple1_3_full_internal.las"
@@ -215,7 +215,7 @@ def test_unusable_packets_are_flagged_and_the_rest_is_read(tmp_path):
         assert (scan.with_waveform, scan.without_waveform, scan.broken) == (29, 2, 9)
         assert scan.packets == 29
         assert sum(count for count, _ in scan.reasons.values()) == 9
-        assert len(scan.warnings) == 4
+        assert len(scan.warnings) == 5
         assert [len(block) for block, _ in reader.read_blocks(unit, 100, True)] == [29]
 
 
@@ -448,3 +448,34 @@ def test_a_link_to_a_strip_finds_the_packets_beside_its_target(tmp_path):
         assert reader.facts.packets.file == other
     with protecting([link]), pytest.raises(ConfigError, match="replace this input"):
         refuse_input(strip.with_suffix(".wdp"))
+
+
+def test_a_sample_has_a_bounded_number_of_samples_of_long_waveforms(tmp_path):
+    path = make_raw(40, n_samples=10_000, most_returns=1).write(tmp_path / "a.las")
+    with StripReader(path) as reader, reader.scan() as scan:
+        taken = [row for block in reader.sample_blocks(scan, 1000) for row in block.point.tolist()]
+        assert len(taken) == LONG_SAMPLES // 10_000 and taken[0] == 0 and taken[-1] == 39
+        every = reader.sample_blocks(scan, 1000, long_samples=40 * 10_000)
+        assert sum(len(block) for block in every) == 40
+
+
+def test_long_waveforms_do_not_take_the_place_of_short_ones(tmp_path):
+    raw = make_raw(200, n_samples=4000, most_returns=1)
+    raw.points["wavepacket_size"][20:] = 50
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        blocks = list(reader.sample_blocks(scan, 1000, long_samples=8000))
+    lengths = [block.samples.shape[1] for block in blocks for _ in range(len(block))]
+    assert lengths.count(50) == 180 and lengths.count(4000) == 2
+
+
+def test_packets_that_overlap_many_times_are_refused(tmp_path):
+    raw = make_raw(40, n_samples=32, most_returns=1)
+    raw.points["wavepacket_offset"] = 60 + 10 * np.arange(40)
+    raw.packets = raw.packets[: 10 * 39 + 32]
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        assert scan.packets == 40
+    raw.points["wavepacket_offset"] = 60 + 2 * np.arange(40)
+    raw.packets = raw.packets[: 2 * 39 + 32]
+    said = "packets overlap: they claim 1,280 bytes of 110"
+    with StripReader(raw.write(tmp_path / "b.las")) as reader, pytest.raises(InputError, match=said):
+        reader.scan()

@@ -152,6 +152,15 @@ def test_no_number_of_echoes_is_too_many():
     np.testing.assert_allclose(np.sort(grown.parameters[:, 1]), times, atol=1e-2)
 
 
+@pytest.mark.parametrize(("length", "number"), [(480, 3), (481, 1)])
+def test_a_window_wider_than_the_most_echoes_side_by_side_does_not_grow(length, number):
+    """Six echoes at most, five widths to both sides, 8 samples wide: 480 samples."""
+    times = np.array([30.0, 60.0, 90.0])
+    y = sum(80.0 * np.exp(-0.5 * ((np.arange(length) - t) / 2.0) ** 2) for t in times)[None]
+    start = np.array([[[70.0], [30.0], [2.0]]])
+    assert decompose(y, start, grow=True, width_high=8.0, max_echoes=6).number.tolist() == [number]
+
+
 def test_a_cluster_alone_gives_the_same_bits_as_among_others():
     rng = np.random.default_rng(8)
     truth = np.stack([draw_random(rng)[:, :1] for _ in range(40)])

@@ -2,14 +2,12 @@
 
 import naive_geometry
 import numpy as np
-import pytest
 
 from wavebatch.kernels.geometry import normals
-from wavebatch.kernels.geometry.group_returns import find_pulses
+from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, find_pulses, find_rays, group_times
 from wavebatch.kernels.geometry.normals import thin_out
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.kernels.geometry.two_lines import LEAST_VARIETY, in_two_lines
-from wavebatch.kernels.geometry.voxels import accumulate_profile, total_until
 from wavebatch.kernels.physics.radiometry import known_distance, slope_error
 
 
@@ -18,6 +16,29 @@ def test_pulses_are_those_of_a_loop(rng):
     assert find_pulses(time).tolist() == naive_geometry.find_pulses(time)
     number = rng.integers(1, 4, len(time))
     assert group_pulses(time, number).tolist() == naive_geometry.group_pulses(time, number)
+
+
+def test_packets_of_equal_time_are_those_of_a_loop(rng):
+    time = np.concatenate([rng.integers(0, 40, 120).astype(float), np.full(LONGEST_PULSE, 77.0), [np.nan] * 3])
+    rng.shuffle(time)
+    assert group_times(time).tolist() == naive_geometry.group_times(time)
+    assert group_times(time[:0]).tolist() == []
+
+
+def test_packets_of_a_pulse_lie_on_one_line(rng):
+    """In any order; other directions, rays beside it, other scanners and other times are other pulses."""
+    ray = rng.integers(0, 12, 150)
+    group, scanner, side = ray // 6, (ray // 3) % 2, ray % 3
+    step = np.array([[0.01, 0.0, -0.15], [0.01, 0.0, -0.15], [0.01, 2e-4, -0.15]])[side]
+    step = step * (1 + 1e-6 * rng.standard_normal((150, 3)))
+    start = np.array([[0.0, 0, 0], [0.3, 0, 0], [0, 0, 0]])[side] + step * rng.uniform(-900, 900, (150, 1))
+    start += 0.01 * rng.standard_normal((150, 3))
+    found = find_rays(group, scanner, start, step)
+    assert found.tolist() == naive_geometry.find_rays(group, scanner, start, step)
+    assert found.tolist() == [int(np.flatnonzero(ray == one)[0]) for one in ray]
+    start[3], step[5] = np.nan, 0.0
+    alone = find_rays(group, scanner, start, step)
+    assert alone[3] == 3 and alone[5] == 5 and np.count_nonzero(alone == 3) == 1
 
 
 def test_dense_points_are_thinned_as_by_a_loop(rng):
@@ -59,14 +80,6 @@ def test_rays_of_single_returns_are_on_the_line_through_those_of_pairs(rng):
     np.testing.assert_allclose(rays[~wrong], true[~wrong], atol=1e-9)
     own = xyz[1::2][wrong]
     np.testing.assert_allclose(rays[wrong], own / np.linalg.norm(own, axis=1)[:, None], atol=1e-12)
-
-
-def test_sums_over_time_are_those_of_a_loop(rng):
-    profile = rng.uniform(0, 3, (5, 9))
-    ray, time = rng.integers(0, 5, 300), rng.uniform(-3, 22, 300)
-    found = total_until(accumulate_profile(profile), ray, time, 2.0)
-    expected = [naive_geometry.total_until(profile[r], t, 2.0) for r, t in zip(ray, time, strict=True)]
-    assert found == pytest.approx(expected)
 
 
 def test_surfaces_struck_from_behind_have_large_errors():

@@ -31,7 +31,8 @@ TWINS = {
         "find_sweeps": "naive_geometry.find_sweeps", "cut_tiles": "naive_geometry.near_tiles",
         "sort_into_tiles": "naive_geometry.near_tiles", "is_inside": "naive_geometry.near_tiles",
         "in_two_lines": "naive_geometry.variety", "cross_voxels": "test_voxel_kernels.walk",
-        "total_until": "naive_geometry.total_until", "accumulate_profile": "naive_geometry.total_until",
+        "sum_before": "test_voxel_kernels.slow_sum", "find_rays": "naive_geometry.find_rays",
+        "group_times": "naive_geometry.group_times",
     },
     "physics": {
         "angles_of_variance": "naive_physics.angle_of_variance", "angles_above": "naive_physics.angle_above",
@@ -97,6 +98,8 @@ NO_TWIN = {
     "tabulate_pulse": "tests fit tabulated pulses as the pulses that they were made of",
     "misfit_of_angles": "tests at known ridges compare its error with the true angle",
     "is_flat": "one comparison",
+    "along_ray": "a projection; find_rays, which has a twin, is made of it",
+    "on_ray": "a distance; find_rays, which has a twin, is made of it",
     "measure_angles": "tests of known planes, and of the scatter that its error states",
     "measure_normals": "planes, neighbours and halves have twins; tests of known roofs",
     "attenuation_of_visibility": "published numbers",

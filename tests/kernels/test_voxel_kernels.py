@@ -8,13 +8,13 @@ import pytest
 from wavebatch.kernels.geometry import voxels
 from wavebatch.kernels.geometry.voxels import (
     KEY_BITS,
-    accumulate_profile,
+    Samples,
     cross_voxels,
     differences_along,
     fits_keys,
     pack_index,
     split_rays,
-    total_until,
+    sum_before,
     unpack_index,
 )
 from wavebatch.kernels.signal.profiles import keep_signal, measure_offsets, window_signal
@@ -119,24 +119,43 @@ def test_a_ray_of_too_many_voxels_does_not_fit():
     assert fits_keys(start, step, *times, 0.005).tolist() == [True, False]
 
 
+def slow_sum(time, spacing, value, until):
+    """What of each sample, spread evenly over its spacing, lies before a time, in exact fractions."""
+    total = Fraction(0)
+    for t, w, v in zip(time.tolist(), spacing.tolist(), value.tolist(), strict=True):
+        passed = (Fraction(float(until)) - Fraction(t)) / Fraction(w) + Fraction(1, 2)
+        total += v * min(max(passed, Fraction(0)), Fraction(1))
+    return total
+
+
 def test_sums_over_time_spread_every_sample_over_its_step(rng):
-    profile = rng.uniform(0, 5, (3, 6))
-    total = accumulate_profile(profile)
-    for time in (-5.0, -0.5, -0.25, 0.0, 1.3, 4.999, 10.0):
-        for row in range(3):
-            edges = [2.0 * (i - 0.5) for i in range(7)]
-            slow = sum(
-                profile[row, i] * min(max((time - edges[i]) / 2.0, 0.0), 1.0) for i in range(6)
-            )
-            assert total_until(total, np.array([row]), np.array([time]), 2.0)[0] == pytest.approx(slow, abs=1e-12)
+    count = np.array([7, 0, 1, 3, 40])
+    first = np.cumsum(count) - count
+    spacing = rng.choice([0.5, 1.0, 2.0], count.sum())
+    time = np.concatenate([np.cumsum(2 + rng.uniform(0, 3, n)) for n in count])
+    value = rng.integers(0, 1 << 40, (len(time), 2))
+    samples = Samples(time, spacing, value)
+    ray = np.repeat(np.arange(5), 30)
+    until = rng.uniform(-3, 90, 150)
+    until[::7] = time[rng.integers(0, len(time), len(until[::7]))]
+    found = sum_before(samples, first, count, ray, until)
+    for row in range(150):
+        part = slice(first[ray[row]], first[ray[row]] + count[ray[row]])
+        for column in (0, 1):
+            expected = slow_sum(time[part], spacing[part], value[part, column], until[row])
+            assert abs(found[row, column] - expected) <= 1
+    whole = sum_before(samples, first, count, np.arange(5), np.full(5, np.inf))
+    assert np.array_equal(whole, [value[one : one + n].sum(axis=0) for one, n in zip(first, count, strict=True)])
+    none = sum_before(Samples(*(part[:0] for part in samples)), first[:1], count[1:2], ray[:2] * 0, until[:2])
+    assert none.tolist() == [[0, 0], [0, 0]]
 
 
 def test_differences_add_up_to_the_whole():
     ray = np.array([0, 0, 0, 2, 2])
-    values, last = np.array([0, 3, 7, 0, 5]), np.array([10, 99, 6])
-    assert differences_along(values, ray, last).tolist() == [3, 4, 3, 5, 1]
+    values, last = np.array([[0], [3], [7], [0], [5]]), np.array([[10], [99], [6]])
+    assert differences_along(values, ray, last).ravel().tolist() == [3, 4, 3, 5, 1]
     none = np.empty(0, np.int64)
-    assert len(differences_along(none, none, last)) == 0
+    assert len(differences_along(values[:0], none, last)) == 0
 
 
 def test_runs_below_the_least_are_noise_and_the_sum_of_a_run_stays():

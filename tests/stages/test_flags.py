@@ -1,5 +1,6 @@
 """Flags and neighbours of echoes against loops over pairs: what is weak, cut, faint beside another one, or the same."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -75,6 +76,21 @@ def test_flags_are_those_of_a_loop(table, rng):
     for flag in EchoFlag.WEAK, EchoFlag.NEAR_EDGE, EchoFlag.NARROW, EchoFlag.RINGING_SUSPECT, EchoFlag.SATURATED:
         assert 0 < np.count_nonzero(found.flags & int(flag)) < len(table), flag
     assert 0 < np.count_nonzero(found.flags & int(EchoFlag.AMPLITUDE_UNRELIABLE)) < np.count_nonzero(strong)
+
+
+def test_memory_for_saturated_echoes_grows_with_the_samples():
+    """A table of echoes by samples would have 6e8 values."""
+    s, m = 65_535, 10_000
+    block = WaveformBlock.from_samples(np.where(np.arange(s) % 13 < 3, 255, 10).astype(np.uint8)[None])
+    table = EchoTable.build(np.zeros(m, int), 1.0 + 6.5 * np.arange(m), np.full(m, 200.0), np.full(m, 2.0))
+    noise = Noise(np.full(1, 10, np.float32), np.ones(1, np.float32))
+    tracemalloc.start()
+    found = flag_echoes(block, noise, SystemPulse(2.0, saturation=255.0), table)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    saturated = (found.flags & int(EchoFlag.SATURATED)) != 0
+    assert saturated[::2].all() and not saturated[1::2].any()
+    assert peak < 100 * (s + m)
 
 
 def test_echoes_that_an_error_of_the_pulse_explains_are_dropped_as_by_a_loop(table, rng):

@@ -194,7 +194,7 @@ def test_a_chain_that_does_not_fit_the_pulse_is_named_and_its_false_echoes_count
     assert result.exit_code == 0
     report = _report(tmp_path, "ringing")
     (line,) = result.stderr.splitlines()
-    assert line.endswith(f"warning: {report['warnings'][0]}")
+    assert line.endswith(f"warning: {report['warnings'][0]['text']}")
     found = re.search(r"pulse, .* about (\d+) of its (\d+) echoes are false .* use --profile auto", line)
     assert int(found[2]) == report["counts"]["echoes"]
     false = report["choice"]["predictions"][0]["false_share"]

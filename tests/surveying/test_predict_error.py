@@ -99,3 +99,12 @@ def test_nothing_to_find_is_no_error():
     for prediction in predict_errors(block, known_system(make_scene("flat").recording), CHAINS):
         assert prediction.range_error == 0
     assert Prediction("x", 0.01, np.inf, 0.0).to_json()["range_error_m"] is None
+
+
+@pytest.mark.filterwarnings("error")
+def test_samples_of_32_bits_are_clipped_at_their_largest_count():
+    """2^32 - 1 is no number of single precision: 2^32, which is, became 0 or whatever the processor makes of it."""
+    block = WaveformBlock.from_samples(np.zeros((3, 60), np.uint32), bits=32)
+    echoes = EchoTable.build(np.arange(3), np.full(3, 30.0), np.full(3, 1e10), np.full(3, 2.0))
+    again, _ = simulate_again(block, known_system(make_scene("flat").recording), echoes, np.random.default_rng(1))
+    assert again.samples[:, 30].tolist() == [2**32 - 1] * 3

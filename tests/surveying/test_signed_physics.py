@@ -150,7 +150,7 @@ def test_a_wrong_divergence_is_named_and_in_the_errors(tmp_path, factor):
     planes = [*roofs([0, 20, 38]), Plane()]
     wrong = write_calibration(tmp_path / "cal.toml", GREEN, divergence=factor * GREEN.divergence)
     columns, true, report = fly(tmp_path, planes, GREEN, 16_000, calibration=wrong)
-    (line,) = [line for line in report["warnings"] if "contradicts the echo widths" in line]
+    (line,) = [one["text"] for one in report["warnings"] if "contradicts the echo widths" in one["text"]]
     assert f"a beam of {factor * GREEN.divergence:g} mrad" in line
     assert re.search(r"a beam of 1\.[01]\d* \+- 0\.0\d\d mrad", line)
     section = true["gamma"] * np.pi / 4 * (1e-3 * GREEN.divergence * true["range"]) ** 2

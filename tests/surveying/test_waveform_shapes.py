@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.defects import find_spikes
 from wavebatch.stages.chain import STAGES
@@ -13,6 +13,7 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
+from wavebatch.surveying.measuring import learn_pulse
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
 from wavebatch.tools.bench.real.pool import read_pool
 
@@ -352,3 +353,10 @@ def test_targets_too_weak_to_be_found_are_measured_beside_strong_echoes(height):
     late = (lags > 9) & (lags < 15)
     assert variance[~late & (lags < 5)].max() < 0.3
     assert variance[late].min() > 1.5 if height else variance[late].max() < 0.3
+
+
+def test_a_pulse_is_chosen_where_no_echo_stands_clear():
+    """All clear echoes were near the digitizer's limit, and the test of wide ones had none left."""
+    block = WaveformBlock.from_samples(np.full((40, 60), 12, np.uint8))
+    one, other = SystemPulse(2.0, kappa=0.1), SystemPulse(2.0, components=((0.1, 3.0, 1.0),))
+    assert learn_pulse._fit_wide_best(block, one, (one, other)) is one

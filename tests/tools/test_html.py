@@ -63,9 +63,7 @@ def test_the_page_of_a_run_has_every_part_and_its_counts_are_those_of_the_report
 def test_a_page_is_the_same_for_the_same_result(flight, tmp_path):
     again = tmp_path / "again.html"
     _run("run", flight / "in", "-o", flight / "out", "--resume", "--html", again, code=3)
-    times = (
-        r"(?s)<h4>Seconds of the processes.*?</section>|<section id=.run.>.*?</section>|\n<p>2 of the strips[^<]*</p>"
-    )
+    times = r"(?s)<h4>Time</h4>.*?</section>|<section id=.run.>.*?</section>|\n<p>2 of the strips[^<]*</p>"
     first, second = (
         re.sub(times, "", path.read_text()).replace("skipped", "written") for path in (flight / "run.html", again)
     )

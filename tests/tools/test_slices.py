@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -361,3 +362,33 @@ def test_a_picture_of_a_slice_ends_near_the_signal(strip):
     every = np.ptp(piece.x) * piece.pixel
     assert extent[0] < low and high < extent[1] and extent[1] - extent[0] < min(1.4 * (high - low), 0.95 * every)
     assert np.isfinite(image).any(axis=1).all()
+
+
+def test_packets_of_one_pulse_are_one_pulse(tmp_path, edit_points):
+    """A forest whose waveforms are cut into two packets of 40 samples each, of canopy and ground."""
+    whole = tmp_path / "whole.las"
+    simulate_strip("forest", whole, pulses=600, seed=4)
+
+    def halve(points):
+        late = points["return_point_wave_location"] >= 40_000
+        points["wavepacket_offset"][late] += 40
+        points["return_point_wave_location"][late] -= 40_000
+        points["wavepacket_size"] = np.minimum(points["wavepacket_size"], 40)
+        return points
+
+    cut = edit_points(whole, tmp_path / "cut.las", halve)
+    content, old = cut.read_bytes(), struct.pack("<BBII", 8, 0, 80, 1000)
+    assert content.count(old) == 1
+    cut.write_bytes(content.replace(old, struct.pack("<BBII", 8, 0, 40, 1000)))
+    both = 0
+    for one, other in zip(read_all(whole), read_all(cut), strict=True):
+        assert np.array_equal(one.gps_time, other.gps_time)
+        for row in range(len(one)):
+            times, found = one.time[one.row == row], other.time[other.row == row]
+            if len(found) > 40:
+                both += 1
+                place = np.searchsorted(times, found - 0.5)
+                assert found == pytest.approx(times[place], abs=0.02) and np.all(np.diff(found) > 0.9)
+    assert both > 100
+    done = CliRunner().invoke(main, ["slice", str(cut), "-o", str(tmp_path / "cut.csv"), "--json"])
+    assert json.loads(done.stdout)["pulses"] == sum(map(len, read_all(whole)))

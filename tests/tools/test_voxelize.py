@@ -410,7 +410,7 @@ def test_a_point_cloud_holds_what_the_npz_holds(tmp_path, point_format, output, 
     centre = found["origin"] + (found["index"] + 0.5) * 0.3
     assert np.stack([cloud.x, cloud.y, cloud.z], axis=1) == pytest.approx(centre, abs=1e-9)
     names = list(cloud.point_format.extra_dimension_names)
-    assert names == ["energy", "rays", "path", "light", "share"]
+    assert names == ["energy", "rays", "path", "light", "share", "share_error"]
     for name in names:
         assert np.array_equal(np.asarray(cloud[name]), found[name])
     assert (np.asarray(cloud.return_number) == 1).all() and (np.asarray(cloud.number_of_returns) == 1).all()

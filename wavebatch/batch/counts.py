@@ -7,13 +7,14 @@ Before you change it: `a + b` must be exact and independent of order, so histogr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.errors import StageError
+from wavebatch.core.errors import StageError, StripWarning
+from wavebatch.core.process import Seconds
 from wavebatch.core.units import FWHM_PER_SIGMA
 
 COUNTS: dict[str, str] = {
@@ -21,6 +22,7 @@ COUNTS: dict[str, str] = {
     "points_with_waveform": "points whose packet can be read",
     "points_without_waveform": "points without a packet (descriptor index 0 or packet size 0)",
     "points_broken": "points whose packet lies outside the file or does not fit its descriptor",
+    "points_cut": "those of points_broken whose packet lies past the end of the file, which is incomplete",
     "waveforms": "packets that went through the chain, each once however many points share it",
     "echoes": "echoes found in them",
     "matched_returns": "points whose echo was found",
@@ -100,13 +102,15 @@ class RunReport:
     """Echoes that reflect more than a white matt surface, level or facing the sensor."""
     remarks: tuple[str, ...] = ()
     """Lines about the strip as a whole, from `explain`."""
+    warnings: tuple[StripWarning, ...] = ()
+    """What makes the results doubtful, from `explain`."""
     echoes_per_waveform: np.ndarray = _zeros(OVERFLOW + 1)
     amplitude: np.ndarray = _zeros(AMPLITUDE_BINS.number)
     """Echoes per bin of AMPLITUDE_BINS."""
     echo_width: np.ndarray = _zeros(WIDTH_BINS.number)
     """Echoes per bin of WIDTH_BINS."""
-    timing: Mapping[str, float] = field(default_factory=dict)
-    """Seconds by task, summed over all processes."""
+    timing: Mapping[str, Seconds] = field(default_factory=dict)
+    """By task, summed over all processes."""
 
     def __add__(self, other: RunReport) -> RunReport:
         return RunReport(**{f.name: _add(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)})
@@ -136,6 +140,11 @@ class RunReport:
     def count(self, name: str) -> int:
         """Return the count of a name in COUNTS."""
         return self.counts.get(name, 0)
+
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether packets were missing: the cloud is to be made again once their file is whole."""
+        return self.count("points_cut") > 0
 
     def check(self, points: str, where: str) -> None:
         """Check that every point and every echo is accounted for.
@@ -178,6 +187,7 @@ class RunReport:
                 },
             },
             "remarks": list(self.remarks),
+            "warnings": [asdict(one) for one in self.warnings],
             "quality": {
                 "echoes_per_waveform": [int(n) for n in self.echoes_per_waveform],
                 "reflectance_above_one": self.above_one,
@@ -199,6 +209,7 @@ class RunReport:
                 column: {name: int(n) for name, n in reasons.items()} for column, reasons in counts["no_data"].items()
             },
             remarks=tuple(str(line) for line in document["remarks"]),
+            warnings=tuple(StripWarning(str(one["code"]), str(one["text"])) for one in document["warnings"]),
             above_one=int(quality.get("reflectance_above_one", 0)),
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
             amplitude=amplitude,

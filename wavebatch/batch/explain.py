@@ -12,16 +12,14 @@ from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
 from wavebatch.batch.selection import describe_extent
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import StripWarning
 from wavebatch.core.no_data import REASONS, NoData
-from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.stages.decompose.loops import loop_model
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
-from wavebatch.surveying.inspect_strip import doubt_packets
-from wavebatch.surveying.measuring.noise_and_width import FEW
-from wavebatch.surveying.measuring.residuals import hides_noise
+from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets
 from wavebatch.surveying.sensor import SensorSource
-from wavebatch.surveying.systems.known_systems import find_source
+from wavebatch.surveying.systems.doubt import doubt_survey
 
 _ANGLE = "incidence_angle"
 
@@ -34,10 +32,6 @@ suits a strip; 35 % on a RIEGL and 80 % on a Leica strip of Gaussians in place o
 
 INVERTED = 5.0
 """Signals are inverted where counts reach this many times further below the baseline than above it."""
-
-MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
-"""Share of the echoes in doubt, because another pulse, misfit or noise serves as well, from which a survey's pulse is
-called a guess; of a known pulse, from which its noise is."""
 
 _NEEDS: dict[str, tuple[NoData, ...]] = {
     "range": (),
@@ -107,45 +101,49 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
-    """Find what makes results of a strip wrong; these lines are printed with --quiet too.
+def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, str]) -> tuple[StripWarning, ...]:
+    """Find what makes results of a strip doubtful.
 
     Parameters
     ----------
     prepared : Prepared
     report : RunReport
         Of the whole strip.
+    dropped : mapping of str to str
+        Records of the input that the cloud does not have, and why.
 
     Returns
     -------
-    tuple of str
-        One line each: a forced survey of another sensor, a selection that leaves nothing, a strip without any waveform
-        or echo, packets that do not fit the returns, a pulse that is a guess, a chain that does not fit the strip's
-        pulse.
+    tuple of StripWarning
+        What makes results wrong comes first: a forced survey of another sensor, a selection that leaves nothing, a
+        strip without any waveform or echo, packets that do not fit the returns, a pulse that is a guess, a chain that
+        does not fit the strip's pulse. Then what the files, the calibration and the records of the input have.
     """
-    choice, echoes = prepared.choice, report.count("echoes")
-    lines = []
-    if prepared.forced:
-        if prepared.job.request.force:
-            lines.append(f"--force: the survey given by --system is not of this sensor: {prepared.forced}")
-        else:
-            doubt = "the survey given by --system is of another sensor, or this is a hillside"
-            lines.append(f"{doubt}: {prepared.forced}")
-    lines += _miss_all(prepared, report)
-    lines += _find_nothing(prepared, report)
-    lines += _doubt_waveforms(prepared, report)
-    lines += _doubt_pulse(prepared, report)
-    lines += () if choice.doubted else _doubt_fits(prepared, report)
-    lines += _doubt_reflectance(report)
-    if not choice.doubted or not echoes:
-        return tuple(lines)
-    share, (_, best) = choice.false_share, choice.predictions
-    lines.append(
-        f"{choice.chain.name or 'this chain'}: does not fit this strip's pulse, which is no plain Gaussian: about "
-        f"{round(share * echoes)} of its {echoes} echoes are false ({100 * share:.0f} % in a trial with the learned "
-        f"pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
-    )
-    return tuple(lines)
+    choice, echoes, warn = prepared.choice, report.count("echoes"), StripWarning.of
+    found = [*warn("forced-system", _name_forced(prepared)), *warn("nothing-selected", _miss_all(prepared, report))]
+    found += warn("empty", _find_nothing(prepared, report))
+    found += warn("foreign-packets", _doubt_waveforms(prepared, report))
+    found += doubt_survey(choice.survey.system, choice.survey.figures) if echoes else ()
+    found += () if choice.doubted else warn("failed-fits", _doubt_fits(prepared, report))
+    found += warn("reflectance", _doubt_reflectance(report))
+    if choice.doubted and echoes:
+        share, (_, best) = choice.false_share, choice.predictions
+        line = (
+            f"{choice.chain.name or 'this chain'}: does not fit this strip's pulse, which is no plain Gaussian: about "
+            f"{round(share * echoes)} of its {echoes} echoes are false ({100 * share:.0f} % in a trial with the "
+            f"learned pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
+        )
+        found += warn("false-echoes", [line])
+    found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
+    return (*found, *warn("dropped-records", map(": ".join, dropped.items())))
+
+
+def _name_forced(prepared: Prepared) -> Iterator[str]:
+    """A survey of another sensor, or of other ground."""
+    if prepared.forced and prepared.job.request.force:
+        yield f"--force: the survey given by --system is not of this sensor: {prepared.forced}"
+    elif prepared.forced:
+        yield f"the survey given by --system is of another sensor, or this is a hillside: {prepared.forced}"
 
 
 def _name_raised(prepared: Prepared) -> Iterator[str]:
@@ -203,36 +201,6 @@ def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
         yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` shows what the strip records"
 
 
-def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """A pulse or noise that is a guess: too few echoes to learn a pulse from, echoes that another one does not find, or
-    no samples to measure noise in.
-    """
-    figures, system = prepared.choice.survey.figures, prepared.system
-    alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
-    if not report.count("echoes") or alone is None:
-        return
-    known = find_source(system) is not None
-    most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
-    reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
-    if alone < FEW and not (known or system.components):
-        reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
-    measured = system.noise.by_kind
-    unseen = measured.get("quiet") == 0 and "outside" not in measured
-    if unseen and not reason:
-        reason = "too few samples without signal"
-    remedy = "give --system, a survey of a longer strip of this sensor"
-    hidden = hides_noise(system.noise)
-    if hidden and not reason:
-        reason, remedy = "most of the noise below count 0", "raise the level of the digitizer in the next flight"
-    if reason:
-        guess = f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
-        guess = f"noise is a guess, of {system.noise.std:.3g} DN" if known or unseen or hidden else guess
-        yield (
-            f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
-            f"{remedy}"
-        )
-
-
 def _doubt_reflectance(report: RunReport) -> Iterator[str]:
     """More reflectances above 1 than metal, signs and wet roofs explain."""
     known = max(report.no_data.get(name, {}).get(NoData.KNOWN.name, 0) for name in ("level_reflectance", "reflectance"))
@@ -264,7 +232,10 @@ def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
 
 
 def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """Return locations that fit no echo."""
+    """Packets of another strip, by --force, and return locations that fit no echo."""
+    if prepared.scan.stranger:
+        yield f"--force: {prepared.scan.stranger}"
+        return
     matched = report.count("matched_returns")
     yield from doubt_packets(prepared.facts, matched, matched + report.count("unmatched_returns"))
 

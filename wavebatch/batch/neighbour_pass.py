@@ -14,7 +14,6 @@ from __future__ import annotations
 import functools
 import itertools
 import pickle
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -28,6 +27,7 @@ from wavebatch.batch.output_rows import Assembled, UnitEchoes, spread
 from wavebatch.batch.unit import Prepared, SolvedBlocks, solve_unit, unpack
 from wavebatch.core.echoes import COLUMNS, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
+from wavebatch.core.process import Seconds
 from wavebatch.files.disk.row_file import RowStore
 from wavebatch.files.disk.spool import Spool
 from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, thin_out
@@ -115,7 +115,7 @@ class SecondPass:
         """Sort all rows into tiles, once all units are there; returns the timing. May be called again."""
         if self._entries is not None:
             return RunReport()
-        start = time.perf_counter()
+        start = Seconds.now()
         reach = _reach(self._step)
         sample = np.concatenate(self._sample)
         self._sample = []
@@ -137,7 +137,7 @@ class SecondPass:
         for tile, count in enumerate(counts.tolist()):
             self._parts.extend((tile, part) for part in range(-(-count // PART_POINTS)))
         self._tiles_left, self._units_left = len(self._parts), len(self._units)
-        return RunReport(timing={"tiles": time.perf_counter() - start})
+        return RunReport(timing={"tiles": Seconds.now() - start})
 
     @property
     def has_more(self) -> bool:
@@ -188,7 +188,7 @@ def begin_unit(blob: bytes, number: int, block_size: int | None) -> tuple[tuple[
         The timing.
     """
     prepared: Prepared = unpack(blob)
-    timing: dict[str, float] = {}
+    timing: dict[str, Seconds] = {}
     solved, echoes, made = solve_unit(prepared, number, block_size, timing)
     needed = {name: made.columns[name] for name in ("echo_flags", *prepared.selector.needed)}
     chain = prepared.job.chain
@@ -216,7 +216,7 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndar
     """
     _gather.cache_clear()  # tiles are done: their memory is needed for the unit
     prepared: Prepared = unpack(blob)
-    timing: dict[str, float] = {}
+    timing: dict[str, Seconds] = {}
     made, solved = pickle.loads(state)
     has_echo = made.echo >= 0
     by_echo = np.zeros(len(made.counted), found.dtype)
@@ -235,7 +235,7 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndar
 
 
 def _solve_again(
-    chain: Chain, solved: SolvedBlocks, values: Mapping[str, np.ndarray], timing: dict[str, float]
+    chain: Chain, solved: SolvedBlocks, values: Mapping[str, np.ndarray], timing: dict[str, Seconds]
 ) -> dict[str, np.ndarray]:
     """The columns of stages that need those of the second pass; values (k,) are by packet, as `gather_echoes` sorts."""
     if not solved:
@@ -284,7 +284,7 @@ def process_tile(blob: bytes, number: int, part: int) -> Found:
     Found
         For the points inside the tile, not for those of its buffer.
     """
-    start = time.perf_counter()
+    start = Seconds.now()
     task: TileTask = unpack(blob)
     stage = task.step.stage
     entries = _read_part(task.entries, number, part)
@@ -295,7 +295,7 @@ def process_tile(blob: bytes, number: int, part: int) -> Found:
     found = np.empty(len(own), _found_dtype(task.step))
     for name, column in zip(found.dtype.names, (*values, gap), strict=True):
         found[name] = column
-    return entries["row"][own], found, RunReport(timing={f"{stage.name}, second pass": time.perf_counter() - start})
+    return entries["row"][own], found, RunReport(timing={f"{stage.name}, second pass": Seconds.now() - start})
 
 
 @functools.lru_cache(maxsize=1)

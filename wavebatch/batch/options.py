@@ -35,7 +35,7 @@ EXCLUSIVE = (
 """Options that exclude each other. One in wavebatch.toml replaces those that come from a weaker source."""
 
 NEEDS = {
-    "force": ("system",), "lever_arm": ("trajectory",), "crs": ("trajectory",), "wavelength": ("visibility",),
+    "lever_arm": ("trajectory",), "crs": ("trajectory",), "wavelength": ("visibility",),
     "attenuation_error": ("attenuation", "visibility"), "seed": ("random",),
 }  # fmt: skip
 """Options that are of no use without one of others."""
@@ -94,7 +94,8 @@ class RunOptions:
         None, "Use this saved survey (`wavebatch survey -o FILE`) instead of surveying the strip.", CHAIN, "FILE"
     )
     force: bool = option(
-        False, "Use the survey of --system also where bits, noise or echo width of the strip contradict it.", CHAIN
+        False, "Use the survey of --system also where bits, noise or echo width of the strip contradict it, and a .wdp "
+        "also where its packets are those of another strip.", CHAIN
     )
     survey: Literal["each", "flight"] = option(
         "each", "Survey each strip alone, or all strips once: kept as DIR/flight.system.toml, used again with "

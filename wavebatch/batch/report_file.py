@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from wavebatch.batch.explain import explain_absence
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import without_nan
+from wavebatch.core.process import Seconds
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
@@ -122,8 +123,6 @@ def build_document(
     report: RunReport,
     cloud: Path,
     size: int,
-    dropped: Mapping[str, str],
-    serious: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Build the report of a strip whose cloud is complete.
 
@@ -136,10 +135,6 @@ def build_document(
     cloud : Path
     size : int
         Of the cloud [bytes].
-    dropped : mapping of str to str
-        Records of the input that the cloud does not have, and why.
-    serious : sequence of str
-        Warnings about wrong results, which come first.
 
     Returns
     -------
@@ -151,6 +146,7 @@ def build_document(
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
     found = {
         "schema": STRIP_SCHEMA,
+        "status": "incomplete" if report.is_incomplete else "complete",
         **described,
         **describe_chain(prepared),
         "strip": {
@@ -172,13 +168,6 @@ def build_document(
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [
-            *serious,
-            *facts.warnings,
-            *prepared.scan.warnings,
-            *prepared.doubts,
-            *map(": ".join, dropped.items()),
-        ],
     }
     return {**found, "checksum": _sum_up(found), "timing": build_timing(report)}
 
@@ -191,11 +180,15 @@ def _sum_up(document: Mapping[str, Any]) -> str:
 
 
 def build_timing(report: RunReport) -> dict[str, Any]:
-    """Return seconds by task, rounded, and waveforms per second of process time."""
-    total = sum(report.timing.values())
-    seconds = {name: round(value, 6) for name, value in report.timing.items()}
-    rate = round(report.count("waveforms") / total) if total > 0 else None
-    return {"seconds": seconds, "process_seconds": round(total, 6), "waveforms_per_process_second": rate}
+    """Return processor and wall time by task, rounded, their sums, and waveforms per second of a processor."""
+    total = sum(report.timing.values(), Seconds())
+    by_task = {
+        f"{kind}_seconds": {name: round(getattr(seconds, kind), 6) for name, seconds in report.timing.items()}
+        for kind in ("processor", "wall")
+    }
+    rate = round(report.count("waveforms") / total.processor) if total.processor > 0 else None
+    sums = {f"total_{kind}_seconds": round(getattr(total, kind), 6) for kind in ("processor", "wall")}
+    return {**by_task, **sums, "waveforms_per_processor_second": rate}
 
 
 def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:

@@ -41,7 +41,7 @@ class Outcome:
 
     job: StripJob
     status: str
-    """written, skipped (resume found the cloud up to date) or failed."""
+    """written, skipped (resume found the cloud up to date), incomplete (either, but packets are missing) or failed."""
     report: RunReport = field(default_factory=RunReport)
     error: BaseException | None = None
     survey: Survey | None = None
@@ -59,7 +59,8 @@ class BatchResult:
         """One line: a prompt or a notebook prints it."""
         names = [outcome.status for outcome in self.outcomes]
         written = f"{names.count('written')} strip{'s' * (names.count('written') != 1)} written"
-        return f"BatchResult({written}, {names.count('skipped')} skipped, {names.count('failed')} failed)"
+        others = ", ".join(f"{names.count(name)} {name}" for name in ("skipped", "incomplete", "failed"))
+        return f"BatchResult({written}, {others})"
 
     @property
     def failed(self) -> int:
@@ -85,15 +86,12 @@ class BatchResult:
     def to_json(self) -> dict[str, Any]:
         """Return the summary of the batch as plain values; all but `timing` is the same for every run."""
         report = self.report
-        strips = [
-            {
-                "strip": str(outcome.job.path),
-                "status": outcome.status,
-                "error": None if outcome.error is None else " ".join(str(outcome.error).split()),
-                "counts": outcome.report.to_json()["counts"],
-            }
-            for outcome in self.outcomes
-        ]
+        strips = []
+        for outcome in self.outcomes:
+            error = None if outcome.error is None else " ".join(str(outcome.error).split())
+            found = outcome.report.to_json()
+            parts = {name: found[name] for name in ("counts", "warnings")}
+            strips.append({"strip": str(outcome.job.path), "status": outcome.status, "error": error, **parts})
         timing = {**build_timing(report), "elapsed_seconds": round(self.seconds, 3)}
         head = {"schema": BATCH_SCHEMA, "version": __version__, "strips": strips}
         advice = self.advice
@@ -111,7 +109,7 @@ def run_batch(
     options : RunOptions
     on_event : callable, optional
         Called with a dictionary for each event; its key `event` is flight, worker (one that does not fit),
-        start, unit, written, skipped or failed.
+        start, unit, written, skipped, incomplete or failed.
         `again` in a failure means that the same cause was reported for another strip before. `strip` of the event
         flight is the file of the flight's survey.
 
@@ -250,7 +248,7 @@ class _Batch:
                 self._tell({"event": "start", "strip": str(strip.job.path)})
                 if report is None:
                     return strip
-                self._end(strip, Outcome(strip.job, "skipped", report))
+                self._end(strip, Outcome(strip.job, "incomplete" if report.is_incomplete else "skipped", report))
         return None
 
     def _take(self, strip: StripTask) -> None:
@@ -265,7 +263,8 @@ class _Batch:
             if strip.is_complete:
                 report = strip.finish()
                 survey = strip.prepared.choice.survey if strip.job.request.system is None else None
-                self._end(strip, Outcome(strip.job, "written", report, survey=survey))
+                status = "incomplete" if report.is_incomplete else "written"
+                self._end(strip, Outcome(strip.job, status, report, survey=survey))
 
     @contextlib.contextmanager
     def _failing(self, strip: StripTask) -> Iterator[None]:
@@ -314,10 +313,8 @@ class _Batch:
             self._tell({**event, "error": outcome.error, "again": again})
         else:
             report = outcome.report.to_json()
-            more = {"counts": report["counts"], "remarks": report["remarks"], "warnings": strip.warnings}
-            more["serious"] = list(strip.serious)
+            more = {name: report[name] for name in ("counts", "remarks", "warnings")}
             if strip.prepared is not None:
-                lost = [*strip.prepared.scan.losses, *strip.prepared.doubts]
-                more |= {"sensor": strip.prepared.sensor.describe(), "doubts": lost}
+                more["sensor"] = strip.prepared.sensor.describe()
                 more["decisions"] = [asdict(decision) for decision in strip.prepared.choice.decisions]
             self._tell({**event, **more})

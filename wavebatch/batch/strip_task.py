@@ -9,9 +9,9 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
-import time
 from collections import deque
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from wavebatch.batch.unit import Prepared, prepare_strip, process_unit
 from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
+from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target
@@ -50,9 +51,6 @@ class StripTask:
         self.facts: StripFacts | None = None
         self.prepared: Prepared | None = None
         self.written = 0
-        self.warnings: list[str] = []
-        self.serious: tuple[str, ...] = ()
-        """Those of the warnings that are about wrong results; they are printed with --quiet too."""
         self._options = options
         self._submitted = 0
         self._blob = b""
@@ -137,7 +135,7 @@ class StripTask:
     def take(self, workers: Workers | Cluster) -> None:
         """Use the oldest result: open the output, or write rows."""
         result = self.pending.popleft().result()
-        start = time.perf_counter()
+        start = Seconds.now()
         if self.prepared is None:
             self.prepared = result
             self._report += result.report
@@ -154,7 +152,7 @@ class StripTask:
             else:
                 self._second.add(*rows)
             self.written += 1
-            self._report += report + RunReport(timing={"write": time.perf_counter() - start})
+            self._report += report + RunReport(timing={"write": Seconds.now() - start})
         if self.written == self.prepared.units and self._second is not None:
             self._report += self._second.cut()
 
@@ -185,7 +183,7 @@ class StripTask:
             Where counts do not add up.
         """
         options, job = self._options, self.job
-        start = time.perf_counter()
+        start = Seconds.now()
         self._report.check(job.options.points, str(job.path))
         self._report += RunReport(remarks=(*_name_stranger(self.prepared), *find_remarks(self.prepared, self._report)))
         if self._stat() != self._state:
@@ -194,12 +192,10 @@ class StripTask:
         report = report_file.report_path(job, options.folder)
         replaces = options.overwrite or options.resume
         size = self._writer.complete()
-        self._report += RunReport(timing={"publish": time.perf_counter() - start})
-        dropped = self._writer.dropped
-        self.serious = find_warnings(self.prepared, self._report)
-        document = report_file.build_document(
-            self.prepared, self._described, self._report, cloud, size, dropped, self.serious
-        )
+        self._report += RunReport(timing={"publish": Seconds.now() - start})
+        warnings = find_warnings(self.prepared, self._report, self._writer.dropped)
+        self._report = replace(self._report, warnings=warnings)
+        document = report_file.build_document(self.prepared, self._described, self._report, cloud, size)
         draft = draft_text(report, report_file.format_json(document), overwrite=replaces)
         try:
             if replaces:
@@ -207,7 +203,6 @@ class StripTask:
             self._writer.publish(draft)
         finally:
             draft.discard()
-        self.warnings = document["warnings"]
         self._close()
         return self._report
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import pickle
-import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,7 +18,8 @@ from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.selection import RowSelector
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import InputError, StripWarning
+from wavebatch.core.process import Seconds
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
@@ -62,12 +62,12 @@ class Prepared:
     choice: Choice
     layout: OutputLayout
     report: RunReport
-    """Timing of the preparation."""
+    """Timing of the preparation, and how many points have lost their packets."""
     sensor: SensorSource = UNKNOWN
     stranger: str = ""
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
     pulse_energy: PulseEnergy | None = None
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[StripWarning, ...] = ()
     """Warnings about inputs that do not quite fit the strip, such as its calibration or the beam's divergence."""
     forced: str = ""
     """What contradicts the saved survey with which the strip is run, by --force or in doubt; empty for nothing."""
@@ -109,29 +109,30 @@ def prepare_strip(job: StripJob) -> Prepared:
     ConfigError
         Where no chain meets the tolerance, or columns or format do not fit the strip.
     """
-    start = time.perf_counter()
+    start = Seconds.now()
     with job.open() as reader:
         facts = reader.facts
         job = replace(job, selection=job.selection.place(facts))
         RowSelector.plan(job.selection, job.chain, plan_layout(job, facts))
-        scan = reader.scan()
+        scan = reader.scan(force=job.request.force)
         try:
-            scanned = time.perf_counter()
+            scanned = Seconds.now()
             setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, calibration=job.calibration,
                             air=job.attenuation and job.attenuation[0], extend=job.extend)  # fmt: skip
-            sensor, doubts = setup.sensor, setup.doubts
+            sensor, doubts = setup.sensor, StripWarning.of("calibration", setup.doubts)
             if setup.stranger:
                 job = replace(job, request=replace(job.request, system=None))
             choice = try_chain(reader, scan, setup.choice, job.request)
             columns = without_columns(job.columns, job.chain, choice.chain)
             job = replace(job, chain=choice.chain, columns=columns, calibration=setup.calibration)
-            surveyed = time.perf_counter()
+            surveyed = Seconds.now()
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
-            doubts += judge_scale(reader, scan) if job.options.points == "echoes" else ()
+            if job.options.points == "echoes":
+                doubts += StripWarning.of("units", judge_scale(reader, scan))
             _hold_height(reader, job.sensor, sensor)
             choice, more = _see_level(reader, scan, job, choice, sensor)
-            doubts += more
+            doubts += StripWarning.of("beam", more)
             job = replace(job, chain=_set_parameters(reader, scan, job.chain))
             energy = find_pulse_energy(reader, scan, job.energy) if needs_sensor(job.chain) else None
             if job.energy is not None and energy is not None:
@@ -142,8 +143,9 @@ def prepare_strip(job: StripJob) -> Prepared:
         except BaseException:
             scan.close()
             raise
-    timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    found = choice, layout, RunReport(timing=timing), sensor, setup.stranger, energy, doubts, setup.forced
+    timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": Seconds.now() - surveyed}
+    report = RunReport(counts={"points_cut": scan.cut}, timing=timing)
+    found = choice, layout, report, sensor, setup.stranger, energy, doubts, setup.forced
     return Prepared(job, facts, scan, units, *found)
 
 
@@ -219,16 +221,16 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
     report : RunReport
     """
     prepared: Prepared = unpack(blob)
-    timing: dict[str, float] = {}
+    timing: dict[str, Seconds] = {}
     _, _, made = solve_unit(prepared, number, block_size, timing)
-    start = time.perf_counter()
+    start = Seconds.now()
     rows, left = prepared.selector.select(made.rows, made.columns)
-    timing["assemble"] += time.perf_counter() - start
+    timing["assemble"] += Seconds.now() - start
     return rows, replace(made.report + left, timing=timing)
 
 
 def solve_unit(
-    prepared: Prepared, number: int, block_size: int | None, timing: dict[str, float]
+    prepared: Prepared, number: int, block_size: int | None, timing: dict[str, Seconds]
 ) -> tuple[SolvedBlocks, UnitEchoes, Assembled]:
     """Run the chain on the packets of a unit and make all of its rows.
 
@@ -248,21 +250,21 @@ def solve_unit(
     made : Assembled
         With the columns that the selection needs.
     """
-    start = time.perf_counter()
+    start = Seconds.now()
     echoes_mode = prepared.job.options.points == "echoes"
     with StripReader(prepared.facts) as reader:
         unit = reader.read_unit(number, prepared.scan)
-        timing["read points"] = time.perf_counter() - start
+        timing["read points"] = Seconds.now() - start
         blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)
         solved = list(_run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
-    start = time.perf_counter()
+    start = Seconds.now()
     echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
     layout, needed = prepared.layout, prepared.selector.needed
     if echoes_mode:
         made = assemble_echoes(unit, echoes, layout, needed, prepared.job.selection.drop_flags)
     else:
         made = assemble_returns(unit, echoes, layout, needed)
-    timing["assemble"] = time.perf_counter() - start
+    timing["assemble"] = Seconds.now() - start
     return solved, echoes, made
 
 
@@ -280,7 +282,7 @@ def _block_size(unit: Unit, wanted: int | None) -> int:
 
 
 def _run_blocks(
-    prepared: Prepared, unit: Unit, blocks: Iterable[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
+    prepared: Prepared, unit: Unit, blocks: Iterable[tuple[WaveformBlock, np.ndarray]], timing: dict[str, Seconds]
 ) -> Iterator[tuple[np.ndarray, Solved]]:
     system = prepared.system
     for block, index in blocks:
@@ -290,13 +292,13 @@ def _run_blocks(
         yield index, prepared.job.chain.solve(placed, system, timing).without_samples()
 
 
-def _timed(items: Iterator, timing: dict[str, float], name: str) -> Iterator:
+def _timed(items: Iterator, timing: dict[str, Seconds], name: str) -> Iterator:
     """The items; the seconds that they take are added to timing[name]."""
-    timing[name] = 0.0
+    timing[name] = Seconds()
     while True:
-        start = time.perf_counter()
+        start = Seconds.now()
         item = next(items, None)
-        timing[name] += time.perf_counter() - start
+        timing[name] += Seconds.now() - start
         if item is None:
             return
         yield item

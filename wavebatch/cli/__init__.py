@@ -92,6 +92,6 @@ def main() -> None:
     `wavebatch COMMAND --help` explains a command, with examples.
 
     Defaults of options can be given by variables (WAVEBATCH_JOBS=4, or for one command WAVEBATCH_RUN_JOBS=4) and in
-    wavebatch.toml beside the inputs (a table per command: [run] with jobs = 4). Options on the command line count
-    first, then variables, then the file.
+    a settings file (--config FILE; a table per command: [run] with jobs = 4). Options on the command line count first,
+    then variables, then the file. A wavebatch.toml beside the inputs can change numbers only.
     """  # fmt: skip

@@ -19,7 +19,7 @@ from wavebatch.cli.messages import answer, print_result, talk
 from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.tools.bench.command import BenchOptions, run_bench
 
-_REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "log_path", "log_level", "debug")
+_REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "log_path", "log_level", "config", "debug")
 """Options that --real uses."""
 
 

@@ -169,7 +169,7 @@ def _point_lines(facts: dict[str, Any]) -> Iterator[str]:
     if time:
         dates = f", {' to '.join(time['dates_gps'])} GPS" if "dates_gps" in time else ""
         yield f"GPS time       {time['least']:.16g} to {time['largest']:.16g} s, {time['kind']}{dates}"
-    for key, name in (("returns", "returns"), ("numbers_of_returns", "of pulses"), ("classes", "classes"),
+    for key, name in (("returns", "return number"), ("numbers_of_returns", "of returns"), ("classes", "classes"),
                       ("point_sources", "sources")):  # fmt: skip
         if facts.get(key):
             pairs = [f"{k}: {n}" for k, n in facts[key].items()]

@@ -42,7 +42,7 @@ class _OneLine(click.ClickException):
 
     def show(self, file: IO[Any] | None = None) -> None:
         """The line on stderr."""
-        click.echo(f"error: {self.message}", file=file, err=file is None)
+        click.echo(printable(f"error: {self.message}"), file=file, err=file is None)
 
 
 class WrongUsage(_OneLine):

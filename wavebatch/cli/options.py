@@ -285,6 +285,8 @@ _COMMON = {
     "log_file": click.option("--log-file", "log_path", type=OutputPath(dir_okay=False, path_type=Path), metavar="FILE",
                              expose_value=False, callback=begin_log,
                              help="Append every message with its time to this file, also with --quiet."),
+    "config": click.option("--config", type=click.Path(path_type=Path), metavar="FILE", expose_value=False,
+                           help="Take options from this settings file (TOML, a table per command), and from no other."),
     "debug": click.option("--debug", is_flag=True, help="Print the traceback of an error."),
 }
 
@@ -296,7 +298,7 @@ def common_options(*names: str, failure: int = 1) -> Callable:
     """
 
     def decorate(command: Callable) -> Callable:
-        shared = (*names, "quiet", "log_file", "log_level", "debug")
+        shared = (*names, "quiet", "log_file", "log_level", "config", "debug")
         return together(*(_COMMON[name] for name in shared))(report_errors(failure)(_protected(command)))
 
     return decorate
@@ -311,7 +313,7 @@ def _protected(command: Callable) -> Callable:
         sources = {name: context.get_parameter_source(name) for name in context.params}
         given = {name for name, source in sources.items() if source is not ParameterSource.DEFAULT}
         check_together({name: context.params[name] for name in given}, context.params)
-        inputs: list[Any] = [context.meta[READ]] if READ in context.meta else []
+        inputs: list[Any] = list(context.meta.get(READ, ()))
         outputs: dict[str, Any] = {}
         if LOG in context.meta:
             outputs[os.path.realpath(context.meta[LOG])] = [context.meta[LOG]]

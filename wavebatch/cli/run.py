@@ -32,11 +32,22 @@ from wavebatch.cli.messages import (
 )
 from wavebatch.cli.program.log_file import typed_command
 from wavebatch.cli.program.progress import Progress
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import WARNINGS, ConfigError, InputError
+from wavebatch.core.suggest import nearest
 from wavebatch.files.disk.protect import refuse_input
 
 EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
-"""All strips are written, but --report, --html or stdout could not be; some strips failed; all strips failed."""
+"""All strips are written, but --report, --html or stdout could not be; some strips failed or lack packets; all failed.
+"""
+
+
+def _parse_codes(text: str) -> tuple[str, ...]:
+    codes = tuple(code.strip() for code in text.split(","))
+    for code in codes:
+        if code not in ("warning", *WARNINGS):
+            raise ConfigError(f"no warning has the code {code!r}; {nearest(code, ['warning', *WARNINGS])}")
+    return tuple(WARNINGS) if "warning" in codes else codes
+
 
 @click.command()
 @shared.strips_argument
@@ -46,6 +57,8 @@ EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
 @click.option("--report", type=shared.OutputPath(dir_okay=False, allow_dash=True), metavar="FILE",
               help="Write a summary of all strips as JSON; - is stdout. An existing FILE is replaced.")
 @shared.html_option
+@click.option("--fail-on", type=shared.Text("warning|CODES", _parse_codes), metavar="warning|CODES",
+              help="Exit with code 3 if a strip has a warning, or one of these codes, e.g. pulse-guess,lost-packets.")
 @click.option("--progress", type=click.Choice(["auto", "bar", "json", "none"]), default="auto", show_default=True,
               help="auto: a bar if stderr is a terminal; json: one line per event on stdout.")
 @click.option("-v", "--verbose", is_flag=True, help="Print more about each strip.")
@@ -61,7 +74,8 @@ def run(**options: Any) -> None:
       0    all strips are written
       1    all strips are written, but --report, --html or stdout cannot be written
       2    wrong usage or chain file, nothing was started; or no chain meets the tolerance
-      3    some strips failed, the others are written
+      3    some strips failed, the others are written; or packets of some are missing (see docs/reliability.md), or
+           a strip has a warning of --fail-on
       4    all strips failed
       130  interrupted; --resume continues
     """  # fmt: skip
@@ -132,14 +146,26 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
         result = run_batch(jobs, batch_options, progress.show)
     if level > 0:
         timing = result.to_json()["timing"]
-        parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["seconds"].items()))
-        talk(f"{timing['elapsed_seconds']:.1f} s elapsed" + (f"; of the processes' time: {parts}" if parts else ""))
+        parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["processor_seconds"].items()))
+        talk(f"{timing['elapsed_seconds']:.1f} s elapsed" + (f"; processor time: {parts}" if parts else ""))
         if advice := result.advice:
             talk(advice)
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     is_reported = _write_page(result, batch_options.folder, options) and is_reported
-    return find_exit_code([outcome.error for outcome in result.outcomes]) or (0 if is_reported else EXIT_UNREPORTED)
+    code = find_exit_code([outcome.error for outcome in result.outcomes]) or _find_warned(result, options["fail_on"])
+    if not code and any(outcome.status == "incomplete" for outcome in result.outcomes):
+        code = EXIT_SOME_FAILED
+    return code or (0 if is_reported else EXIT_UNREPORTED)
+
+
+def _find_warned(result: Any, codes: tuple[str, ...] | None) -> int:
+    """The exit code for warnings that shall fail; strips that --resume skipped have theirs too."""
+    found = [one.job.path for one in result.outcomes if {w.code for w in one.report.warnings} & set(codes or ())]
+    if found:
+        talk(f"error: --fail-on: {count(len(found), 'strip')} with such a warning, the first is {found[0]}; the clouds "
+             "are written")  # fmt: skip
+    return EXIT_SOME_FAILED if found else 0
 
 
 def _report(document: dict[str, Any], target: str | None) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,7 +84,7 @@ def survey(
     if chain_file is not None:
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
     document = _document(saved, facts)
-    print_result(as_json, document, _lines(saved, facts))
+    print_result(as_json, document, [*_lines(saved, facts), *_warning_lines(document)])
     if html_file is not None:
         from wavebatch.tools.html.survey_page import write_survey_page
 
@@ -102,6 +102,7 @@ def survey(
 def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
     """The survey, and what else is shown of the strip."""
     from wavebatch.files.disk.fingerprint import take_fingerprint
+    from wavebatch.surveying.inspect_strip import doubt_files
     from wavebatch.surveying.system_file import SavedSurvey
     from wavebatch.tools.api.strip import open_strip
     from wavebatch.tools.api.strip import survey as survey_strip
@@ -116,6 +117,7 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
             "points": scan.points,
             "packets": scan.packets,
             "direction": {"sign": scan.vectors.direction, "evidence": scan.vectors.evidence},
+            "warnings": [asdict(one) for one in doubt_files(opened.facts, scan)],
         }
         packet_file = opened.facts.packets.file
         if options["angles"] is not None:
@@ -181,12 +183,14 @@ def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Pat
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import SYSTEM_SCHEMA, describe_system
+    from wavebatch.surveying.systems.doubt import doubt_survey
     from wavebatch.surveying.systems.figures import describe_figures
 
     return {
         "schema": SYSTEM_SCHEMA,
         "version": saved.version,
         **facts,
+        "warnings": [*facts.get("warnings", ()), *map(asdict, doubt_survey(saved.survey.system, saved.survey.figures))],
         "fingerprint": dict(saved.fingerprint),
         "waveforms": saved.survey.waveforms,
         "system": describe_system(saved.survey.system),
@@ -234,6 +238,13 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     yield "decisions"
     for decision in saved.survey.decisions:
         yield f"  {'needed' if decision.needed else 'left out':10}{decision.part:26}{decision.reason}"
+
+
+def _warning_lines(document: dict[str, Any]) -> Iterator[str]:
+    """What is doubtful, also of single strips of a flight."""
+    for strip in document.get("strips", ()):
+        yield from (_line("warning", f"{strip['strip']}: {one['text']}") for one in strip["warnings"])
+    yield from (_line("warning", one["text"]) for one in document["warnings"])
 
 
 def _strip_lines(facts: dict[str, Any], size: str) -> Iterator[str]:

@@ -37,7 +37,7 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @shared.options_of(VoxelOptions, "size")
 @shared.options_of(Deconvolution)
 @shared.options_of(VoxelOptions, "headroom", "ground_height", "reflectance_ratio")
-@shared.where_option("Use only waveforms with a return (a point of the strip)")
+@shared.where_option("Use only pulses with a return (a point of the strip)")
 @click.option("--profiles", type=shared.OutputPath(path_type=Path), metavar="FILE.npz",
               help="Also write the deconvolved signal of every pulse: energy and, with --calibration, cross section by "
               "time.")
@@ -61,19 +61,25 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
       path           length of these rays inside it [m]
       light          light that was left in them, in units of whole rays
       share          share of that light that was caught in it; 1 - share is its gap probability
+      share_error    standard deviation of share: by the number of rays, by how much more than these explain the
+                     shares of neighbouring voxels differ, and by the error of RATIO
 
     Light is shared along a ray as its signal times the square of the range, where signal from the ground counts
     RATIO times as much as that from the canopy. The ratio is that at which the sum does not depend on how much light
     reached the ground; where the strip does not show it, it is taken as 1, and a note says so.
+
+    A pulse is one ray, with all of its packets (of equal GPS time and scanner, on one line). Between packets nothing
+    was recorded, because no light triggered the digitizer: it counts as empty air, and a note says how much light may
+    hide there. Where a packet is missing or broken, the light is known up to it, not beyond.
 
     Each sample is spread over its length along the ray, so that voxels smaller than a sample (15 cm) have no holes. A
     ray ends at its last signal; voxels after it were not seen. A voxel that is not in the file was not seen, or
     (without --all-crossed) was seen to be empty.
 
     An .npz file holds index (n, 3), one array per value, origin, size, crs and meta; voxel i lies between origin + i
-    size and origin + (i + 1) size. --profiles writes an .npz with the arrays point, gps_time, start, step, spacing,
-    anchored, clipped, first, count (one value per pulse with signal) and time, energy, cross_section (one per sample
-    with signal); the samples of pulse p are first[p] to first[p] + count[p] - 1, at start + time step.
+    size and origin + (i + 1) size. --profiles writes an .npz with the arrays point, gps_time, start, step, packets,
+    known, anchored, clipped, first, count (one value per pulse with signal) and time, spacing, energy, cross_section
+    (one per sample with signal); the samples of pulse p are first[p] to first[p] + count[p] - 1, at start + time step.
 
     Memory does not grow with the strip; large strips need room in TMPDIR. The options
     for the sensor position are for cross sections only.
@@ -130,20 +136,30 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
     x, y, z = summary.shape
     yield (
         f"{summary.output}: {count(summary.voxels, 'voxel')} of {summary.size:g} m in {x} x {y} x {z}, "
-        f"{summary.energy:.6g} DN ns from {summary.with_signal} of {count(summary.waveforms, 'waveform')}"
+        f"{summary.energy:.6g} DN ns from {summary.with_signal} of {count(summary.pulses, 'pulse')}"
     )
     if summary.profiles is not None:
         yield f"{summary.profiles}: {count(summary.profile_samples, 'sample')} of {summary.with_signal} pulses"
+    if summary.left_out:
+        yield f"note: {count(summary.left_out, 'waveform')} left out by --where: no return of the pulse meets it"
     notes = {
-        "left out by --where: none of their returns meets it": summary.left_out,
         "without a return at the signal; placed by the raw return location": summary.with_signal - summary.anchored,
         "saturated; the energy is too low": summary.clipped,
         "left out: the position is not a number or far outside": summary.outside,
         "without a known cross section": summary.unknown,
+        "with a packet that is missing or broken: light is known up to it, not beyond": summary.lost_packets,
     }
     for text, number in notes.items():
         if number:
-            yield f"note: {count(number, 'waveform')} {text}"
+            yield f"note: {count(number, 'pulse')} {text}"
+    if summary.several_packets:
+        hidden = ""
+        if summary.hidden_light is not None:
+            hidden = f"; up to {summary.hidden_light:.2g} of a pulse's light may hide there"
+        yield (
+            f"note: {count(summary.several_packets, 'pulse')} of several packets; between them nothing was recorded: "
+            f"it counts as empty{hidden}"
+        )
     yield from _tell_ratio(summary)
 
 

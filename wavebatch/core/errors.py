@@ -1,7 +1,13 @@
-"""The three errors of wavebatch; each is also the builtin error that a caller would expect.
+"""The three errors of wavebatch, and the warnings about a strip.
 
-All rooms raise them; the command line prints them as one line. Any other exception is a bug.
+All rooms raise the errors; each is also the builtin error that a caller would expect, and the command line prints it as
+one line. Any other exception is a bug.
 """
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 
 class ConfigError(ValueError):
@@ -14,3 +20,49 @@ class InputError(OSError):
 
 class StageError(RuntimeError):
     """A stage broke its contract while a block ran through it: a bug, which is never hidden."""
+
+
+WARNINGS = {
+    "header": "header, descriptors or the place of the packets are wrong; the strip is read all the same",
+    "packets": "packets, or the vectors of their points, are unusual; they are used",
+    "lost-packets": "points whose packets cannot be used: they are written without attributes",
+    "foreign-packets": "the packets, or the return locations, do not belong to the points",
+    "empty": "no points, no waveforms or no echoes",
+    "nothing-selected": "the selection leaves no point",
+    "pulse-guess": "the survey knows the pulse too little: widths, errors and the number of echoes depend on it",
+    "noise-guess": "the survey knows the noise too little: errors and the number of echoes depend on it",
+    "forced-system": "the survey of --system contradicts the strip",
+    "false-echoes": "the chain that was asked for does not fit the pulse: many of its echoes are false",
+    "failed-fits": "far more fits than usual did not converge, or ended at a bound",
+    "calibration": "the calibration does not quite fit the strip, or its constant is less certain",
+    "reflectance": "more reflectances above 1 than surfaces explain",
+    "beam": "the divergence contradicts the widths of the echoes",
+    "units": "coordinates may be in other units than the vectors of the packets",
+    "dropped-records": "records of the strip that its cloud does not have",
+}
+"""What makes results of a strip doubtful, by a code that stays the same in later versions."""
+
+_OF_FILES = ("header", "packets", "dropped-records")
+"""Codes of what is odd about a file, while the results are as good as usual."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class StripWarning:
+    """What makes results of a strip doubtful: a code of WARNINGS, and a line with the figures and the remedy."""
+
+    code: str
+    text: str
+
+    def __post_init__(self) -> None:
+        if self.code not in WARNINGS:
+            raise ValueError(f"{self.code!r} is no code of a warning")
+
+    @classmethod
+    def of(cls, code: str, lines: Iterable[str]) -> tuple[StripWarning, ...]:
+        """Return a warning for each line."""
+        return tuple(cls(code, line) for line in lines)
+
+    @property
+    def is_loud(self) -> bool:
+        """Whether it is printed with --quiet too: what is written is less sure, or less, than its inputs promise."""
+        return self.code not in _OF_FILES

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, so that none is lost, wherever it arrives.
+"""Ctrl-C, SIGTERM and the limit of processor time, so that none is lost, wherever it arrives.
 
 A signal raises KeyboardInterrupt in the main thread. Compressors and other compiled code that calls Python turn an
 exception into an error of theirs, and Python drops one that is raised while an object is deleted. So a signal also
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 EXIT_INTERRUPTED = 130
-"""Exit code after Ctrl-C or SIGTERM, as shells give it."""
+"""Exit code after Ctrl-C, SIGTERM or SIGXCPU, as shells give it after Ctrl-C."""
 
 _PAUSE = 10.0
 """Seconds after a signal in which others do not interrupt the cleaning up; later ones do, in case it hangs."""
@@ -31,7 +31,7 @@ _PAUSE = 10.0
 _SOON = 0.05
 """Seconds after which a KeyboardInterrupt that Python has dropped is raised again."""
 
-_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGXCPU") if hasattr(signal, name)]
 
 
 class _Interrupt(KeyboardInterrupt):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-import time
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -20,6 +19,7 @@ import numpy as np
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
 from wavebatch.core.no_data import SUFFIX
+from wavebatch.core.process import Seconds
 from wavebatch.core.schema import Range, read_hint
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import PulseShape
@@ -301,7 +301,7 @@ class Chain:
                 made.update(step.stage.makes)
         return tuple(found)
 
-    def run(self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None) -> EchoTable:
+    def run(self, block: WaveformBlock, system: SystemPulse, timing: dict[str, Seconds] | None = None) -> EchoTable:
         """Find and describe the echoes of a block.
 
         Parameters
@@ -311,7 +311,7 @@ class Chain:
         system : SystemPulse
             Pulse and noise of the strip, from its survey.
         timing : dict, optional
-            Seconds spent in each stage are added here, by the stage's name.
+            Time spent in each stage is added here, by the stage's name.
 
         Returns
         -------
@@ -327,7 +327,7 @@ class Chain:
         """
         return self.solve(block, system, timing).echoes
 
-    def solve(self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None) -> Solved:
+    def solve(self, block: WaveformBlock, system: SystemPulse, timing: dict[str, Seconds] | None = None) -> Solved:
         """Find the echoes of a block, and keep what they were found in: for residuals and pictures.
 
         Parameters
@@ -354,7 +354,7 @@ class Chain:
         small = solved.without_samples()
         return small._replace(block=replace(small.block, returns=None), echoes=replace(small.echoes, attributes=kept))
 
-    def solve_again(self, solved: Solved, timing: dict[str, float] | None = None) -> EchoTable:
+    def solve_again(self, solved: Solved, timing: dict[str, Seconds] | None = None) -> EchoTable:
         """Run the stages again that need the columns of the second pass, once the echoes have them.
 
         Parameters
@@ -382,7 +382,7 @@ class Chain:
         return {**solved._asdict(), "system": system}
 
     def estimate_noise(
-        self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None
+        self, block: WaveformBlock, system: SystemPulse, timing: dict[str, Seconds] | None = None
     ) -> tuple[WaveformBlock, Noise, SystemPulse]:
         """Return the block without the strip's defects, its noise, and the system of its digitizer."""
         system = system.of(block)
@@ -390,9 +390,9 @@ class Chain:
         cleaned = clean_block(block, system)
         return cleaned, self._call(self.steps[0], {"block": cleaned, "system": system}, timing), system
 
-    def _call(self, step: Step, data: Mapping[str, Any], timing: dict[str, float] | None) -> Any:
+    def _call(self, step: Step, data: Mapping[str, Any], timing: dict[str, Seconds] | None) -> Any:
         """The result of a stage."""
-        start, block = time.perf_counter(), data["block"]
+        start, block = Seconds.now(), data["block"]
         try:
             result = step.stage.function(*(data[name] for name in KINDS[step.stage.kind][0]), **step.parameters)
         except ConfigError as error:
@@ -403,5 +403,5 @@ class Chain:
                 f"{type(error).__name__}: {error}; this is a bug, please report it with the strip"
             ) from error
         if timing is not None:
-            timing[step.stage.name] = timing.get(step.stage.name, 0.0) + time.perf_counter() - start
+            timing[step.stage.name] = timing.get(step.stage.name, Seconds()) + (Seconds.now() - start)
         return result

@@ -262,16 +262,23 @@ def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: floa
 
 def _flag_saturated(block: WaveformBlock, noise: Noise, level: float, table: EchoTable) -> EchoTable:
     """Flag echoes with clipped samples within 1.5 widths of their centre, and amplitudes that are guesses."""
-    rows = np.flatnonzero(np.any(block.samples >= level, axis=1)[table.waveform])
+    clipped = block.samples >= level
+    if block.missing is not None:
+        clipped &= ~block.missing
+    rows = np.flatnonzero(clipped.any(axis=1)[table.waveform])
     if not len(rows):
         return table
-    sample = np.arange(block.samples.shape[1]) * block.spacing
-    near = np.abs(sample - table.time[rows, None]) <= 1.5 * table.sigma[rows, None]
-    if block.missing is not None:
-        near &= ~block.missing[table.waveform[rows]]
-    clipped = ((block.samples[table.waveform[rows]] >= level) & near).any(axis=1)
+    # The first clipped sample after the beginning of an echo must lie before its end. Looked up in the list of clipped
+    # samples: echoes x samples would be 4e8 for one waveform of 65,535 samples with spikes.
+    row, at = np.nonzero(clipped)
+    s = block.samples.shape[1]
+    place = np.append(row * s + at, len(clipped) * s)
+    time, reach = table.time[rows], 1.5 * table.sigma[rows]
+    low = np.ceil(np.clip((time - reach) / block.spacing, 0, s)).astype(np.int64)
+    high = np.floor(np.clip((time + reach) / block.spacing, -1, s - 1)).astype(np.int64)
+    start = table.waveform[rows].astype(np.int64) * s
     saturated = np.zeros(len(table), bool)
-    saturated[rows] = clipped
+    saturated[rows] = place[np.searchsorted(place, start + low)] <= start + high
     guess = saturated & (UNRELIABLE_BELOW * table.amplitude > level - noise.baseline[table.waveform])
     table = table.with_flags(EchoFlag.SATURATED, saturated)
     return table.with_flags(EchoFlag.AMPLITUDE_UNRELIABLE, guess)

@@ -26,6 +26,8 @@ APART, MARGIN = 4.0, 0.5
 """A recording has a level of its own if it differs from its waveform's baseline by APART standard errors and MARGIN
 times the noise, as much as the foot of an echo can raise its quiet samples."""
 
+MOST_RECORDINGS = 8
+"""Waveforms with more keep one level: sensors join two or three, and each takes as long as a whole waveform."""
 
 FOOT = 2.0
 """Error of a level that only the lowest samples show, over the noise: the foot of an echo may lie there."""
@@ -94,7 +96,8 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit
     lowest samples: a level that is too high loses the foot of an echo, one that is too low makes false echoes.
     """
     row, start, end = find_stretches(~block.missing)
-    several = np.bincount(row, minlength=len(block))[row] > 1
+    number = np.bincount(row, minlength=len(block))[row]
+    several = (number > 1) & (number <= MOST_RECORDINGS)
     row, start, end = row[several], start[several], end[several]
     if not len(row):
         return noise

@@ -10,7 +10,7 @@ import functools
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.auto_chain import decide
 from wavebatch.surveying.choose_chain import sample_size
+from wavebatch.surveying.inspect_strip import doubt_files
 from wavebatch.surveying.measuring.noise_and_width import (
     FAR_OFF,
     FEW,
@@ -195,7 +196,8 @@ def _read_sample(
             share = waveforms or sample_size(reader, scan)
             share = max(-(-share // strips), 1 if waveforms else LEAST_SHARE)
             blocks = tuple(reader.sample_blocks(scan, share))
-            facts = {"points": scan.points, "packets": scan.packets}
+            warnings = [asdict(one) for one in doubt_files(reader.facts, scan)]
+            facts = {"points": scan.points, "packets": scan.packets, "warnings": warnings}
             fingerprint = take_fingerprint(path, reader.facts.packets.file)
         if not blocks:
             raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")

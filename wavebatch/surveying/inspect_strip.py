@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError, StripWarning
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.strip.header_check import audit_header
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
@@ -139,7 +139,7 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
     except InputError as error:
         problems.append(_without_name(path, error))
     else:
-        problems += doubt_packets(facts, *_match_returns(reader, scan))
+        problems += () if scan.stranger else doubt_packets(facts, *_match_returns(reader, scan))
     notes = [*_note_descriptors(facts, scan), *scan.notes, *audit_header(reader, scan)]
     summary = ", ".join(f"{n} {name}{'s' * (n != 1)}" for n, name in ((scan.points, "point"), (scan.packets, "packet")))
     if scan.packets:
@@ -178,6 +178,13 @@ def _describe_samples(reader: StripReader, scan: StripScan) -> dict[str, Any]:
         "waveforms_with_gaps": sum(gaps),
         "lengths": sorted(set(lengths)),
     }
+
+
+def doubt_files(facts: StripFacts, scan: StripScan) -> Iterator[StripWarning]:
+    """What is odd about the files of a strip that can be processed."""
+    yield from StripWarning.of("header", facts.warnings)
+    for line in scan.warnings:
+        yield StripWarning("lost-packets" if line in scan.losses else "packets", line)
 
 
 def doubt_packets(facts: StripFacts, matched: int, returns: int) -> Iterator[str]:

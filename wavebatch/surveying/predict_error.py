@@ -158,7 +158,8 @@ def simulate_again(
     signal += np.sqrt(variance).astype(np.float32) * rng.standard_normal((n, s), dtype=np.float32)
     signal += system.noise.baseline + system.noise.baseline_spread * rng.standard_normal((n, 1))
     top = block.digitizer.max_count if system.saturation is None else min(system.saturation, block.digitizer.max_count)
-    counts = np.clip(np.rint(signal), 0, top).astype(np.min_scalar_type(block.digitizer.max_count))
+    # In double precision: 2^32 - 1 in single precision is 2^32, which no sample of 32 bits can hold.
+    counts = np.clip(np.rint(signal.astype(np.float64)), 0, top).astype(np.min_scalar_type(block.digitizer.max_count))
     trial = WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
     plain = replace(system, defects=Defects())
     return replace(trial, digitizer=block.digitizer), plain

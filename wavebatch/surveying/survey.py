@@ -17,8 +17,8 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.choose_pulse import Tried, choose_pulse, settle
 from wavebatch.surveying.hidden_neighbours import measure_hidden
+from wavebatch.surveying.measuring.choose_pulse import Tried, choose_pulse, settle
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
     find_isolated,
@@ -40,6 +40,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
+from wavebatch.surveying.systems.doubt import share_unexplained
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import list_known
 from wavebatch.surveying.systems.skew import measure_skew
@@ -394,7 +395,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
-        figures.echoes_in_doubt = choice.doubt
+        figures.echoes_in_doubt = max(choice.doubt, share_unexplained(system, echoes, block.spacing))
     else:
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)

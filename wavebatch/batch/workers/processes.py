@@ -30,7 +30,7 @@ from wavebatch.batch.workers.futures import end_future, settle, wait_uninterrupt
 from wavebatch.batch.workers.serve import PATIENCE, serve_calls
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
-from wavebatch.core.memory import CHILD, keep_freed_memory
+from wavebatch.core.process import CHILD, keep_freed_memory
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 _POLL = 1.0

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.memory import CHILD
+from wavebatch.core.process import CHILD
 
 _PROBE = "from wavebatch.batch.workers.processor import probe_arithmetic; print(probe_arithmetic())"
 

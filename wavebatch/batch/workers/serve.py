@@ -18,7 +18,7 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
-from wavebatch.core.memory import keep_freed_memory
+from wavebatch.core.process import keep_freed_memory
 
 _FIRST_MODULE = "wavebatch.batch.neighbour_pass"
 """What a new process imports while it waits: with it comes nearly all that calls need."""

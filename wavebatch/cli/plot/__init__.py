@@ -138,7 +138,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 
     chain, request = find_request(shared.from_options(RunOptions, options))
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
-    with opened as reader, reader.scan() as scan:
+    with opened as reader, reader.scan(force=options["force"]) as scan:
         choice = prepare(reader, scan, chain, request, positions=Positions.NONE).choice
         system = choice.survey.system
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))

@@ -72,8 +72,10 @@ SETTINGS_PAGE = (
     "WAVEBATCH_OPTION is the default of an option of every command, WAVEBATCH_COMMAND_OPTION that of one command, for "
     "example WAVEBATCH_RUN_JOBS=4.",
     ".SH FILES",
-    "wavebatch.toml in the folder of the inputs holds defaults of options in a table per command, for example [run] "
-    "with jobs = 4. Options on the command line count first, then variables, then the file.",
+    "A settings file holds defaults of options in a table per command, for example [run] with jobs = 4. That of "
+    "--config FILE or WAVEBATCH_CONFIG is the only one; without it, wavebatch.toml beside the inputs counts before "
+    "that in the folder for settings of the user. The one beside the inputs can change numbers only. "
+    "Options on the command line count first, then variables, then files.",
 )
 
 

@@ -105,7 +105,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     AIR: ("reflectance_error", "scan_angle"),
     WHICH: ("flags", "packets", "point_numbers", "times", "most", "random", "limit"),
     OUTPUT: ("html_file", "report", "as_json"),
-    RUNNING: ("dry_run", "progress", "verbose", "quiet", "log_path", "log_level", "debug", "help"),
+    RUNNING: ("dry_run", "fail_on", "progress", "verbose", "quiet", "log_path", "log_level", "config", "debug", "help"),
 }
 """Names of options under a heading of --help, besides those of RunOptions. Others come first, under Options.
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from wavebatch.cli.messages import count, one_line, print_safely, printable, write_message
 from wavebatch.cli.program import log_file
+from wavebatch.core.errors import StripWarning
 
 
 class Progress:
@@ -62,12 +63,15 @@ class Progress:
             if self._debug:
                 self._say("".join(traceback.format_exception(error)).rstrip())
             self._say(f"error: {_place(printable(strip), one_line(error))}")
-        elif kind == "written":
+        elif kind == "incomplete" and "decisions" not in event:
+            cut = count(event["counts"]["points_cut"], "point")
+            remedy = "get its waveform data again, whole"
+            self._say(printable(f"{strip}: is incomplete as before: the packets of {cut} are missing; {remedy}"))
+        elif kind in ("written", "incomplete"):
             self._tell(_summary(event, self._level > 0))
-            # Printed with --quiet too: what is written is less sure, or less, than its inputs promise.
-            loud = {*event["serious"], *event["doubts"]}
-            for line in event["warnings"]:
-                (self._say if line in loud else self._tell)(printable(f"{strip}: warning: {line}"))
+            for one in event["warnings"]:
+                say = self._say if StripWarning(**one).is_loud else self._tell
+                say(printable(f"{strip}: warning: {one['text']}"))
             more = [*_decisions(event), *_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])]
             for line in [*more * (self._level > 0), *event["remarks"]]:
                 self._tell(f"{strip}: {line}")

@@ -1,9 +1,10 @@
-"""Defaults of options from outside of the command line: WAVEBATCH_* variables, and wavebatch.toml beside the strips.
+"""Defaults of options from outside of the command line: WAVEBATCH_* variables, and settings files.
 
 Click reads both (`envvar` of an option, `default_map` of a context): an option on the command line counts first, then
-the variable, then the file, then the default. Here is what click lacks: where the file lies, what it must not give
-because it may have come with the data, and what is said of it. What changes results is never silent: the settings in
-force are printed in one line.
+the variable, then the file, then the default. Here is what click lacks: where the files lie, and what is said of them.
+A file that the user names or keeps in his own folder may give any option. A wavebatch.toml beside the inputs may have
+come with them: it gives only the options of HARMLESS. What changes results is never silent: the settings in force are
+printed in one line.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import difflib
 import glob
 import os
 import re
+import shlex
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,17 +29,28 @@ FILE = "wavebatch.toml"
 PREFIX = "WAVEBATCH_"
 
 READ = "wavebatch.settings_read"
-"""Key of a context's `meta`: the file that was read."""
+"""Key of a context's `meta`: values by option, of each file that was read; the first file counts first."""
 
 _ORDER = (ParameterSource.COMMANDLINE, ParameterSource.ENVIRONMENT, ParameterSource.DEFAULT_MAP)
 """What counts first."""
 
-NEVER = ("overwrite", "force", "help", "debug")
-"""Options that are given on the command line only: they may destroy files, or hide that a result is wrong."""
+NO_VARIABLE = ("overwrite", "force", "help", "debug")
+"""Options that no variable gives: they may destroy files, or hide that a result is wrong."""
 
-IN_NO_FILE = {"run": ("report", "resume", "scheduler"), "import": ("resume",)}
-"""Options by command that replace files without --overwrite, or trust other machines: wavebatch.toml may have come with
-the data."""
+HARMLESS = frozenset({
+    "attenuation", "attenuation-error", "bbox", "classes", "columns", "direction", "divergence", "drop-flags", "flags",
+    "flight-height", "headerless", "lever-arm", "names", "no-data", "points", "profile", "reflectance-ratio",
+    "tolerance", "visibility", "wavelength", "where",
+})  # fmt: skip
+"""All options that a file beside the inputs may give: they change numbers of the result. None names a file, folder,
+address or plug-in, replaces or hides anything, or decides how much of the machine is used: `format` decides which files
+--overwrite replaces, `crs` may name a grid file, `energy` a file. A new option is not harmless until it is listed."""
+
+LONGEST = 4096
+"""Most characters of a value from a file beside the inputs: messages show it."""
+
+MOST_BYTES = 1 << 20
+"""Largest settings file: a table for each command with all of its options takes 10 kB."""
 
 SIMILAR = 0.74
 """Least similarity of a variable that no command reads to one that is read, for a warning: JBOS to JOBS is 0.75."""
@@ -53,7 +66,7 @@ _INPUTS = ("strips", "strip", "clouds", "files", "cloud", "a")
 def add_variables(command: click.Command, title: str) -> None:
     """Let each option of a command be given by a variable: WAVEBATCH_RUN_JOBS counts before WAVEBATCH_JOBS."""
     for option in command.params:
-        if isinstance(option, click.Option) and option.name not in NEVER:
+        if isinstance(option, click.Option) and option.name not in NO_VARIABLE:
             words = re.sub("[- ]", "_", f"{title} {_option_name(option)}").upper()
             general = _option_name(option).replace("-", "_").upper()
             own = [option.envvar] if isinstance(option.envvar, str) else []
@@ -61,15 +74,29 @@ def add_variables(command: click.Command, title: str) -> None:
 
 
 def read_settings(command: click.Command, title: str, context: click.Context, arguments: list[str]) -> None:
-    """Take the command's table of wavebatch.toml beside the inputs as defaults; click's errors for a wrong one."""
+    """Take the command's tables of the settings files as defaults; click's errors for a wrong one.
+
+    A file that the user names is the only one. Without it, that beside the inputs counts before that of the user.
+    """
     try:
         parsed, _, _ = command.make_parser(click.Context(command)).parse_args(list(arguments))
     except click.UsageError:
         return  # the real parsing says what is wrong
-    path = _find_file(parsed)
-    if path is not None:
-        context.meta[READ] = path
-        context.default_map = _read_file(path, title, _list_options(command))
+    options = _list_options(command)
+    named = parsed.get("config") or options["config"].resolve_envvar_value(context)
+    own = Path(named or os.path.join(click.get_app_dir("wavebatch"), FILE))
+    beside = None if named else _find_file(parsed)
+    found: dict[Path, dict[str, Any]] = {}
+    if beside is not None:
+        found[beside] = _read_file(beside, title, options, is_users=False)
+    if named or os.path.isfile(own):
+        given = {name for values in found.values() for name in values}
+        barred = given.union(*(rivals for rivals in EXCLUSIVE if given.intersection(rivals)))
+        values = _read_file(own, title, options, is_users=True)
+        found[own] = {name: value for name, value in values.items() if name not in barred}
+    if found:
+        context.meta[READ] = found
+        context.default_map = {name: value for values in found.values() for name, value in values.items()}
 
 
 def drop_rivals(context: click.Context) -> None:
@@ -96,7 +123,8 @@ def tell_settings(context: click.Context) -> None:
     for name, option in _list_options(context.command).items():
         source = context.get_parameter_source(name)
         if source is ParameterSource.DEFAULT_MAP:
-            value, place = context.default_map[name], str(context.meta[READ])
+            place, value = next((str(path), values[name]) for path, values in context.meta[READ].items()
+                                if name in values)  # fmt: skip
         elif source is ParameterSource.ENVIRONMENT:
             place = next(variable for variable in option.envvar if os.environ.get(variable))
             value = os.environ[place]
@@ -123,7 +151,7 @@ def _find_strangers(context: click.Context) -> Iterator[str]:
         near = difflib.get_close_matches(name, known, 1, SIMILAR)
         if name in known:
             continue
-        if name.lower().rpartition("_")[2] in NEVER:
+        if name.lower().rpartition("_")[2] in NO_VARIABLE:
             yield f"{PREFIX}{name} is ignored: this option can be given on the command line only"
         elif near or name.startswith(prefixes):
             meant = f"did you mean {PREFIX}{near[0]}?" if near else "see --help for the names"
@@ -167,7 +195,8 @@ def _find_file(parsed: Mapping[str, Any]) -> Path | None:
         found[os.path.realpath(path) if os.path.isfile(path) else ""] = path
     if len(found) > 1:
         files = ", ".join(str(path) for key, path in found.items() if key)
-        raise click.UsageError(f"the inputs lie in folders with different settings ({files}); run them one by one")
+        raise click.UsageError(f"the inputs lie in folders with different settings ({files}); run them one by one, or "
+                               "give --config FILE")
     return next((path for key, path in found.items() if key), None)
 
 
@@ -182,34 +211,43 @@ def _folder(word: str) -> Path:
     return parent
 
 
-def _read_file(path: Path, title: str, options: Mapping[str, click.Option]) -> dict[str, Any]:
-    """Values of the command's table in the file, by name of the parameter; ConfigError becomes wrong usage."""
+def _read_file(path: Path, title: str, options: Mapping[str, click.Option], *, is_users: bool) -> dict[str, Any]:
+    """Values of the command's table in the file, by name of the parameter; ConfigError becomes wrong usage.
+
+    is_users: the user named the file or keeps it; else it may have come with the data.
+    """
     from wavebatch.files.text_file import read_text
-    from wavebatch.files.toml_file import parse_toml
+    from wavebatch.files.toml_file import parse_toml, shorten
 
     try:
-        table: Any = parse_toml(read_text(path, "settings file"), str(path)).values
+        table: Any = parse_toml(read_text(path, "settings file", MOST_BYTES), str(path)).values
     except ConfigError as error:
         raise click.UsageError(str(error)) from error
     for part in title.split():
         table = table.get(part, {}) if isinstance(table, dict) else {}
     if not isinstance(table, dict):
         raise click.UsageError(f"{path}: [{title}] must be a table of options")
-    known = {_option_name(one): name for name, one in options.items()}
+    known = {_option_name(one): name for name, one in options.items() if name != "config"}
     found = {}
     for key, value in table.items():
         if isinstance(value, dict):
             continue
         key = OLD_NAMES.get(f"--{key}", key).removeprefix("--") if key not in known else key
         if key not in known:
-            raise click.UsageError(f"{path}: [{title}] has no option {key!r}; {nearest(key, list(known))}")
-        if known[key] in NEVER:
-            raise click.UsageError(f"{path}: {key} can be given on the command line only; remove it from the file")
-        if known[key] in IN_NO_FILE.get(title, ()):
-            where = "on the command line or in a variable only, since the file may have come with the data"
-            raise click.UsageError(f"{path}: {key} can be given {where}; remove it")
+            raise click.UsageError(f"{path}: [{title}] has no option {shorten(key)}; {nearest(key, list(known))}")
+        if not is_users and not _is_harmless(key, value):
+            raise click.UsageError(
+                f"{path}: [{title}] must not set {key} so: a file that lies with the data may change numbers only; "
+                f"remove the line, or, if the whole file can be trusted, give --config {shlex.quote(str(path))}"
+            )
         found[known[key]] = _convert(value, options[known[key]], path)
     return found
+
+
+def _is_harmless(key: str, value: Any) -> bool:
+    """Whether a file that came with the data may set an option to this value."""
+    # A profile may also be the path of a chain file.
+    return key in HARMLESS and len(str(value)) <= LONGEST and (key != "profile" or str(value).isidentifier())
 
 
 def _convert(value: Any, option: click.Option, path: Path) -> Any:

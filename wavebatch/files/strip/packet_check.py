@@ -43,13 +43,15 @@ class Reason(IntEnum):
     OVERFULL = 7
     PACKED = 8
     DAMAGED = 9
+    CUT = 10
 
 
 REASON_TEXTS = {
     Reason.NO_DESCRIPTOR: "refer to a descriptor that the header does not have",
     Reason.BAD_DESCRIPTOR: "refer to a descriptor that is empty, too long, without spacing, or of more than 32 bits",
     Reason.EMPTY: "have a packet without a whole sample",
-    Reason.OUTSIDE: "have a packet outside the waveform data",
+    Reason.CUT: "have a packet past the end of the waveform data",
+    Reason.OUTSIDE: "have a packet before the start of the waveform data",
     Reason.NO_GEOMETRY: "have an impossible return location or packet vector (not a number, 0, or far too long)",
     Reason.OVERFULL: "share one packet with more points than a pulse can have",
     Reason.PACKED: "have samples of other than 8, 16 or 32 bits, and a packet size that fits neither whole bytes "
@@ -142,14 +144,15 @@ class Judge:
         packed = (size == self._packed[index]) & ~packs
         n_samples = np.where(packed, self._samples[index], n_samples)
         room = self._end - np.where(packed | packs, size, n_samples * self._width[index])
-        inside = (room >= 0) & (offset <= np.maximum(room, 0).astype(np.uint64)) & (offset >= np.uint64(self._least))
+        inside = (room >= 0) & (offset <= np.maximum(room, 0).astype(np.uint64))
         keys = (offset << INDEX_BITS) | index
         reason = np.zeros(len(points), np.uint8)
         if overfull is not None and len(overfull):
             place = np.minimum(np.searchsorted(overfull, keys), len(overfull) - 1)
             reason[overfull[place] == keys] = Reason.OVERFULL
         reason[~_has_geometry(points, form)] = Reason.NO_GEOMETRY
-        reason[~inside] = Reason.OUTSIDE
+        reason[~inside] = Reason.CUT
+        reason[offset < np.uint64(self._least)] = Reason.OUTSIDE
         reason[n_samples == 0] = Reason.EMPTY
         reason[self._odd[index] & (n_samples < self._samples[index])] = Reason.PACKED
         reason[~self._good[index]] = Reason.BAD_DESCRIPTOR

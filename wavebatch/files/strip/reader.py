@@ -7,7 +7,7 @@ exactly one of them; results must not depend on blocks or processes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
+from wavebatch.files.strip.packet_owner import compare_returns, is_strange, sample_size
 from wavebatch.files.strip.packet_vectors import OPTIONS, Decision, read_toward
 from wavebatch.files.strip.packets import PacketFile, block_rows
 from wavebatch.files.strip.sample_form import PLAIN, SampleForm, read_samples
@@ -38,6 +39,10 @@ UNIT_BYTES = 1 << 26
 """Most bytes of points per unit: very long records make smaller units."""
 _SAMPLED_UNITS = 16
 """Units that a sample is read from: enough to cover the strip, few enough to be fast."""
+
+LONG, LONG_SAMPLES = 2048, 1 << 17
+"""Of waveforms with more samples than LONG a sample of the strip has at most LONG_SAMPLES samples. No sensor records so
+much of one pulse; where all of it is echoes, a survey takes 50 us per sample, twenty times as long as the chain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,16 +133,42 @@ class StripReader(Closing):
         self._points.close()
         self._packets.close()
 
-    def scan(self, *, tolerant: bool = False) -> StripScan:
-        """Return the result of one pass over the point records; samples of a few packets are read.
+    def scan(self, *, tolerant: bool = False, force: bool = False) -> StripScan:
+        """Return the result of one pass over the point records; samples of some packets are read.
 
-        tolerant: put reasons against processing into `problems` instead of raising InputError.
+        tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
+        packets of another strip.
         """
         scan = scan_strip(self.facts, self._points, self._packets, self._unit_points())
+        if not scan.problems and (stranger := self._find_stranger(scan)):
+            remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
+            scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
         if scan.problems and not tolerant:
             scan.close()
             raise InputError(f"{self.facts.path}: {scan.problems[0]}")
         return scan
+
+    def _find_stranger(self, scan: StripScan) -> str:
+        """Why the packets of the .wdp are certainly those of another strip; empty where they may be its own."""
+        if not scan.with_waveform or self.facts.packets.internal:
+            return ""
+        used = scan.by_descriptor.keys() & self.facts.digitizers
+        longest = max(self.facts.digitizers[index].n_samples for index in used)
+        table = compare_returns(self._sample_returns(scan, sample_size(longest)))
+        if not is_strange(table):
+            return ""
+        return (
+            f"{self.facts.packets.file.name} belongs to another strip: in a sample of {len(table)} packets, returns "
+            "lie on echoes no more often than by chance, and are not as strong as these"
+        )
+
+    def _sample_returns(self, scan: StripScan, n_waveforms: int) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
+        """Yield about `n_waveforms` waveforms, each block with the intensities of its returns."""
+        for unit, rows in self.sample_units(scan, n_waveforms):
+            for block, _ in self.read_rows(unit, rows, n_waveforms):
+                # The few returns that stand in another unit get the intensity of a point of this one.
+                near = np.clip(block.returns.point - unit.start, 0, len(unit.points) - 1)
+                yield block, unit.points["intensity"][near].astype(float)
 
     def unit_count(self) -> int:
         """Return the number of units."""
@@ -202,14 +233,26 @@ class StripReader(Closing):
             for block, _ in self.read_blocks(unit, size, owned_only=True):
                 yield block
 
-    def sample_blocks(self, scan: StripScan, n_waveforms: int, size: int = 4096) -> Iterator[WaveformBlock]:
+    def sample_blocks(
+        self, scan: StripScan, n_waveforms: int, size: int = 4096, *, long_samples: int = LONG_SAMPLES
+    ) -> Iterator[WaveformBlock]:
         """Yield about `n_waveforms` waveforms spread evenly over the strip, the same ones every time.
+
+        Fewer of those longer than LONG, so that they have at most `long_samples` samples together.
 
         Within a unit the packets are taken in the order of their bytes, and blocks come in that order: a survey of the
         strip does not change where its points are sorted in another way.
         """
         if n_waveforms <= 0:
             return
+        for unit, rows in self.sample_units(scan, n_waveforms, long_samples):
+            for block, _ in self.read_rows(unit, rows, size):
+                yield block
+
+    def sample_units(
+        self, scan: StripScan, n_waveforms: int, long_samples: int = LONG_SAMPLES
+    ) -> Iterator[tuple[Unit, np.ndarray]]:
+        """Yield units, each with its rows (k,) of unit.packets that `sample_blocks` reads."""
         chosen = even_places(self.unit_count(), _SAMPLED_UNITS).tolist()
         left = n_waveforms
         for position, number in enumerate(chosen):
@@ -219,8 +262,9 @@ class StripReader(Closing):
             share = -(-left // (len(chosen) - position))
             rows = rows[even_places(len(rows), share)]
             left -= len(rows)
-            for block, _ in self.read_rows(unit, rows, size):
-                yield block
+            rows, taken = _thin_long(rows, unit.packets.n_samples[rows], long_samples // (len(chosen) - position))
+            long_samples -= taken
+            yield unit, rows
             if left <= 0:
                 return
 
@@ -269,6 +313,15 @@ class StripReader(Closing):
                 yield samples, digitizer, chosen
 
 
+def _thin_long(rows: np.ndarray, length: np.ndarray, room: int) -> tuple[np.ndarray, int]:
+    """Rows without so many of those longer than LONG that the others have at most `room` samples; and these samples."""
+    long = np.flatnonzero(length > LONG)
+    if length[long].sum() <= room:
+        return rows, int(length[long].sum())
+    kept = long[even_places(len(long), room // int(length.max()))]
+    return rows[np.union1d(np.flatnonzero(length <= LONG), kept)], int(length[kept].sum())
+
+
 class _Geometry:
     """Positions and returns of the waveforms of a unit."""
 
@@ -307,7 +360,7 @@ class _Geometry:
             returns=ReturnTable(
                 np.repeat(np.arange(len(rows), dtype=np.int32), counts), location / PS_PER_NS, self._index[place], xyz
             ),
-            scanner=_read_scanner(lead),
+            scanner=read_scanner(lead),
             missing=missing,
         )
 
@@ -320,7 +373,7 @@ class _Geometry:
         return take_records(self._all, entries)
 
 
-def _read_scanner(records: np.ndarray) -> np.ndarray | None:
+def read_scanner(records: np.ndarray) -> np.ndarray | None:
     """Scanner channels of records (n,), u1 (n,); None for point formats 4 and 5."""
     if "classification_flags" not in records.dtype.names:
         return None

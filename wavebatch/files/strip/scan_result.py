@@ -53,11 +53,18 @@ class StripScan(Closing):
     """Reasons why the strip cannot be processed; empty unless the scan was `tolerant`."""
     forms: Mapping[int, SampleForm]
     """How samples are stored, by descriptor index; only descriptors whose counts are not simply read as they are."""
+    stranger: str = ""
+    """Why the packets are certainly those of another strip; empty where they are not, or where it was not asked."""
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know about how samples are stored, one line each."""
         return tuple(note for form in self.forms.values() for note in form.notes)
+
+    @property
+    def cut(self) -> int:
+        """Points whose packet lies past the end of the file: it is shorter than its packets need."""
+        return self.reasons.get(Reason.CUT, (0, 0))[0]
 
     @property
     def losses(self) -> tuple[str, ...]:
@@ -89,6 +96,7 @@ def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]])
 def describe_oddities(reasons: dict[Reason, tuple[int, int]], short: int) -> Iterator[str]:
     """Yield warnings about a strip that can be processed."""
     for reason, (count, first) in reasons.items():
-        yield f"{count} points (first: point {first}) {REASON_TEXTS[reason]}; they are written unchanged"
+        remedy = "; get it again, whole, then run with --resume" if reason is Reason.CUT else ""
+        yield f"{count} points (first: point {first}) {REASON_TEXTS[reason]}; they are written unchanged{remedy}"
     if short:
         yield f"{short} points have packets with fewer samples than their descriptor gives; these samples are used"

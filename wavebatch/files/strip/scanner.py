@@ -25,10 +25,13 @@ from wavebatch.files.strip.packet_vectors import DirectionTally, decide, find_fo
 from wavebatch.files.strip.packets import PacketFile
 from wavebatch.files.strip.sample_form import FormSample, find_forms
 from wavebatch.files.strip.scan_result import StripScan, describe_hopeless, describe_oddities
-from wavebatch.files.strip.shared_packets import Groups, NearSharing, find_far, group_keys
+from wavebatch.files.strip.shared_packets import MAX_RETURNS, Groups, NearSharing, find_far, group_keys
 
 LONGEST_RUN = 64
 """Shorter runs of points with one GPS time (a pulse) are not cut by a border; longer ones are no pulses."""
+MOST_OVERLAP = 4
+"""Times that packets may claim the bytes of the waveform data: once is right, and damaged points claim some again. 1 MB
+of packets that begin a byte apart would be 1e9 samples. Returns far apart in the file claim their packet once each."""
 _PAIRS, _VOTERS = 4096, 256
 """Most pairs and points of a unit that vote on the direction of vectors."""
 _FAR_SAMPLES = 32
@@ -73,12 +76,15 @@ class _Scanner:
         self._judge = Judge(facts)
         self._form = find_form(self._take_first())
         self._tally, self._votes = _Tally(), DirectionTally(self._form)
+        self._claimed = 0
         self._borders = [0]
         units = -(-facts.header.point_count // unit_points)
         self._context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
         self._decoded = Spool(units, facts.dtype)
         self._keeps = facts.header.compressed
         low, high = facts.packets.offsets
+        self._widths = np.zeros(256, np.int64)
+        self._widths[list(facts.digitizers)] = [digitizer.width for digitizer in facts.digitizers.values()]
         self._near = NearSharing(low, max(low, high), self._context)
         self._window: list[_Part] = []
 
@@ -110,7 +116,7 @@ class _Scanner:
             self._context.close()
             self._decoded.close()
             raise
-        return self._finish(packets - len(overfull), reach, overfull)
+        return self._finish(packets - len(overfull), reach, overfull, MAX_RETURNS if suspects.any() else MOST_OVERLAP)
 
     def _cut_units(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yields first index and points of each unit, and collects the borders."""
@@ -157,7 +163,10 @@ class _Scanner:
         own = np.arange(len(parts.keys)) >= len(parts.keys) - len(rows)
         groups = self._near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
         first = groups.order[groups.starts] - (len(parts.keys) - len(rows))
-        self._sample.add(judged, rows[first[first >= 0]])
+        new = rows[first[first >= 0]]
+        self._sample.add(judged, new)
+        width = np.take(self._widths, points["wavepacket_index"][new])
+        self._claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
         if len(rows):
             self._votes.add_points(take_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
             self._vote(groups, parts, own)
@@ -232,7 +241,8 @@ class _Scanner:
             self._tally.reasons[Reason.OVERFULL] += many
             self._tally.reasons[Reason.USABLE] -= many
 
-    def _finish(self, packets: int, reach: int, overfull: np.ndarray) -> StripScan:
+    def _finish(self, packets: int, reach: int, overfull: np.ndarray, most: int) -> StripScan:
+        """most: how many times packets may claim the bytes that are there."""
         tally, facts, points = self._tally, self._facts, self._facts.header.point_count
         usable, missing = int(tally.reasons[Reason.USABLE]), int(tally.reasons[Reason.NO_WAVEFORM])
         decision = decide(self._votes, facts.direction_option, metres_per_unit(facts.units)[0])
@@ -240,6 +250,12 @@ class _Scanner:
         problems = list(decision.problems)
         if not usable and missing < points:
             problems.insert(0, describe_hopeless(facts, reasons))
+        low, high = facts.packets.offsets
+        if self._claimed > most * max(high - low, 0):
+            problems.append(
+                f"packets overlap: they claim {self._claimed:,} bytes of {high - low:,}; the strip is damaged, or its "
+                "packets belong to another one: get both again"
+            )
         return StripScan(
             points=points,
             with_waveform=usable,

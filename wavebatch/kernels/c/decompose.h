@@ -48,6 +48,12 @@ static int is_resolved(const Solution *s) {
     return 1;
 }
 
+/* Whether fits of a window may grow: not where it is wider than the most echoes side by side, each as wide as an echo can
+   be. No more echoes explain such a run, and trying them takes ten times as long, for runs of up to 65,535 samples. */
+static int may_grow(const Settings *s, const Window *w) {
+    return s->grow && w->n <= s->max_echoes * 2 * HERMITE_REACH * s->width_high;
+}
+
 /* Fall of chi2 that one more echo needs: the acceptance, and what a misfit of the pulse model may explain (R3). */
 static double least_fall(const Settings *s, int64_t k, const double *parameters, double std) {
     const double *amplitude = parameters, *width = parameters + 2 * k;
@@ -79,7 +85,7 @@ static int grow_window(const Settings *s, const Limits *limits, Work *work) {
         describe_fit(limits, work, &work->trial);
         if (target < INFINITY && !is_resolved(&work->trial)) return 0;
         exchange(&work->trial, &work->best);
-        if (!work->fit.converged || !s->grow || k >= s->max_echoes) return 0;
+        if (!work->fit.converged || !may_grow(s, &work->window) || k >= s->max_echoes) return 0;
         hermite_moments(work, &work->fit);
         if (!is_misfit(s, work, &work->fit)) return 0;
         if (!reserve(work, k + 1, work->window.vectors)) return -1;
@@ -114,7 +120,7 @@ static int decompose_window(const Settings *s, const Clusters *clusters, int64_t
     if (!set_starts(clusters, cluster, work) || grow_window(s, &limits, work) < 0) return -1;
     const int64_t k = work->best.k;
     const double cost = work->best.cost, fall = least_fall(s, k, work->best.parameters, work->window.std);
-    if (!s->grow || cost - work->window.used < fall) return 0;
+    if (!may_grow(s, &work->window) || cost - work->window.used < fall) return 0;
     exchange(&work->best, &work->spare);
     narrow.low[2] = fmax(limits.low[2], s->width_ref / BREATH);
     narrow.high[2] = fmin(limits.high[2], s->width_ref * BREATH);

@@ -35,6 +35,76 @@ def find_pulses(gps_time: np.ndarray) -> np.ndarray:
     return np.where(alone, np.arange(n), np.repeat(start, length))
 
 
+ALIGNED = 1e-4
+"""Largest difference of the directions of a pulse's packets [rad]: they differ by 6e-6 on real strips, those of pulses
+that follow each other by 2e-4 and more."""
+
+BESIDE = 0.1
+"""Largest distance between the rays of a pulse's packets [m]: coordinates are rounded to centimetres, and footprints
+are wider."""
+
+
+def group_times(gps_time: np.ndarray) -> np.ndarray:
+    """First packet of equal GPS time, of each packet, wherever it stands.
+
+    Where the time is 0 or not a number, or the same for LONGEST_PULSE packets or more, each packet is alone.
+
+    Parameters
+    ----------
+    gps_time : float64 (n,), s
+
+    Returns
+    -------
+    int64 (n,)
+    """
+    time = np.nan_to_num(gps_time, nan=0.0)
+    _, first, group, count = np.unique(time, return_index=True, return_inverse=True, return_counts=True)
+    alone = (count >= LONGEST_PULSE)[group] | (time == 0)
+    return np.where(alone, np.arange(len(time)), first[group])
+
+
+def find_rays(group: np.ndarray, scanner: np.ndarray, start: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """First packet of the pulse that each packet belongs to: of equal time, from one scanner, and on one line.
+
+    Parameters
+    ----------
+    group : int64 (n,)
+        Equal for packets of equal time.
+    scanner : int (n,)
+    start, step : float64 (n, 3), m, m/ns
+        A position on each ray, and its direction.
+
+    Returns
+    -------
+    int64 (n,)
+    """
+    ray, left = np.arange(len(group)), np.lexsort((scanner, group))
+    while len(left):
+        new = np.append(True, (np.diff(group[left]) != 0) | (np.diff(scanner[left]) != 0))
+        head = left[np.flatnonzero(new)[np.cumsum(new) - 1]]
+        turn = step[left] - step[head]
+        same = (turn * turn).sum(axis=1) <= ALIGNED**2 * (step[head] * step[head]).sum(axis=1)
+        same = (same & on_ray(start[left], start[head], step[head])) | (left == head)
+        ray[left[same]] = head[same]
+        left = left[~same]
+    return ray
+
+
+def along_ray(place: np.ndarray, start: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Time (n,) [ns] at which rays from `start` pass nearest to positions (n, 3); NaN for rays without direction."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return ((place - start) * step).sum(axis=1) / (step * step).sum(axis=1)
+
+
+def on_ray(place: np.ndarray, start: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Whether positions (n, 3) lie on the rays, bool (n,)."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        way = step * along_ray(place, start, step)[:, None]
+        off = place - start - way
+        allowed = BESIDE + ALIGNED * np.sqrt((way * way).sum(axis=1))
+        return (off * off).sum(axis=1) <= allowed**2
+
+
 def find_nearest(
     echo_waveform: np.ndarray, echo_time: np.ndarray, return_waveform: np.ndarray, return_time: np.ndarray
 ) -> np.ndarray:

@@ -36,6 +36,17 @@ class Crossings(NamedTuple):
     """The voxel, int64 (m, 3)."""
 
 
+class Samples(NamedTuple):
+    """Samples with signal along rays, ray after ray, each in the order of time."""
+
+    time: np.ndarray
+    """Middle of the sample, float64 (m,), ns."""
+    spacing: np.ndarray
+    """Time that it spans, float64 (m,), ns."""
+    value: np.ndarray
+    """What is summed, in units so small that whole numbers do: sums then depend on no order. int64 (m, k)."""
+
+
 def fits_keys(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float) -> np.ndarray:
     """Rays that stay where keys reach and cross at most MOST_STEPS voxels per axis.
 
@@ -149,38 +160,42 @@ def unpack_index(key: np.ndarray) -> np.ndarray:
     return index
 
 
-def accumulate_profile(profile: np.ndarray) -> np.ndarray:
-    """Sum of profiles (n, s) up to the end of each sample, float64 (n, s + 1), added in order of the samples."""
-    total = np.zeros((profile.shape[0], profile.shape[1] + 1))
-    np.cumsum(profile, axis=1, out=total[:, 1:])
-    return total
-
-
-def total_until(total: np.ndarray, ray: np.ndarray, time: np.ndarray, spacing: float) -> np.ndarray:
-    """The part of each ray's profile before a time.
+def sum_before(
+    samples: Samples, first: np.ndarray, count: np.ndarray, ray: np.ndarray, time: np.ndarray
+) -> np.ndarray:
+    """Sums of the samples of each ray up to given times.
 
     Parameters
     ----------
-    total : float64 (n, s + 1)
-        From `accumulate_profile`.
+    samples : Samples
+        Of all rays, ray after ray, in the order of time.
+    first, count : int64 (n,)
+        The samples of each ray.
     ray : int64 (m,)
         Number of the ray.
     time : float64 (m,), ns
-        After sample 0.
-    spacing : float, ns
-        Time between two samples; each sample is spread evenly from half a spacing before it to half a spacing after it.
 
     Returns
     -------
-    float64 (m,)
+    int64 (m, k)
+        A sample counts evenly from half its spacing before its time to half its spacing after it.
     """
-    s = total.shape[1] - 1
-    place = np.clip(time / spacing + 0.5, 0.0, s)
-    sample = np.minimum(place.astype(np.int64), s - 1)
-    flat = total.reshape(-1)
-    at = ray * (s + 1) + sample
-    before = flat[at]
-    return before + (place - sample) * (flat[at + 1] - before)
+    edge = samples.time - 0.5 * samples.spacing
+    low, high = first[ray], first[ray] + count[ray]
+    base = low
+    # Bisection: the number of samples of the ray that begin before the time.
+    for _ in range(int(count.max(initial=0)).bit_length()):
+        middle = (low + high) // 2
+        right = (low < high) & (edge[np.minimum(middle, len(edge) - 1)] < time)
+        low, high = np.where(right, middle + 1, low), np.where(right, high, np.minimum(middle, high))
+    total = np.zeros((len(samples.value) + 1, samples.value.shape[1]), np.int64)
+    np.cumsum(samples.value, axis=0, out=total[1:])
+    sums = total[low] - total[base]
+    begun = np.flatnonzero(low > base)
+    last = low[begun] - 1
+    after = np.clip(1.0 - (time[begun] - edge[last]) / samples.spacing[last], 0.0, 1.0)
+    sums[begun] -= np.rint(samples.value[last] * after[:, None]).astype(np.int64)
+    return sums
 
 
 def differences_along(values: np.ndarray, ray: np.ndarray, last: np.ndarray) -> np.ndarray:
@@ -188,16 +203,16 @@ def differences_along(values: np.ndarray, ray: np.ndarray, last: np.ndarray) -> 
 
     Parameters
     ----------
-    values : float64 (m,)
+    values : int64 (m, k)
         Sums at the entry of each voxel, 0 at the first voxel of every ray.
     ray : int64 (m,)
         Number of the ray, ascending.
-    last : float64 (n,)
+    last : int64 (n, k)
         Sums of whole rays.
 
     Returns
     -------
-    float64 (m,)
+    int64 (m, k)
         The differences of a ray add up to its `last` exactly.
     """
     after = np.empty_like(values)

@@ -18,16 +18,20 @@ LEAST_PULSES = 100
 LEAST_SPREAD = 0.1
 """Smallest standard deviation of the ground's share of the light: below, nothing shows what it counts."""
 
-LARGEST_ERROR = 0.25
-"""Largest relative error of a ratio that is used."""
+LARGEST_ERROR = 0.5
+"""Largest relative error of a ratio that is used: a ratio of 1 that nothing supports is off by more."""
 
 LOWEST, HIGHEST = 0.02, 50.0
 """Ratios that are looked for."""
 
 MODEL_ERROR = 0.03
 """Least relative error of a ratio. Besides, light that varies from pulse to pulse by a relative s moves the ratio by up
-to s^2 (simulated: 3 to 10 % for reflectances that vary by a fifth).
+to s^2 (simulated: 3 to 10 % for reflectances that vary by a fifth), and pulses that do not fit it at all, as those on a
+second kind of soil, by as much as they differ.
 """
+
+_MOST_UNLIKE = np.log(4.0)
+"""Pulses whose light differs by more have hardly any: they tell nothing about reflectances."""
 
 PARTS = 10
 """Parts of the strip; the error is found from leaving out one after the other."""
@@ -78,7 +82,8 @@ def estimate_canopy_ratio(canopy: np.ndarray, ground: np.ndarray) -> CanopyRatio
     if any(other is None for other in others):
         return None
     error = float(np.sqrt((PARTS - 1) * np.mean((np.array(others) - np.mean(others)) ** 2)))
-    error = float(np.hypot(np.hypot(error, MODEL_ERROR), _measure_scatter(canopy, ground, np.exp(found)) ** 2))
+    scatter, unlike = _measure_scatter(canopy, ground, np.exp(found))
+    error = float(np.sqrt(error**2 + MODEL_ERROR**2 + scatter**4 + unlike**2))
     return CanopyRatio(float(np.exp(found)), float(np.exp(found) * error)) if error < LARGEST_ERROR else None
 
 
@@ -104,10 +109,13 @@ def _share(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> np.ndarray:
     return ratio * ground / (canopy + ratio * ground)
 
 
-def _measure_scatter(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> float:
-    """Robust relative standard deviation of the light of pulses."""
+def _measure_scatter(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> tuple[float, float]:
+    """Robust relative standard deviation of the light of pulses, and what pulses beyond it add."""
     light = np.log(canopy + ratio * ground)
-    return MAD_TO_STD * float(np.median(np.abs(light - np.median(light))))
+    off = np.abs(light - np.median(light))
+    scatter = MAD_TO_STD * float(np.median(off))
+    beyond = (off > _CLIP * scatter) & (off < _MOST_UNLIKE)
+    return scatter, float(np.sqrt(np.mean(np.where(beyond, off, 0.0) ** 2)))
 
 
 def _slope(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> float:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
+from wavebatch.core.process import Seconds
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import Chain
 from wavebatch.tools.bench.worker import Worker, peak_memory
@@ -87,9 +88,9 @@ def _add_file_lap(lap: Laps, run: FileRun) -> None:
 
 def run_kernels(chain: Chain, block: WaveformBlock, system: SystemPulse) -> float:
     """Seconds for noise, detection and decomposition of the block."""
-    timing: dict[str, float] = {}
+    timing: dict[str, Seconds] = {}
     chain.run(block, system, timing)
-    return sum(timing.get(step.stage.name, 0.0) for step in chain.steps[:3])
+    return sum(timing[step.stage.name].wall for step in chain.steps[:3])
 
 
 def run_file(chain: Chain, strip: Path, folder: Path, jobs: int) -> FileRun:
@@ -102,4 +103,4 @@ def run_file(chain: Chain, strip: Path, folder: Path, jobs: int) -> FileRun:
         if outcome.error is not None:
             raise outcome.error
     timing = result.report.timing
-    return FileRun(seconds, sum(timing.get(name, 0.0) for name in PREPARATION), result.report.count("waveforms"))
+    return FileRun(seconds, sum(timing[name].wall for name in PREPARATION), result.report.count("waveforms"))

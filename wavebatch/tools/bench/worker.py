@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.core.errors import StageError
-from wavebatch.core.memory import CHILD
+from wavebatch.core.process import CHILD
 from wavebatch.files.disk.closing import Closing
 
 _START = "from wavebatch.tools.bench.worker import serve; serve()"
@@ -62,7 +62,7 @@ class Worker(Closing):
 
 def serve() -> None:
     """Answers calls on stdin until stdin ends; other output to stdout is sent to stderr."""
-    from wavebatch.core.memory import keep_freed_memory
+    from wavebatch.core.process import keep_freed_memory
 
     keep_freed_memory()
     replies = os.fdopen(os.dup(1), "wb")

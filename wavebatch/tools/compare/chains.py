@@ -15,6 +15,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
+from wavebatch.files.strip.packets import MAX_SAMPLES
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import list_profiles
@@ -106,14 +107,16 @@ def match_sides(
     if clouds and limit is not None:
         raise ConfigError(f"{clouds[0].name}: a cloud has the echoes of all waveforms; leave --limit out")
     check_tolerance(tolerance_ns)
-    with StripReader(strip) as reader, reader.scan() as scan:
+    with StripReader(strip) as reader, reader.scan(force=force) as scan:
         saved = None if survey is None else SavedSurvey(survey)
         request = Request(auto=True, system=saved, force=force)
         choice = prepare(reader, scan, widest_chain(), request, positions=Positions.NONE).choice
         chains = {key: side for key, side in (("a", a), ("b", b)) if side is not None and not side.is_cloud}
         system = choice.survey.system
         runs = {key: ChainRun(side.chain or choice.chain, system, tolerance_ns) for key, side in chains.items()}
-        blocks = reader.sample_blocks(scan, limit, _BLOCK) if limit is not None else reader.all_blocks(scan, _BLOCK)
+        blocks = reader.all_blocks(scan, _BLOCK)
+        if limit is not None:
+            blocks = reader.sample_blocks(scan, limit, _BLOCK, long_samples=limit * MAX_SAMPLES)
         if clouds:
             between = _match_cloud(blocks, Path(strip), a, b, runs, tolerance_ns)
         else:

@@ -14,6 +14,7 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.batch.report_file import cloud_path, report_path
 from wavebatch.batch.run import BatchResult, Outcome
+from wavebatch.core.errors import StripWarning
 from wavebatch.tools.html import markup
 from wavebatch.tools.html.charts import figures, figures_of
 from wavebatch.tools.html.outliers import FEWEST, FIGURES, describe_sensor, find_outliers, measure_strip
@@ -48,11 +49,12 @@ def write_run_page(target: Path, result: BatchResult, folder: Path, command: str
     """Write the page of a finished batch; folder: of its outputs. Raises InputError if it cannot be written."""
     strips = [_read_strip(outcome, place, folder) for place, outcome in enumerate(result.outcomes)]
     marks = find_outliers([strip.figures for strip in strips], [strip.sensor for strip in strips])
-    # Strips to look at come first where there are too many to show all.
-    order = sorted(strips, key=lambda strip: (not marks[strip.number], strip.number))
+    # Strips to look at come first, in the table and where there are too many to show all.
+    order = sorted(strips, key=lambda one: (not (one.outcome.error or one.outcome.report.warnings),
+                                            not marks[one.number], one.number))  # fmt: skip
     most = min(MOST_PARTS, 1 + result.report.count("waveforms") // PART_WAVEFORMS) if len(strips) > FEW else FEW
     shown = {strip.number for strip in [one for one in order if one.has_report][:most]}
-    write_page(target, _title(strips), _parts(result, strips, marks, shown, command))
+    write_page(target, _title(strips), _parts(result, order, marks, shown, command))
 
 
 def _title(strips: Sequence[_Strip]) -> str:
@@ -114,7 +116,8 @@ def _summary(result: BatchResult, counts: dict[str, Any]) -> str:
     passed = sum(counts["passed_through"].values())
     states = [outcome.status for outcome in result.outcomes]
     cards = [
-        ("strips written", f"{states.count('written') + states.count('skipped')} of {len(states)}"),
+        ("strips written", f"{len(states) - result.failed} of {len(states)}"),
+        ("with warnings", f"{sum(bool(outcome.report.warnings) for outcome in result.outcomes)}"),
         ("points in", f"{counts['points_in']:,}"),
         ("waveforms", f"{counts['waveforms']:,}"),
         ("echoes", f"{counts['echoes']:,}"),
@@ -126,13 +129,16 @@ def _summary(result: BatchResult, counts: dict[str, Any]) -> str:
     cards[-1:-1] = [("left out", f"{left:,}")] if left else []
     body = "".join(f'<div class="card"><b>{markup.text(value)}</b>{markup.text(name)}</div>' for name, value in cards)
     lines = [f"{states.count('skipped')} of the strips were up to date (--resume)."] if "skipped" in states else []
+    if "incomplete" in states:
+        lines.append(f"{states.count('incomplete')} of the strips are incomplete: packets are missing.")
     if advice := result.advice:
         lines.append(advice)
     return markup.section("Summary", f'<div class="cards">{body}</div>', *map(markup.paragraph, lines))
 
 
 def _index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set[int]) -> str:
-    head = ["strip", "status", "points in", "waveforms", "echoes", "points out", *(one[0] for one in FIGURES.values())]
+    head = ["strip", "status", "warnings", "points in", "waveforms", "echoes", "points out",
+            *(one[0] for one in FIGURES.values())]  # fmt: skip
     rows = []
     for strip in strips:
         counts = strip.outcome.report.to_json()["counts"]
@@ -140,6 +146,7 @@ def _index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set
         name, place = markup.text(strip.outcome.job.path.name), strip.number
         link = f'<a href="#strip-{place}">{name}</a>' if place in shown else name
         rows.append([markup.Cell(link, strip.outcome.job.path.name), strip.outcome.status,
+                     _warning_cell(strip.outcome.report.warnings),
                      *([None] * 4 if strip.outcome.status == "failed" else numbers),
                      *(_figure_cell(strip, key, marks[place]) for key in FIGURES)])  # fmt: skip
     notes = [
@@ -150,11 +157,20 @@ def _index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set
     ]
     if len(shown) < sum(strip.has_report for strip in strips):
         notes.append(
-            "Names with a link have a part below, marked strips first. For another strip: `wavebatch run STRIP -o DIR "
-            "--resume --html PAGE.html` with the same options."
+            "Names with a link have a part below, strips with warnings first. For another strip: `wavebatch run STRIP "
+            "-o DIR --resume --html PAGE.html` with the same options."
         )
     index = markup.table(head, rows, sortable=True, tall=True)
     return markup.section("Strips", *map(markup.paragraph, notes), markup.FILTER, index, mark="strips")
+
+
+def _warning_cell(warnings: Sequence[StripWarning]) -> markup.Cell:
+    """The codes of the warnings, and below them what they say."""
+    if not warnings:
+        return markup.Cell("", 0)
+    codes = markup.text(", ".join(dict.fromkeys(one.code for one in warnings)))
+    says = markup.bullets(one.text for one in warnings)
+    return markup.Cell(f'<details><summary class="mark">{codes}</summary>{says}</details>', len(warnings))
 
 
 def _figure_cell(strip: _Strip, key: str, marks: dict[str, str]) -> markup.Cell:
@@ -168,6 +184,6 @@ def _figure_cell(strip: _Strip, key: str, marks: dict[str, str]) -> markup.Cell:
 def _provenance(result: BatchResult, command: str) -> str:
     timing = result.to_json()["timing"]
     rows = {"wavebatch": __version__, "elapsed": f"{timing['elapsed_seconds']:.1f} s"}
-    if timing["waveforms_per_process_second"]:
-        rows["waveforms per second of the processes"] = f"{timing['waveforms_per_process_second']:,}"
+    if timing["waveforms_per_processor_second"]:
+        rows["waveforms per second of a processor"] = f"{timing['waveforms_per_processor_second']:,}"
     return markup.section("Run", markup.facts(rows), markup.code(command) if command else "", mark="run")

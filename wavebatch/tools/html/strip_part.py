@@ -29,7 +29,7 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
     """The sections of a strip, from its report; pictures that cannot be made say why."""
     found, survey = report["strip"], report["strip"]["survey"]
     read = read_survey(found)
-    warnings = markup.bullets([*report["warnings"], *report["remarks"]], "warning")
+    warnings = markup.bullets([*(one["text"] for one in report["warnings"]), *report["remarks"]], "warning")
     choice = report["choice"]
     parts = [
         warnings,
@@ -123,10 +123,12 @@ def _list_provenance(strip: Path, report: Mapping[str, Any]) -> list[str]:
         "wavebatch": report["version"],
     }
     options = json.dumps({**report["options"], **report["request"]}, indent=2, sort_keys=True, ensure_ascii=False)
-    seconds = [[name, value] for name, value in sorted(report["timing"]["seconds"].items())]
+    timing = report["timing"]
+    busy, wall = timing["processor_seconds"], timing["wall_seconds"]
+    seconds = [[name, busy[name], wall[name]] for name in sorted(busy)]
     return [
         markup.facts(rows),
         markup.section("Chain as it was used", markup.code(report["chain"]), level=4),
         markup.section("Options and request", markup.code(options), level=4),
-        markup.section("Seconds of the processes", markup.table(["task", "s"], seconds), level=4),
+        markup.section("Time", markup.table(["task", "processor [s]", "wall [s]"], seconds), level=4),
     ]

@@ -38,7 +38,8 @@ def _parts(
     like = document.get("looks_like")
     if like:
         rows["sensor"] = like["sentence"]
-    yield markup.section("Summary", markup.facts(rows))
+    doubts = markup.bullets([one["text"] for one in document["warnings"]], "warning")
+    yield markup.section("Summary", doubts, markup.facts(rows))
     if "strips" in document:
         yield _list_strips(document)
     yield markup.section("Survey", draw_survey(survey), mark="survey")

@@ -15,6 +15,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.strip.shared_packets import expand
+from wavebatch.kernels.geometry.group_returns import find_pulses
 from wavebatch.kernels.geometry.scan_lines import find_sweeps
 
 LEAST_PULSES = 8
@@ -22,13 +23,17 @@ LEAST_PULSES = 8
 MOST_PULSES = 16_384
 """Longer lines are cut: without a moving mirror, a strip would be one line and memory would not be bounded."""
 _BLOCK = 4096
+_SAME_RAY = 1e-4
+"""Largest relative difference of the directions of two waveforms of one pulse: they are in single precision. Pulses
+whose times are rounded to the same lie at least 10 cm apart at 1 km."""
 _FLOOR = 0.25
 """Quantile of a waveform that is used as its level without signal: signal fills less than three quarters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pulses:
-    """n pulses in file order, with count[i] samples of pulse i in `values`, one pulse after the other."""
+    """n pulses, or first their waveforms, in file order, with count[i] samples of pulse i in `time` and `values`, one
+    pulse after the other."""
 
     point: np.ndarray
     gps_time: np.ndarray
@@ -36,6 +41,8 @@ class _Pulses:
     direction: np.ndarray
     spacing: np.ndarray
     count: np.ndarray
+    time: np.ndarray
+    """After sample 0 [ns], of each sample."""
     values: np.ndarray
 
     def __len__(self) -> int:
@@ -43,13 +50,14 @@ class _Pulses:
 
     @property
     def first(self) -> np.ndarray:
-        """Where the samples of each pulse begin in `values`."""
+        """Where the samples of each pulse begin."""
         return np.cumsum(self.count) - self.count
 
     def take(self, rows: np.ndarray) -> _Pulses:
         """Some pulses, with only their samples."""
-        kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[:-1]}
-        return _Pulses(**kept, values=self.values[expand(self.first[rows], kept["count"])])
+        kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[:-2]}
+        samples = expand(self.first[rows], kept["count"])
+        return _Pulses(**kept, time=self.time[samples], values=self.values[samples])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +100,7 @@ def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
         if not parts:
             continue
         pulses = _join(parts)
-        pulses = pulses.take(np.argsort(pulses.point, kind="stable"))
+        pulses = _join_waveforms(pulses.take(np.argsort(pulses.point, kind="stable")))
         axis = _find_across(pulses.direction) if axis is None else axis
         edges = _cut_long(np.append(find_sweeps(_measure_angle(pulses, axis), pulses.gps_time), len(pulses)))
         last = unit.number == reader.unit_count() - 1
@@ -125,12 +133,29 @@ def _shape(block: WaveformBlock) -> _Pulses:
     if block.missing is not None:
         values[block.missing] = np.nan
     place = (block.point, block.gps_time, block.origin, block.direction)
-    return _Pulses(*place, np.full(n, block.spacing), np.full(n, s), values.reshape(-1))
+    time = np.tile(np.arange(s) * block.spacing, n)
+    return _Pulses(*place, np.full(n, block.spacing), np.full(n, s), time, values.reshape(-1))
 
 
 def _join(parts: list[_Pulses]) -> _Pulses:
     names = [field.name for field in fields(_Pulses)]
     return _Pulses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def _join_waveforms(waveforms: _Pulses) -> _Pulses:
+    """Pulses from waveforms in file order: those of one time and direction are one pulse, the earliest first."""
+    ray, n = waveforms.direction, len(waveforms)
+    new = find_pulses(waveforms.gps_time) == np.arange(n)
+    turned = np.linalg.norm(np.diff(ray, axis=0), axis=1) > _SAME_RAY * np.linalg.norm(ray[1:], axis=1)
+    new[1:] |= turned
+    start, pulse = np.flatnonzero(new), np.cumsum(new) - 1
+    lead = start[pulse]
+    lag = ((waveforms.origin - waveforms.origin[lead]) * ray[lead]).sum(axis=1) / (ray[lead] ** 2).sum(axis=1)
+    order = np.lexsort((lag, pulse))
+    waveforms, lag = waveforms.take(order), lag[order]
+    first = {field.name: getattr(waveforms, field.name)[start] for field in fields(waveforms)[:-3]}
+    time = waveforms.time + np.repeat(lag - lag[start][pulse], waveforms.count)
+    return _Pulses(**first, count=np.add.reduceat(waveforms.count, start), time=time, values=waveforms.values)
 
 
 def find_main_axis(apart: np.ndarray) -> np.ndarray:
@@ -157,9 +182,8 @@ def _cut_long(edges: np.ndarray) -> np.ndarray:
 
 def _build_line(number: int, pulses: _Pulses) -> ScanLine:
     row = np.repeat(np.arange(len(pulses)), pulses.count)
-    time = (np.arange(len(row)) - pulses.first[row]) * pulses.spacing[row]
     place, there = (pulses.point, pulses.gps_time, pulses.origin, pulses.direction), ~np.isnan(pulses.values)
-    return ScanLine(number, *place, float(pulses.spacing[0]), row[there], time[there], pulses.values[there])
+    return ScanLine(number, *place, float(pulses.spacing[0]), row[there], pulses.time[there], pulses.values[there])
 
 
 def align_times(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:

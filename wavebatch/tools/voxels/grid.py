@@ -14,16 +14,19 @@ import numpy as np
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.key_sums import HELD, KeyedSums
 from wavebatch.kernels.geometry.voxels import (
+    KEY_BITS,
     Crossings,
+    Samples,
     cross_voxels,
     differences_along,
     fits_keys,
     pack_index,
     split_rays,
-    total_until,
+    sum_before,
     unpack_index,
 )
-from wavebatch.tools.voxels.rays import RayTable, measure_lengths
+from wavebatch.tools.voxels.light import LightRule
+from wavebatch.tools.voxels.rays import Rays, measure_lengths
 
 LIGHT_UNIT = 2.0**-30
 """Unit in which light is summed [rays]."""
@@ -34,7 +37,16 @@ PATH_UNIT = 2.0**-20
 SECTION_UNIT = 2.0**-40
 """Unit in which cross sections are summed [m2]."""
 
-_RAYS, _LIGHT, _CAUGHT, _PATH, _ENERGY, _SECTION, _UNKNOWN = range(7)
+_RAYS, _LIGHT, _CAUGHT, _PATH, _ENERGY, _SQUARES, _CAUGHT_BY_RATIO, _LIGHT_BY_RATIO, _SECTION, _UNKNOWN = range(10)
+
+_NEXT_Y = np.uint64(1 << KEY_BITS[2])
+"""From the key of a voxel to that of its neighbour along y."""
+
+_CLASSES = 40
+"""Classes of voxels, by doublings of the rays in them."""
+
+_LEAST_PAIRS = 10.0
+"""Pairs of neighbours that weigh as much as the spread of all classes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +69,7 @@ COLUMNS = (
     VoxelColumn("path", "f4", "m", "length of these rays in it"),
     VoxelColumn("light", "f4", "rays", "light that reached it"),
     VoxelColumn("share", "f4", "-", "share of it returned here", -9999.0),
+    VoxelColumn("share_error", "f4", "-", "std of share, 1 sigma", -9999.0),
 )
 """Values of every voxel; cross_section only with a calibration."""
 
@@ -80,7 +93,7 @@ class VoxelGrid(Closing):
         self.size, self.anchor = size, anchor
         self.columns = tuple(column for column in COLUMNS if sections or column.name != "cross_section")
         self._unit, self._sections, self._everything = unit, sections, everything
-        self._sums = KeyedSums(7 if sections else 5, held=held)
+        self._sums = KeyedSums(10 if sections else 8, held=held)
         self._low = np.full(3, np.iinfo(np.int64).max)
         self._high = np.full(3, np.iinfo(np.int64).min)
         self._energy = 0
@@ -90,6 +103,8 @@ class VoxelGrid(Closing):
         """Rays left out: their position is not a number, or too far from all others."""
         self.unknown = 0
         """Rays with signal of unknown cross section."""
+        self.spread = np.ones(_CLASSES)
+        """Variance of shares over that of a binomial, by class of voxel."""
 
     def close(self) -> None:
         """Removes what lies on disk."""
@@ -110,18 +125,20 @@ class VoxelGrid(Closing):
         """Voxels from the least to the largest index that is kept, i8 (3,)."""
         return np.where(self._low > self._high, 0, self._high - self._low + 1)
 
-    def add(self, rays: RayTable, spacing: float) -> None:
-        """Adds the rays of a block; spacing: of their samples [ns]."""
-        local = rays.start - self.anchor * self.size
-        good = np.flatnonzero(fits_keys(local, rays.step, rays.begin, rays.end, self.size))
-        self.outside += len(local) - len(good)
-        self.rays += len(good)
+    def add(self, rays: Rays, rule: LightRule) -> None:
+        """Adds rays, with the light that the rule finds in them."""
+        local = rays.table["start"] - self.anchor * self.size
+        step, begin, end = (rays.table[name] for name in ("step", "begin", "end"))
+        good = fits_keys(local, step, begin, end, self.size)
+        self.outside += int(np.count_nonzero(~good))
+        self.unknown += int(rays.table["unknown"][good].sum())
+        good = np.flatnonzero(good)
         rays, local = rays.take(good), local[good]
-        self.unknown += int(rays.unknown.sum())
-        for part in split_rays(local, rays.step, rays.begin, rays.end, self.size):
-            some = rays.take(part)
-            found = cross_voxels(local[part], some.step, some.begin, some.end, self.size)
-            values = self._list_values(found, some, spacing)
+        step, begin, end = (rays.table[name] for name in ("step", "begin", "end"))
+        self.rays += len(good)
+        for part in split_rays(local, step, begin, end, self.size):
+            found = cross_voxels(local[part], step[part], begin[part], end[part], self.size)
+            values = self._list_values(found, rays.take(part), rule)
             kept = slice(None) if self._everything else values[:, _ENERGY] > 0
             index = found.index[kept]
             if len(index):
@@ -130,47 +147,91 @@ class VoxelGrid(Closing):
             self._energy += int(values[:, _ENERGY].sum())
             self._sums.add(pack_index(found.index), values)
 
-    def _list_values(self, found: Crossings, rays: RayTable, spacing: float) -> np.ndarray:
+    def _list_values(self, found: Crossings, rays: Rays, rule: LightRule) -> np.ndarray:
         """Values that every crossing adds to its voxel, i8 (m, columns); over a ray they add up to its total."""
-        ray = found.ray
+        ray, table, samples = found.ray, rays.table, rays.samples
         first = np.append(True, ray[1:] != ray[:-1])[: len(ray)]
-
-        def spread(total: np.ndarray, unit: float) -> np.ndarray:
-            before = np.where(first, 0.0, total_until(total, ray, found.enter, spacing))
-            return differences_along(_count(before, unit), ray, _count(total[:, -1], unit))
-
-        whole = rays.caught[:, -1:]
-        part = rays.caught / np.where(whole > 0, whole, 1.0)
-        values = np.zeros((len(ray), 7 if self._sections else 5), np.int64)
-        values[:, _RAYS] = 1
-        values[:, _CAUGHT] = spread(part, LIGHT_UNIT)
-        values[:, _LIGHT] = _count(1.0, LIGHT_UNIT) - _sum_before(values[:, _CAUGHT], first)
-        values[:, _PATH] = _count(found.inside * measure_lengths(rays.step)[ray], PATH_UNIT)
-        values[:, _ENERGY] = spread(rays.energy, self._unit)
+        caught, ground = (_count(part, LIGHT_UNIT) for part in rule.weigh(rays))
+        summed = [caught, ground, _count(samples["energy"], self._unit), _count(samples["section"], SECTION_UNIT)]
+        summed = Samples(samples["time"], samples["spacing"], np.stack(summed, axis=1))
+        each = np.arange(len(table))
+        last = sum_before(summed, table["first"], table["count"], each, np.full(len(table), np.inf))
+        before = sum_before(summed, table["first"], table["count"], ray, found.enter)
+        before[first] = 0
+        part = differences_along(before, ray, last)
+        # What is beyond a lost packet has energy, but light is known up to there only.
+        known = found.enter < table["known"][ray]
+        inside = np.clip(table["known"][ray] - found.enter, 0.0, found.inside)
+        light = np.where(known, np.maximum(_count(1.0, LIGHT_UNIT) - before[:, 0], 0), 0)
+        share = last[ray, 1] * LIGHT_UNIT
+        values = np.zeros((len(ray), 10 if self._sections else 8), np.int64)
+        values[:, _RAYS], values[:, _LIGHT], values[:, _CAUGHT] = known, light, part[:, 0]
+        values[:, _PATH] = _count(inside * measure_lengths(table["step"])[ray], PATH_UNIT)
+        values[:, _ENERGY] = part[:, 2]
+        values[:, _SQUARES] = _count((light * LIGHT_UNIT) ** 2, LIGHT_UNIT)
+        # Derivatives over the logarithm of the ratio of reflectances: it moves light between canopy and ground.
+        values[:, _CAUGHT_BY_RATIO] = part[:, 1] - np.rint(share * part[:, 0]).astype(np.int64)
+        by_ratio = np.rint(share * before[:, 0]).astype(np.int64) - before[:, 1]
+        values[:, _LIGHT_BY_RATIO] = np.where(known, by_ratio, 0)
         if self._sections:
-            values[:, _SECTION] = spread(rays.section, SECTION_UNIT)
-            values[:, _UNKNOWN] = rays.unknown[ray] & (values[:, _ENERGY] > 0)
+            values[:, _SECTION] = part[:, 3]
+            values[:, _UNKNOWN] = table["unknown"][ray] & (part[:, 2] > 0)
         return values
 
-    def pieces(self) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    def measure_spread(self) -> None:
+        """Compares neighbouring voxels, once all rays are in: how much more than a binomial their shares spread.
+
+        Neighbours along y are close to each other in the order of the sums. By doublings of the rays in them, because
+        leaves come in clumps: the more rays a voxel has, the more of them meet the same clump.
+        """
+        sums = np.zeros((3, _CLASSES), np.int64)
+        old_key, old = np.empty(0, np.uint64), np.empty((0, 3))
+        for key, rows in self._sums.pieces():
+            lit = rows[:, _LIGHT] > 0
+            key, value = np.concatenate([old_key, key[lit]]), np.concatenate([old, _list_shares(rows[lit])])
+            if not len(key):
+                continue
+            at = np.minimum(np.searchsorted(key, key + _NEXT_Y), len(key) - 1)
+            some = np.flatnonzero((key[at] == key + _NEXT_Y) & (at >= len(old_key)))
+            (share, rays, light), (other, more, brighter) = value[some].T, value[at[some]].T
+            both = (share * light + other * brighter) / (light + brighter)
+            kind = _classify(np.minimum(rays, more))
+            expected = both * (1.0 - both) * (1.0 / rays + 1.0 / more)
+            for row, part in zip(sums, ((share - other) ** 2, expected, np.full(len(some), LIGHT_UNIT)), strict=True):
+                np.add.at(row, kind, _count(part, LIGHT_UNIT))
+            late = key + _NEXT_Y >= key[-1]
+            old_key, old = key[late], value[late]
+        found, expected, pairs = sums
+        of_all = found.sum() / expected.sum() if expected.any() else 1.0
+        each = np.where(expected > 0, found / np.maximum(expected, 1), of_all)
+        self.spread = (pairs * each + _LEAST_PAIRS * of_all) / (pairs + _LEAST_PAIRS)
+
+    def pieces(self, log_error: float = 0.0) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Index and columns of the voxels, some at a time, in the order of x, then y, then z.
 
-        The index i8 (m, 3) counts from `low`.
+        The index i8 (m, 3) counts from `low`. log_error: that of the logarithm of the ratio of reflectances.
         """
         for key, sums in self._sums.pieces():
             if not self._everything:
                 some = np.flatnonzero(sums[:, _ENERGY] > 0)
                 key, sums = key[some], sums[some]
-            yield unpack_index(key) - self._low, self._finish(sums)
+            yield unpack_index(key) - self._low, self._finish(sums, log_error)
 
-    def _finish(self, sums: np.ndarray) -> dict[str, np.ndarray]:
-        light, caught = sums[:, _LIGHT], sums[:, _CAUGHT]
+    def _finish(self, sums: np.ndarray, log_error: float) -> dict[str, np.ndarray]:
+        lit = sums[:, _LIGHT] > 0
+        share, rays, light = _list_shares(sums).T
+        rays = rays / self.spread[_classify(rays)]
+        # A share of 0 or 1 alone states no error: half a ray of light and of shade are added.
+        near = (share * rays + 0.5) / (rays + 1.0)
+        spread = near * (1.0 - near) / rays
+        by_ratio = (sums[:, _CAUGHT_BY_RATIO] - share * sums[:, _LIGHT_BY_RATIO]) * LIGHT_UNIT / light
         columns = {
             "energy": sums[:, _ENERGY] * self._unit,
             "rays": sums[:, _RAYS],
             "path": sums[:, _PATH] * PATH_UNIT,
-            "light": light * LIGHT_UNIT,
-            "share": np.where(light > 0, caught / np.maximum(light, 1), np.nan),
+            "light": sums[:, _LIGHT] * LIGHT_UNIT,
+            "share": np.where(lit, share, np.nan),
+            "share_error": np.where(lit, np.sqrt(spread + (by_ratio * log_error) ** 2), np.nan),
         }
         if self._sections:
             columns["cross_section"] = np.where(sums[:, _UNKNOWN] > 0, np.nan, sums[:, _SECTION] * SECTION_UNIT)
@@ -181,7 +242,12 @@ def _count(values: np.ndarray | float, unit: float) -> np.ndarray:
     return np.rint(values * (1.0 / unit)).astype(np.int64)
 
 
-def _sum_before(values: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Sum of the earlier values of the same ray, (m,); first: True where a ray begins."""
-    before = np.cumsum(values) - values
-    return before - before[first][np.cumsum(first) - 1] if len(values) else before
+def _list_shares(sums: np.ndarray) -> np.ndarray:
+    """Share of the light that was caught, the whole rays with the same error, and the light, f8 (m, 3)."""
+    light = np.maximum(sums[:, _LIGHT], 1)
+    rays = np.maximum(light * (light * LIGHT_UNIT) / np.maximum(sums[:, _SQUARES], 1), LIGHT_UNIT)
+    return np.stack([sums[:, _CAUGHT] / light, rays, light * LIGHT_UNIT], axis=1)
+
+
+def _classify(rays: np.ndarray) -> np.ndarray:
+    return np.clip(np.log2(rays).astype(np.int64) + 8, 0, _CLASSES - 1)

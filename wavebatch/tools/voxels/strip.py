@@ -1,13 +1,13 @@
-"""A strip to voxels: every block is deconvolved and added to the grid, then the grid is written in order.
+"""A strip to voxels: every pulse is deconvolved and added to the grid, then the grid is written in order.
 
 `wavebatch voxelize` calls `voxelize_strip`. Memory does not grow with the strip: sums beyond a limit lie on disk. The
-output must not depend on block size, so nothing here may mix waveforms of a block.
+output must not depend on batches, so nothing here may mix pulses of a batch.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import MISSING, asdict, dataclass, field, replace
 from pathlib import Path
@@ -18,36 +18,41 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.order import even_places
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.column_reader import find_keep
 from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
-from wavebatch.files.strip.reader import StripReader, StripScan, Unit
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
 from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
-from wavebatch.surveying.sensor import SensorRequest
+from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.floor import Floor
-from wavebatch.tools.voxels.gap import SAMPLED, find_rule
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
-from wavebatch.tools.voxels.output import VoxelSpace, check_target, write_voxels
+from wavebatch.tools.voxels.light import find_rule
+from wavebatch.tools.voxels.output import Piece, VoxelSpace, check_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
 from wavebatch.tools.voxels.profile_file import ProfileWriter
-from wavebatch.tools.voxels.rays import LightRule, trace_profiles
-
-BLOCK_SAMPLES = 1 << 20
-"""Samples read at a time."""
+from wavebatch.tools.voxels.pulses import Batch, read_batches
+from wavebatch.tools.voxels.rays import PACKET, SAMPLE, Rays, join_packets, list_signal, measure_lengths
 
 LARGEST = 1e6
 """Largest voxel [m]."""
+
+SAMPLED = 4096
+"""Pulses from which the reflectance ratio is estimated."""
+
+_SAMPLED_UNITS = 16
+"""Units that they are read from."""
 
 _SAMPLED = 2048
 """Waveforms from which the middle and the extent of the strip are found."""
@@ -75,7 +80,7 @@ class VoxelOptions:
         None, "Reflectance of the canopy over that of the ground.", form="RATIO", unset="estimated from the strip"
     )
     where: Condition | None = None
-    """Use only waveforms of which a return meets this, with all of their signal."""
+    """Use only pulses of which a return meets this, with all of their signal."""
     energy: str | None = None
     """Energy of each emitted pulse, by which the signal is divided; see `find_pulse_energy`."""
 
@@ -96,13 +101,20 @@ class VoxelSummary:
     origin: tuple[float, float, float]
     """Lower corner of that box [m]."""
     waveforms: int
+    """Packets with samples: a pulse has one or several."""
+    pulses: int
+    several_packets: int
+    """Pulses of several packets; between them nothing was recorded, which counts as empty air."""
+    lost_packets: int
+    """Pulses with a packet that is missing or broken: their light is known up to it, not beyond."""
     with_signal: int
+    """Pulses with signal."""
     anchored: int
-    """Waveforms with signal placed by a return of their packet; the others are placed by the raw location."""
+    """Pulses with signal placed by a return of each packet; the others are placed by the raw location."""
     clipped: int
-    """Waveforms with samples at the digitizer's limit: their energy is too low."""
+    """Pulses with samples at the digitizer's limit: their energy is too low."""
     outside: int
-    """Waveforms left out: their position is not a number, or too far from all others."""
+    """Pulses left out: their position is not a number, or too far from all others."""
     energy: float
     """[DN ns]."""
     method: str
@@ -113,19 +125,21 @@ class VoxelSummary:
     sensor: str | None = None
     """Source of the sensor's positions; None without calibration."""
     unknown: int = 0
-    """Waveforms with signal of unknown cross section: channels without a constant, pulses without a sensor position."""
+    """Pulses with signal of unknown cross section: channels without a constant, pulses without a sensor position."""
     reflectance_ratio: float = 1.0
     """Reflectance of canopy over that of ground, by which light is shared between them."""
     reflectance_ratio_err: float | None = None
     """Its standard deviation; None where it was given or assumed."""
     reflectance_ratio_source: str = "assumed"
     """`given`, `strip`, `assumed` (1, because the strip does not show it), or `no canopy`."""
+    hidden_light: float | None = None
+    """Most of a pulse's light that may hide between two of its packets: 5 % of the recorded packets have less."""
     profiles: str | None = None
     """File with the profiles of single pulses."""
     profile_samples: int = 0
     """Samples with signal in that file."""
     left_out: int = 0
-    """Waveforms without a return that meets the condition of --where; `waveforms` are the others."""
+    """Waveforms of pulses without a return that meets the condition of --where; `waveforms` are the others."""
     warnings: tuple[str, ...] = ()
     """Why cross sections may be less sure than the calibration says."""
 
@@ -152,7 +166,7 @@ def voxelize_strip(
     system: a saved survey, instead of a survey of this strip. force: also where the strip contradicts it. calibration:
     for cross sections; it or the survey must have the divergence of the beam. profiles: an .npz for those of single
     pulses. progress: called with the number of waveforms done since the last call, and the total. block_size, held:
-    waveforms at a time, and sums in memory; the output does not depend on them.
+    packets at a time, and sums in memory; the output does not depend on them.
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
@@ -161,7 +175,7 @@ def voxelize_strip(
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: the voxels are written to this file; choose another name")
-    with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
+    with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan(force=force) as scan:
         if not scan.packets:
             raise InputError(f"{strip}: holds no waveform to put into voxels; see `wavebatch check`")
         positions = Positions.IF_KNOWN if calibration is None else Positions.REQUIRED
@@ -178,9 +192,9 @@ def voxelize_strip(
         middle = _find_middle(reader, scan, options)
         floor = Floor(middle)
         ceiling = find_ceiling(reader, scan, middle, options.size, floor)
-        sample = (source.fill(block) for block in reader.sample_blocks(scan, SAMPLED))
-        deconvolution, height, given = options.deconvolution, options.ground_height, options.reflectance_ratio
-        rule = find_rule(sample, pulse, deconvolution, floor.finish(), height, given)
+        energy = find_pulse_energy(reader, scan, options.energy)
+        tracer = _Tracer(reader, source, pulse, options, floor.finish(), ceiling, energy, calibration is not None)
+        rule = find_rule(map(tracer.trace, _sample_batches(reader, scan)), options.reflectance_ratio)
         with (
             _open_grid(reader, middle, options, calibration is not None, held) as grid,
             (
@@ -189,21 +203,29 @@ def voxelize_strip(
                 else nullcontext()
             ) as writer,
         ):
-            counts: Counter[str] = Counter(waveforms=0, with_signal=0, anchored=0, clipped=0)
-            energy = find_pulse_energy(reader, scan, options.energy)
-            for block, chosen in _read_blocks(reader, scan, block_size, keep, energy):
-                used = block if chosen is None else block.rows(chosen)
-                counts["left_out"] += len(block) - len(used)
-                if len(used):
-                    _add_block(grid, counts, source.fill(used), pulse, options, ceiling, rule, writer)
+            counts: Counter[str] = Counter(waveforms=0, pulses=0, with_signal=0, anchored=0, clipped=0)
+            counts.update(several_packets=0, lost_packets=0)
+            for batch in read_batches(reader, scan, keep=keep, block_size=block_size):
+                rays = tracer.trace(batch)
+                grid.add(rays, rule)
+                if writer is not None:
+                    writer.add_rays(rays)
+                table, packets = rays.table, int(rays.table["packets"].sum())
+                counts.update({name: int(np.count_nonzero(table[name])) for name in ("anchored", "clipped")})
+                counts.update(waveforms=packets, pulses=len(table), with_signal=int(np.count_nonzero(table["count"])))
+                counts["several_packets"] += int(np.count_nonzero(table["packets"] > 1))
+                counts["lost_packets"] += int(np.count_nonzero(table["known"] < np.inf))
                 if progress is not None:
-                    progress(len(block), scan.packets)
+                    progress(sum(len(rows) for _, rows, *_ in batch.parts), scan.packets)
+            grid.measure_spread()
+            counts["left_out"] = 0 if keep is None else scan.packets - counts["waveforms"]
             meta = _describe(strip, options, pulse, calibration) | {
-                "reflectance_ratio": {"ratio": rule.ratio, "error": rule.error, "source": rule.source}
+                "reflectance_ratio": {"ratio": rule.ratio, "error": rule.error, "source": rule.source},
+                "hidden_light": rule.hidden_light,
             }
             meta["pulse_energy"] = None if energy is None else energy.describe()
             space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
-            voxels = _write_both(target, space, grid, writer, overwrite)
+            voxels = _write_both(target, space, grid.pieces(rule.log_error), writer, overwrite)
             return VoxelSummary(
                 **counts,
                 strip=str(strip),
@@ -211,7 +233,7 @@ def voxelize_strip(
                 voxels=voxels,
                 profiles=None if profiles is None else str(profiles),
                 profile_samples=0 if writer is None else writer.samples,
-                method=deconvolution.method,
+                method=options.deconvolution.method,
                 pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA,
                 noise=pulse.noise.std,
                 sensor=None if calibration is None else source.kind,
@@ -225,18 +247,19 @@ def voxelize_strip(
                 reflectance_ratio=rule.ratio,
                 reflectance_ratio_err=rule.error,
                 reflectance_ratio_source=rule.source,
+                hidden_light=rule.hidden_light,
             )
 
 
 def _write_both(
-    target: Path, space: VoxelSpace, grid: VoxelGrid, writer: ProfileWriter | None, overwrite: bool
+    target: Path, space: VoxelSpace, pieces: Iterable[Piece], writer: ProfileWriter | None, overwrite: bool
 ) -> int:
     """Writes profiles and voxels, or neither; the number of voxels."""
     others = []
     if writer is not None:
         meta = {name: value for name, value in space.meta.items() if name not in ("columns", "size_m", "headroom_m")}
         others.append(writer.complete_profiles(meta, space.facts.crs or ""))
-    return write_voxels(target, space, grid.pieces(), others=others, overwrite=overwrite)
+    return write_voxels(target, space, pieces, others=others, overwrite=overwrite)
 
 
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
@@ -275,61 +298,56 @@ def _open_grid(reader: StripReader, middle: np.ndarray, options: VoxelOptions, s
     )
 
 
-def _read_blocks(
-    reader: StripReader,
-    scan: StripScan,
-    size: int | None,
-    keep: Callable[[np.ndarray], np.ndarray] | None,
-    energy: PulseEnergy | None,
-) -> Iterator[tuple[WaveformBlock, np.ndarray | None]]:
-    """Every packet of the strip once, and which of them have a return that is kept, bool (n,); None: all."""
-    for unit in reader.read_units(scan):
-        longest = int(unit.packets.n_samples.max(initial=1))
-        chosen = None if keep is None else _choose_packets(unit, keep)
-        for block, index in reader.read_blocks(unit, size or max(BLOCK_SAMPLES // longest, 1), owned_only=True):
-            filled = block if energy is None else energy.fill(block, unit)
-            yield filled, None if chosen is None else chosen[index]
+def _sample_batches(reader: StripReader, scan: StripScan) -> Iterator[Batch]:
+    """Pulses spread evenly over the strip, about SAMPLED."""
+    numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
+    share = -(-SAMPLED // max(len(numbers), 1))
+    return read_batches(reader, scan, numbers=numbers.tolist(), choose=lambda some: some[even_places(len(some), share)])
 
 
-def _choose_packets(unit: Unit, keep: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Whether a point of each packet of the unit is kept, bool (packets,)."""
-    chosen = np.zeros(len(unit.packets.owned) + 1, bool)
-    chosen[unit.packet_of_point[keep(unit.points)]] = True
-    if len(unit.context):
-        chosen[unit.packet_of_context[keep(unit.context)]] = True
-    return chosen[:-1]  # the last one is that of points without a packet, -1
+@dataclass(frozen=True, slots=True)
+class _Tracer:
+    """What turns the packets of a strip into rays."""
 
+    reader: StripReader
+    sensor: SensorSource
+    pulse: SystemPulse
+    options: VoxelOptions
+    floor: Floor
+    ceiling: Ceiling
+    energy: PulseEnergy | None
+    sections: bool
 
-def _add_block(
-    grid: VoxelGrid,
-    counts: Counter[str],
-    block: WaveformBlock,
-    pulse: SystemPulse,
-    options: VoxelOptions,
-    ceiling: Ceiling,
-    rule: LightRule,
-    writer: ProfileWriter | None,
-) -> None:
-    profiles = deconvolve_block(block, pulse, options.deconvolution)
-    if block.pulse_energy is not None:
-        known = np.isfinite(block.pulse_energy)
-        profiles = replace(profiles, value=profiles.value / np.where(known, block.pulse_energy, 1.0)[:, None])
-    headroom = options.headroom
-    if headroom is None:
-        headroom = ceiling.measure_headroom(block.origin, block.direction)
-    rays = trace_profiles(
-        block,
-        profiles,
-        rule,
-        headroom=headroom,
-        system=pulse if pulse.radiometry.constant is not None else None,
-    )
-    grid.add(rays, block.spacing)
-    if writer is not None:
-        writer.add_block(block, profiles, rays)
-    anchored = int((profiles.seen & profiles.anchored).sum())
-    counts.update(with_signal=int(profiles.seen.sum()), anchored=anchored, clipped=int(profiles.clipped.sum()))
-    counts["waveforms"] += len(block)
+    def trace(self, batch: Batch) -> Rays:
+        """The rays of the pulses of a batch that `--where` keeps."""
+        packets, samples = [np.empty(0, PACKET)], [np.empty(0, SAMPLE)]
+        number = 0
+        for unit, rows, groups, kept in batch.parts:
+            place = np.zeros(len(unit.packets), np.int64)
+            place[rows] = np.arange(len(rows))
+            for block, index in self.reader.read_rows(unit, rows, max(len(rows), 1)):
+                block = self.sensor.fill(block if self.energy is None else self.energy.fill(block, unit))
+                profiles = deconvolve_block(block, self.pulse, self.options.deconvolution)
+                if block.pulse_energy is not None:
+                    known = np.isfinite(block.pulse_energy)
+                    scale = np.where(known, block.pulse_energy, 1.0)[:, None]
+                    profiles = replace(profiles, value=profiles.value / scale)
+                system = self.pulse if self.sections else None
+                at = place[index]
+                found = list_signal(block, profiles, groups[at], self.floor, self.options.ground_height, system)
+                found[0]["kept"] = kept[at]
+                found[1]["packet"] += number
+                number += len(block)
+                packets.append(found[0])
+                samples.append(found[1])
+        rays = join_packets(np.concatenate(packets), np.concatenate(samples), batch.lost)
+        rays = rays.take(rays.table["kept"])
+        headroom = self.options.headroom
+        if headroom is None:
+            headroom = self.ceiling.measure_headroom(rays.table["start"], rays.table["step"])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rays.table["begin"] -= headroom / measure_lengths(rays.table["step"])
+        return rays
 
 
 def _describe(

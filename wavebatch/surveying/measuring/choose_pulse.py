@@ -15,10 +15,10 @@ import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.surveying.joint_pulse import learn_jointly
-from wavebatch.surveying.judge import describe_waveforms, explain
+from wavebatch.surveying.measuring.joint_pulse import learn_jointly
+from wavebatch.surveying.measuring.judge import describe_waveforms, explain
+from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
-from wavebatch.surveying.mirror import Mirror, look_in_mirror
 
 STRICT = 0.92
 """Least width of an echo where a pulse is judged, over the pulse's: nothing reflects narrower, and widths scatter by up

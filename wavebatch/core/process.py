@@ -1,4 +1,4 @@
-"""Memory and threads of a process.
+"""Memory, threads and time of a process.
 
 `keep_freed_memory` is called once at the start of each worker process, because kernels allocate the same few megabytes
 thousands of times. It changes speed only, never results.
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import sys
+import time
+from dataclasses import dataclass
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Parameters of glibc's mallopt(3)."""
@@ -42,3 +44,24 @@ def keep_freed_memory() -> bool:
     except (AttributeError, OSError):
         return False
     return bool(mallopt(_TRIM_THRESHOLD, KEEP)) and bool(mallopt(_MMAP_THRESHOLD, KEEP // 4))
+
+
+@dataclass(frozen=True, slots=True)
+class Seconds:
+    """Time that tasks took; sums and differences are taken part by part."""
+
+    processor: float = 0.0
+    """Of all threads of the process that did the task [s]."""
+    wall: float = 0.0
+    """By the clock, with waiting for the disk and for other programs [s]."""
+
+    @classmethod
+    def now(cls) -> Seconds:
+        """Return the times of this process; only differences mean something."""
+        return cls(time.process_time(), time.perf_counter())
+
+    def __add__(self, other: Seconds) -> Seconds:
+        return Seconds(self.processor + other.processor, self.wall + other.wall)
+
+    def __sub__(self, other: Seconds) -> Seconds:
+        return Seconds(self.processor - other.processor, self.wall - other.wall)

@@ -10,7 +10,7 @@ import numpy as np
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.score import list_pairs, pair_nearest
-from wavebatch.surveying.judge import explain
+from wavebatch.surveying.measuring.judge import explain
 
 STRONG = 30.0
 ZONE = 2.0

@@ -1,0 +1,58 @@
+"""Whether the pulse or the noise of a survey is a guess, for `survey` and `run`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import StripWarning
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
+from wavebatch.surveying.measuring.noise_and_width import FEW
+from wavebatch.surveying.measuring.residuals import hides_noise
+from wavebatch.surveying.systems.figures import Figures
+from wavebatch.surveying.systems.known_systems import find_source
+
+MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
+"""Share of the echoes in doubt, because another pulse, misfit or noise serves as well, from which a survey's pulse is
+called a guess; of a known pulse, from which its noise is."""
+
+
+def doubt_survey(system: SystemPulse, figures: Figures) -> Iterator[StripWarning]:
+    """Say that pulse or noise is a guess: too few echoes to learn a pulse from, echoes that another one does not find,
+    or no samples to measure noise in.
+    """
+    alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
+    if alone is None:
+        return
+    known = find_source(system) is not None
+    most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
+    reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
+    if alone < FEW and not (known or system.components):
+        reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
+    measured = system.noise.by_kind
+    unseen = measured.get("quiet") == 0 and "outside" not in measured
+    if unseen and not reason:
+        reason = "too few samples without signal"
+    remedy = "give --system, a survey of a longer strip of this sensor"
+    hidden = hides_noise(system.noise)
+    if hidden and not reason:
+        reason, remedy = "most of the noise below count 0", "raise the level of the digitizer in the next flight"
+    if reason:
+        code, guess = "pulse-guess", f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
+        if known or unseen or hidden:
+            code, guess = "noise-guess", f"noise is a guess, of {system.noise.std:.3g} DN"
+        yield StripWarning(
+            code, f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
+            f"{remedy}",
+        )  # fmt: skip
+
+
+def share_unexplained(system: SystemPulse, echoes: EchoTable, spacing: float) -> float:
+    """Share of the clear echoes whose samples the pulse and the noise do not explain; 0 with too few of them."""
+    clear = echoes.amplitude > MIN_SNR * system.noise.std
+    unexplained = find_unexplained(echoes, system, spacing)[clear] > 1
+    return float(np.mean(unexplained)) if len(unexplained) >= FEW else 0.0
