@@ -104,7 +104,7 @@ class Survey:
     waveforms: int
     figures: Figures = field(default_factory=Figures)
     decisions: tuple[Decision, ...] = ()
-    candidates: tuple[Tried, ...] = ()
+    candidates: tuple[Tried, ...] = field(default=(), compare=False)
     """Pulses that were tried, that which describes waveforms best first; empty for a survey from a file."""
 
 

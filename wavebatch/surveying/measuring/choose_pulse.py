@@ -142,7 +142,8 @@ def choose_pulse(
     Notes
     -----
     Pulses are learned on one half of the waveforms and judged on the other. Of those that cost the same, by SURE
-    standard errors, the one with the fewest echoes is taken: an echo must be proven.
+    standard errors, the one with the fewest parameters is taken, three of each echo and of each Gaussian of the pulse:
+    what is claimed must be proven.
     """
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
     part = thin_block(block, 2 * number)
@@ -191,8 +192,8 @@ def _try_changes(block: WaveformBlock, name: str, system: SystemPulse) -> Candid
 
 
 def _decide(found: list[Candidate], number: int) -> Choice:
-    """The candidate with the fewest echoes that no other one beats surely."""
-    ordered = sorted(found, key=lambda one: (one.echoes, one.name))
+    """The candidate with the fewest parameters, of echoes and pulse, that no other one beats surely."""
+    ordered = sorted(found, key=lambda one: (one.echoes + max(len(one.system.components), 1), one.name))
     best = ordered[0]
     for one in ordered[1:]:
         if best.exceeds(one) > SURE:

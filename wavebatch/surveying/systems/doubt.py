@@ -10,6 +10,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import StripWarning
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.stages.flags import find_unexplained
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.measuring.residuals import hides_noise

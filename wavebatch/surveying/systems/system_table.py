@@ -35,6 +35,7 @@ NUMBERS: dict[str, Key] = {
     "ringing": Key("ringing", 0.0, 1.0, "largest after-pulse, as a share of the amplitude"),
     "saturation_dn": Key("saturation", 1.0, 1e10, "count at which the digitizer clips", optional=True),
     "acceptance": Key("acceptance", 1.0, 1e6, "least fall of chi2 for which an echo is added"),
+    "significance": Key("significance", 0.0, 1e3, "least energy of an echo, where that is more than the chain's", True),
     "misfit": Key("misfit", 0.0, 1.0, "of strong echoes to the pulse, as a share of them", optional=True),
     "level_variance_ns2": Key("widths.variance", -1e8, 0.0, "of level ground's echoes less the pulse's", True),
     "level_error_ns2": Key("widths.error", 0.0, 1e8, "standard deviation of level_variance", True),
