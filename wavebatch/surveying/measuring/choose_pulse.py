@@ -15,6 +15,7 @@ import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.surveying.measuring.joint_pulse import learn_jointly
 from wavebatch.surveying.measuring.judge import describe_waveforms, explain
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
@@ -71,6 +72,8 @@ class Candidate:
     length: np.ndarray
     """Of the description of each waveform [nats], float64 (n,)."""
     echoes: int
+    gaussians: int
+    """Of the pulse, that had to be learned: 0 for one from elsewhere."""
 
     @property
     def typical(self) -> float:
@@ -141,9 +144,10 @@ def choose_pulse(
 
     Notes
     -----
-    Pulses are learned on one half of the waveforms and judged on the other. Of those that cost the same, by SURE
-    standard errors, the one with the fewest parameters is taken, three of each echo and of each Gaussian of the pulse:
-    what is claimed must be proven.
+    Pulses are learned on one half of the waveforms and judged on the other, where the pulse has to be written down too:
+    half the logarithm of the samples for each of its parameters; one from elsewhere is known. Of those that cost the
+    same, by SURE standard errors, the simplest pulse is taken, then the one with the fewest echoes: what is claimed
+    must be proven.
     """
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
     part = thin_block(block, 2 * number)
@@ -151,9 +155,12 @@ def choose_pulse(
     small = len(part) < SMALL
     learn, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
     few = thin_block(held, FEWEST)
-    looked = [_judge(few, name, system, 0.003) for name, system in {**starts, **(given or {})}.items()]
+    given = given or {}
+    every = {**starts, **given}
+    looked = [_judge(few, name, system, 0.003, known=name in given) for name, system in every.items()]
     leader = min(looked, key=lambda one: one.typical)
-    found = [_try_changes(held, one.name, one.system) for one in looked if one.exceeds(leader) < HOPELESS]
+    hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
+    found = [_try_changes(held, one.name, one.system, known=one.name in given) for one in hopeful]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
     found += [_try_changes(held, name, system) for name, system in _learn(learn, begin)]
     return _decide(found, len(held))
@@ -176,24 +183,26 @@ def _bear(system: SystemPulse, change: float) -> SystemPulse:
     return replace(system, misfit=max(COVERED * change, system.misfit), tail_misfit=(), beside=(), hidden=())
 
 
-def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float) -> Candidate:
+def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, *, known: bool) -> Candidate:
     """A pulse judged on waveforms; echoes narrower than the pulse are forbidden: nothing reflects so."""
     borne = _bear(system, change)
     explained = explain(block, borne, least_width=STRICT, width_prior=0.0)
-    length = describe_waveforms(block, borne, explained, change)
-    return Candidate(name, system, change, length, len(explained.echoes))
+    gaussians = 0 if known else max(len(system.components), 1)
+    written = 3 * gaussians * 0.5 * log(np.count_nonzero(explained.sums.used)) / len(block)
+    length = describe_waveforms(block, borne, explained, change) + written
+    return Candidate(name, system, change, length, len(explained.echoes), gaussians)
 
 
-def _try_changes(block: WaveformBlock, name: str, system: SystemPulse) -> Candidate:
+def _try_changes(block: WaveformBlock, name: str, system: SystemPulse, *, known: bool = False) -> Candidate:
     """The pulse with the least change of shape that no other one beats surely."""
-    tried = [_judge(block, name, system, change) for change in CHANGES]
+    tried = [_judge(block, name, system, change, known=known) for change in CHANGES]
     best = min(tried, key=lambda one: one.typical)
     return next(one for one in tried if one.exceeds(best) < SURE)
 
 
 def _decide(found: list[Candidate], number: int) -> Choice:
-    """The candidate with the fewest parameters, of echoes and pulse, that no other one beats surely."""
-    ordered = sorted(found, key=lambda one: (one.echoes + max(len(one.system.components), 1), one.name))
+    """The candidate with the simplest pulse, then the fewest echoes, that no other one beats surely."""
+    ordered = sorted(found, key=lambda one: (one.gaussians, one.echoes, one.name))
     best = ordered[0]
     for one in ordered[1:]:
         if best.exceeds(one) > SURE:

@@ -21,6 +21,7 @@ from wavebatch.stages.detect.maximum import matched_filter
 from wavebatch.stages.flags import use_noise_errors
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
+from wavebatch.surveying.measuring.noise_and_width import find_edge
 
 WIDER = 1.0 + 0.02 * 2.0 ** np.arange(-0.5, 9.0)
 """Upper ends of the uniform laws, from the pulse's own width on, that make up the widths' density: any density that
@@ -29,7 +30,7 @@ falls from there on is a sum of such [widths of the pulse]."""
 ANYWHERE = 0.01
 """Share of the widths that may be anything up to the widest: one in a hundred echoes is no echo."""
 
-SCATTERS = 0.01, 0.02, 0.04
+SCATTERS = 0.01, 0.02, 0.04, 0.06
 """Scatter of the widths of level ground beyond their errors that is tried [widths]: no pulse model is exact, and pulses
 change from shot to shot."""
 
@@ -120,26 +121,12 @@ def describe_waveforms(
 
 
 def find_own_width(explained: Explained, ref: float) -> float:
-    """Find where the density of widths begins, over the pulse's own width `ref` [samples].
+    """Find the narrowest width that echoes repeat (`find_edge`), over the pulse's own width `ref` [samples].
 
-    Echoes of level ground scatter about the pulse's width, wider ones lie above it: the place from which a falling
-    density, seen through its scatter, describes the widths best. 1 with too few widths.
+    1 with too few widths that are known.
     """
     ratio, error, known = _measure_widths(explained, ref)
-    if np.count_nonzero(known) < LEAST_KNOWN:
-        return 1.0
-    ratio, error = ratio[known], error[known]
-
-    def cost(own: float) -> float:
-        return float(np.sum(_describe_widths(ratio / own, error / own, np.ones(len(ratio), bool)) - log(np.array(own))))
-
-    low, high = 0.8, 1.25
-    for _ in range(4):  # four times a grid of seven, each five times as fine
-        grid = np.linspace(low, high, 7)
-        best = grid[int(np.argmin([cost(float(own)) for own in grid]))]
-        half = 0.2 * (high - low)
-        low, high = best - 0.5 * half, best + 0.5 * half
-    return float(best)
+    return find_edge(ratio[known], error[known]) if np.count_nonzero(known) >= LEAST_KNOWN else 1.0
 
 
 def _measure_widths(explained: Explained, ref: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -156,7 +143,7 @@ def _describe_widths(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) ->
     if np.count_nonzero(known) < LEAST_KNOWN:
         return np.zeros(len(ratio))
     costs = [_describe_scattered(ratio, np.hypot(error, scatter), known) for scatter in SCATTERS]
-    return min(costs, key=lambda cost: float(np.sum(cost[known])))
+    return min(costs, key=lambda cost: float(np.sum(cost[known]))) - log(SQRT_2PI * error)
 
 
 def _describe_scattered(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -167,7 +154,7 @@ def _describe_scattered(ratio: np.ndarray, error: np.ndarray, known: np.ndarray)
         weight /= np.maximum(np.einsum("mk->m", weight), 1e-300)[:, None]
         share = (np.einsum("mk->k", weight) + 0.5) / (np.count_nonzero(known) + 0.5 * len(share))
     density = (1 - ANYWHERE) * np.einsum("mk,k->m", laws, share) + ANYWHERE / WIDER[-1]
-    return -log(density) - log(SQRT_2PI * error)
+    return -log(density)
 
 
 def _laws(ratio: np.ndarray, error: np.ndarray) -> np.ndarray:
