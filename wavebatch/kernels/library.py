@@ -20,7 +20,7 @@ _POINTER = ctypes.c_void_p
 FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
     "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse", "render_pulses",
-    "pair_differences",
+    "measure_changes", "pair_differences",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 

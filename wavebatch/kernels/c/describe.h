@@ -127,7 +127,7 @@ static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t 
 
 /* Takes a change of an echo's shape off what is left, as far as it is likely, and returns what it costs. The two
    directions are the next after those of the fit, as in `hermite_moments`. */
-static double change_shape(const Described *w, Desk *d, int64_t echo) {
+static double change_shape(const Described *w, Desk *d, int64_t echo, double *heights, double *energies) {
     const int64_t vectors = d->vectors;
     const float time = w->time[echo], inverse = 1 / w->width[echo];
     double cost = 0, energy = 0;
@@ -152,6 +152,7 @@ static double change_shape(const Described *w, Desk *d, int64_t echo) {
         for (int64_t v = 0; v < vectors; v++) row[v] *= d->weight[v] * (float)(energy * w->amplitude[echo]);
         innovate(w, row, vectors);
         double own = dot(row, row, vectors), height = dot(row, d->rest, vectors) / (own + 1 / (w->change * w->change));
+        if (heights) { heights[r - 3] = height; energies[r - 3] = own; continue; }
         for (int64_t v = 0; v < vectors; v++) d->rest[v] -= row[v] * (float)height;
         cost += 0.5 * (height / w->change) * (height / w->change) + 0.5 * log_double(1 + w->change * w->change * own);
     }
@@ -179,7 +180,7 @@ EXPORT int64_t describe_waveforms(const Described *w, double *length, double *vo
         innovate(w, d.rest, vectors);
         int64_t echo = -1;
         for (int64_t j = 0; w->change > 0 && j < CHANGED && (echo = next_strongest(w, first, end, echo)) >= 0; j++)
-            sum += change_shape(w, &d, echo);
+            sum += change_shape(w, &d, echo, NULL, NULL);
         const float *rest = (const float *)d.rest;
         for (int64_t t = 0; t < w->length; t++) {
             if (!w->used[i * w->length + t]) continue;
@@ -190,6 +191,24 @@ EXPORT int64_t describe_waveforms(const Described *w, double *length, double *vo
         length[i] = sum + 0.5 * (FREEDOM + 1) * log_double(product);
         volume[i] = 0;
         for (int64_t j = first; j < end; j += TOGETHER) volume[i] += shared_volume(w, &d, j, end - j < TOGETHER ? end - j : TOGETHER);
+    }
+    clear_desk(&d);
+    return good ? 0 : -1;
+}
+
+/* Change of the shape of the strongest echo of each waveform in two directions, as a share of its amplitude, and one over
+   the variance of each, (n, 2); 0 where there is no echo. */
+EXPORT int64_t measure_changes(const Described *w, double *heights, double *energies) {
+    Desk d = {0};
+    int good = furnish(&d, 1, VECTORS(w->length));
+    memset(heights, 0, 2 * w->n * sizeof(double));
+    memset(energies, 0, 2 * w->n * sizeof(double));
+    for (int64_t i = 0; i < w->n && good; i++) {
+        int64_t echo = next_strongest(w, w->first[i], w->first[i + 1], -1);
+        if (echo < 0) continue;
+        lay_out(w, i, &d);
+        innovate(w, d.rest, d.vectors);
+        change_shape(w, &d, echo, heights + 2 * i, energies + 2 * i);
     }
     clear_desk(&d);
     return good ? 0 : -1;

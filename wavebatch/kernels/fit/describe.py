@@ -19,6 +19,10 @@ LEAST_LEFT = 0.02
 """Least share of the noise's variance that the two samples before leave open: an estimated correlation may be none."""
 
 
+UNBOUND = 1e3
+"""Change of a shape that bounds nothing."""
+
+
 class Sums(NamedTuple):
     """n waveforms of s samples, and sums of pulses in them."""
 
@@ -97,6 +101,26 @@ def describe_left(sums: Sums, noise: SampleNoise, change: float) -> tuple[np.nda
     length, volume = np.zeros(len(sums.left)), np.zeros(len(sums.left))
     call("describe_waveforms", _as_structure(sums, noise, change), length, volume)
     return length, volume
+
+
+def measure_changes(sums: Sums, noise: SampleNoise) -> tuple[np.ndarray, np.ndarray]:
+    """Return how the shape of the strongest echo of each waveform differs from the pulse.
+
+    Parameters
+    ----------
+    sums : Sums
+    noise : SampleNoise
+
+    Returns
+    -------
+    change : float64 (n, 2)
+        In the two directions of `describe_left`, as a share of the echo's energy; by least squares.
+    precision : float64 (n, 2)
+        One over the variance of each; 0 for a waveform without an echo.
+    """
+    change, precision = np.zeros((len(sums.left), 2)), np.zeros((len(sums.left), 2))
+    call("measure_changes", _as_structure(sums, noise, UNBOUND), change, precision)
+    return change, precision
 
 
 def gather_pulse(

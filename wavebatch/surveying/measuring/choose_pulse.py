@@ -17,7 +17,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
 from wavebatch.surveying.measuring.joint_pulse import learn_jointly
-from wavebatch.surveying.measuring.judge import describe_waveforms, explain
+from wavebatch.surveying.measuring.judge import describe_waveforms, explain, measure_change
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
 
@@ -31,9 +31,9 @@ SAMPLES, MOST, LEAST = 60_000, 384, 96
 SMALL = 120
 """Waveforms below which halves are too few to learn a pulse from: the judge then sees what it was learned from."""
 
-CHANGES = (0.0, 0.003, 0.01, 0.03)
-"""Changes of the pulse from shot to shot that are tried, as shares of the amplitude: in steps of a factor 3, since the
-length changes little within a factor 2 of the best."""
+CHANGES, STEP_OF_CHANGES = (0.0, 0.003, 0.01, 0.03), 3.4
+"""Changes of the pulse from shot to shot that are tried, as shares of the amplitude: in steps of a factor 3.4 at most,
+since the length changes little within a factor 2 of the best."""
 
 COVERED = 3.2
 """Misfit over the change from shot to shot: two directions of change promise more than this squared to one echo in
@@ -74,6 +74,8 @@ class Candidate:
     echoes: int
     gaussians: int
     """Of the pulse, that had to be learned: 0 for one from elsewhere."""
+    seen: float
+    """Change of the shape that the median of the strongest echoes shows."""
 
     @property
     def typical(self) -> float:
@@ -190,12 +192,18 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     gaussians = 0 if known else max(len(system.components), 1)
     written = 3 * gaussians * 0.5 * log(np.count_nonzero(explained.sums.used)) / len(block)
     length = describe_waveforms(block, borne, explained, change) + written
-    return Candidate(name, system, change, length, len(explained.echoes), gaussians)
+    return Candidate(
+        name, system, change, length, len(explained.echoes), gaussians, measure_change(borne, explained)
+    )
 
 
 def _try_changes(block: WaveformBlock, name: str, system: SystemPulse, *, known: bool = False) -> Candidate:
-    """The pulse with the least change of shape that no other one beats surely."""
+    """The pulse with the least change of shape that no other one beats surely, of those that its echoes show.
+
+    Neighbours too close to be found change the shape of some echoes, which is no change from shot to shot.
+    """
     tried = [_judge(block, name, system, change, known=known) for change in CHANGES]
+    tried = [one for one in tried if one.change <= STEP_OF_CHANGES * one.seen]
     best = min(tried, key=lambda one: one.typical)
     return next(one for one in tried if one.exceeds(best) < SURE)
 

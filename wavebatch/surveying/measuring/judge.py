@@ -11,10 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.units import SQRT_2PI
+from wavebatch.core.units import SQRT_2PI, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
-from wavebatch.kernels.fit.describe import SampleNoise, Sums, count_echoes, describe_left, render_pulses
+from wavebatch.kernels.fit.describe import (
+    SampleNoise,
+    Sums,
+    count_echoes,
+    describe_left,
+    measure_changes,
+    render_pulses,
+)
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.maximum import matched_filter
@@ -72,6 +79,25 @@ def explain(block: WaveformBlock, system: SystemPulse, **options: float) -> Expl
 def sample_noise(system: SystemPulse) -> SampleNoise:
     """Return the noise of a quiet sample."""
     return SampleNoise(system.noise.quiet, system.noise.gain, system.noise.correlation)
+
+
+def measure_change(system: SystemPulse, explained: Explained) -> float:
+    """Measure how much the pulse changes from shot to shot, as a share of its amplitude.
+
+    By the median over the strongest echoes of the waveforms: a pulse that changes does so in each of them, neighbours
+    that are too close to be found change the shape of some. 0 with too few of them, or where noise explains all.
+    """
+    change, precision = measure_changes(explained.sums, sample_noise(system))
+    known = precision > 0
+    if np.count_nonzero(known) < 2 * LEAST_KNOWN:
+        return 0.0
+    square, noise = change[known] ** 2, 1 / precision[known]
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        more = np.median(square / (middle * middle + noise)) > SQUARED_NORMAL_MEDIAN
+        low, high = (middle, high) if more else (low, middle)
+    return low
 
 
 def describe_waveforms(

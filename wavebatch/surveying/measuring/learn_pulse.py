@@ -253,8 +253,9 @@ def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float
     width = system.sigma_ref / spacing
     far = np.abs(stack.lag - fit.datum) > 4 * width
     ringing = float(np.abs(stack.value[far]).max(initial=0.0))
-    # rms over the stack, in the kernel's terms: as if all of it lay within the stack's span
-    misfit = fit.rms * float(np.sqrt((stack.lag[-1] - stack.lag[0]) / (SQRT_PI * width)))
+    # What the model misses of the stack beyond chance, in the kernel's terms: its energy over that of a Gaussian.
+    missed = max(fit.rms**2 - float(np.mean(stack.error**2)), 0.0)
+    misfit = float(np.sqrt(missed * (stack.lag[-1] - stack.lag[0]) / (SQRT_PI * width)))
     system = replace(system, ringing=ringing, kappa=fit.kappa, components=(), misfit=misfit)
     if len(fit.components) > 1:
         components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
