@@ -42,7 +42,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.systems.doubt import share_unexplained
 from wavebatch.surveying.systems.figures import Figures, Level
-from wavebatch.surveying.systems.known_systems import list_known
+from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known
 from wavebatch.surveying.systems.skew import measure_skew
 
 SAMPLE = 8192
@@ -376,6 +376,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if len(main) >= ENOUGH_TO_LEARN:
             starts["lone echoes"] = learn_pulse(block, system, main, figures)
         else:
+            guess = guess_width(block, system)
+            starts |= {} if guess is None else {"single echoes": guess}
             starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in list_widths(block)}
         choice = choose_pulse(block, starts, list_known(block, system))
         system, candidates = choice.best.system, choice.describe()
@@ -391,6 +393,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
         system = measure_tail(block, system, find_strong(clear))
+        if not (system.components or system.kappa):
+            system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system, mirror = settle(block, system)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)

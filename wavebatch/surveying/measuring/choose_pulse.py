@@ -73,7 +73,7 @@ class Candidate:
     """Of the description of each waveform [nats], float64 (n,)."""
     echoes: int
     gaussians: int
-    """Of the pulse, that had to be learned: 0 for one from elsewhere."""
+    """Of the pulse, as far as they had to be learned: 1 for one from elsewhere."""
     seen: float
     """Change of the shape that the median of the strongest echoes shows."""
 
@@ -189,11 +189,11 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     """A pulse judged on waveforms; echoes narrower than the pulse are forbidden: nothing reflects so."""
     borne = _bear(system, change)
     explained = explain(block, borne, least_width=STRICT, width_prior=0.0)
-    gaussians = 0 if known else max(len(system.components), 1)
-    written = 3 * gaussians * 0.5 * log(np.count_nonzero(explained.sums.used)) / len(block)
+    gaussians = max(len(system.components), 1)
+    written = 0.0 if known else 3 * gaussians * 0.5 * log(np.count_nonzero(explained.sums.used)) / len(block)
     length = describe_waveforms(block, borne, explained, change) + written
     return Candidate(
-        name, system, change, length, len(explained.echoes), gaussians, measure_change(borne, explained)
+        name, system, change, length, len(explained.echoes), 1 if known else gaussians, measure_change(borne, explained)
     )
 
 

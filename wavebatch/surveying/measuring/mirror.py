@@ -9,6 +9,7 @@ import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import list_pairs, pair_nearest
 from wavebatch.surveying.measuring.judge import explain
 
@@ -27,6 +28,7 @@ class Mirror:
 
 
 def look_in_mirror(block: WaveformBlock, system: SystemPulse) -> Mirror:
+    block = block.rows(np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1)))
     e = explain(block, system)
     mirrored = replace(block, samples=np.ascontiguousarray((block.samples - 2 * e.sums.left).astype(np.float32)))
     echoes, other = e.echoes, explain(mirrored, system).echoes

@@ -15,11 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.order import robust_std
+from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
@@ -164,6 +167,45 @@ def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tup
     number = near.sum(axis=1)
     power = np.where(near, left, 0.0) ** 2
     return np.where(number > 0, np.sqrt(power.sum(axis=1) / np.maximum(number, 1)), NO_FIT), left, lag
+
+
+def guess_width(block: WaveformBlock, system: SystemPulse) -> SystemPulse | None:
+    """Return the Gaussian of the narrower single echoes; None with fewer than LEAST_ECHOES of them.
+
+    The lower quartile, without what noise takes off it: widths of one surface then give their median. Of all echoes:
+    noise makes the strongest of many weak ones both high and narrow.
+    """
+    lone = find_lone(block, system, len(block))
+    if len(lone) < LEAST_ECHOES:
+        return None
+    low, middle = np.quantile(lone.sigma, (0.25, 0.5))
+    width = min(low + 0.674 * float(np.median(lone.sigma_err)), middle)
+    # Not below half a sample, as for isolated echoes: spikes are no pulses.
+    return replace(system, sigma_ref=max(float(width), 0.5 * block.spacing))
+
+
+def find_ringing(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> float:
+    """Largest after-pulse that echoes show together at one lag, as a share of them; 0 where there is none.
+
+    Second targets are at another distance in every waveform, an after-pulse is not: the median shows it alone. Its
+    height is that which a tenth of the echoes exceed, so that noise does not lift most after-pulses over the limit.
+    """
+    if len(lone) < LEAST_ECHOES:
+        return 0.0
+    _, left, lag = fit_alone(block, system, lone)
+    largest = 0.0
+    for place in np.arange(2.5, RINGING_REACH, 0.5):
+        near = np.abs(lag / system.sigma_ref - place) < 0.5
+        here = np.where(near & np.isfinite(left), left, np.nan)
+        rows = np.isfinite(here).any(axis=1)
+        if rows.sum() < LEAST_ECHOES:
+            continue
+        value = np.nanmean(here[rows], axis=1)
+        middle = float(np.median(value))
+        error = MEDIAN_ERROR * robust_std(value) / np.sqrt(len(value))
+        if middle > max(LEAST_RINGING, RINGING_ERRORS * error):
+            largest = max(largest, float(np.quantile(value, 0.9)))
+    return min(largest, LARGEST_RINGING)
 
 
 def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
