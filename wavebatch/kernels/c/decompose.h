@@ -126,6 +126,59 @@ static int decompose_window(const Settings *s, const Clusters *clusters, int64_t
     return 0;
 }
 
+/* Errors of the best fit once more, with what is known of its amplitudes. */
+static void renew_errors(const Settings *s, const Prior *prior, Work *work) {
+    Solution *best = &work->best;
+    const int64_t k = best->k, per = 3;
+    work->fit.prior = *prior;
+    memcpy(work->fit.parameters, best->parameters, per * k * sizeof(double));
+    evaluate_rows(k, per, s, work, best->parameters);
+    multiply_rows(per * k + 1, work->window.vectors, work->rows, work->fit.gram);
+    add_prior(k, per, prior, work->window.std, best->parameters, work->fit.gram);
+    FOR_EACH_NUMBER(find_errors, work, best);
+}
+
+/* Takes out echoes of the best fit that are not known: amplitudes below `known` errors without which chi2 rises by less
+   than a new echo must lower it.
+
+   Errors of close echoes are those of a parabola, and the valley of chi2 is none: where they say that an amplitude may
+   as well be 0, the fit without the echo says how far chi2 rises on the way there. An echo without which it rises
+   enough has an amplitude of `known` errors, and those that share its light have less to share. Where one is left out,
+   the time of each other may be wrong by as much as it moves. */
+static void leave_out_unknown(const Settings *s, Work *work) {
+    const Limits limits = limits_of(s, &work->window);
+    const Prior prior = {s->width_ref, s->prior_spread, 0, 0}, none = {0};
+    const double noise = work->window.std;
+    Solution *best = &work->best;
+    int64_t all = best->k, asked = 0;
+    double *before = work->h3; /* times as they were */
+    memcpy(before, best->parameters + all, all * sizeof(double));
+    for (; best->k > 1 && asked < 2 * all; asked++) {
+        const int64_t k = best->k;
+        int64_t least = 0, left = 0;
+        for (int64_t j = 1; j < k; j++)
+            if (best->parameters[j] * best->errors[least] < best->parameters[least] * best->errors[j]) least = j;
+        const double amplitude = best->parameters[least], error = best->errors[least];
+        if (amplitude >= s->known * error) break;
+        for (int64_t i = 0; i < 3 * k; i++)
+            if (i % k != least) work->fit.parameters[left++] = best->parameters[i];
+        fit_window(k - 1, 3, s, &limits, k > 2 ? &prior : &none, INFINITY, work);
+        if (!(amplitude > 0) || work->fit.cost - best->cost < least_fall(s, k - 1, work->fit.parameters, noise)) {
+            memset(work->known, 0, k * sizeof(double));
+            memmove(before + least, before + least + 1, (k - 1 - least) * sizeof(double));
+            describe_fit(&limits, work, best);
+        } else {
+            work->known[least] += noise * noise * (s->known * s->known / (amplitude * amplitude) - 1 / (error * error));
+            renew_errors(s, &prior, work);
+        }
+    }
+    memset(work->known, 0, all * sizeof(double));
+    for (int64_t j = 0; j < best->k && best->k < all; j++) {
+        double *error = best->errors + best->k + j, moved = best->parameters[best->k + j] - before[j];
+        *error = sqrt(*error * *error + moved * moved);
+    }
+}
+
 /* The same echoes with a skew of their own each, 1.2. */
 static void free_skews(const Settings *s, Work *work) {
     const int64_t k = work->best.k;
@@ -174,6 +227,7 @@ EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, 
         if (!reserve(&work, clusters->number[i], VECTORS(clusters->high[i] - clusters->low[i]))) { i = -1; break; }
         cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
         if (decompose_window(s, clusters, i, &work) < 0) { i = -1; break; }
+        if (s->known > 0) leave_out_unknown(s, &work);
         if (s->skew_spread > 0 && s->pulse.kind != LOG_NORMAL) free_skews(s, &work);
         if (s->pulse.kind == LOG_NORMAL) tied_skews(origin_of(s, &work.window), &work.best);
         if (*found + work.best.k > out->room) break;

@@ -236,7 +236,7 @@ INLINE int invert(int64_t k, int64_t per, Work *work, const double *gram, double
     int is_flat = 1;
     for (int64_t i = 0; i < n; i++) {
         for (int64_t j = 0; j <= i; j++) matrix[i * n + j] = gram[i * rows + j];
-        matrix[i * n + i] = matrix[i * n + i] * (1 + RIDGE) + RIDGE;
+        matrix[i * n + i] = matrix[i * n + i] * (1 + RIDGE) + RIDGE + (i < k ? work->known[i] : 0);
     }
     factor(n, matrix, work->pivot, 1e-300);
     for (int64_t c = 0; c < n; c++) {

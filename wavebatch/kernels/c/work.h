@@ -33,6 +33,7 @@ typedef struct {
     Fit fit, next;
     Solution trial, best, spare;
     double *kept, *products, *matrix, *pivot, *step, *column, *h3, *h4;
+    double *known;                             /* of amplitudes: one over variance, in noise, beside what the fit says */
     uint8_t *frozen;
     float *taps;
     int64_t reach;                             /* of the taps of a new pulse */
@@ -59,19 +60,19 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
         && enlarge(&w->fit.parameters, p * number) && enlarge(&w->fit.gram, p * p * number) && enlarge(&w->next.parameters, p * number)
         && enlarge(&w->kept, p * number) && enlarge(&w->products, p * p * number) && enlarge(&w->matrix, p * p * number)
         && enlarge(&w->pivot, p * number) && enlarge(&w->step, p * number) && enlarge(&w->column, p * p * number)
-        && enlarge(&w->h3, p * number) && enlarge(&w->h4, p * number) && enlarge(&w->frozen, p);
+        && enlarge(&w->h3, p * number) && enlarge(&w->h4, p * number) && enlarge(&w->known, p * number) && enlarge(&w->frozen, p);
     Solution *all[] = {&w->trial, &w->best, &w->spare};
     for (int i = 0; i < 3 && good; i++)
         good = enlarge(&all[i]->parameters, p * number) && enlarge(&all[i]->errors, p * number)
             && enlarge(&all[i]->shared, p * number) && enlarge(&all[i]->at_bound, p);
-    if (good) { w->room = k; w->vectors = vectors; }
+    if (good) { w->room = k; w->vectors = vectors; memset(w->known, 0, p * number); }
     return good;
 }
 
 static void free_work(Work *w) {
     void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->rows, w->about, w->padded, w->energy,
         w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->h3, w->h4,
-        w->frozen, w->taps, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
+        w->known, w->frozen, w->taps, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
         w->best.errors, w->best.shared, w->best.at_bound, w->spare.parameters, w->spare.errors, w->spare.shared, w->spare.at_bound};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++) free(all[i]);
 }

@@ -21,6 +21,9 @@ from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 
 _ADAPTIVE = FitOptions(significance=4.5)
 
+KNOWN = 3.0
+"""Errors that the amplitude of an echo beside others must have: a fit with one fewer explains the samples else."""
+
 CLOSED_VALUES = 1 << 21
 """Samples around peaks that the closed form takes at a time: noise has a peak at every fourth sample."""
 
@@ -133,6 +136,7 @@ def adaptive(
         prior_spread=width_prior * shape_limits(system, block.spacing).ref,
         gate_residual=gate_residual,
         gate_hermite=gate_hermite,
+        known=KNOWN,
     )
     return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -11,14 +11,15 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Clusters
+from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Settings, Solution
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
-from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
+from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, join_tables, merge_unresolved
 from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes
 from wavebatch.stages.pulse_tables import (
@@ -157,8 +158,90 @@ def fit_candidates(
         Fitted echoes with errors and flags.
     """
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
-    solution = decompose_clusters(samples_of(block, noise), candidates, clusters, settings)
-    return describe_solution(block, noise, system, clusters, solution, settings, significance)
+    samples = samples_of(block, noise)
+    solution = decompose_clusters(samples, candidates, clusters, settings)
+
+    def describe(clusters: Clusters, solution: Solution) -> EchoTable:
+        columns = {CLUSTER: solution.cluster} if settings.known else {}
+        return describe_solution(block, noise, system, clusters, solution, settings, significance, columns)
+
+    table = describe(clusters, solution)
+    return _leave_out_unknown(table, samples, clusters, solution, settings, describe) if settings.known else table
+
+
+CLUSTER, FACTOR = "cluster", "factor"
+"""Columns of a table while its decomposer works: cluster of each echo, and its error over that of the fit alone."""
+
+
+def _leave_out_unknown(
+    table: EchoTable,
+    samples: Samples,
+    clusters: Clusters,
+    solution: Solution,
+    settings: Settings,
+    describe: Callable[[Clusters, Solution], EchoTable],
+) -> EchoTable:
+    """Leave out echoes whose amplitudes are unknown by their final errors, which hold more than the noise of the fit.
+
+    Their clusters are fitted again in noise that is so much larger: the fit leaves out what that noise explains
+    (`leave_out_unknown` in kernels/c/decompose.h).
+    """
+    unknown = _find_unknown(table, solution, settings)
+    waveforms = np.unique(table.waveform[unknown])
+    part = np.flatnonzero(np.isin(clusters.waveform, waveforms))
+    rest = replace(table, attributes={}).take(np.flatnonzero(~np.isin(table.waveform, waveforms)))
+    if not len(part):
+        return rest
+    clusters, solution = Clusters(*(column[part] for column in clusters)), solution.take(part)
+    again = settings._replace(grow=False, acceptance=settings.known**2)
+    table = describe(clusters, solution)
+    for _ in range(ROUNDS):
+        unknown = _find_unknown(table, solution, settings)
+        if not unknown.any():
+            break
+        factor = np.zeros(len(clusters.number))
+        np.maximum.at(factor, table.attributes[CLUSTER][unknown], table.attributes[FACTOR][unknown])
+        rows = np.flatnonzero(factor)
+        solution = _replace_clusters(solution, rows, _fit_again(samples, clusters, solution, again, rows, factor[rows]))
+        table = describe(clusters, solution)
+    return join_tables(rest, replace(table, attributes={}))
+
+
+def _find_unknown(table: EchoTable, solution: Solution, settings: Settings) -> np.ndarray:
+    """Echoes beside others in a fit whose amplitude is less than `known` of its errors, bool (m,)."""
+    beside = solution.number[table.attributes[CLUSTER]] > 1
+    return beside & (table.amplitude < ROUNDED * settings.known * table.amplitude_err)
+
+
+def _fit_again(
+    samples: Samples, clusters: Clusters, solution: Solution, settings: Settings, rows: np.ndarray, factor: np.ndarray
+) -> Solution:
+    """Clusters at `rows` fitted again from their echoes, in noise `factor` (r,) as large; errors are of noise alone."""
+    old, waveform = solution.take(rows), clusters.waveform[rows]
+    amplitude, time, width, _ = old.parameters.T
+    place = np.arange(len(rows))
+    some = Samples(*(None if column is None else column[waveform] for column in samples))
+    some = some._replace(std=(some.std * factor).astype(np.float32))
+    windows = Clusters(place, clusters.low[rows], clusters.high[rows], np.cumsum(old.number) - old.number, old.number)
+    new = decompose_clusters(some, Candidates(place[old.cluster], time, amplitude, width), windows, settings)
+    each = factor[new.cluster, None]
+    return new._replace(
+        misfit=new.misfit * factor, cost=new.cost * factor**2, errors=new.errors / each, shared=new.shared / each**2
+    )
+
+
+def _replace_clusters(solution: Solution, rows: np.ndarray, new: Solution) -> Solution:
+    """The solution with other fits of the clusters `rows`."""
+    order = np.arange(len(solution.number))
+    order[rows] = len(order) + np.arange(len(rows))
+    return Solution(*map(np.concatenate, zip(solution, new, strict=True))).take(order)
+
+
+ROUNDS = 3
+"""Times that unknown echoes are looked for: with one less, errors of others may grow."""
+
+ROUNDED = 0.999
+"""Amplitudes that the fit found known have as many errors, but for rounding."""
 
 
 def describe_solution(
@@ -219,6 +302,8 @@ def describe_solution(
     amplitude, time, width = parameters[keep].T
     amplitude_err, time_err, width_err = errors[keep].T
     spacing = block.spacing
+    if CLUSTER in given:
+        given = {**given, FACTOR: factors[:, 0]}
     table = EchoTable.build(
         waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
         amplitude_err=amplitude_err, sigma_err=width_err * spacing, relative_energy_err=energy_err[keep],
@@ -228,7 +313,10 @@ def describe_solution(
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components or not system.components:
         table = drop_unproven(table, system, clip_level(block, system) - system.noise.baseline)
+    fitted_err = table.amplitude_err
     table = cover_misfit(table, system, spacing)
+    if CLUSTER in given:
+        table = table.with_attributes(**{FACTOR: table.attributes[FACTOR] * table.amplitude_err / fitted_err})
     if settings.grow:
         table = cover_hidden(table, system, len(block))
     return flag_echoes(block, noise, system, clear_lone(table))
