@@ -57,11 +57,12 @@ def propose(p, x, residual, std, s, shape):
     return start, promise
 
 
-def errors_of(p, x, std, prior, used, shape):
-    """Standard deviations (3, k) with what is known of the widths."""
+def errors_of(p, x, std, prior, used, shape, known=0.0):
+    """Standard deviations (3, k) with what is known of the widths, and of the amplitudes (k,): one over variance."""
     jacobian = slopes(p, x, **shape)[used] / std
     fisher = jacobian.T @ jacobian
     k = p.shape[1]
+    fisher[np.arange(k), np.arange(k)] += known
     if prior:
         for j in range(k):
             fisher[2 * k + j, 2 * k + j] += (p[2, j] < prior[0]) / prior[1] ** 2
@@ -76,6 +77,12 @@ def is_resolved(p, errors):
 
 def decompose(y, std, start, s, clip=np.inf, **shape):
     """Parameters (3, k), errors and chi2 of one window; s: Settings, whose widths, gates and acceptance count."""
+    best = find_echoes(y, std, start, s, clip, **shape)
+    return leave_out_unknown(y, std, best, s, clip, **shape) if s.known else best
+
+
+def find_echoes(y, std, start, s, clip, **shape):
+    """The same before echoes that are not known are left out."""
     first = grow(y, std, start, s, (s.width_low, s.width_high), clip, **shape)
     fall = least_fall(first[0], std, s)
     if not s.grow or first[2] - len(y) < fall:
@@ -85,6 +92,35 @@ def decompose(y, std, start, s, clip=np.inf, **shape):
     second = grow(y, std, narrow[0], s, (s.width_low, s.width_high), clip, **shape)
     better = second[2] + fall * (second[0].shape[1] - first[0].shape[1]) < first[2]
     return second if better else first
+
+
+def leave_out_unknown(y, std, fit, s, clip, **shape):
+    """The fit without the echoes whose amplitude is below `known` errors and without which chi2 rises too little."""
+    p, errors, chi2 = fit
+    x, k = np.arange(float(len(y))), p.shape[1]
+    low, high = (np.array([a, t, w])[:, None] for a, t, w in ((0, -3, s.width_low), (1e12, len(y) + 2, s.width_high)))
+    known, before = np.zeros(k), p[1]
+
+    def prior_of(k):
+        return (s.width_ref, s.prior_spread) if s.prior_spread and k > 1 else None
+
+    def find_errors(p, known):
+        used = ~((y >= clip) & (y - naive.model(p, x, **shape) <= 0))
+        return errors_of(p, x, std, prior_of(p.shape[1]), used, shape, known)
+
+    while p.shape[1] > 1 and (known == 0).any():
+        j = int(np.argmin(np.where(known == 0, p[0] / errors[0], np.inf)))
+        if p[0, j] >= s.known * errors[0, j]:
+            break
+        start = np.delete(p, j, axis=1)
+        less, rest = naive.fit(y, x, std, start, low, high, clipped=y >= clip, prior=prior_of(p.shape[1] - 1), **shape)
+        if rest - chi2 < least_fall(less, std, s):
+            p, chi2, before, known = less, rest, np.delete(before, j), np.zeros(p.shape[1] - 1)
+        else:
+            known[j] = max((2 / p[0, j]) ** 2 - 1 / errors[0, j] ** 2, 1e-300)
+        errors = find_errors(p, known)
+    errors[1] = np.hypot(errors[1], p[1] - before)
+    return p, errors, chi2
 
 
 def least_fall(p, std, s):

@@ -22,7 +22,7 @@ from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 _ADAPTIVE = FitOptions(significance=4.5)
 
 KNOWN = 3.0
-"""Errors that the amplitude of an echo beside others must have: a fit with one fewer explains the samples else."""
+"""Errors that the amplitude of an echo beside others must have, or a fit without it must explain the samples worse."""
 
 CLOSED_VALUES = 1 << 21
 """Samples around peaks that the closed form takes at a time: noise has a peak at every fourth sample."""

@@ -186,31 +186,35 @@ def _leave_out_unknown(
     Their clusters are fitted again in noise that is so much larger: the fit leaves out what that noise explains
     (`leave_out_unknown` in kernels/c/decompose.h).
     """
-    unknown = _find_unknown(table, solution, settings)
-    waveforms = np.unique(table.waveform[unknown])
-    part = np.flatnonzero(np.isin(clusters.waveform, waveforms))
-    rest = replace(table, attributes={}).take(np.flatnonzero(~np.isin(table.waveform, waveforms)))
-    if not len(part):
-        return rest
-    clusters, solution = Clusters(*(column[part] for column in clusters)), solution.take(part)
+    waveforms = np.unique(clusters.waveform[_find_unknown(table, settings, np.ones(len(solution.number))) > 0])
+    part, own = np.isin(clusters.waveform, waveforms), np.isin(table.waveform, waveforms)
+    if not len(waveforms):
+        return replace(table, attributes={})
+    rest, clusters = table.take(~own), Clusters(*(column[part] for column in clusters))
+    solution = solution.take(np.flatnonzero(part))
+    table, noise = describe(clusters, solution), np.ones(len(clusters.number))
     again = settings._replace(grow=False, acceptance=settings.known**2)
-    table = describe(clusters, solution)
     for _ in range(ROUNDS):
-        unknown = _find_unknown(table, solution, settings)
-        if not unknown.any():
+        larger = _find_unknown(table, settings, noise)
+        rows = np.flatnonzero((larger > 0) & (solution.number > 1))
+        if not len(rows):
             break
-        factor = np.zeros(len(clusters.number))
-        np.maximum.at(factor, table.attributes[CLUSTER][unknown], table.attributes[FACTOR][unknown])
-        rows = np.flatnonzero(factor)
-        solution = _replace_clusters(solution, rows, _fit_again(samples, clusters, solution, again, rows, factor[rows]))
+        noise[rows] = larger[rows]
+        solution = _replace_clusters(solution, rows, _fit_again(samples, clusters, solution, again, rows, noise[rows]))
         table = describe(clusters, solution)
-    return join_tables(rest, replace(table, attributes={}))
+    return join_tables(replace(rest, attributes={}), replace(table, attributes={}))
 
 
-def _find_unknown(table: EchoTable, solution: Solution, settings: Settings) -> np.ndarray:
-    """Echoes beside others in a fit whose amplitude is less than `known` of its errors, bool (m,)."""
-    beside = solution.number[table.attributes[CLUSTER]] > 1
-    return beside & (table.amplitude < ROUNDED * settings.known * table.amplitude_err)
+def _find_unknown(table: EchoTable, settings: Settings, noise: np.ndarray) -> np.ndarray:
+    """Noise of each cluster, over that of a fit, in which its unknown echoes must be asked; 0 without any.
+
+    noise: float64 (c,), the noise in which they were asked already.
+    """
+    cluster, factor = table.attributes[CLUSTER], table.attributes[FACTOR]
+    unknown = (table.amplitude < settings.known * table.amplitude_err) & (factor > ROOM * noise[cluster])
+    larger = np.zeros(len(noise))
+    np.maximum.at(larger, cluster[unknown], factor[unknown])
+    return larger
 
 
 def _fit_again(
@@ -240,8 +244,8 @@ def _replace_clusters(solution: Solution, rows: np.ndarray, new: Solution) -> So
 ROUNDS = 3
 """Times that unknown echoes are looked for: with one less, errors of others may grow."""
 
-ROUNDED = 0.999
-"""Amplitudes that the fit found known have as many errors, but for rounding."""
+ROOM = 1.05
+"""Factor on errors up to which echoes are not asked again: baselines add a few per cent."""
 
 
 def describe_solution(
