@@ -54,7 +54,8 @@ class Settings(ctypes.Structure):
             "width_ref width_low width_high clip noise_gain tolerance acceptance misfit prior_spread gate_residual "
             "gate_hermite known skew_mean skew_spread",
         ),
-        *_fields(ctypes.c_int64, "max_iterations max_echoes grow undamped"),
+        *_fields(ctypes.c_int64, "max_iterations max_echoes grow undamped whitened"),
+        ("whitening", ctypes.c_double * 9),
     ]
 
 

@@ -45,6 +45,7 @@ from wavebatch.surveying.systems.doubt import measure_doubt
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import choose_pulse, find_source, guess_pulse
 from wavebatch.surveying.systems.skew import measure_skew
+from wavebatch.surveying.whitening import choose_whitening
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
@@ -394,6 +395,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its
         # misfit; a few echoes of a small strip, full of neighbours, do not know better.
         strong = strong if find_source(system) is None else find_strong(clear, 0)
+        system = choose_whitening(part, system)
         unsure, system = system, measure_misfit(block, system, strong)
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
@@ -415,6 +417,7 @@ def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
     """Whether two surveys with one pulse find the same echoes, near enough for the shares of a scene."""
     ratio = other.noise.std / one.noise.std
     alike = one.noise.gain == other.noise.gain and one.misfit == other.misfit
+    alike &= one.noise.whitening == other.noise.whitening
     return alike and max(ratio, 1 / ratio) < SAME_THRESHOLD
 
 

@@ -82,8 +82,9 @@ static int grow_window(const Settings *s, const Limits *limits, Work *work) {
         if (target < INFINITY && !is_resolved(&work->trial)) return 0;
         exchange(&work->trial, &work->best);
         if (!work->fit.converged || !s->grow || k >= s->max_echoes) return 0;
-        hermite_moments(work, &work->fit);
-        if (!is_misfit(s, work, &work->fit)) return 0;
+        if (s->whitened) whitened_moments(s, work, &work->fit);
+        else hermite_moments(work, &work->fit);
+        if (!(s->whitened ? is_whitened_misfit : is_misfit)(s, work, &work->fit)) return 0;
         if (!reserve(work, k + 1, work->window.vectors)) return -1;
         double promise = propose_echo(s, work, &work->fit, limits, &work->next), fall = least_fall(s, k, work->fit.parameters, work->window.std);
         if (!(promise > 0.5 * fall)) return 0;
@@ -232,6 +233,7 @@ EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, 
     for (; i >= 0 && i < clusters->n; i++) {
         if (!reserve(&work, clusters->number[i], VECTORS(clusters->high[i] - clusters->low[i]))) { i = -1; break; }
         cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
+        if (s->whitened && s->grow) find_new_energy(&work);
         if (decompose_window(s, clusters, i, &work) < 0) { i = -1; break; }
         if (s->known > 0) leave_out_unknown(s, &work);
         if (s->skew_spread > 0 && s->pulse.kind != LOG_NORMAL) free_skews(s, &work);
@@ -258,7 +260,8 @@ EXPORT int64_t promise_echoes(const Block *block, const Clusters *clusters, cons
         work.fit.k = k; work.fit.per = 3;
         evaluate_rows(k, 3, s, &work, work.fit.parameters);
         multiply_rows(3 * k + 1, work.window.vectors, work.rows, work.fit.gram);
-        hermite_moments(&work, &work.fit);
+        if (s->whitened) { find_new_energy(&work); whitened_moments(s, &work, &work.fit); }
+        else hermite_moments(&work, &work.fit);
         promise[i] = propose_echo(s, &work, &work.fit, &limits, &work.next);
     }
     free_work(&work);

@@ -48,6 +48,8 @@ class Settings(NamedTuple):
     """Limit of h3^2 + h4^2 (docs/algorithms.md 4.2)."""
     known: float = 0.0
     """Errors that the amplitude of an echo needs beside others, or chi2 must rise enough without it; 0: any will do."""
+    whitening: np.ndarray | None = None
+    """Filter that makes the noise white, float64 (3, 3), `whitening_filter`; None where fits take it for white."""
     undamped: bool = False
     """Gauss-Newton steps without damping or limits, for comparison (docs/algorithms.md 1.3)."""
     skew_mean: float = 0.0

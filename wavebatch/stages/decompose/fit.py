@@ -17,7 +17,7 @@ from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.solve import FIT, EchoLimits, FitOptions, fit_candidates, fit_gaussian, make_settings
 from wavebatch.stages.flags import flag_echoes
-from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import fit_misfit, pulse_shape, shape_limits
 
 _ADAPTIVE = FitOptions(significance=4.5)
 
@@ -131,7 +131,7 @@ def adaptive(
         fit,
         grow=True,
         acceptance=acceptance or system.acceptance,
-        misfit=max(system.misfit, SINGLE_PRECISION),
+        misfit=max(fit_misfit(system, block.spacing), SINGLE_PRECISION),
         max_echoes=max_echoes,
         prior_spread=width_prior * shape_limits(system, block.spacing).ref,
         gate_residual=gate_residual,

@@ -31,6 +31,7 @@ from wavebatch.stages.pulse_tables import (
     describe_echoes,
     error_factors,
     matched_gaussian,
+    noise_filter,
     pulse_shape,
     shape_limits,
 )
@@ -125,7 +126,7 @@ def make_settings(
     limits = shape_limits(pulse, block.spacing, fit.least_width, fit.most_width)
     return Settings(
         *limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise.gain, tolerance=fit.tolerance,
-        max_iterations=fit.max_iterations, **options,
+        max_iterations=fit.max_iterations, whitening=noise_filter(system), **options,
     )  # fmt: skip
 
 

@@ -20,7 +20,14 @@ from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, ga
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import (
+    clip_level,
+    fit_misfit,
+    model_parameters,
+    noise_filter,
+    pulse_shape,
+    shape_limits,
+)
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, find_strongest
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW
 from wavebatch.surveying.measuring.residuals import find_common, render_own, subtract_echoes
@@ -106,6 +113,7 @@ def measure_misfit(
     if len(fitted) >= FEW:
         ratio = fitted.amplitude.astype(np.float64) / system.noise.std
         energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
+        energy *= fit_misfit(replace(system, misfit=1.0), block.spacing) ** 2
         every = (_promise(part, samples_of(part, noise), system, fitted, reach) - NOISE_PROMISE) / energy
         share = np.quantile(every, MISFIT_QUANTILE)
         if bounded:
@@ -162,9 +170,7 @@ def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     return replace(system, beside=tuple(profile))
 
 
-def _promise(
-    part: WaveformBlock, samples: Samples, system: SystemPulse, echoes: EchoTable, reach: float
-) -> np.ndarray:
+def _promise(part: WaveformBlock, samples: Samples, system: SystemPulse, echoes: EchoTable, reach: float) -> np.ndarray:
     """Fall of chi2 (m,) that one more echo promises near each echo, the only one of its waveform."""
     spacing = part.spacing
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
@@ -177,7 +183,7 @@ def _promise(
     echo = np.arange(len(echoes))
     windows = Clusters(echoes.waveform.astype(np.int64), low, high, echo, np.ones_like(echo))
     amplitude, time, width = main.T
-    settings = Settings(*limits, shape, clip_level(part, system), system.noise.gain)
+    settings = Settings(*limits, shape, clip_level(part, system), system.noise.gain, whitening=noise_filter(system))
     fitted = Candidates(windows.waveform, time, amplitude, width)
     return promise_echoes(samples, fitted, windows, settings)
 

@@ -53,6 +53,10 @@ ROWS: dict[str, Rows] = {
         "noise.correlation", ((-1.0, 1.0),), "numbers",
         "of the noise of two samples 1, 2, ... spacings apart; empty: white noise",
     ),
+    "whitening": Rows(
+        "noise.whitening", ((-2.0, 2.0),), "numbers",
+        "what predicts the noise of a sample from the two before it; empty: fits take noise for white", optional=True,
+    ),
     "pattern_dn": Rows(
         "defects.pattern", ((-1e6, 1e6),), "numbers", "offsets that repeat along the samples, taken off; empty: none"
     ),
