@@ -8,6 +8,7 @@ from fits import decompose, settings
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import Samples, decompose_clusters, promise_echoes
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, PulseTable
+from wavebatch.kernels.signal.noise import whitening_filter
 
 LENGTH = 48
 GROWING = {"grow": True, "prior_spread": 0.2, "tolerance": 1e-6, "max_iterations": 200}
@@ -132,19 +133,24 @@ def draw_crowd(rng):
     ("draw", "clip"),
     [(draw_random, np.inf), (draw_random, 200.0), (draw_stiff, np.inf), (draw_stiff, 200.0), (draw_crowd, np.inf)],
 )
-@pytest.mark.parametrize("known", [0.0, 3.0])
-def test_clusters_grow_as_those_of_the_twin(shape, draw, clip, known):
+@pytest.mark.parametrize(("known", "whitening"), [(0.0, ()), (3.0, ()), (3.0, (1.1, -0.4))])
+def test_clusters_grow_as_those_of_the_twin(shape, draw, clip, known, whitening):
     rng, m = np.random.default_rng(5), 20 if draw is draw_crowd else 50  # its twin takes long
     truth = [draw(rng) for _ in range(m)]
     y = np.stack([naive_fit.naive.model(p, np.arange(float(LENGTH)), components=shape.components) for p in truth])
-    y = np.minimum(np.rint(y + rng.standard_normal(y.shape)), clip)
+    noise = rng.standard_normal(y.shape)
+    if whitening:
+        noise = np.linalg.solve(naive_fit.whiten(LENGTH, np.zeros(LENGTH, bool), *whitening), noise.T).T
+    y = np.minimum(np.rint(y + noise), clip)
     peak = y.argmax(axis=1).astype(float)
     start = np.stack([y.max(axis=1), peak, np.full(m, 2.0)], axis=1)[:, :, None]
     options = GROWING | {"shape": shape, "clip": clip if np.isfinite(clip) else None, "known": known}
+    options |= {"whitening": whitening_filter(whitening)} if whitening else {}
     found = decompose(y, start, **options)
     ends, same, near, alike = np.cumsum(found.number), 0, 0, 0
     for i in range(m):
-        twin = naive_fit.decompose(y[i], 1.0, start[i], settings(**options), clip, components=shape.components)
+        white = naive_fit.whiten(LENGTH, y[i] >= clip, *whitening) if whitening else None
+        twin = naive_fit.decompose(y[i], 1.0, start[i], settings(**options), clip, white, components=shape.components)
         p, errors, chi2 = twin
         if p.shape[1] != found.number[i]:
             continue
