@@ -19,7 +19,7 @@ from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
-from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, join_tables, merge_unresolved
+from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
 from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes
 from wavebatch.stages.pulse_tables import (
@@ -187,13 +187,16 @@ def _leave_out_unknown(
     Their clusters are fitted again in noise that is so much larger: the fit leaves out what that noise explains
     (`leave_out_unknown` in kernels/c/decompose.h).
     """
-    waveforms = np.unique(clusters.waveform[_find_unknown(table, settings, np.ones(len(solution.number))) > 0])
-    part, own = np.isin(clusters.waveform, waveforms), np.isin(table.waveform, waveforms)
-    if not len(waveforms):
+    noise = np.ones(len(solution.number))
+    unknown = (_find_unknown(table, settings, noise) > 0) & (solution.number > 1)
+    if not unknown.any():
         return replace(table, attributes={})
-    rest, clusters = table.take(~own), Clusters(*(column[part] for column in clusters))
-    solution = solution.take(np.flatnonzero(part))
-    table, noise = describe(clusters, solution), np.ones(len(clusters.number))
+    is_part = np.zeros(len(samples.counts), bool)
+    is_part[clusters.waveform[unknown]] = True
+    part, own = np.flatnonzero(is_part[clusters.waveform]), is_part[table.waveform]
+    rest, table = table.take(~own), table.take(own)
+    table = table.with_attributes(**{CLUSTER: np.searchsorted(part, table.attributes[CLUSTER])})
+    clusters, solution, noise = Clusters(*(column[part] for column in clusters)), solution.take(part), noise[part]
     again = settings._replace(grow=False, acceptance=settings.known**2)
     for _ in range(ROUNDS):
         larger = _find_unknown(table, settings, noise)
@@ -203,7 +206,8 @@ def _leave_out_unknown(
         noise[rows] = larger[rows]
         solution = _replace_clusters(solution, rows, _fit_again(samples, clusters, solution, again, rows, noise[rows]))
         table = describe(clusters, solution)
-    return join_tables(replace(rest, attributes={}), replace(table, attributes={}))
+    both = EchoTable.concatenate((replace(rest, attributes={}), replace(table, attributes={})))
+    return both.take(np.argsort(both.waveform, kind="stable"))
 
 
 def _find_unknown(table: EchoTable, settings: Settings, noise: np.ndarray) -> np.ndarray:
@@ -245,8 +249,8 @@ def _replace_clusters(solution: Solution, rows: np.ndarray, new: Solution) -> So
 ROUNDS = 3
 """Times that unknown echoes are looked for: with one less, errors of others may grow."""
 
-ROOM = 1.05
-"""Factor on errors up to which echoes are not asked again: baselines add a few per cent."""
+ROOM = 1.1
+"""Factor on errors up to which echoes are not asked again: baselines and small misfits add a few per cent."""
 
 
 def describe_solution(
