@@ -41,11 +41,11 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
+from wavebatch.surveying.measuring.whitening import choose_whitening
 from wavebatch.surveying.systems.doubt import measure_doubt
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import choose_pulse, find_source, guess_pulse
 from wavebatch.surveying.systems.skew import measure_skew
-from wavebatch.surveying.whitening import choose_whitening
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
