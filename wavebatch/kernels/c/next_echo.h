@@ -95,14 +95,18 @@ static void whitened_moments(const Settings *s, Work *work, const Fit *fit) {
     }
 }
 
-/* Energy of a whitened new pulse at each sample of the window, once per window; the same wherever no gap is near. */
+/* Energy of a whitened new pulse at each sample of the window; the same wherever no gap is near, and near the ends of
+   all windows without gaps and weights. */
 static void find_new_energy(Work *work) {
     const Window *w = &work->window;
     const int64_t room = w->vectors * LANES, reach = work->reach, plain = !w->is_weighted && !w->any_clipped && w->used == w->n;
     const float *filter = (const float *)w->filter, *weight = (const float *)w->weight;
-    float *energy = (float *)work->new_energy;
+    const int64_t edge = reach + 3, last = w->n - 1, is_long = plain && w->n > 2 * edge;
+    float *energy = (float *)work->new_energy, *begin = work->edges, *end = begin + edge + 1;
+    for (int64_t t = 0; t <= last && is_long && work->has_edges; t++)
+        energy[t] = t < edge ? begin[t] : last - t < edge ? end[last - t] : begin[edge];
+    if (is_long && work->has_edges) return;
     for (int64_t t = 0; t < room; t++) {
-        if (plain && t - reach > 2 && t + reach + 2 < w->n) { energy[t] = energy[t - 1]; continue; }
         float sum = 0;
         for (int64_t i = t > reach ? t - reach : 0; i <= t + reach + 2 && i < w->n; i++) {
             float value = 0;
@@ -114,6 +118,8 @@ static void find_new_energy(Work *work) {
         }
         energy[t] = sum;
     }
+    for (int64_t t = 0; t <= edge && is_long; t++) { begin[t] = energy[t]; end[t] = energy[last - t]; }
+    work->has_edges |= is_long;
 }
 
 static void correlate(const Work *work, const lanes *row, const float *taps, lanes *out);
@@ -147,6 +153,7 @@ static int is_misfit(const Settings *s, Work *work, const Fit *fit) {
 static int make_taps(Work *work, const Settings *s, int64_t length) {
     work->reach = (int64_t)ceil(fmin(3 * s->width_ref, length));
     if (!enlarge(&work->taps, 2 * (work->reach + 1) * sizeof(float))) return 0;
+    if (!enlarge(&work->edges, 2 * (work->reach + 4) * sizeof(float))) return 0;
     for (int64_t i = 0; i <= work->reach; i++) {
         double z = i / s->width_ref, tap = exp_lanes(ALL(-0.5 * z * z))[0];
         work->taps[i] = tap;

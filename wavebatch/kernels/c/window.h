@@ -54,14 +54,10 @@ static void set_filter(const Settings *s, Window *w) {
 /* A row filtered in place, from its end. */
 INLINE void whiten(const Window *w, lanes *row) {
     const int64_t n = w->vectors;
-    float first[2 + LANES] = {0};
-    memcpy(first + 2, row, sizeof(lanes));
     for (int64_t v = n - 1; v >= 0; v--) {
-        const float *here = v > 0 ? (const float *)(row + v) : first + 2;
-        lanes one, two;
-        memcpy(&one, here - 1, sizeof one);
-        memcpy(&two, here - 2, sizeof two);
-        row[v] = row[v] * w->filter[v] + one * w->filter[n + v] + two * w->filter[2 * n + v];
+        const lanes here = row[v], left = v > 0 ? row[v - 1] : ALL(0);
+        const lanes one = {left[3], here[0], here[1], here[2]}, two = {left[2], left[3], here[0], here[1]};
+        row[v] = here * w->filter[v] + one * w->filter[n + v] + two * w->filter[2 * n + v];
     }
 }
 

@@ -37,8 +37,9 @@ typedef struct {
     double *kept, *products, *matrix, *pivot, *step, *column, *h3, *h4;
     double *known;                             /* of amplitudes: one over variance, in noise, beside what the fit says */
     uint8_t *frozen;
-    float *taps;
+    float *taps, *edges;                       /* of a new pulse; its energy, whitened, from each end of a window */
     int64_t reach;                             /* of the taps of a new pulse */
+    int has_edges;
 } Work;
 
 /* Enlarges a buffer and keeps what is in it; false where there is no memory. */
@@ -75,7 +76,7 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
 static void free_work(Work *w) {
     void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->window.filter, w->back, w->new_energy, w->rows, w->about, w->padded, w->energy,
         w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->h3, w->h4,
-        w->known, w->frozen, w->taps, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
+        w->known, w->frozen, w->taps, w->edges, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
         w->best.errors, w->best.shared, w->best.at_bound, w->spare.parameters, w->spare.errors, w->spare.shared, w->spare.at_bound};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++) free(all[i]);
 }
