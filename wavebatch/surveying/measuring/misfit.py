@@ -60,6 +60,10 @@ TAIL_BEFORE, TAIL_AFTER = 15, 40
 BESIDE, NOT_ABSORBED = 10, 3
 """Widths of the pulse beside an echo up to which what is left is measured, and from which."""
 
+MOSTLY_FREE = 0.25
+"""Share of the samples at a distance that must be free of other echoes: the few that are beside many hold echoes that
+were not found."""
+
 ONE_SIGMA = 0.6827
 """Share of normal values within one standard deviation."""
 
@@ -163,8 +167,9 @@ def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
         free[row, max(int(time - NOT_ABSORBED * ref), 0) : int(time + NOT_ABSORBED * ref) + 2] = False
     profile = []
     for place in range(-BESIDE, BESIDE + 1):
-        here = np.abs(seen[free & (lag >= place - 0.5) & (lag < place + 0.5)])
-        if abs(place) >= NOT_ABSORBED and len(here) >= ENOUGH_TO_LEARN:
+        near = (lag >= place - 0.5) & (lag < place + 0.5)
+        here = np.abs(seen[free & near])
+        if abs(place) >= NOT_ABSORBED and len(here) >= max(ENOUGH_TO_LEARN, MOSTLY_FREE * np.count_nonzero(near)):
             variance = float(np.quantile(here, ONE_SIGMA)) ** 2 - 1
             profile.append((float(place * system.sigma_ref), max(variance, 0.0)))
     return replace(system, beside=tuple(profile))
