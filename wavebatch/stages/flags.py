@@ -146,7 +146,7 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
         more = energy * core**2 + np.where(strong, np.interp(lag, lags, beside), 0.0)
         variance[row] = np.maximum(variance[row], more)
     factor = np.sqrt(find_unexplained(table, system, spacing) * (1 + variance))
-    return _scale_errors(table, factor)
+    return scale_errors(table, factor)
 
 
 def use_noise_errors(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:
@@ -162,10 +162,11 @@ def use_noise_errors(table: EchoTable, system: SystemPulse, spacing: float) -> E
     EchoTable
         The same echoes.
     """
-    return _scale_errors(table, 1 / np.sqrt(find_unexplained(table, system, spacing)))
+    return scale_errors(table, 1 / np.sqrt(find_unexplained(table, system, spacing)))
 
 
-def _scale_errors(table: EchoTable, factor: np.ndarray) -> EchoTable:
+def scale_errors(table: EchoTable, factor: np.ndarray) -> EchoTable:
+    """Return the echoes (m,) with all errors times `factor`, float (m,)."""
     if (factor == 1).all():
         return table
     factor = factor.astype(np.float32)

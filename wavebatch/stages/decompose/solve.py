@@ -21,7 +21,7 @@ from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
 from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
 from wavebatch.stages.detect.candidates import samples_of
-from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes
+from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes, scale_errors
 from wavebatch.stages.pulse_tables import (
     BROADEST,
     LEAST_WIDTH,
@@ -167,11 +167,19 @@ def fit_candidates(
         return describe_solution(block, noise, system, clusters, solution, settings, significance, columns)
 
     table = describe(clusters, solution)
-    return _leave_out_unknown(table, samples, clusters, solution, settings, describe) if settings.known else table
+    if not settings.known:
+        return table
+    table = _leave_out_unknown(table, samples, clusters, solution, settings, describe)
+    proven = (table.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
+    share = np.where(proven, table.amplitude / (PROVEN * table.amplitude_err), 1.0)
+    return scale_errors(table, np.minimum(share, 1.0))
 
+
+PROVEN = 2.0
+"""Errors of the amplitude of an echo beside others that chi2 proves, as in kernels/c/decompose.h."""
 
 CLUSTER, FACTOR = "cluster", "factor"
-"""Columns of a table while its decomposer works: cluster of each echo, and its error over that of the fit alone."""
+"""Columns of a table while its decomposer works: cluster of each echo, and what misfits add to its errors."""
 
 
 def _leave_out_unknown(
@@ -182,7 +190,7 @@ def _leave_out_unknown(
     settings: Settings,
     describe: Callable[[Clusters, Solution], EchoTable],
 ) -> EchoTable:
-    """Leave out echoes whose amplitudes are unknown by their final errors, which hold more than the noise of the fit.
+    """Leave out echoes whose amplitudes are unknown by their final errors, which hold misfits of the pulse too.
 
     Their clusters are fitted again in noise that is so much larger: the fit leaves out what that noise explains
     (`leave_out_unknown` in kernels/c/decompose.h).
@@ -250,7 +258,7 @@ ROUNDS = 3
 """Times that unknown echoes are looked for: with one less, errors of others may grow."""
 
 ROOM = 1.1
-"""Factor on errors up to which echoes are not asked again: baselines and small misfits add a few per cent."""
+"""Factor on errors by misfits up to which echoes are not asked again."""
 
 
 def describe_solution(
@@ -312,7 +320,7 @@ def describe_solution(
     amplitude_err, time_err, width_err = errors[keep].T
     spacing = block.spacing
     if CLUSTER in given:
-        given = {**given, FACTOR: factors[:, 0]}
+        given = {**given, FACTOR: np.ones(len(waveform), np.float32)}
     table = EchoTable.build(
         waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
         amplitude_err=amplitude_err, sigma_err=width_err * spacing, relative_energy_err=energy_err[keep],
