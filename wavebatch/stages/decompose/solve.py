@@ -320,7 +320,8 @@ def describe_solution(
     amplitude_err, time_err, width_err = errors[keep].T
     spacing = block.spacing
     if CLUSTER in given:
-        given = {**given, FACTOR: np.ones(len(waveform), np.float32)}
+        # Colour that makes errors larger is left to the acceptance, which has made `noise.std` of it.
+        given = {**given, FACTOR: np.minimum(factors[:, 0], 1.0).astype(np.float32)}
     table = EchoTable.build(
         waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
         amplitude_err=amplitude_err, sigma_err=width_err * spacing, relative_energy_err=energy_err[keep],
