@@ -28,7 +28,8 @@ def innovate(row, correlation):
     """What the two samples before do not predict, of variance 1."""
     factors, left = predict(correlation)
     before = np.r_[0.0, 0.0, row]
-    return np.array([before[i + 2] - factors[0] * before[i + 1] - factors[1] * before[i] for i in range(len(row))]) / np.sqrt(left)
+    rest = [before[i + 2] - factors[0] * before[i + 1] - factors[1] * before[i] for i in range(len(row))]
+    return np.array(rest) / np.sqrt(left)
 
 
 def directions(evaluate, x, echo, used):

@@ -59,7 +59,8 @@ TWINS = {
         "find_maxima": "naive.find_peaks",
         "measure_covariance": "naive_signal.measure_covariance", "measure_recovery": "naive_signal.measure_recovery",
         "find_levels": "naive_signal.find_level", "keep_longest": "naive_signal.keep_longest",
-        "residual_noise": "naive_signal.residual_noise", "colour_factors": "naive_signal.colour_factors",
+        "residual_noise": "naive_signal.residual_noise", "whitening_filter": "naive_fit.whiten",
+        "colour_factors": "naive_signal.colour_factors",
         "find_reference": "naive_signal.find_reference", "measure_outgoing": "naive_signal.measure_outgoing",
         "fit_height": "naive_signal.fit_height", "keep_signal": "naive_signal.keep_runs",
         "measure_offsets": "naive_signal.measure_offset", "find_runs": "naive.find_runs",
@@ -91,6 +92,7 @@ BY_LOOP = {
 
 NO_TWIN = {
     "find_datum": "tests of pulses with a known place",
+    "predict_noise": "tests put it into the equations that it solves",
     "find_seam": "tests on plain counts with a known seam",
     "bound_time": "a formula; crlb, which has a twin, is made of it",
     "fit_gaussians": "its fit is fit_bounded, its model naive.pulse; tests learn known sums again",

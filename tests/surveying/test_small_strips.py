@@ -59,8 +59,8 @@ def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path,
     path = cut_strip(whole, tmp_path / "cut.las", 50)
     assert _survey(path).figures.echoes_in_doubt < 0.05
     _leave_out(monkeypatch, "nasa-lvis")
-    for strip in (path, whole):
-        assert _survey(strip).figures.echoes_in_doubt > MOST_DOUBTED
+    assert _survey(path).figures.echoes_in_doubt > MOST_DOUBTED
+    assert _survey(whole).figures.echoes_in_doubt > 0.05, "halves differ in a quarter: unknown echoes are left out"
 
 
 @pytest.mark.parametrize(("change", "doubted"), [(0.0, False), (0.05, True)])

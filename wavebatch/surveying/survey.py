@@ -40,6 +40,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
+from wavebatch.surveying.measuring.whitening import choose_whitening
 from wavebatch.surveying.systems.doubt import share_unexplained
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known
@@ -395,6 +396,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = measure_tail(block, system, find_strong(clear))
         if not (system.components or system.kappa):
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
+        system = choose_whitening(part, system)
         system, mirror = settle(block, system)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
@@ -415,6 +417,7 @@ def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
     """Whether two surveys with one pulse find the same echoes, near enough for the shares of a scene."""
     ratio = other.noise.std / one.noise.std
     alike = one.noise.gain == other.noise.gain and one.misfit == other.misfit
+    alike &= one.noise.whitening == other.noise.whitening
     return alike and max(ratio, 1 / ratio) < SAME_THRESHOLD
 
 

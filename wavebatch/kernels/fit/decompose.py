@@ -109,6 +109,10 @@ def _as_structure(settings: Settings) -> library.Settings:
     pulse = as_pulse(settings.shape)
     values = settings._asdict() | {"pulse": pulse, "clip": np.inf if settings.clip is None else settings.clip}
     del values["shape"]
+    table = np.zeros((3, 3)) if settings.whitening is None else np.asarray(settings.whitening, np.float64)
+    if table.shape != (3, 3) or not np.isfinite(table).all():
+        raise ValueError("a whitening filter has three finite rows of three")
+    values |= {"whitened": settings.whitening is not None, "whitening": (ctypes.c_double * 9)(*table.ravel())}
     structure = library.Settings(**values)
     structure.arrays = pulse.arrays
     return structure

@@ -695,3 +695,53 @@ def correlation_matrix(correlation: tuple[float, ...] | np.ndarray, size: int) -
     rho = np.asarray(correlation, np.float64)
     lag = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
     return np.r_[1.0, rho, 0.0][np.minimum(lag, len(rho) + 1)]
+
+
+def predict_noise(correlation: tuple[float, ...] | np.ndarray) -> tuple[float, float] | None:
+    """Find what predicts the noise of a sample from the two before it.
+
+    Parameters
+    ----------
+    correlation : (k,)
+        Of the noise at lags 1, 2, ... [samples].
+
+    Returns
+    -------
+    (float, float) or None
+        Shares of the sample before, and of the one before that; None where no noise has such a correlation.
+
+    References
+    ----------
+    The equations of Yule and Walker for an autoregression of order 2; docs/algorithms.md H11.
+    """
+    one, two = (float(value) for value in (*correlation, 0.0, 0.0)[:2])
+    if not (abs(one) < MOST_PREDICTED and 2 * one * one - 1 < MOST_PREDICTED * two < MOST_PREDICTED**2):
+        return None
+    return one * (1 - two) / (1 - one * one), (two - one * one) / (1 - one * one)
+
+
+MOST_PREDICTED = 0.999
+"""Correlation of noise from which on it is as good as constant: nothing is left that is new in a sample."""
+
+
+def whitening_filter(whitening: tuple[float, float], gain: float = 1.0) -> np.ndarray:
+    """Return the filter that makes coloured noise white.
+
+    Parameters
+    ----------
+    whitening : (float, float)
+        As `predict_noise` returns it.
+    gain : float
+        Standard deviation of the white noise over that of a coloured sample.
+
+    Returns
+    -------
+    float64 (3, 3)
+        Row q: coefficients of a sample and of those 1 and 2 before it, for one with q others before it. They are rows
+        of the inverse Cholesky factor of the noise's correlation.
+    """
+    near, far = whitening
+    one = near / (1 - far)
+    left = 1 - one * one
+    rows = np.array([[1.0, 0.0, 0.0], [1.0, -one, 0.0], [1.0, -near, -far]])
+    return gain * rows / np.sqrt([1.0, left, left * (1 - far * far)])[:, None]

@@ -54,6 +54,10 @@ ROWS: dict[str, Rows] = {
         "noise.correlation", ((-1.0, 1.0),), "numbers",
         "of the noise of two samples 1, 2, ... spacings apart; empty: white noise",
     ),
+    "whitening": Rows(
+        "noise.whitening", ((-2.0, 2.0),), "numbers",
+        "what predicts the noise of a sample from the two before it; empty: fits take noise for white", optional=True,
+    ),
     "pattern_dn": Rows(
         "defects.pattern", ((-1e6, 1e6),), "numbers", "offsets that repeat along the samples, taken off; empty: none"
     ),
@@ -130,6 +134,7 @@ def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
     own = parts[""]
     own["seams"] = dict(own.get("seams", ()))
     _check_components(own["components"], f"{table.where}: components")
+    _check_whitening(parts["noise"].get("whitening", ()), f"{table.where}: whitening")
     return SystemPulse(
         **own,
         noise=ReceiverNoise(by_kind=read_numbers(table.table(_NOISE), low=0.0), **parts["noise"]),
@@ -144,6 +149,11 @@ def _check_components(components: tuple[tuple[float, ...], ...], where: str) -> 
         raise ConfigError(f"{where} must be empty or hold 2 to {MOST_COMPONENTS} Gaussians, it holds {len(components)}")
     if components and components[0][0] < 0.01:
         raise ConfigError(f"{where} row 1 is the main Gaussian, its weight must be positive, it is {components[0][0]}")
+
+
+def _check_whitening(whitening: tuple[float, ...], where: str) -> None:
+    if whitening and not (len(whitening) == 2 and abs(whitening[1]) < 1 and abs(whitening[0]) < 1 - whitening[1]):
+        raise ConfigError(f"{where} must be empty or hold two shares a, b of steady noise: |a| < 1 - b and |b| < 1")
 
 
 def read_numbers(table: TomlTable, low: float = -MOST_FIGURE) -> dict[str, float]:
