@@ -53,9 +53,9 @@ a higher threshold than these add: echoes of 4 to 6 noises are some 2 % of a sce
 STEP, LARGEST = 1.6, 0.1
 """Factor by which the misfit grows at a time, and its largest value: what exceeds it is no pulse of this strip."""
 
-WORTH = 0.3
+WORTH = 0.15
 """Mirrored echoes that a step must take away, per echo that it takes: misfit that leaves an echo of one sign has no
-twin in the mirror, so that a third means that most of them were false. Close targets have hardly one."""
+twin in the mirror, so that a seventh means that many of them were false. Close targets have hardly one."""
 
 SIGNIFICANCE, FINER, MOST_SIGNIFICANT = 4.5, 0.25, 6.5
 """Least energy of an echo to begin with, step by which it grows, and where it ends [standard deviations]."""

@@ -147,11 +147,16 @@ def describe_waveforms(
 
 
 def find_own_width(explained: Explained, ref: float) -> float:
-    """Find the narrowest width that echoes repeat (`find_edge`), over the pulse's own width `ref` [samples].
+    """Find the narrowest width that strong echoes repeat (`find_edge`), over the pulse's own width `ref` [samples].
 
-    1 with too few widths that are known.
+    Of those at least half as high as the strongest of their waveform: what a wrong pulse makes of its after-pulses
+    repeats too, and is narrower. 1 with too few widths that are known.
     """
     ratio, error, known = _measure_widths(explained, ref)
+    echoes = explained.echoes
+    strongest = np.zeros(len(explained.sums.left), np.float32)
+    np.maximum.at(strongest, echoes.waveform, echoes.amplitude)
+    known &= echoes.amplitude >= 0.5 * strongest[echoes.waveform]
     return find_edge(ratio[known], error[known]) if np.count_nonzero(known) >= LEAST_KNOWN else 1.0
 
 
