@@ -49,8 +49,6 @@ from wavebatch.surveying.systems.skew import measure_skew
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
 
-REFINEMENTS = 3
-"""Times, at most, that the pulse is learned again from echoes fitted with it; mostly once is enough."""
 
 LEAST_QUIET_SAMPLES = 4
 """Samples before the strongest echo from which a waveform has a level."""
@@ -58,8 +56,6 @@ LEAST_QUIET_SAMPLES = 4
 LEAST_LEVELS = 5
 """Waveforms of a descriptor from which on its level is compared with that of others."""
 
-SAME_THRESHOLD = 1.03
-"""Ratio of two noises up to which the sample is not decomposed again."""
 
 NARROWER = 0.85
 """Width of the chosen pulse, over that of isolated echoes, below which quiet samples are looked for once more if there
@@ -411,14 +407,6 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     figures = _describe(part, system, echoes, figures)
     decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
     return Survey(system, len(block), figures, decisions, candidates)
-
-
-def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
-    """Whether two surveys with one pulse find the same echoes, near enough for the shares of a scene."""
-    ratio = other.noise.std / one.noise.std
-    alike = one.noise.gain == other.noise.gain and one.misfit == other.misfit
-    alike &= one.noise.whitening == other.noise.whitening
-    return alike and max(ratio, 1 / ratio) < SAME_THRESHOLD
 
 
 def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:

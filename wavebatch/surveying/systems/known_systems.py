@@ -39,28 +39,6 @@ LEAST_SNR = 10.0
 MOST_ECHOES = 200
 """Echoes, the strongest ones, in which pulses are compared; more do not change the answer."""
 
-COMPARED = 256
-"""Waveforms in which pulses are compared."""
-
-SURE, SCALES, STEEP = 1.05, (0.88, 1.12), 1.06
-"""Cost of the strip's pulse over that of a known one (`measure_cost`), times what the known one costs more at the best
-of these widths, from which it is taken: a pulse that serves as well stretched is another one. It is 1.05 to 2.5 for the
-right one in strips of all sizes. Where the strip's is a guess, the second factor alone must be STEEP: any pulse with a
-tail serves better than a guess."""
-
-CROWDED = 1.5
-"""Echoes per waveform from which a learned pulse may have taken neighbours for a tail, however well it fits."""
-
-NEARLY = 1.03
-"""Cost of a narrower known pulse, over that of a learned one, up to which it is taken where it is STEEP: slopes within
-a large footprint widen all echoes of a strip, so that they explain themselves as well."""
-
-ALMOST = 1.1
-"""Cost of a known pulse, over that of the strip's drawn together, up to which it is taken in its place: in a canopy a
-pulse that is too narrow costs hardly more than the right one."""
-
-SHORT = 5.0
-"""Misfit in chi2 per echo from which a learned pulse is doubted: a third of what pays for one more echo."""
 
 BEFORE, AFTER = 4.0, 9.0
 """Widths of the pulse before and after an echo in which the misfit is measured: both shipped pulses with their
@@ -69,9 +47,6 @@ after-pulses lie within."""
 SAME_SPACING = 0.01
 """How far the spacing of a strip may be from that of a known sensor, as a share of it."""
 
-WIDTHS = 0.6, 1.25
-"""Width of a known pulse, over that of the isolated echoes, within which it is tried: echoes of a canopy are wider than
-the pulse."""
 
 ALIKE = 0.05
 """Difference of two pulses, as `compare_pulses` measures it, up to which one looks like the other ..."""
