@@ -16,8 +16,9 @@ import numpy as np
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
+from wavebatch.stages.pulse_tables import shape_limits
 from wavebatch.surveying.measuring.joint_pulse import learn_jointly
-from wavebatch.surveying.measuring.judge import describe_waveforms, explain, measure_change
+from wavebatch.surveying.measuring.judge import describe_waveforms, explain, find_own_width, measure_change
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
 
@@ -53,11 +54,13 @@ a higher threshold than these add: echoes of 4 to 6 noises are some 2 % of a sce
 STEP, LARGEST = 1.6, 0.1
 """Factor by which the misfit grows at a time, and its largest value: what exceeds it is no pulse of this strip."""
 
-WORTH = 0.15
-"""Mirrored echoes that a step must take away, per echo that it takes: misfit that leaves an echo of one sign has no
-twin in the mirror, so that a seventh means that many of them were false. Close targets have hardly one."""
+WORTH = 0.3
+"""Echoes in the mirror per echo that is false: misfit that leaves an echo of one sign has no twin there."""
 
-SIGNIFICANCE, FINER, MOST_SIGNIFICANT = 4.5, 0.25, 6.5
+LEAST_MISFIT = 0.0005
+"""Misfit to begin with where there is none: half a noise at 1,000 noises."""
+
+SIGNIFICANCE, FINER, MOST_SIGNIFICANT = 4.5, 0.5, 6.5
 """Least energy of an echo to begin with, step by which it grows, and where it ends [standard deviations]."""
 
 
@@ -169,8 +172,12 @@ def choose_pulse(
 
 
 def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
-    """Pulses learned from one echo per cluster and from all echoes, two rounds each."""
+    """Pulses learned from one echo per cluster and from all echoes, two rounds each; before them a Gaussian."""
     system = begin.system
+    if not (system.components or system.kappa):
+        every = explain(block, _bear(system, begin.change), width_prior=0.0)
+        own = find_own_width(every, shape_limits(system, block.spacing).ref)
+        yield "gaussian of all echoes", replace(system, sigma_ref=system.sigma_ref * own)
     for name, options in (("one echo per cluster", {"max_echoes": 1}), ("all echoes", {})):
         for last in (False, True):
             explained = explain(block, _bear(system, begin.change), **options)
@@ -190,7 +197,7 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     borne = _bear(system, change)
     explained = explain(block, borne, least_width=STRICT, width_prior=0.0)
     gaussians = max(len(system.components), 1)
-    written = 0.0 if known else 3 * gaussians * 0.5 * log(np.count_nonzero(explained.sums.used)) / len(block)
+    written = 0.0 if known else 3 * gaussians * 0.5 * log(max(np.count_nonzero(explained.sums.used), 1)) / len(block)
     length = describe_waveforms(block, borne, explained, change) + written
     return Candidate(
         name, system, change, length, len(explained.echoes), 1 if known else gaussians, measure_change(borne, explained)
@@ -216,7 +223,8 @@ def _decide(found: list[Candidate], number: int) -> Choice:
         if best.exceeds(one) > SURE:
             best = one
     tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
-    best = replace(best, system=_bear(best.system, best.change))
+    # The mirror says how much more than the change itself is asked for.
+    best = replace(best, system=_bear(best.system, best.change / COVERED))
     doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
 
@@ -240,28 +248,29 @@ def settle(block: WaveformBlock, system: SystemPulse) -> tuple[SystemPulse, Mirr
 
     Notes
     -----
-    Near strong echoes the pulse's misfit, which echoes absorb, shows in the mirror; in quiet stretches noise does. A
-    step is kept only if it takes away more than it should by chance: where mirrored echoes do not follow, what they
-    show is not cured so.
+    Near strong echoes the pulse's misfit, which echoes absorb, shows in the mirror; in quiet stretches noise does. Each
+    is raised while the mirror shows more than it may, and stays where the echoes that are found less those that are
+    false are most: where mirrored echoes do not follow, what they show is not cured so.
     """
     part = thin_block(block, int(np.clip(4 * SAMPLES // block.samples.shape[1], 2 * LEAST, 2048)))
-    mirror = look_in_mirror(part, system)
-    for _ in range(20):
-        beside = mirror.beside > bound(FALSE_BESIDE, mirror.mains) and system.misfit < LARGEST
-        quiet = mirror.quiet > bound(FALSE_QUIET, mirror.echoes) and system.significance < MOST_SIGNIFICANT
-        if not beside and not quiet:
+    tried = [(system, look_in_mirror(part, system))]
+    while tried[-1][1].beside > bound(FALSE_BESIDE, tried[-1][1].mains) and tried[-1][0].misfit < LARGEST:
+        harder = replace(system, misfit=min(max(STEP * tried[-1][0].misfit, LEAST_MISFIT), LARGEST))
+        tried.append((harder, look_in_mirror(part, harder)))
+    system, mirror = max(tried, key=_worth)
+    tried = [(system, mirror)]
+    for significance in np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER):
+        if tried[-1][1].quiet <= bound(FALSE_QUIET, tried[-1][1].echoes):
             break
-        harder = replace(
-            system,
-            misfit=min(max(STEP * system.misfit, 0.001), LARGEST) if beside else system.misfit,
-            significance=max(system.significance, SIGNIFICANCE) + FINER if quiet else system.significance,
-        )
-        seen = look_in_mirror(part, harder)
-        fewer = mirror.beside + mirror.quiet - seen.beside - seen.quiet
-        if fewer < WORTH * (mirror.echoes - seen.echoes):
-            break
-        system, mirror = harder, seen
-    return system, mirror
+        harder = replace(system, significance=float(significance))
+        tried.append((harder, look_in_mirror(part, harder)))
+    return max(tried, key=_worth)
+
+
+def _worth(tried: tuple[SystemPulse, Mirror]) -> float:
+    """Echoes that are found, less those that are false by the mirror."""
+    _, mirror = tried
+    return mirror.echoes - (mirror.beside + mirror.quiet) / WORTH
 
 
 def bound(share: float, number: int) -> float:
