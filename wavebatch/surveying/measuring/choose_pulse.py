@@ -54,7 +54,7 @@ a higher threshold than these add: echoes of 4 to 6 noises are some 2 % of a sce
 STEP, LARGEST = 1.6, 0.1
 """Factor by which the misfit grows at a time, and its largest value: what exceeds it is no pulse of this strip."""
 
-WORTH = 0.3
+WORTH = 0.2
 """Echoes in the mirror per echo that is false: misfit that leaves an echo of one sign has no twin there."""
 
 LEAST_MISFIT = 0.0005
