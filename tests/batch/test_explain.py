@@ -72,7 +72,8 @@ def test_locations_that_fit_no_echo_warn_in_cron_too(tmp_path, edit_points):
     strip = edit_points(source, tmp_path / "zero.las", forget)
     shutil.copy(source.with_suffix(".wdp"), strip.with_suffix(".wdp"))
     lines = warn_quietly(strip, tmp_path)
-    assert any("returns lie where their packet has an echo: zero.wdp belongs to another strip, or" in one for one in lines)
+    text = "returns lie where their packet has an echo: zero.wdp belongs to another strip, or"
+    assert any(text in line for line in lines)
 
 
 def test_inverted_and_empty_waveforms_are_told(tiny_strip, tmp_path):
