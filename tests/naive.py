@@ -105,8 +105,10 @@ def model(parameters, x, **shape):
     return sum(a * pulse(x, t, s, **shape) for a, t, s in parameters.T)
 
 
-def fit(y, x, std, start, low, high, clipped=None, weight=None, prior=None, **shape):
-    """Parameters (3, k) and chi2 of one problem by scipy, with the same box, censoring and prior as the batch."""
+def fit(y, x, std, start, low, high, clipped=None, weight=None, prior=None, white=None, **shape):
+    """Parameters (3, k) and chi2 of one problem by scipy, with the same box, censoring and prior as the batch.
+
+    white: matrix that whitens the noise."""
     k = start.shape[1]
 
     def residual(flat):
@@ -116,7 +118,7 @@ def fit(y, x, std, start, low, high, clipped=None, weight=None, prior=None, **sh
             r = np.where(clipped & (r <= 0), 0.0, r)
         if weight is not None:
             r = r * weight
-        r = r / std
+        r = (r if white is None else white @ r) / std
         if prior is None:
             return r
         width, spread = prior

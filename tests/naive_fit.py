@@ -7,46 +7,79 @@ from scipy.optimize import brentq
 GAIN_121 = np.sqrt(6.0) / 4.0
 
 
+def whiten(n, clipped, near, far):
+    """Matrix (n, n) that whitens noise of which each sample is near and far shares of the two before it, and new.
+
+    By the covariance of each run of samples that are not clipped; clipped ones stand alone."""
+    rho = [1.0, near / (1 - far)]
+    while len(rho) < n:
+        rho.append(near * rho[-1] + far * rho[-2])
+    white, begin = np.eye(n), 0
+    for end in [*np.flatnonzero(clipped), n]:
+        lag = np.abs(np.subtract.outer(np.arange(end - begin), np.arange(end - begin)))
+        white[begin:end, begin:end] = np.linalg.inv(np.linalg.cholesky(np.array(rho)[lag]))
+        begin = end + 1
+    return white
+
+
 def slopes(p, x, **shape):
     """Derivatives of the model by amplitudes, times and widths, (L, 3 k)."""
     return naive.differentiate(lambda flat: naive.model(flat.reshape(3, -1), x, **shape), p, 1e-4)
 
 
-def moments(p, x, residual, std):
-    """h3 and h4 of the residual around each Gaussian, (k,) both."""
+def moments(p, x, residual, std, white=None, shape=None):
+    """h3 and h4 of the residual around each Gaussian, (k,) both; white: of whitened directions less what fits take."""
     found = []
+    fitted = None if white is None else white @ slopes(p, x, **shape)
     for _, t, s in p.T:
         z = np.clip((x - t) / s, -5, 5)
         bell = np.exp(-0.5 * ((x - t) / s) ** 2)
+        before = fitted
         for direction in ((8 * z**3 - 12 * z) * bell, (16 * z**4 - 48 * z**2 + 12) * bell):
+            if white is not None:
+                direction = white @ direction
+                direction = direction - before @ np.linalg.lstsq(before, direction, rcond=None)[0]
+                before = np.c_[before, direction]
             found.append(direction @ residual / np.sqrt(max(direction @ direction, 1e-12)) / std)
     return np.array(found).reshape(-1, 2).T
 
 
-def is_misfit(p, x, residual, std, s):
+def new_pulse(x, i, s):
+    """A new echo of amplitude 1 at sample i."""
+    return np.where(np.abs(x - x[i]) <= np.ceil(3 * s.width_ref), np.exp(-0.5 * ((x - x[i]) / s.width_ref) ** 2), 0)
+
+
+def is_misfit(p, x, residual, std, s, white=None, shape=None):
     """Whether the residual holds more than noise."""
+    if white is not None:
+        new = [white @ new_pulse(x, i, s) for i in range(1, len(x) - 1)]
+        highest = max(one @ residual / np.sqrt(one @ one) for one in new)
+        h3, h4 = moments(p, x, residual, std, white, shape)
+        return highest > s.gate_residual * std or (h3**2 + h4**2).max() > s.gate_hermite
     smooth = (residual[:-2] + 2 * residual[1:-1] + residual[2:]) / 4
     h3, h4 = moments(p, x, residual, std)
     return smooth.max(initial=0) > s.gate_residual * GAIN_121 * std or (h3**2 + h4**2).max() > s.gate_hermite
 
 
-def propose(p, x, residual, std, s, shape):
+def propose(p, x, residual, std, s, shape, white=None):
     """Start of the fit with one echo more, and the fall of chi2 that it promises."""
-    jacobian = slopes(p, x, **shape)
+    unit = np.eye(len(x)) if white is None else white
+    jacobian = unit @ slopes(p, x, **shape)
+    most = max(np.sum((unit @ new_pulse(x, i, s)) ** 2) for i in range(len(x)))
     best, place, height, change = 0.0, 0, 0.0, np.zeros(p.size)
     for i in range(len(x)):
-        new = np.where(np.abs(x - x[i]) <= np.ceil(3 * s.width_ref), np.exp(-0.5 * ((x - x[i]) / s.width_ref) ** 2), 0)
+        new = unit @ new_pulse(x, i, s)
         shared = np.linalg.lstsq(jacobian, new, rcond=None)[0]
         left = new - jacobian @ shared
         energy, onto = left @ left, max(left @ residual, 0.0)
-        if energy > 0.03 * s.width_ref * np.sqrt(np.pi) and onto**2 / energy > best:
+        if energy > 0.03 * most and onto**2 / energy > best:
             best, place, height, change = onto**2 / energy, i, onto / energy, shared
     da, dt, ds = -height * change.reshape(p.shape)
     a, t, w = p
     ref = s.width_ref
     old = np.array([np.maximum(a + da, 0.2 * a), t + np.clip(dt, -ref, ref), w + np.clip(ds, -0.4 * w, 0.3 * w)])
     start, promise = np.c_[old, [height, x[place], ref]], best / std**2
-    h3, h4 = moments(p, x, residual, std)
+    h3, h4 = moments(p, x, residual, std, white, shape)
     gain = np.where(h4 < 0, h3**2 + h4**2, 0.0)
     j = int(np.argmax(gain))
     if gain[j] > promise:
@@ -57,11 +90,13 @@ def propose(p, x, residual, std, s, shape):
     return start, promise
 
 
-def errors_of(p, x, std, prior, used, shape):
-    """Standard deviations (3, k) with what is known of the widths."""
-    jacobian = slopes(p, x, **shape)[used] / std
+def errors_of(p, x, std, prior, used, shape, known=0.0, white=None):
+    """Standard deviations (3, k) with what is known of the widths, and of the amplitudes (k,): one over variance."""
+    jacobian = slopes(p, x, **shape) * used[:, None] / std
+    jacobian = jacobian if white is None else white @ jacobian
     fisher = jacobian.T @ jacobian
     k = p.shape[1]
+    fisher[np.arange(k), np.arange(k)] += known
     if prior:
         for j in range(k):
             fisher[2 * k + j, 2 * k + j] += (p[2, j] < prior[0]) / prior[1] ** 2
@@ -74,17 +109,54 @@ def is_resolved(p, errors):
     return (p[0] > 0).all() and (gap > 0.25 * np.hypot(error[1:], error[:-1])).all()
 
 
-def decompose(y, std, start, s, clip=np.inf, **shape):
+def decompose(y, std, start, s, clip=np.inf, white=None, **shape):
     """Parameters (3, k), errors and chi2 of one window; s: Settings, whose widths, gates and acceptance count."""
-    first = grow(y, std, start, s, (s.width_low, s.width_high), clip, **shape)
+    best = find_echoes(y, std, start, s, clip, white, **shape)
+    return leave_out_unknown(y, std, best, s, clip, white, **shape) if s.known else best
+
+
+def find_echoes(y, std, start, s, clip, white, **shape):
+    """The same before echoes that are not known are left out."""
+    first = grow(y, std, start, s, (s.width_low, s.width_high), clip, white, **shape)
     fall = least_fall(first[0], std, s)
     if not may_grow(y, s) or first[2] - len(y) < fall:
         return first
     widths = max(s.width_low, s.width_ref / 1.1), min(s.width_high, s.width_ref * 1.1)
-    narrow = grow(y, std, start, s, widths, clip, **shape)
-    second = grow(y, std, narrow[0], s, (s.width_low, s.width_high), clip, **shape)
+    narrow = grow(y, std, start, s, widths, clip, white, **shape)
+    second = grow(y, std, narrow[0], s, (s.width_low, s.width_high), clip, white, **shape)
     better = second[2] + fall * (second[0].shape[1] - first[0].shape[1]) < first[2]
     return second if better else first
+
+
+def leave_out_unknown(y, std, fit, s, clip, white, **shape):
+    """The fit without the echoes whose amplitude is below `known` errors and without which chi2 rises too little."""
+    p, errors, chi2 = fit
+    x, k = np.arange(float(len(y))), p.shape[1]
+    low, high = (np.array([a, t, w])[:, None] for a, t, w in ((0, -3, s.width_low), (1e12, len(y) + 2, s.width_high)))
+    known, before = np.zeros(k), p[1]
+
+    def prior_of(k):
+        return (s.width_ref, s.prior_spread) if s.prior_spread and k > 1 else None
+
+    def find_errors(p, known):
+        used = ~((y >= clip) & (y - naive.model(p, x, **shape) <= 0))
+        return errors_of(p, x, std, prior_of(p.shape[1]), used, shape, known, white)
+
+    while p.shape[1] > 1 and (known == 0).any():
+        j = int(np.argmin(np.where(known == 0, p[0] / errors[0], np.inf)))
+        if p[0, j] >= s.known * errors[0, j]:
+            break
+        start = np.delete(p, j, axis=1)
+        less, rest = naive.fit(
+            y, x, std, start, low, high, clipped=y >= clip, prior=prior_of(p.shape[1] - 1), white=white, **shape
+        )
+        if rest - chi2 < least_fall(less, std, s):
+            p, chi2, before, known = less, rest, np.delete(before, j), np.zeros(p.shape[1] - 1)
+        else:
+            known[j] = max((2 / p[0, j]) ** 2 - 1 / errors[0, j] ** 2, 1e-300)
+        errors = find_errors(p, known)
+    errors[1] = np.hypot(errors[1], p[1] - before)
+    return p, errors, chi2
 
 
 def least_fall(p, std, s):
@@ -96,7 +168,7 @@ def may_grow(y, s):
     return s.grow and len(y) <= s.max_echoes * 10 * s.width_high
 
 
-def grow(y, std, start, s, widths, clip, **shape):
+def grow(y, std, start, s, widths, clip, white=None, **shape):
     """The same from one start, with widths within these two."""
     x = np.arange(float(len(y)))
     clipped = y >= clip
@@ -105,7 +177,7 @@ def grow(y, std, start, s, widths, clip, **shape):
     best, target = None, np.inf
     for _ in range(20):
         prior = (s.width_ref, s.prior_spread) if s.prior_spread and start.shape[1] > 1 else None
-        p, chi2 = naive.fit(y, x, std, start, low, high, clipped=clipped, prior=prior, **shape)
+        p, chi2 = naive.fit(y, x, std, start, low, high, clipped=clipped, prior=prior, white=white, **shape)
         if not chi2 < target:
             return best
         outside = np.maximum(np.maximum(-p[1], p[1] - x[-1]), 0) / p[2]
@@ -115,14 +187,14 @@ def grow(y, std, start, s, widths, clip, **shape):
             continue
         residual = y - naive.model(p, x, **shape)
         used = ~(clipped & (residual <= 0))
-        residual = residual * used
-        errors = errors_of(p, x, std, prior, used, shape)
+        residual = residual * used if white is None else white @ (residual * used)
+        errors = errors_of(p, x, std, prior, used, shape, white=white)
         if best is not None and not is_resolved(p, errors):
             return best
         best = p, errors, chi2
-        if not may_grow(y, s) or p.shape[1] >= s.max_echoes or not is_misfit(p, x, residual, std, s):
+        if not may_grow(y, s) or p.shape[1] >= s.max_echoes or not is_misfit(p, x, residual, std, s, white, shape):
             return best
-        start, promise = propose(p, x, residual, std, s, shape)
+        start, promise = propose(p, x, residual, std, s, shape, white)
         fall = least_fall(p, std, s)
         if not promise > 0.5 * fall:
             return best

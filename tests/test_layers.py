@@ -20,7 +20,8 @@ INSIDE = {
         {"explain", "neighbour_pass"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
     ],
     "surveying/measuring": [
-        {"lone_echoes", "trial"}, {"noise_and_width"}, {"residuals"}, {"misfit", "learn_pulse", "narrow_pulse"},
+        {"lone_echoes", "trial"}, {"noise_and_width"}, {"residuals"},
+        {"misfit", "learn_pulse", "narrow_pulse", "whitening"},
     ],
     "batch/workers": [
         {"processor"}, {"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"},

@@ -59,8 +59,7 @@ def test_packets_of_another_strip_warn_in_cron_too(riegl, tmp_path):
     strip = tmp_path / "mixed.las"
     shutil.copy(riegl, strip)
     shutil.copy(data_file("lvis/lvis1.wdp"), strip.with_suffix(".wdp"))
-    line, doubt = warn_quietly(strip, tmp_path, "--force")
-    assert "the system pulse is a guess" in doubt
+    line, *_ = warn_quietly(strip, tmp_path, "--force")
     assert "--force: mixed.wdp belongs to another strip" in line
 
 
@@ -72,8 +71,9 @@ def test_locations_that_fit_no_echo_warn_in_cron_too(tmp_path, edit_points):
     source = data_file("lvis/lvis1.las")
     strip = edit_points(source, tmp_path / "zero.las", forget)
     shutil.copy(source.with_suffix(".wdp"), strip.with_suffix(".wdp"))
-    (line,) = warn_quietly(strip, tmp_path)
-    assert "returns lie where their packet has an echo: zero.wdp belongs to another strip, or" in line
+    lines = warn_quietly(strip, tmp_path)
+    text = "returns lie where their packet has an echo: zero.wdp belongs to another strip, or"
+    assert any(text in line for line in lines)
 
 
 def test_inverted_and_empty_waveforms_are_told(tiny_strip, tmp_path):
@@ -129,7 +129,7 @@ def test_echoes_in_doubt_warn_in_cron_too(tiny_strip, tmp_path):
     text = (tmp_path / "sure.toml").read_text()
     for share, said in ((0.1, False), (0.2, True)):
         path = tmp_path / f"{share}.toml"
-        path.write_text(text.replace("[figures]", f"[figures]\nechoes_in_doubt = {share}"))
+        path.write_text(re.sub("echoes_in_doubt = .*", f"echoes_in_doubt = {share}", text))
         lines = warn_quietly(tiny_strip, tmp_path / f"out-{share}", "--system", str(path))
         assert len(lines) == said
     assert "20 % of the echoes in doubt: the system pulse is a guess" in lines[0] and "give --system" in lines[0]

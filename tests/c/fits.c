@@ -13,7 +13,7 @@ typedef struct {
     const char *name;
     Pulse pulse;
     double clip, noise_gain, prior_spread, skew_spread;
-    int64_t bytes, missing, per_sample, grow, undamped;
+    int64_t bytes, missing, per_sample, grow, undamped, whitened;
 } Case;
 
 static uint64_t state = 1;
@@ -77,7 +77,8 @@ static int run_case(const Case *c, const Strip *strip) {
     Clusters clusters = {WAVEFORMS, strip->waveform, strip->low, strip->high, strip->first, strip->number, strip->amplitude, strip->time, strip->width};
     Settings settings = {.pulse = c->pulse, .width_ref = 2, .width_low = 1, .width_high = 12, .clip = c->clip, .noise_gain = c->noise_gain,
         .tolerance = 1e-2, .acceptance = 15, .misfit = 0.001, .prior_spread = c->prior_spread, .gate_residual = 4.2, .gate_hermite = 8.5,
-        .skew_mean = 0.05, .skew_spread = c->skew_spread, .max_iterations = 40, .max_echoes = 6, .grow = c->grow, .undamped = c->undamped};
+        .skew_mean = 0.05, .skew_spread = c->skew_spread, .max_iterations = 40, .max_echoes = 6, .grow = c->grow, .undamped = c->undamped,
+        .known = 3, .whitened = c->whitened, .whitening = {{1.7, 0, 0}, {2, -1.2, 0}, {2.2, -1.7, 0.4}}};
     static int64_t number[WAVEFORMS];
     static uint8_t converged[WAVEFORMS], at_bound[WAVEFORMS * MOST_ECHOES];
     static double misfit[WAVEFORMS], cost[WAVEFORMS], promise[WAVEFORMS];
@@ -121,6 +122,8 @@ int main(void) {
         {"undamped", gaussian, none, 0, 0, 0, 1, 0, 0, 0, 1},
         {"free skews", gaussian, none, 0, 0.2, 0.1, 2, 0, 0, 1, 0},
         {"sum", sum, none, 0, 0.2, 0, 1, 0, 0, 1, 0},
+        {"whitened", sum, none, 0, 0.2, 0, 1, 0, 0, 1, 0, 1},
+        {"whitened, clipped, gaps", gaussian, 120, 0.02, 0.2, 0, 2, 1, 0, 1, 0, 1},
         {"skewed", skewed, none, 0.01, 0.2, 0, 1, 0, 0, 1, 0},
         {"skewed free", skewed, none, 0, 0.2, 0.1, 1, 1, 0, 1, 0},
         {"peaked", peaked, none, 0, 0.2, 0, 2, 0, 0, 1, 0},

@@ -150,7 +150,7 @@ def test_errors_count_what_the_prior_knows_of_widths(rng):
     y, prior = record(rng, truth), (2.2, 0.15)
     held = fit(y, near(rng, truth), width_ref=prior[0], prior_spread=prior[1], **TIGHT)
     for p, errors in zip(held.parameters[:, :3], held.errors[:, :3], strict=True):
-        expected = naive_fit.errors_of(p, np.arange(float(LENGTH)), 1.0, prior, slice(None), {})
+        expected = naive_fit.errors_of(p, np.arange(float(LENGTH)), 1.0, prior, np.ones(LENGTH), {})
         np.testing.assert_allclose(errors, expected, rtol=5e-3)
 
 

@@ -43,7 +43,7 @@ def has(instructions):
 def test_all_models_and_options_are_fitted(plain):
     lines = plain.splitlines()
     cases = {line.rpartition(" ")[0] for line in (line.partition(":")[0] for line in lines)}
-    assert len(cases) == 16 and len(lines) == 16 * 24
+    assert len(cases) == 18 and len(lines) == 18 * 24
     echoes = [int(line.partition(": ")[2].split()[0]) for line in lines]
     assert min(echoes) == 1 and max(echoes) >= 5 and sum(number > 1 for number in echoes) > 100
     assert sum("converged 1" in line for line in lines) > 0.9 * len(lines) and "nan" not in plain

@@ -1,6 +1,7 @@
 """Kernels of signal that nothing else compares with a slow, plain twin: noise, defects, sums, runs, deconvolution."""
 
 import naive
+import naive_fit
 import naive_signal
 import numpy as np
 import pytest
@@ -18,8 +19,10 @@ from wavebatch.kernels.signal.noise import (
     keep_longest,
     measure_covariance,
     measure_recovery,
+    predict_noise,
     quiet_edges,
     residual_noise,
+    whitening_filter,
 )
 from wavebatch.kernels.signal.profiles import fit_height
 from wavebatch.kernels.signal.runs import find_stretches, lobe_edges
@@ -239,6 +242,23 @@ def test_coloured_noise_widens_errors_as_its_covariance_says():
     assert colour_factors((), *columns) == (1.0, 1.0, 1.0, 1.0)
     matrix = correlation_matrix((0.5, 0.2), 5)
     assert matrix[0].tolist() == [1.0, 0.5, 0.2, 0.0, 0.0] and (matrix == matrix.T).all()
+
+
+@pytest.mark.parametrize("correlation", [(0.8, 0.64, 0.5), (0.5,), (0.86, 0.59, 0.25), (-0.3, -0.1)])
+def test_a_whitening_filter_is_the_inverse_cholesky_factor_of_its_noise(correlation):
+    near, far = predict_noise(correlation)
+    assert near + far * correlation[0] == pytest.approx(correlation[0])
+    assert near * correlation[0] + far == pytest.approx((*correlation, 0.0)[1])
+    rows, white = whitening_filter((near, far), 1.5), naive_fit.whiten(8, np.zeros(8, bool), near, far)
+    for i in range(8):
+        q = min(i, 2)
+        assert white[i, i - q : i + 1][::-1] == pytest.approx(rows[q, : q + 1] / 1.5)
+        assert not np.abs(np.delete(white[i], range(i - q, i + 1))).max() > 1e-9
+
+
+@pytest.mark.parametrize("correlation", [(1.0, 1.0), (0.8, 0.1), (0.5, 1.0), (-0.9, 0.5)])
+def test_what_no_noise_has_is_not_predicted(correlation):
+    assert predict_noise(correlation) is None
 
 
 @pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4)])

@@ -95,8 +95,7 @@ def test_a_small_strip_has_the_echoes_of_the_whole_strip(riegl, tmp_path, points
     if small.figures.isolated_echoes < 20:
         assert find_source(small.system).name == "riegl-q680i"
         reason = next(one.reason for one in small.decisions if one.part == "learned pulse")
-        assert reason.startswith("pulse from the shipped riegl-q680i")
-        assert small.figures.pulse_cost < small.figures.isolated_pulse_cost
+        assert reason.startswith("riegl-q680i: ")
 
 
 @pytest.mark.quick_cases("317")

@@ -58,9 +58,7 @@ def test_a_pulse_is_no_wider_than_the_narrowest_echoes(seed, sigma, tail, share)
     height = sum(weight * np.exp(-0.5 * ((lag - delay) / width) ** 2) for weight, delay, width in _lobes(sigma, tail))
     true = 0.01 * np.count_nonzero(height > 0.5 * height.max())
     assert _half_width(survey.system) == pytest.approx(true, rel=0.02)
-    assert find_source(survey.system) is None and len(survey.system.components) == 2 * (tail > 0)
-    reason = next(one.reason for one in survey.decisions if one.part == "learned pulse")
-    assert reason.startswith("pulse from the isolated echoes, drawn together")
+    assert find_source(survey.system) is None
     assert np.mean(choose_chain(survey).run(block, survey.system).count(NUMBER) == number) > 0.98
 
 

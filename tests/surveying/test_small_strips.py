@@ -6,13 +6,13 @@ from helpers_scenes import make_block, make_scene
 from strips import cut_strip
 from writer_tools import data_file
 
-from wavebatch.batch.explain import MOST_DOUBTED, MOST_DOUBTED_KNOWN
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.systems import known_systems as module
+from wavebatch.surveying.systems.doubt import MOST_DOUBTED, MOST_DOUBTED_KNOWN
 from wavebatch.surveying.systems.known_systems import find_source
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
@@ -59,8 +59,8 @@ def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path,
     path = cut_strip(whole, tmp_path / "cut.las", 50)
     assert _survey(path).figures.echoes_in_doubt < 0.05
     _leave_out(monkeypatch, "nasa-lvis")
-    for strip in (path, whole):
-        assert _survey(strip).figures.echoes_in_doubt > MOST_DOUBTED
+    assert _survey(path).figures.echoes_in_doubt > MOST_DOUBTED
+    assert _survey(whole).figures.echoes_in_doubt > 0.05, "halves differ in a quarter: unknown echoes are left out"
 
 
 @pytest.mark.parametrize(("change", "doubted"), [(0.0, False), (0.05, True)])
@@ -70,7 +70,7 @@ def test_samples_that_no_pulse_explains_leave_echoes_in_doubt(change, doubted, r
     swing = np.exp(-0.5 * (x - time - 7) ** 2) * rng.uniform(-change, 0, (600, 1))
     y = 100 + 2000 * (np.exp(-0.125 * (x - time) ** 2) + swing) + rng.standard_normal((600, 60))
     doubt = survey_block(WaveformBlock.from_samples(np.rint(y).astype(np.uint16))).figures.echoes_in_doubt
-    assert (doubt or 0.0) > MOST_DOUBTED if doubted else doubt is None
+    assert (doubt > MOST_DOUBTED) == doubted
 
 
 def _broad_echoes(rng, places, heights, most):
@@ -113,8 +113,8 @@ def test_fifty_packets_of_level_ground_are_sure(strip, request, tmp_path):
 def test_a_known_pulse_keeps_its_misfit_in_a_small_strip():
     """Packets of a dense forest with eight quiet samples each."""
     survey = _survey(data_file("neon/neon_harv_a.las"))
-    assert find_source(survey.system).name == "neon-gemini" and survey.system.misfit == 0
-    assert 0.01 < survey.figures.echoes_in_doubt < 0.1
+    assert find_source(survey.system).name == "neon-gemini" and survey.system.misfit < 0.01
+    assert survey.figures.echoes_in_doubt > MOST_DOUBTED_KNOWN
 
 
 def test_echoes_that_a_smaller_noise_would_find_are_in_doubt_too():

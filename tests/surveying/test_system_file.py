@@ -35,6 +35,7 @@ SYSTEM = SystemPulse(
         by_kind={"quiet": 1 / 3, "tail smoothed": 2e-7, "core": 1e22},
         gain=5e-324,
         correlation=(0.63, 1 / 7, -0.1),
+        whitening=(0.58, 1 / 23),
         recovery=42.0,
     ),
     kappa=-0.1,
@@ -147,10 +148,10 @@ def test_without_saturation_nothing_clips():
 
 def test_files_of_earlier_versions_are_read():
     """They have no correlation, no tail, no misfit and nothing of what is left beside echoes."""
-    text = re.sub(r"^(correlation|tail_misfit|beside|misfit|hidden) = .*\n", "", TEXT, flags=re.M)
-    assert text.count("\n") == TEXT.count("\n") - 5
+    text = re.sub(r"^(correlation|whitening|tail_misfit|beside|misfit|hidden) = .*\n", "", TEXT, flags=re.M)
+    assert text.count("\n") == TEXT.count("\n") - 6
     system = parse_survey(text, "x").survey.system
-    noise = replace(SYSTEM.noise, correlation=())
+    noise = replace(SYSTEM.noise, correlation=(), whitening=())
     assert system == replace(SYSTEM, noise=noise, tail_misfit=(), beside=(), misfit=0.0, hidden=())
 
 
@@ -174,6 +175,8 @@ def test_files_of_earlier_versions_are_read():
         ("correlation = [", "correlation = [2, ", "correlation row 1 must lie between -1 and 1"),
         ("correlation = [", "correlation = [[0.5], ", "correlation row 1 must be a number"),
         ("correlation = [", "correlation = 1 # [", "correlation must be a list of numbers"),
+        ("whitening = [", "whitening = [0.1, ", "whitening must be empty or hold two shares a, b of steady noise"),
+        ("whitening = [", "whitening = [1.2, 0.1] # [", "hold two shares a, b of steady noise"),
         ("correlation = [", "correlation = [" + 2000 * "0, ", "at most 1024 are read"),
         ("tail_misfit = [", "tail_misfit = [1.0, ", r"tail_misfit must be a list of \[lag, share\]"),
         ("tail_misfit = [[-9.3, 0.0021]", "tail_misfit = [[-9.3, -1]", "tail_misfit row 1 must lie between 0 and 10"),

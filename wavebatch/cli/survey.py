@@ -19,6 +19,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
 
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
+    from wavebatch.surveying import Survey
     from wavebatch.surveying.flight import Flight
     from wavebatch.surveying.system_file import SavedSurvey
 
@@ -210,7 +211,7 @@ def _find_likeness(saved: SavedSurvey) -> dict[str, Any] | None:
     found = find_likeness(survey.system, survey.figures.spacing_ns or 0.0)
     if found is None:
         return None
-    taken = survey.figures.pulse_cost is not None and find_source(survey.system) is not None
+    taken = find_source(survey.system) is not None
     return {"sensor": found.known.sensor, "name": found.known.name, "difference": found.difference, "taken": taken,
             "sentence": found.describe()}  # fmt: skip
 
@@ -300,12 +301,7 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
     if like is not None:
         taken = f"{like['sensor']}: its shipped pulse is used"
         yield _line("sensor", taken if like["taken"] else like["sentence"])
-    yield _line("pulse models", f"from {figures.isolated_echoes or 0:.0f} isolated echoes; misfit per amplitude")
-    if figures.misfit_goal is None:
-        model = "a shipped pulse" if system.components else "a Gaussian of their width"
-        yield f"  too few to learn a pulse from: {model} is used"
-    else:
-        yield from _misfit_lines(saved)
+    yield from _candidate_lines(saved.survey)
     yield _line("kappa", f"{figures.kappa:z.4f}" if figures.kappa is not None else "not known")
     yield _line("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
     yield _line("acceptance", f"one more echo must lower chi2 by {system.acceptance:g}")
@@ -319,14 +315,20 @@ def _digitizer_lines(saved: SavedSurvey) -> Iterator[str]:
         yield _line(f"digitizer {index}", f"{noise}; {_name_model(one)}; s_ref {one.sigma_ref:.4f} ns")
 
 
-def _misfit_lines(saved: SavedSurvey) -> Iterator[str]:
-    figures, system = saved.survey.figures, saved.survey.system
-    chosen = len(system.components) or (0 if system.kappa else 1)
-    tried = {1: figures.misfit_gaussians[1], 0: figures.misfit_skewed} | figures.misfit_gaussians
-    for number, misfit in tried.items():
-        words = f"{number} gaussian{'s' * (number > 1)}" if number else "skewed"
-        yield f"  {words:18}{misfit:.4f}{'  chosen' if number == chosen else ''}"
-    yield f"  {'unseen below':18}{figures.misfit_goal:.4f}"
+def _candidate_lines(survey: Survey) -> Iterator[str]:
+    """Pulses that were tried, the one with the fewest nats first, and what the mirror shows of the one chosen."""
+    figures = survey.figures
+    if survey.candidates:
+        yield _line("pulses tried", "nats that describe a waveform, full width, change from shot to shot, echoes")
+    for one in survey.candidates:
+        change = f"{100 * one.change:.1f} %"
+        text = f"{one.nats:9.2f}  {one.fwhm_ns:7.3f} ns  {change:>6}  {one.echoes_per_waveform:6.3f}"
+        yield f"  {one.name:22}{text}{'  chosen' if one.chosen else f'  longer by {one.longer_by:.1f} errors'}"
+    if figures.false_in_noise_share is not None:
+        shares = figures.false_in_noise_share, figures.false_by_misfit_share
+        noise, misfit = (f"{100 * share:.2g}" for share in shares)
+        words = f"of 100 echoes about {noise} noise (in quiet); beside 100 strong ones about {misfit} of misfit"
+        yield _line("false echoes", words)
 
 
 def _scene_lines(saved: SavedSurvey) -> Iterator[str]:

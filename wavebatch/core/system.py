@@ -31,6 +31,8 @@ class ReceiverNoise:
     """Correlation of the noise of two samples 1, 2, ... spacings apart; empty where it is white."""
     gain: float = 0.0
     """Signal-dependent noise variance per count of signal [count] (docs/algorithms.md H12)."""
+    whitening: tuple[float, ...] = ()
+    """What predicts the noise of a sample from the two before it; empty where fits take noise for white."""
 
     @property
     def quiet(self) -> float:

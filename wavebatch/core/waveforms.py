@@ -262,6 +262,10 @@ class SystemPulse:
     """Largest after-pulse as a share of the amplitude."""
     acceptance: float = 15.0
     """Smallest fall of chi2 for which an echo is added."""
+    significance: float = 0.0
+    """Least energy of an echo [standard deviations of the noise's], where that is more than the chain asks for: a
+    survey raises it where noise makes more echoes than expected.
+    """
     misfit: float = 0.0
     """How far strong echoes deviate from the pulse, as a share of their amplitude. A fall of chi2 that this explains
     does not add an echo.

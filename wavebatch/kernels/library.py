@@ -19,7 +19,8 @@ _POINTER = ctypes.c_void_p
 
 FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
-    "logarithms", "solve_equations", "decode_packets",
+    "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse", "render_pulses",
+    "measure_changes", "pair_differences",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -52,9 +53,10 @@ class Settings(ctypes.Structure):
         *_fields(
             ctypes.c_double,
             "width_ref width_low width_high clip noise_gain tolerance acceptance misfit prior_spread gate_residual "
-            "gate_hermite skew_mean skew_spread",
+            "gate_hermite known skew_mean skew_spread",
         ),
-        *_fields(ctypes.c_int64, "max_iterations max_echoes grow undamped"),
+        *_fields(ctypes.c_int64, "max_iterations max_echoes grow undamped whitened"),
+        ("whitening", ctypes.c_double * 9),
     ]
 
 
@@ -85,6 +87,19 @@ class Echoes(ctypes.Structure):
     _fields_ = [
         *_fields(ctypes.c_int64, "room"),
         *_fields(_POINTER, "number converged misfit cost parameters errors shared at_bound"),
+    ]
+
+
+class Described(ctypes.Structure):
+    """`Described` of kernels/c/describe.h."""
+
+    _fields_ = [
+        *_fields(ctypes.c_int64, "n length"),
+        *_fields(_POINTER, "left model used first amplitude time width"),
+        ("pulse", Pulse),
+        *_fields(ctypes.c_double, "variance gain change"),
+        ("ahead", ctypes.c_double * 2),
+        ("left_over", ctypes.c_double),
     ]
 
 

@@ -11,7 +11,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.runs import gap_distance
-from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.stages.pulse_tables import clip_level, fit_misfit
 
 NEIGHBOURS = 5
 """Each echo is compared with this many echoes before and after it."""
@@ -146,7 +146,7 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
         more = energy * core**2 + np.where(strong, np.interp(lag, lags, beside), 0.0)
         variance[row] = np.maximum(variance[row], more)
     factor = np.sqrt(find_unexplained(table, system, spacing) * (1 + variance))
-    return _scale_errors(table, factor)
+    return scale_errors(table, factor)
 
 
 def use_noise_errors(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:
@@ -162,10 +162,11 @@ def use_noise_errors(table: EchoTable, system: SystemPulse, spacing: float) -> E
     EchoTable
         The same echoes.
     """
-    return _scale_errors(table, 1 / np.sqrt(find_unexplained(table, system, spacing)))
+    return scale_errors(table, 1 / np.sqrt(find_unexplained(table, system, spacing)))
 
 
-def _scale_errors(table: EchoTable, factor: np.ndarray) -> EchoTable:
+def scale_errors(table: EchoTable, factor: np.ndarray) -> EchoTable:
+    """Return the echoes (m,) with all errors times `factor`, float (m,)."""
     if (factor == 1).all():
         return table
     factor = factor.astype(np.float32)
@@ -189,7 +190,8 @@ def find_unexplained(table: EchoTable, system: SystemPulse, spacing: float) -> n
     samples = SPAN * system.sigma_ref / spacing
     energy = table.amplitude.astype(np.float64) ** 2 * table.sigma
     energy = np.bincount(table.waveform, energy)[table.waveform] * SQRT_PI / spacing / system.noise.std**2
-    chi2 = np.nan_to_num(table.residual).astype(np.float64) ** 2 / (1 + system.misfit**2 * energy / samples)
+    expected = 1 + fit_misfit(system, spacing) ** 2 * energy / samples
+    chi2 = np.nan_to_num(table.residual).astype(np.float64) ** 2 / expected
     return np.where(chi2 > 1 + BEYOND_CHANCE * np.sqrt(2 / samples), chi2, 1.0)
 
 

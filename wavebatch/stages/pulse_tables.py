@@ -23,7 +23,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     find_datum,
     measure_pulse,
 )
-from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, correlation_matrix
+from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, correlation_matrix, whitening_filter
 
 
 def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
@@ -69,6 +69,48 @@ def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
         Level [count].
     """
     return float(block.digitizer.max_count) if system.saturation is None else system.saturation
+
+
+def noise_filter(system: SystemPulse) -> np.ndarray | None:
+    """Return the filter that makes the strip's noise white, with `noise.std`.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+
+    Returns
+    -------
+    float64 (3, 3) or None
+        As `whitening_filter`; None where fits take the noise for white.
+    """
+    noise = system.noise
+    return whitening_filter(noise.whitening, noise.std / noise.quiet) if noise.whitening else None
+
+
+def fit_misfit(system: SystemPulse, spacing: float) -> float:
+    """Return the misfit of the pulse as fits see it: whitened, it grows with the third and fourth Hermite directions.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+
+    Returns
+    -------
+    float
+        Share of the amplitude.
+    """
+    if not (system.noise.whitening and system.misfit):
+        return system.misfit
+    ref = system.sigma_ref / spacing
+    z = np.arange(-np.ceil(6 * ref), np.ceil(6 * ref) + 1) / ref
+    bell = exp(-0.5 * z * z)
+    both = (8 * z**3 - 12 * z) * bell, (16 * z**4 - 48 * z**2 + 12) * bell
+    gains = [np.sum(np.convolve(one, noise_filter(system)[2]) ** 2) / np.sum(one * one) for one in both]
+    return system.misfit * max(float(np.sqrt(max(gains))), 1.0)
 
 
 class ShapeLimits(NamedTuple):
@@ -243,36 +285,46 @@ def error_factors(
     Notes
     -----
     `noise.std` is what coloured noise does to amplitudes; times and widths suffer less from noise that changes slowly
-    (docs/algorithms.md H11).
+    (docs/algorithms.md H11). A whitened fit is right where its two coefficients say all of the noise.
     """
-    if not system.noise.correlation and level_err is None:
+    noise = system.noise
+    if not noise.correlation and level_err is None:
         return np.ones((len(width), 4))
-    shape = pulse_shape(system, spacing)
-    widths, factors, by_level = _factor_table(shape, shape_limits(system, spacing), system.noise.correlation)
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    widths, factors, by_level = _factor_table(shape, limits, noise.correlation, noise.whitening)
     found = np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
     if level_err is None:
         return found
+    if noise.whitening:
+        level_err = level_err * noise.std / noise.quiet
     return np.hypot(found, level_err[:, None] * np.stack([np.interp(width, widths, one) for one in by_level.T], axis=1))
 
 
 @lru_cache(maxsize=8)
 def _factor_table(
-    shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...]
+    shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...], whitening: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Widths (k,), the factors of errors there (k, 4), and what a wrong level adds to them (k, 4)."""
-    alone = max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
+    # A fit that takes noise for white has errors by `noise.std`, one that whitens it by the noise of a sample.
+    alone = 1.0 if whitening else max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
     widths = exp(np.linspace(log(limits.low), log(limits.high), FACTOR_WIDTHS))
-    found = np.stack([_factors_at(shape, limits, float(width), correlation) for width in widths])
+    found = np.stack([_factors_at(shape, limits, float(width), correlation, whitening) for width in widths])
     return widths, found[:, 0] / alone, found[:, 1]
 
 
-def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...]) -> np.ndarray:
-    """Errors of amplitude, time, width, energy in noise of this correlation, over those in white noise (2, 4).
+def _factors_at(
+    shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...], whitening: tuple[float, ...]
+) -> np.ndarray:
+    """Errors of amplitude, time, width, energy in noise of this correlation, over those that the fit gives (2, 4).
 
     The second row are those by a level that is wrong by the noise of a sample.
     """
     joint = _pulse_rows(shape, width)
-    main = solve(np.einsum("is,js->ij", joint, joint), joint)
+    bare = np.eye(joint.shape[1])
+    if whitening:
+        bare = np.stack([np.convolve(row, whitening_filter(whitening)[2]) for row in bare])
+    seen = np.einsum("is,sf->if", joint, bare)
+    main = solve(np.einsum("if,jf->ij", seen, seen), seen)
     # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
     main = np.concatenate([main, main[:1] + main[2:]])
     whole = main.copy()
@@ -280,9 +332,10 @@ def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlatio
     if shape.components:
         peak, by_peak = _change_with_width(pulse_measures(shape, limits), np.float64(width))
         whole[0] += by_peak / peak * width * main[2]
-    variance = np.einsum("is,st,it->i", whole, correlation_matrix(correlation, joint.shape[1]), whole)
-    white = np.sum(whole * whole, axis=1)
-    return np.stack([np.sqrt(np.maximum(variance / white, LEAST_FACTOR)), whole.sum(axis=1) / np.sqrt(white)])
+    given = np.sum(whole * whole, axis=1)
+    weights = np.einsum("if,sf->is", whole, bare)
+    variance = np.einsum("is,st,it->i", weights, correlation_matrix(correlation, joint.shape[1]), weights)
+    return np.stack([np.sqrt(np.maximum(variance / given, LEAST_FACTOR)), weights.sum(axis=1) / np.sqrt(given)])
 
 
 def _change_with_width(table: PulseMeasures, width: np.ndarray) -> list[np.ndarray]:

@@ -22,7 +22,7 @@ from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled
-from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import model_parameters, noise_filter, pulse_shape, shape_limits
 from wavebatch.stages.score import match_echoes
 
 WAVEFORMS = 2048
@@ -155,7 +155,7 @@ def simulate_again(
     # Rounding to whole counts, below, adds this part of the noise again.
     white = max(system.noise.std**2 - QUANTISATION_STD**2, 0.0)
     variance = white + system.noise.gain * np.maximum(signal, 0)
-    signal += np.sqrt(variance).astype(np.float32) * rng.standard_normal((n, s), dtype=np.float32)
+    signal += np.sqrt(variance).astype(np.float32) * _draw_noise(rng, n, s, system)
     signal += system.noise.baseline + system.noise.baseline_spread * rng.standard_normal((n, 1))
     top = block.digitizer.max_count if system.saturation is None else min(system.saturation, block.digitizer.max_count)
     # In double precision: 2^32 - 1 in single precision is 2^32, which no sample of 32 bits can hold.
@@ -163,6 +163,19 @@ def simulate_again(
     trial = WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
     plain = replace(system, defects=Defects())
     return replace(trial, digitizer=block.digitizer), plain
+
+
+def _draw_noise(rng: np.random.Generator, n: int, s: int, system: SystemPulse) -> np.ndarray:
+    """Noise that fits of this system see with a standard deviation of 1: coloured where they whiten it, f4 (n, s)."""
+    noise = rng.standard_normal((n, s), dtype=np.float32)
+    if system.noise.whitening:
+        rows = noise_filter(system).astype(np.float32)
+        for i in range(s):
+            before = min(i, 2)
+            for j in range(1, before + 1):
+                noise[:, i] -= rows[before, j] * noise[:, i - j]
+            noise[:, i] /= rows[before, 0]
+    return noise
 
 
 def _rms(values: np.ndarray) -> float:

@@ -18,39 +18,37 @@ from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_sa
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.hidden_neighbours import measure_hidden
+from wavebatch.surveying.measuring.choose_pulse import COVERED, Tried, choose_pulse, settle
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
     find_isolated,
     find_strong,
     learn_pulse,
-    refine_pulse,
 )
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import measure_beside, measure_misfit
+from wavebatch.surveying.measuring.misfit import measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,
     RESIDUAL_LOOK,
-    SETTLED,
-    SMALL,
     find_saturation,
+    list_widths,
     measure_again,
     measure_gaussian,
     measure_quiet,
     thin_block,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
-from wavebatch.surveying.systems.doubt import measure_doubt
+from wavebatch.surveying.measuring.whitening import choose_whitening
+from wavebatch.surveying.systems.doubt import share_unexplained
 from wavebatch.surveying.systems.figures import Figures, Level
-from wavebatch.surveying.systems.known_systems import choose_pulse, find_source, guess_pulse
+from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known
 from wavebatch.surveying.systems.skew import measure_skew
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
 
-REFINEMENTS = 3
-"""Times, at most, that the pulse is learned again from echoes fitted with it; mostly once is enough."""
 
 LEAST_QUIET_SAMPLES = 4
 """Samples before the strongest echo from which a waveform has a level."""
@@ -58,8 +56,6 @@ LEAST_QUIET_SAMPLES = 4
 LEAST_LEVELS = 5
 """Waveforms of a descriptor from which on its level is compared with that of others."""
 
-SAME_THRESHOLD = 1.03
-"""Ratio of two noises up to which the sample is not decomposed again."""
 
 NARROWER = 0.85
 """Width of the chosen pulse, over that of isolated echoes, below which quiet samples are looked for once more if there
@@ -105,6 +101,8 @@ class Survey:
     waveforms: int
     figures: Figures = field(default_factory=Figures)
     decisions: tuple[Decision, ...] = ()
+    candidates: tuple[Tried, ...] = field(default=(), compare=False)
+    """Pulses that were tried, that which describes waveforms best first; empty for a survey from a file."""
 
 
 def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
@@ -311,7 +309,8 @@ def _add_digitizers(
     whole = {name: float(np.average([getattr(scene, name) for scene in scenes], weights=counts)) for name in names}
     figures = replace(found.figures, **whole)
     system = replace(found.system, digitizers=systems)
-    return Survey(system, sum(counts), figures, (*_decide(system, main.spacing, figures), *decisions))
+    kept = (*_decide(system, main.spacing, figures, found.candidates), *decisions)
+    return Survey(system, sum(counts), figures, kept, found.candidates)
 
 
 def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock) -> bool:
@@ -365,41 +364,42 @@ def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlo
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
     """As survey_block, from noise and width by `measure_gaussian`; once more where noise grows with the signal."""
-    first, figures = system, Figures()
+    first, figures, candidates = system, Figures(), ()
     if learn:
         clear = find_clear(block, system)
         main = find_isolated(block, system, clear)
         figures.isolated_echoes = len(main)
-        learned = len(main) >= ENOUGH_TO_LEARN
-        if learned:
-            system = learn_pulse(block, system, main, figures)
+        starts = {"gaussian": system}
+        if len(main) >= ENOUGH_TO_LEARN:
+            starts["lone echoes"] = learn_pulse(block, system, main, figures)
         else:
-            system = guess_pulse(block, system, guess=len(main) < FEW)
+            guess = guess_width(block, system)
+            starts |= {} if guess is None else {"single echoes": guess}
+            starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in list_widths(block)}
+        choice = choose_pulse(block, starts, list_known(block, system))
+        system, candidates = choice.best.system, choice.describe()
+        figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change
+        gaussians = (one.typical for one in choice.tried if one.name.startswith("gaussian"))
+        figures.gaussian_nats = min(gaussians, default=None)
         part = thin_block(block, RESIDUAL_LOOK)
-        for _ in range(REFINEMENTS):
-            last = system.sigma_ref
-            system, chosen = refine_pulse(part, system, decompose_sample(part, system), figures)
-            if len(chosen) < ENOUGH_TO_LEARN or abs(system.sigma_ref / last - 1) < SETTLED:
-                break
-        learned |= len(chosen) >= ENOUGH_TO_LEARN
-        strong = find_strong(clear)
-        system = choose_pulse(block, system, strong, learned=learned, figures=figures)
         if not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref:
             noise = measure_quiet(block, system.sigma_ref / block.spacing).noise
             system = replace(system, noise=replace(noise, gain=first.noise.gain))
-        before, echoes = system, decompose_sample(part, system)
+        echoes = decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
-        # The strongest echoes are the same, and clear, whatever pulse is learned from them. A known pulse has its
-        # misfit; a few echoes of a small strip, full of neighbours, do not know better.
-        strong = strong if find_source(system) is None else find_strong(clear, 0)
-        unsure, system = system, measure_misfit(block, system, strong)
-        if not _finds_alike(before, system):
-            echoes = decompose_sample(part, system)
-        doubt = measure_doubt(block, part, (unsure, system), strong, echoes)
-        if len(block) < SMALL or doubt > 0:
-            figures.echoes_in_doubt = max(doubt, figures.echoes_in_doubt or 0.0)
+        system = measure_tail(block, system, find_strong(clear))
+        if not (system.components or system.kappa):
+            system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
+        system = choose_whitening(part, system)
+        if system.noise.whitening:  # such fits see a change of the pulse's shape as sharply as the judge does
+            system = replace(system, misfit=max(COVERED * choice.best.change, system.misfit))
+        system, mirror = settle(block, system)
+        figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
+        figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
+        echoes = decompose_sample(part, system)
+        figures.echoes_in_doubt = max(choice.doubt, share_unexplained(system, echoes, block.spacing))
     else:
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
@@ -407,15 +407,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     system = replace(measure_hidden(part, measure_beside(part, system, echoes), echoes), widths=widths)
     system = measure_skew(part, system, echoes) if learn else system
     figures = _describe(part, system, echoes, figures)
-    decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system.defects))
-    return Survey(system, len(block), figures, decisions)
-
-
-def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
-    """Whether two surveys with one pulse find the same echoes, near enough for the shares of a scene."""
-    ratio = other.noise.std / one.noise.std
-    alike = one.noise.gain == other.noise.gain and one.misfit == other.misfit
-    return alike and max(ratio, 1 / ratio) < SAME_THRESHOLD
+    decisions = (*_decide(system, block.spacing, figures, candidates), *_decide_defects(system.defects))
+    return Survey(system, len(block), figures, decisions, candidates)
 
 
 def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:
@@ -461,7 +454,9 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figu
     )
 
 
-def _decide(system: SystemPulse, spacing: float, figures: Figures) -> tuple[Decision, ...]:
+def _decide(
+    system: SystemPulse, spacing: float, figures: Figures, candidates: tuple[Tried, ...]
+) -> tuple[Decision, ...]:
     """The table of docs/algorithms.md 4.4: what this scene needs, and the reason for each part left out."""
     width = system.sigma_ref / spacing
     share = figures.overlapped_share
@@ -470,7 +465,7 @@ def _decide(system: SystemPulse, spacing: float, figures: Figures) -> tuple[Deci
     inverted = "the signal goes down from its baseline: counts are mirrored when they are read"
     return (
         *((Decision(Part.INVERTED, True, inverted),) if figures.inverted else ()),
-        Decision(Part.PULSE, learned > 1, _explain_pulse(system, figures)),
+        Decision(Part.PULSE, learned > 1, _explain_pulse(candidates)),
         Decision(Part.SKEW, system.kappa != 0, _explain_skew(system, figures)),
         Decision(Part.GROWTH, share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
         Decision(Part.PRIOR, share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (limit 40 %)"),
@@ -519,22 +514,14 @@ def _decide_seams(seams: Mapping[int, int]) -> Iterator[Decision]:
         yield Decision("seam left out", True, reason)
 
 
-def _explain_pulse(system: SystemPulse, figures: Figures) -> str:
-    """Why the pulse is, or is not, a sum of Gaussians."""
-    if figures.pulse_cost is not None:
-        source, cost, isolated = find_source(system), figures.pulse_cost, figures.isolated_pulse_cost
-        name = f"the shipped {source.name}" if source else "the isolated echoes, drawn together"
-        return f"pulse from {name}: echoes and misfit of a waveform cost {cost:.0f} with it, {isolated:.0f} without"
-    if not figures.misfit_gaussians:
-        few = f"{int(figures.isolated_echoes or 0)} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
-        ringing = f"after-pulses of {100 * system.ringing:.1f} % that strong echoes show are flagged"
-        return f"{few}; {ringing}" if system.ringing else few
-    one = figures.misfit_gaussians[1]
-    number = len(system.components)
-    if number > 1:
-        best = figures.misfit_gaussians.get(number, 0.0)
-        return f"{number} Gaussians miss the stacked echoes by {best:.4f} of the amplitude, one by {one:.4f}"
-    return f"one Gaussian misses the stacked echoes by {one:.4f} of the amplitude; a simple pulse is enough"
+def _explain_pulse(candidates: tuple[Tried, ...]) -> str:
+    """Why the pulse is the one that it is."""
+    if not candidates:
+        return "no pulse was looked for"
+    chosen = next(one for one in candidates if one.chosen)
+    others = [one for one in candidates if not one.chosen]
+    text = f"{chosen.name}: {chosen.nats:.1f} nats describe a waveform"
+    return text + "".join(f", {one.nats:.1f} with {one.name}" for one in others[:2])
 
 
 def _explain_skew(system: SystemPulse, figures: Figures) -> str:

@@ -6,6 +6,8 @@ static const double FAINT = 1;                 /* height in the window, in noise
 static const double MOST_SKEW = 0.6;           /* the half after the peak is then twice as wide as the half before it */
 static const double MOST_AMPLITUDE = 1e12;     /* above any count of 32 bits, also of the peak of a clipped echo */
 static const double BREATH = 1.1;              /* widths of the second try, over or under that of the pulse */
+static const double PROVEN = 2;                /* errors of an amplitude whose echo chi2 proves: simulated pairs scatter by
+                                                  .35 to .65 of it, however much chi2 rises without the echo */
 static const double ROOT_PI = 1.7724538509055161;
 
 /* Amplitudes from 0, times within 3 samples of the window, widths and skews as set. */
@@ -86,8 +88,9 @@ static int grow_window(const Settings *s, const Limits *limits, Work *work) {
         if (target < INFINITY && !is_resolved(&work->trial)) return 0;
         exchange(&work->trial, &work->best);
         if (!work->fit.converged || !may_grow(s, &work->window) || k >= s->max_echoes) return 0;
-        hermite_moments(work, &work->fit);
-        if (!is_misfit(s, work, &work->fit)) return 0;
+        if (s->whitened) whitened_moments(s, work, &work->fit);
+        else hermite_moments(work, &work->fit);
+        if (!(s->whitened ? is_whitened_misfit : is_misfit)(s, work, &work->fit)) return 0;
         if (!reserve(work, k + 1, work->window.vectors)) return -1;
         double promise = propose_echo(s, work, &work->fit, limits, &work->next), fall = least_fall(s, k, work->fit.parameters, work->window.std);
         if (!(promise > 0.5 * fall)) return 0;
@@ -130,6 +133,63 @@ static int decompose_window(const Settings *s, const Clusters *clusters, int64_t
     if (grow_window(s, &limits, work) < 0) return -1;
     if (!(work->best.cost + fall * (work->best.k - k) < cost)) exchange(&work->best, &work->spare);
     return 0;
+}
+
+/* Errors of the best fit once more, with what is known of its amplitudes. */
+static void renew_errors(const Settings *s, const Prior *prior, Work *work) {
+    Solution *best = &work->best;
+    const int64_t k = best->k, per = 3;
+    work->fit.prior = *prior;
+    memcpy(work->fit.parameters, best->parameters, per * k * sizeof(double));
+    evaluate_rows(k, per, s, work, best->parameters);
+    multiply_rows(per * k + 1, work->window.vectors, work->rows, work->fit.gram);
+    add_prior(k, per, prior, work->window.std, best->parameters, work->fit.gram);
+    FOR_EACH_NUMBER(find_errors, work, best);
+}
+
+/* Takes out echoes of the best fit that are not known: amplitudes below `known` errors without which chi2 rises by less
+   than a new echo must lower it.
+
+   Errors of close echoes are those of a parabola, and the valley of chi2 is none: where they say that an amplitude may
+   as well be 0, the fit without the echo says how far chi2 rises on the way there. An echo without which it rises
+   enough has an amplitude of PROVEN errors at least, and those that share its light have less to share. Where one is
+   left out, the time of each other may be wrong by as much as it moves. */
+static void leave_out_unknown(const Settings *s, Work *work) {
+    const Limits limits = limits_of(s, &work->window);
+    const Prior prior = {s->width_ref, s->prior_spread, 0, 0}, none = {0};
+    const double noise = work->window.std;
+    Solution *best = &work->best;
+    const int64_t all = best->k;
+    double *before = work->h3; /* times as they were */
+    memcpy(before, best->parameters + all, all * sizeof(double));
+    for (int64_t k = best->k, asked = 0; k > 1 && asked < k; k = best->k) {
+        int64_t least = -1, left = 0;
+        for (int64_t j = 0; j < k; j++) {
+            const double *a = best->parameters, *e = best->errors;
+            if (!(work->known[j] > 0) && (least < 0 || a[j] * e[least] < a[least] * e[j])) least = j;
+        }
+        const double amplitude = best->parameters[least], error = best->errors[least];
+        if (amplitude >= s->known * error) break;
+        for (int64_t i = 0; i < 3 * k; i++)
+            if (i % k != least) work->fit.parameters[left++] = best->parameters[i];
+        fit_window(k - 1, 3, s, &limits, k > 2 ? &prior : &none, INFINITY, work);
+        if (!(amplitude > 0) || work->fit.cost - best->cost < least_fall(s, k - 1, work->fit.parameters, noise)) {
+            memset(work->known, 0, k * sizeof(double));
+            memmove(before + least, before + least + 1, (k - 1 - least) * sizeof(double));
+            describe_fit(&limits, work, best);
+            asked = 0;
+        } else {
+            double more = noise * noise * (PROVEN * PROVEN / (amplitude * amplitude) - 1 / (error * error));
+            work->known[least] = fmax(more, 1e-300); /* above 0: it was asked */
+            renew_errors(s, &prior, work);
+            asked++;
+        }
+    }
+    memset(work->known, 0, all * sizeof(double));
+    for (int64_t j = 0; j < best->k && best->k < all; j++) {
+        double *error = best->errors + best->k + j, moved = best->parameters[best->k + j] - before[j];
+        *error = sqrt(*error * *error + moved * moved);
+    }
 }
 
 /* The same echoes with a skew of their own each, 1.2. */
@@ -179,7 +239,9 @@ EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, 
     for (; i >= 0 && i < clusters->n; i++) {
         if (!reserve(&work, clusters->number[i], VECTORS(clusters->high[i] - clusters->low[i]))) { i = -1; break; }
         cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
+        if (s->whitened && s->grow) find_new_energy(&work);
         if (decompose_window(s, clusters, i, &work) < 0) { i = -1; break; }
+        if (s->known > 0) leave_out_unknown(s, &work);
         if (s->skew_spread > 0 && s->pulse.kind != LOG_NORMAL) free_skews(s, &work);
         if (s->pulse.kind == LOG_NORMAL) tied_skews(origin_of(s, &work.window), &work.best);
         if (*found + work.best.k > out->room) break;
@@ -204,7 +266,8 @@ EXPORT int64_t promise_echoes(const Block *block, const Clusters *clusters, cons
         work.fit.k = k; work.fit.per = 3;
         evaluate_rows(k, 3, s, &work, work.fit.parameters);
         multiply_rows(3 * k + 1, work.window.vectors, work.rows, work.fit.gram);
-        hermite_moments(&work, &work.fit);
+        if (s->whitened) { find_new_energy(&work); whitened_moments(s, &work, &work.fit); }
+        else hermite_moments(&work, &work.fit);
         promise[i] = propose_echo(s, &work, &work.fit, &limits, &work.next);
     }
     free_work(&work);

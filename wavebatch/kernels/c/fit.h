@@ -49,12 +49,12 @@ INLINE void evaluate_rows(int64_t k, int64_t per, const Settings *s, Work *work,
         const float amplitude = echo.amplitude;
         for (int64_t v = 0; v < n; v++) residual[v] -= row.pulse[v] * amplitude;
     }
-    if (!w->any_clipped && !w->is_weighted) return;
-    for (int64_t v = 0; v < n; v++) {
+    for (int64_t v = 0; v < n && (w->any_clipped || w->is_weighted); v++) {
         lanes weight = w->is_weighted ? w->weight[v] : ALL(1);
         if (w->any_clipped) weight = pick((w->clipped[v] > 0.f) & (residual[v] <= 0.f), ALL(0), weight);
         for (int64_t i = 0; i <= per * k; i++) work->rows[i * n + v] *= weight;
     }
+    for (int64_t i = 0; i <= per * k && w->is_whitened; i++) whiten(w, work->rows + i * n);
 }
 
 /* Inner products of all rows: the lower triangle of gram, (rows, rows). */
@@ -236,7 +236,7 @@ INLINE int invert(int64_t k, int64_t per, Work *work, const double *gram, double
     int is_flat = 1;
     for (int64_t i = 0; i < n; i++) {
         for (int64_t j = 0; j <= i; j++) matrix[i * n + j] = gram[i * rows + j];
-        matrix[i * n + i] = matrix[i * n + i] * (1 + RIDGE) + RIDGE;
+        matrix[i * n + i] = matrix[i * n + i] * (1 + RIDGE) + RIDGE + (i < k ? work->known[i] : 0);
     }
     factor(n, matrix, work->pivot, 1e-300);
     for (int64_t c = 0; c < n; c++) {

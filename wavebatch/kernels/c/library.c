@@ -14,6 +14,7 @@
 #include "fit.h"
 #include "next_echo.h"
 #include "decompose.h"
+#include "describe.h"
 #include "signal.h"
 #include "elementary.h"
 #include "wdz.h"

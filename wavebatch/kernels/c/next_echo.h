@@ -3,7 +3,17 @@
 static const double SMOOTH_GAIN = 0.61237243569579452; /* of white noise through [1 2 1]/4 */
 static const double HERMITE_REACH = 5;         /* widths: beyond, the pulse is zero */
 static const double LEAST_PIVOT = 1e-7;        /* below is what rounding of float32 products leaves */
+static const double LEAST_SHAPE = 1e-3;        /* share of a moment's direction that the fit must leave */
 static const double LEAST_NEW = 0.03;          /* share of a new echo's energy that the present ones must leave */
+
+/* The equations of a fit for `factor`, in work->matrix. */
+static void set_equations(const Fit *fit, Work *work) {
+    const int64_t p = 3 * fit->k;
+    for (int64_t i = 0; i < p; i++) {
+        for (int64_t j = 0; j <= i; j++) work->matrix[i * p + j] = fit->gram[i * (p + 1) + j];
+        work->matrix[i * p + i] = work->matrix[i * p + i] * (1 + RIDGE) + RIDGE;
+    }
+}
 
 /* Gauss-Hermite moments h3, h4 of the residual around each echo: N(0, 1) if the fit is right. The directions are the next
    two after the three that a fit removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. */
@@ -28,8 +38,107 @@ static void hermite_moments(Work *work, const Fit *fit) {
     }
 }
 
+/* Takes off a direction what the rows of the fit, factorised, have of it. */
+static void take_rows_off(Work *work, int64_t p, lanes *direction) {
+    const int64_t n = work->window.vectors;
+    double *share = work->column;
+    for (int64_t i = 0; i < p; i++) {
+        lanes sum = ALL(0);
+        for (int64_t v = 0; v < n; v++) sum += work->rows[i * n + v] * direction[v];
+        share[i] = sum_lanes(sum);
+    }
+    solve(p, work->matrix, work->pivot, share);
+    for (int64_t i = 0; i < p; i++) {
+        const float part = share[i];
+        for (int64_t v = 0; v < n; v++) direction[v] -= work->rows[i * n + v] * part;
+    }
+}
+
+INLINE double multiply(int64_t n, const lanes *a, const lanes *b) {
+    lanes sum = ALL(0);
+    for (int64_t v = 0; v < n; v++) sum += a[v] * b[v];
+    return sum_lanes(sum);
+}
+
+/* The same where noise is whitened: the two directions are, too, and then what the fit removes is taken off them. */
+static void whitened_moments(const Settings *s, Work *work, const Fit *fit) {
+    const Window *w = &work->window;
+    const int64_t k = fit->k, p = 3 * k, n = w->vectors;
+    const lanes *residual = work->rows + p * n;
+    lanes *third = work->about + 3 * n, *fourth = work->about + 4 * n;
+    Basis row = {work->about, work->about + n, work->about + 2 * n, third};
+    set_equations(fit, work);
+    factor(p, work->matrix, work->pivot, LEAST_PIVOT);
+    for (int64_t j = 0; j < k; j++) {
+        const Echo echo = {fit->parameters[j], fit->parameters[k + j], fit->parameters[2 * k + j], 0};
+        const float time = echo.time, inverse = 1 / echo.width;
+        evaluate_pulse(&s->pulse, 0, &echo, w->x, n, row);
+        for (int64_t v = 0; v < n; v++) {
+            lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
+            lanes once = row.by_width[v] * z, twice = once * z, weight = w->is_weighted ? w->weight[v] : ALL(1);
+            third[v] = (once * 8.f - row.by_time[v] * 12.f) * weight;
+            fourth[v] = (twice * 16.f - row.by_width[v] * 48.f + row.pulse[v] * 12.f) * weight;
+        }
+        double *moment[] = {work->h3 + j, work->h4 + j};
+        for (int q = 0; q < 2; q++) {
+            lanes *direction = q ? fourth : third;
+            whiten(w, direction);
+            const double all = multiply(n, direction, direction);
+            take_rows_off(work, p, direction);
+            if (q) {
+                const float share = multiply(n, third, fourth) / fmax(multiply(n, third, third), 1e-12);
+                for (int64_t v = 0; v < n; v++) fourth[v] -= third[v] * share;
+            }
+            const double left = multiply(n, direction, direction);
+            *moment[q] = left > LEAST_SHAPE * all ? multiply(n, direction, residual) / sqrt(left) / w->std : 0;
+        }
+    }
+}
+
+/* Energy of a whitened new pulse at each sample of the window; the same wherever no gap is near, and near the ends of
+   all windows without gaps and weights. */
+static void find_new_energy(Work *work) {
+    const Window *w = &work->window;
+    const int64_t room = w->vectors * LANES, reach = work->reach, plain = !w->is_weighted && !w->any_clipped && w->used == w->n;
+    const float *filter = (const float *)w->filter, *weight = (const float *)w->weight;
+    const int64_t edge = reach + 3, last = w->n - 1, is_long = plain && w->n > 2 * edge;
+    float *energy = (float *)work->new_energy, *begin = work->edges, *end = begin + edge + 1;
+    for (int64_t t = 0; t <= last && is_long && work->has_edges; t++)
+        energy[t] = t < edge ? begin[t] : last - t < edge ? end[last - t] : begin[edge];
+    if (is_long && work->has_edges) return;
+    for (int64_t t = 0; t < room; t++) {
+        float sum = 0;
+        for (int64_t i = t > reach ? t - reach : 0; i <= t + reach + 2 && i < w->n; i++) {
+            float value = 0;
+            for (int64_t j = 0; j < 3 && j <= i; j++) {
+                int64_t away = i - j < t ? t - i + j : i - j - t;
+                if (away <= reach) value += filter[j * room + i] * work->taps[away] * (w->is_weighted ? weight[i - j] : 1);
+            }
+            sum += value * value;
+        }
+        energy[t] = sum;
+    }
+    for (int64_t t = 0; t <= edge && is_long; t++) { begin[t] = energy[t]; end[t] = energy[last - t]; }
+    work->has_edges |= is_long;
+}
+
+static void correlate(const Work *work, const lanes *row, const float *taps, lanes *out);
+
+/* Whether a new pulse finds more in the whitened residual than noise explains, or the moments do. */
+static int is_whitened_misfit(const Settings *s, Work *work, const Fit *fit) {
+    const Window *w = &work->window;
+    const float *share = (const float *)work->about, *energy = (const float *)work->new_energy;
+    double shape = 0, highest = 0;
+    for (int64_t j = 0; j < fit->k; j++) shape = fmax(shape, work->h3[j] * work->h3[j] + work->h4[j] * work->h4[j]);
+    filter_back(w, work->rows + 3 * fit->k * w->vectors, work->back);
+    correlate(work, work->back, work->taps, work->about);
+    for (int64_t i = 1; i + 1 < w->n; i++)
+        if (share[i] > 0 && energy[i] > 0) highest = fmax(highest, (double)share[i] * share[i] / energy[i]);
+    return highest > s->gate_residual * s->gate_residual * w->std * w->std || shape > s->gate_hermite;
+}
+
 /* Whether the smoothed residual or its moments exceed what noise explains. Needs hermite_moments. */
-static int is_misfit(const Settings *s, const Work *work, const Fit *fit) {
+static int is_misfit(const Settings *s, Work *work, const Fit *fit) {
     const Window *w = &work->window;
     const float *residual = (const float *)(work->rows + 3 * fit->k * w->vectors);
     double shape = 0;
@@ -44,6 +153,7 @@ static int is_misfit(const Settings *s, const Work *work, const Fit *fit) {
 static int make_taps(Work *work, const Settings *s, int64_t length) {
     work->reach = (int64_t)ceil(fmin(3 * s->width_ref, length));
     if (!enlarge(&work->taps, 2 * (work->reach + 1) * sizeof(float))) return 0;
+    if (!enlarge(&work->edges, 2 * (work->reach + 4) * sizeof(float))) return 0;
     for (int64_t i = 0; i <= work->reach; i++) {
         double z = i / s->width_ref, tap = exp_lanes(ALL(-0.5 * z * z))[0];
         work->taps[i] = tap;
@@ -76,11 +186,8 @@ static void correlate(const Work *work, const lanes *row, const float *taps, lan
 static void project_out(Work *work, const Fit *fit, lanes *energy, lanes *onto) {
     const int64_t p = 3 * fit->k, n = work->window.vectors;
     double *lower = work->matrix, *right = work->step;
-    for (int64_t i = 0; i < p; i++) {
-        for (int64_t j = 0; j <= i; j++) lower[i * p + j] = fit->gram[i * (p + 1) + j];
-        lower[i * p + i] = lower[i * p + i] * (1 + RIDGE) + RIDGE;
-        right[i] = fit->gram[p * (p + 1) + i];
-    }
+    set_equations(fit, work);
+    for (int64_t i = 0; i < p; i++) right[i] = fit->gram[p * (p + 1) + i];
     factor(p, lower, work->pivot, LEAST_PIVOT);
     for (int64_t i = 0; i < p; i++) {
         lanes *row = work->about + i * n;
@@ -126,9 +233,13 @@ static double propose_echo(const Settings *s, Work *work, const Fit *fit, const 
     const Window *w = &work->window;
     const int64_t k = fit->k, p = 3 * k, n = w->vectors;
     lanes *onto = work->about + p * n;
-    for (int64_t i = 0; i <= p; i++) correlate(work, work->rows + i * n, work->taps, work->about + i * n);
+    for (int64_t i = 0; i <= p; i++) {
+        if (w->is_whitened) filter_back(w, work->rows + i * n, work->back);
+        correlate(work, w->is_whitened ? work->back : work->rows + i * n, work->taps, work->about + i * n);
+    }
     for (int64_t v = 0; v < n; v++) work->rows[v] = pick(w->x[v] >= 0.f, ALL(1), ALL(0)); /* the pulses are not needed any more */
-    correlate(work, work->rows, work->taps + work->reach + 1, work->energy);
+    if (w->is_whitened) memcpy(work->energy, work->new_energy, n * sizeof(lanes));
+    else correlate(work, work->rows, work->taps + work->reach + 1, work->energy);
     float most = 0, *left = (float *)work->energy;
     for (int64_t i = 0; i < w->n; i++) most = fmaxf(most, left[i]);
     project_out(work, fit, work->energy, onto);

@@ -25,8 +25,10 @@ typedef struct {
     double acceptance, misfit;                 /* fall of chi2 that one more echo needs, 2.3 and R3 */
     double prior_spread;                       /* of widths below width_ref; 0 for no prior, H1 */
     double gate_residual, gate_hermite;        /* of the residual test, 4.2 */
+    double known;                              /* errors that an amplitude needs beside other echoes; 0: it is not asked */
     double skew_mean, skew_spread;             /* of free skews; spread 0: skews are not free */
-    int64_t max_iterations, max_echoes, grow, undamped;
+    int64_t max_iterations, max_echoes, grow, undamped, whitened;
+    double whitening[3][3];                    /* row q: coefficients of a sample, and of those before it, after q others */
 } Settings;
 
 typedef struct { /* n waveforms of `length` samples */

@@ -35,6 +35,46 @@ static void weigh(Window *w, double gain) {
     }
 }
 
+/* Whitening as an autoregression of order 2: of each sample less what the two before it predict. The first samples, and
+   those after a gap, are predicted from as many as there are (rows of the Cholesky factor), so that nothing is lost.
+   Clipped samples are gaps whatever the model: where they came and went, chi2 would jump. */
+static void set_filter(const Settings *s, Window *w) {
+    const int64_t room = w->vectors * LANES;
+    const float *x = (const float *)w->x, *clipped = (const float *)w->clipped;
+    float *filter = (float *)w->filter;
+    int64_t before = 0;
+    for (int64_t i = 0; i < room; i++) {
+        int is_clipped = w->any_clipped && clipped[i] > 0, is_there = i < w->n && x[i] >= 0;
+        if (is_clipped) before = 0;
+        for (int64_t j = 0; j < 3; j++) filter[j * room + i] = is_there ? s->whitening[before][j] : 0;
+        before = !is_there || is_clipped ? 0 : before < 2 ? before + 1 : 2;
+    }
+}
+
+/* A row filtered in place, from its end. */
+INLINE void whiten(const Window *w, lanes *row) {
+    const int64_t n = w->vectors;
+    for (int64_t v = n - 1; v >= 0; v--) {
+        const lanes here = row[v], left = v > 0 ? row[v - 1] : ALL(0);
+        const lanes one = {left[3], here[0], here[1], here[2]}, two = {left[2], left[3], here[0], here[1]};
+        row[v] = here * w->filter[v] + one * w->filter[n + v] + two * w->filter[2 * n + v];
+    }
+}
+
+/* The transpose of weights and filter: a whitened row's product with a new pulse, whitened, is that of the row filtered
+   back with the pulse as it is. */
+static void filter_back(const Window *w, const lanes *row, lanes *out) {
+    const int64_t room = w->vectors * LANES;
+    const float *from = (const float *)row, *filter = (const float *)w->filter;
+    float *to = (float *)out;
+    for (int64_t i = 0; i < room; i++) {
+        to[i] = filter[i] * from[i];
+        if (i + 1 < room) to[i] += filter[room + i + 1] * from[i + 1];
+        if (i + 2 < room) to[i] += filter[2 * room + i + 2] * from[i + 2];
+    }
+    for (int64_t v = 0; v < w->vectors && w->is_weighted; v++) out[v] *= w->weight[v];
+}
+
 /* Cuts samples low .. high - 1 of a waveform, above its baseline. */
 static void cut_window(const Block *block, const Settings *s, int64_t waveform, int64_t low, int64_t high, Window *w) {
     float *y = (float *)w->y, *x = (float *)w->x, *clipped = (float *)w->clipped;
@@ -51,4 +91,6 @@ static void cut_window(const Block *block, const Settings *s, int64_t waveform, 
         if (block->missing[first + i]) { y[i] = 0; x[i] = OUTSIDE; clipped[i] = 0; w->used--; }
     for (int64_t i = n; i < w->vectors * LANES; i++) { y[i] = 0; x[i] = OUTSIDE; clipped[i] = 0; }
     if (w->is_weighted) weigh(w, s->noise_gain);
+    w->is_whitened = s->whitened;
+    if (w->is_whitened) set_filter(s, w);
 }

@@ -5,7 +5,8 @@ typedef struct { /* samples of one cluster, padded to whole vectors */
     double std;
     lanes *y, *x;                              /* signal; position, OUTSIDE where there is no sample */
     lanes *clipped, *weight;                   /* 1 where clipped; noise without signal over noise */
-    int any_clipped, is_weighted;
+    lanes *filter;                             /* where noise is whitened: coefficients of samples i, i - 1, i - 2; (3, vectors) */
+    int any_clipped, is_weighted, is_whitened;
 } Window;
 
 typedef struct { double width, spread, skew, skew_spread; } Prior; /* spread 0: none */
@@ -30,12 +31,15 @@ typedef struct {
     int64_t room, vectors;                     /* echoes and vectors for which there is memory */
     Window window;
     lanes *rows, *about, *padded, *energy;     /* of the fit; correlated with a new pulse */
+    lanes *back, *new_energy;                  /* where noise is whitened: a row filtered back; energy of a new pulse */
     Fit fit, next;
     Solution trial, best, spare;
     double *kept, *products, *matrix, *pivot, *step, *column, *h3, *h4;
+    double *known;                             /* of amplitudes: one over variance, in noise, beside what the fit says */
     uint8_t *frozen;
-    float *taps;
+    float *taps, *edges;                       /* of a new pulse; its energy, whitened, from each end of a window */
     int64_t reach;                             /* of the taps of a new pulse */
+    int has_edges;
 } Work;
 
 /* Enlarges a buffer and keeps what is in it; false where there is no memory. */
@@ -54,24 +58,25 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
     size_t row = vectors * sizeof(lanes), p = 4 * k + 1, number = sizeof(double);
     size_t padded = row + 2 * VECTORS(w->reach) * sizeof(lanes);
     int good = enlarge(&w->window.y, row) && enlarge(&w->window.x, row) && enlarge(&w->window.clipped, row)
-        && enlarge(&w->window.weight, row) && enlarge(&w->rows, p * row) && enlarge(&w->about, p * row)
+        && enlarge(&w->window.weight, row) && enlarge(&w->window.filter, 3 * row) && enlarge(&w->back, row)
+        && enlarge(&w->new_energy, row) && enlarge(&w->rows, p * row) && enlarge(&w->about, p * row)
         && enlarge(&w->padded, padded) && enlarge(&w->energy, row)
         && enlarge(&w->fit.parameters, p * number) && enlarge(&w->fit.gram, p * p * number) && enlarge(&w->next.parameters, p * number)
         && enlarge(&w->kept, p * number) && enlarge(&w->products, p * p * number) && enlarge(&w->matrix, p * p * number)
         && enlarge(&w->pivot, p * number) && enlarge(&w->step, p * number) && enlarge(&w->column, p * p * number)
-        && enlarge(&w->h3, p * number) && enlarge(&w->h4, p * number) && enlarge(&w->frozen, p);
+        && enlarge(&w->h3, p * number) && enlarge(&w->h4, p * number) && enlarge(&w->known, p * number) && enlarge(&w->frozen, p);
     Solution *all[] = {&w->trial, &w->best, &w->spare};
     for (int i = 0; i < 3 && good; i++)
         good = enlarge(&all[i]->parameters, p * number) && enlarge(&all[i]->errors, p * number)
             && enlarge(&all[i]->shared, p * number) && enlarge(&all[i]->at_bound, p);
-    if (good) { w->room = k; w->vectors = vectors; }
+    if (good) { w->room = k; w->vectors = vectors; memset(w->known, 0, p * number); }
     return good;
 }
 
 static void free_work(Work *w) {
-    void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->rows, w->about, w->padded, w->energy,
+    void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->window.filter, w->back, w->new_energy, w->rows, w->about, w->padded, w->energy,
         w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->h3, w->h4,
-        w->frozen, w->taps, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
+        w->known, w->frozen, w->taps, w->edges, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
         w->best.errors, w->best.shared, w->best.at_bound, w->spare.parameters, w->spare.errors, w->spare.shared, w->spare.at_bound};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++) free(all[i]);
 }

@@ -104,21 +104,33 @@ def _check(samples: Samples, candidates: Candidates, clusters: Clusters) -> tupl
 
 def _as_structure(settings: Settings) -> library.Settings:
     """The settings for the library."""
-    shape = settings.shape
+    if not 0 < settings.width_ref < np.inf:
+        raise ValueError("the width of the pulse must be above 0")
+    pulse = as_pulse(settings.shape)
+    values = settings._asdict() | {"pulse": pulse, "clip": np.inf if settings.clip is None else settings.clip}
+    del values["shape"]
+    table = np.zeros((3, 3)) if settings.whitening is None else np.asarray(settings.whitening, np.float64)
+    if table.shape != (3, 3) or not np.isfinite(table).all():
+        raise ValueError("a whitening filter has three finite rows of three")
+    values |= {"whitened": settings.whitening is not None, "whitening": (ctypes.c_double * 9)(*table.ravel())}
+    structure = library.Settings(**values)
+    structure.arrays = pulse.arrays
+    return structure
+
+
+def as_pulse(shape: PulseShape) -> library.Pulse:
+    """The pulse for the library; the structure holds the arrays to which it points."""
     components = np.array(shape.components, np.float64).reshape(-1, 3)
     rows = (np.zeros(2, np.float32),) * 2 if shape.table is None else (shape.table.value, shape.table.slope)
-    if not 0 < settings.width_ref < np.inf or not 2 <= len(rows[0]) == len(rows[1]):
-        raise ValueError("the width of the pulse must be above 0, and its table have a slope for each of its rows")
+    if not 2 <= len(rows[0]) == len(rows[1]):
+        raise ValueError("the table of a pulse must have a slope for each of its rows")
     first, step = (0.0, 1.0) if shape.table is None else shape.table[:2]
     pulse = library.Pulse(
         _kind(shape), shape.kappa, shape.power, len(components), place(components, np.float64),
         len(rows[0]), first, step, *(place(row, np.float32) for row in rows), shape.origin == "waveform",
     )  # fmt: skip
-    values = settings._asdict() | {"pulse": pulse, "clip": np.inf if settings.clip is None else settings.clip}
-    del values["shape"]
-    structure = library.Settings(**values)
-    structure.arrays = components, *rows
-    return structure
+    pulse.arrays = components, *rows
+    return pulse
 
 
 def _kind(shape: PulseShape) -> int:

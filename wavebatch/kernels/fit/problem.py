@@ -46,6 +46,10 @@ class Settings(NamedTuple):
     """Limit of the smoothed residual [noise standard deviations] (docs/algorithms.md 4.2)."""
     gate_hermite: float = 8.5
     """Limit of h3^2 + h4^2 (docs/algorithms.md 4.2)."""
+    known: float = 0.0
+    """Errors that the amplitude of an echo needs beside others, or chi2 must rise enough without it; 0: any will do."""
+    whitening: np.ndarray | None = None
+    """Filter that makes the noise white, float64 (3, 3), `whitening_filter`; None where fits take it for white."""
     undamped: bool = False
     """Gauss-Newton steps without damping or limits, for comparison (docs/algorithms.md 1.3)."""
     skew_mean: float = 0.0
@@ -78,6 +82,14 @@ class Solution(NamedTuple):
     def cluster(self) -> np.ndarray:
         """Cluster of each echo, int64 (m,)."""
         return np.repeat(np.arange(len(self.number)), self.number)
+
+
+    def take(self, rows: np.ndarray) -> Solution:
+        """The clusters `rows`, int (r,), in that order, with their echoes."""
+        first = np.cumsum(self.number) - self.number
+        number = self.number[rows]
+        echo = np.arange(number.sum()) + np.repeat(first[rows] - (np.cumsum(number) - number), number)
+        return Solution(*(column[rows] for column in self[:4]), *(column[echo] for column in self[4:]))
 
 
 def choose(solutions: list[Solution], chosen: np.ndarray) -> Solution:

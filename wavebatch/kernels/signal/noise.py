@@ -6,12 +6,14 @@ each waveform's own quiet mean, corrected for that mean (docs/algorithms.md H10,
 
 from __future__ import annotations
 
+import ctypes
 from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.kernels.elementary import exp, solve
+from wavebatch.kernels.library import call
 from wavebatch.kernels.signal.floor import MOST_LEAST, undo_floor
 from wavebatch.kernels.signal.signal import (
     SMOOTH_GAIN,
@@ -375,23 +377,18 @@ def measure_covariance(
     float64 (k,) or None
         k <= 1 + MOST_LAGS. None where fewer than LEAST_QUIET_PAIRS neighbours are quiet.
     """
-    used = quiet.astype(np.float32)
+    signal, quiet = np.ascontiguousarray(signal, np.float32), np.ascontiguousarray(quiet)
+    masks = [None, None] if mirrored is None else [np.ascontiguousarray(mask) for mask in mirrored]
     half, pairs = [], []
     # In fewer waveforms than `measure_recovery` needs a tail of echoes looks like slow noise.
     most = MOST_LAGS if signal.shape[1] >= 2 * LEAST_WAVEFORMS else lags
     for lag in range(1, min(most, len(signal) - 1) + 1):
         if lag > lags and not _rises(half):
             break
-        both = used[lag:] * used[:-lag]
-        if mirrored is not None:
-            high, low = (both * (mask[lag:] | mask[:-lag]) for mask in mirrored)
-            noise = min(float(np.sum(low - low * high)) / max(float(np.sum(high - low * high)), 1.0), 1.0)
-            both += low - high - (1 - noise) * low * high
-        number = float(np.sum(both, dtype=np.float64))
+        number, square = _pair_differences(signal, quiet, masks, lag)
         if number < (LEAST_SHARE * pairs[0] if pairs else LEAST_QUIET_PAIRS):
             break
-        step = signal[lag:] - signal[:-lag]
-        half.append(0.5 * float(np.einsum("sn,sn,sn->", step, step, both, dtype=np.float64)) / number)
+        half.append(0.5 * square / number)
         pairs.append(number)
     if not half:
         return None
@@ -406,6 +403,21 @@ def measure_covariance(
         if slow is not None and slow[0] > (1 + SETTLED) * sill:
             return slow
     return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
+
+
+def _pair_differences(
+    signal: np.ndarray, quiet: np.ndarray, masks: list[np.ndarray | None], lag: int
+) -> tuple[float, float]:
+    """Pairs of quiet samples `lag` apart and the sum of their squared differences; masks: as `mirrored`, or None."""
+    found = np.zeros((4, 2))
+    given = [ctypes.c_void_p(None) if mask is None else mask for mask in masks]
+    call("pair_differences", *map(ctypes.c_int64, signal.shape), signal, quiet, *given, ctypes.c_int64(lag), found)
+    every, high, low, both = found
+    if masks[0] is None:
+        return float(every[0]), float(every[1])
+    noise = min((low[0] - both[0]) / max(high[0] - both[0], 1.0), 1.0)
+    number, square = every + low - high - (1 - noise) * both
+    return float(number), float(square)
 
 
 def _extend(half: np.ndarray, pairs: np.ndarray, lags: int, most: float) -> np.ndarray | None:
@@ -683,3 +695,53 @@ def correlation_matrix(correlation: tuple[float, ...] | np.ndarray, size: int) -
     rho = np.asarray(correlation, np.float64)
     lag = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
     return np.r_[1.0, rho, 0.0][np.minimum(lag, len(rho) + 1)]
+
+
+def predict_noise(correlation: tuple[float, ...] | np.ndarray) -> tuple[float, float] | None:
+    """Find what predicts the noise of a sample from the two before it.
+
+    Parameters
+    ----------
+    correlation : (k,)
+        Of the noise at lags 1, 2, ... [samples].
+
+    Returns
+    -------
+    (float, float) or None
+        Shares of the sample before, and of the one before that; None where no noise has such a correlation.
+
+    References
+    ----------
+    The equations of Yule and Walker for an autoregression of order 2; docs/algorithms.md H11.
+    """
+    one, two = (float(value) for value in (*correlation, 0.0, 0.0)[:2])
+    if not (abs(one) < MOST_PREDICTED and 2 * one * one - 1 < MOST_PREDICTED * two < MOST_PREDICTED**2):
+        return None
+    return one * (1 - two) / (1 - one * one), (two - one * one) / (1 - one * one)
+
+
+MOST_PREDICTED = 0.999
+"""Correlation of noise from which on it is as good as constant: nothing is left that is new in a sample."""
+
+
+def whitening_filter(whitening: tuple[float, float], gain: float = 1.0) -> np.ndarray:
+    """Return the filter that makes coloured noise white.
+
+    Parameters
+    ----------
+    whitening : (float, float)
+        As `predict_noise` returns it.
+    gain : float
+        Standard deviation of the white noise over that of a coloured sample.
+
+    Returns
+    -------
+    float64 (3, 3)
+        Row q: coefficients of a sample and of those 1 and 2 before it, for one with q others before it. They are rows
+        of the inverse Cholesky factor of the noise's correlation.
+    """
+    near, far = whitening
+    one = near / (1 - far)
+    left = 1 - one * one
+    rows = np.array([[1.0, 0.0, 0.0], [1.0, -one, 0.0], [1.0, -near, -far]])
+    return gain * rows / np.sqrt([1.0, left, left * (1 - far * far)])[:, None]

@@ -17,9 +17,12 @@ from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.solve import FIT, EchoLimits, FitOptions, fit_candidates, fit_gaussian, make_settings
 from wavebatch.stages.flags import flag_echoes
-from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import fit_misfit, pulse_shape, shape_limits
 
 _ADAPTIVE = FitOptions(significance=4.5)
+
+KNOWN = 3.0
+"""Errors that the amplitude of an echo beside others must have, or a fit without it must explain the samples worse."""
 
 CLOSED_VALUES = 1 << 21
 """Samples around peaks that the closed form takes at a time: noise has a peak at every fourth sample."""
@@ -128,13 +131,15 @@ def adaptive(
         fit,
         grow=True,
         acceptance=acceptance or system.acceptance,
-        misfit=max(system.misfit, SINGLE_PRECISION),
+        misfit=max(fit_misfit(system, block.spacing), SINGLE_PRECISION),
         max_echoes=max_echoes,
         prior_spread=width_prior * shape_limits(system, block.spacing).ref,
         gate_residual=gate_residual,
         gate_hermite=gate_hermite,
+        known=KNOWN,
     )
-    return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
+    significance = max(fit.significance, system.significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
 def _start_closed_form(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -11,16 +11,17 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Clusters
+from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Settings, Solution
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
 from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
 from wavebatch.stages.detect.candidates import samples_of
-from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes
+from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes, scale_errors
 from wavebatch.stages.pulse_tables import (
     BROADEST,
     LEAST_WIDTH,
@@ -30,6 +31,7 @@ from wavebatch.stages.pulse_tables import (
     describe_echoes,
     error_factors,
     matched_gaussian,
+    noise_filter,
     pulse_shape,
     shape_limits,
 )
@@ -124,7 +126,7 @@ def make_settings(
     limits = shape_limits(pulse, block.spacing, fit.least_width, fit.most_width)
     return Settings(
         *limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise.gain, tolerance=fit.tolerance,
-        max_iterations=fit.max_iterations, **options,
+        max_iterations=fit.max_iterations, whitening=noise_filter(system), **options,
     )  # fmt: skip
 
 
@@ -157,8 +159,106 @@ def fit_candidates(
         Fitted echoes with errors and flags.
     """
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
-    solution = decompose_clusters(samples_of(block, noise), candidates, clusters, settings)
-    return describe_solution(block, noise, system, clusters, solution, settings, significance)
+    samples = samples_of(block, noise)
+    solution = decompose_clusters(samples, candidates, clusters, settings)
+
+    def describe(clusters: Clusters, solution: Solution) -> EchoTable:
+        columns = {CLUSTER: solution.cluster} if settings.known else {}
+        return describe_solution(block, noise, system, clusters, solution, settings, significance, columns)
+
+    table = describe(clusters, solution)
+    if not settings.known:
+        return table
+    table = _leave_out_unknown(table, samples, clusters, solution, settings, describe)
+    proven = (table.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
+    share = np.where(proven, table.amplitude / (PROVEN * table.amplitude_err), 1.0)
+    return scale_errors(table, np.minimum(share, 1.0))
+
+
+PROVEN = 2.0
+"""Errors of the amplitude of an echo beside others that chi2 proves, as in kernels/c/decompose.h."""
+
+CLUSTER, FACTOR = "cluster", "factor"
+"""Columns of a table while its decomposer works: cluster of each echo, and what misfits add to its errors."""
+
+
+def _leave_out_unknown(
+    table: EchoTable,
+    samples: Samples,
+    clusters: Clusters,
+    solution: Solution,
+    settings: Settings,
+    describe: Callable[[Clusters, Solution], EchoTable],
+) -> EchoTable:
+    """Leave out echoes whose amplitudes are unknown by their final errors, which hold misfits of the pulse too.
+
+    Their clusters are fitted again in noise that is so much larger: the fit leaves out what that noise explains
+    (`leave_out_unknown` in kernels/c/decompose.h).
+    """
+    noise = np.ones(len(solution.number))
+    unknown = (_find_unknown(table, settings, noise) > 0) & (solution.number > 1)
+    if not unknown.any():
+        return replace(table, attributes={})
+    is_part = np.zeros(len(samples.counts), bool)
+    is_part[clusters.waveform[unknown]] = True
+    part, own = np.flatnonzero(is_part[clusters.waveform]), is_part[table.waveform]
+    rest, table = table.take(~own), table.take(own)
+    table = table.with_attributes(**{CLUSTER: np.searchsorted(part, table.attributes[CLUSTER])})
+    clusters, solution, noise = Clusters(*(column[part] for column in clusters)), solution.take(part), noise[part]
+    again = settings._replace(grow=False, acceptance=settings.known**2)
+    for _ in range(ROUNDS):
+        larger = _find_unknown(table, settings, noise)
+        rows = np.flatnonzero((larger > 0) & (solution.number > 1))
+        if not len(rows):
+            break
+        noise[rows] = larger[rows]
+        solution = _replace_clusters(solution, rows, _fit_again(samples, clusters, solution, again, rows, noise[rows]))
+        table = describe(clusters, solution)
+    both = EchoTable.concatenate((replace(rest, attributes={}), replace(table, attributes={})))
+    return both.take(np.argsort(both.waveform, kind="stable"))
+
+
+def _find_unknown(table: EchoTable, settings: Settings, noise: np.ndarray) -> np.ndarray:
+    """Noise of each cluster, over that of a fit, in which its unknown echoes must be asked; 0 without any.
+
+    noise: float64 (c,), the noise in which they were asked already.
+    """
+    cluster, factor = table.attributes[CLUSTER], table.attributes[FACTOR]
+    unknown = (table.amplitude < settings.known * table.amplitude_err) & (factor > ROOM * noise[cluster])
+    larger = np.zeros(len(noise))
+    np.maximum.at(larger, cluster[unknown], factor[unknown])
+    return larger
+
+
+def _fit_again(
+    samples: Samples, clusters: Clusters, solution: Solution, settings: Settings, rows: np.ndarray, factor: np.ndarray
+) -> Solution:
+    """Clusters at `rows` fitted again from their echoes, in noise `factor` (r,) as large; errors are of noise alone."""
+    old, waveform = solution.take(rows), clusters.waveform[rows]
+    amplitude, time, width, _ = old.parameters.T
+    place = np.arange(len(rows))
+    some = Samples(*(None if column is None else column[waveform] for column in samples))
+    some = some._replace(std=(some.std * factor).astype(np.float32))
+    windows = Clusters(place, clusters.low[rows], clusters.high[rows], np.cumsum(old.number) - old.number, old.number)
+    new = decompose_clusters(some, Candidates(place[old.cluster], time, amplitude, width), windows, settings)
+    each = factor[new.cluster, None]
+    return new._replace(
+        misfit=new.misfit * factor, cost=new.cost * factor**2, errors=new.errors / each, shared=new.shared / each**2
+    )
+
+
+def _replace_clusters(solution: Solution, rows: np.ndarray, new: Solution) -> Solution:
+    """The solution with other fits of the clusters `rows`."""
+    order = np.arange(len(solution.number))
+    order[rows] = len(order) + np.arange(len(rows))
+    return Solution(*map(np.concatenate, zip(solution, new, strict=True))).take(order)
+
+
+ROUNDS = 3
+"""Times that unknown echoes are looked for: with one less, errors of others may grow."""
+
+ROOM = 1.1
+"""Factor on errors by misfits up to which echoes are not asked again."""
 
 
 def describe_solution(
@@ -219,6 +319,9 @@ def describe_solution(
     amplitude, time, width = parameters[keep].T
     amplitude_err, time_err, width_err = errors[keep].T
     spacing = block.spacing
+    if CLUSTER in given:
+        # Colour that makes errors larger is left to the acceptance, which has made `noise.std` of it.
+        given = {**given, FACTOR: np.minimum(factors[:, 0], 1.0).astype(np.float32)}
     table = EchoTable.build(
         waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
         amplitude_err=amplitude_err, sigma_err=width_err * spacing, relative_energy_err=energy_err[keep],
@@ -228,7 +331,10 @@ def describe_solution(
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components or not system.components:
         table = drop_unproven(table, system, clip_level(block, system) - system.noise.baseline)
+    fitted_err = table.amplitude_err
     table = cover_misfit(table, system, spacing)
+    if CLUSTER in given:
+        table = table.with_attributes(**{FACTOR: table.attributes[FACTOR] * table.amplitude_err / fitted_err})
     if settings.grow:
         table = cover_hidden(table, system, len(block))
     return flag_echoes(block, noise, system, clear_lone(table))

@@ -6,18 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
-from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import model_parameters, pulse_measures, pulse_shape, shape_limits
-from wavebatch.surveying.measuring.lone_echoes import ALONE, MIN_SNR, fit_lone
+from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
+from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, fit_lone
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, SMALL, find_edge
-from wavebatch.surveying.measuring.residuals import subtract_echoes
 from wavebatch.surveying.measuring.trial import TRIAL
 from wavebatch.surveying.systems.figures import Figures
 
@@ -33,8 +31,6 @@ NARROWEST = 0.06
 FAR_FROM_LIMIT = 0.75
 """Amplitude, over the largest count, up to which no receiver compresses an echo much."""
 
-SEPARATE = 5.0
-"""Widths of the pulse to the next echo from which its error does not matter to a stack."""
 
 FIRST_COMPONENTS = 3
 """Components of the first pulse, which only has to fit well enough to separate echoes."""
@@ -89,72 +85,10 @@ def _nearest_to_edge(echoes: EchoTable) -> EchoTable:
     return echoes.take(np.sort(order[:: max(len(order) // MOST_STACKED, 1)]))
 
 
-def refine_pulse(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figures: Figures
-) -> tuple[SystemPulse, EchoTable]:
-    """The pulse learned once more from all echoes that stand clear, also of waveforms with several, and these echoes.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-    system : SystemPulse
-        With the pulse learned so far.
-    echoes : EchoTable
-        The block decomposed with it.
-    figures : Figures
-        Gets the misfits of the models.
-
-    Notes
-    -----
-    Pulse and echoes are found in turn: if the pulse is too wide, the narrowest echoes are narrower and correct it. The
-    signal of other echoes of the waveform is subtracted. Times come from fits with the pulse: Gaussian fits to a pulse
-    that is not a Gaussian would scatter and widen the stack.
-    """
-    clear = _find_separate(block, system, echoes)
-    chosen = _nearest_to_edge(echoes.take(clear))
-    if len(chosen) < ENOUGH_TO_LEARN:
-        return system, chosen
-    signal, first = _lift(block, system, echoes, chosen)
-    return _learn(block, system, chosen, signal, figures, first=first), chosen
-
-
-def _lift(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, chosen: EchoTable
-) -> tuple[np.ndarray, np.ndarray]:
-    """The signal of each chosen echo without all others, float32 (m, k), and the first of its samples, int64 (m,).
-
-    Only the samples that are stacked: a waveform of 65,536 samples may hold thousands of chosen echoes.
-    """
-    s = block.samples.shape[1]
-    before, after = _reach(block, system)
-    length = min(int(np.ceil(before + after)) + 2, s)
-    first = np.clip(np.floor(chosen.time / block.spacing - before), 0, s - length).astype(np.int64)
-    at = first[:, None] + np.arange(length)
-    signal = subtract_echoes(block, system, echoes)[chosen.waveform[:, None], at]
-    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
-    whole = np.stack([chosen.amplitude, chosen.time / block.spacing, chosen.sigma / block.spacing], axis=1)
-    main = model_parameters(shape, limits, whole.astype(np.float64)).astype(np.float32)
-    signal += evaluate_pulse(shape, at.astype(np.float32), main[:, 1:2], main[:, 2:3])[0] * main[:, :1]
-    return signal, first
-
-
 def _reach(block: WaveformBlock, system: SystemPulse) -> tuple[float, float]:
     """How far the learned pulse reaches before and after its centre [samples]."""
     half = max(system.sigma_ref / block.spacing / 2, 1)
     return BEFORE * half, AFTER * half
-
-
-def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
-    """Rows of clear echoes whose neighbours are at least SEPARATE widths away, or a tenth as high."""
-    top = system.saturation or float(block.samples.max())
-    good = (echoes.amplitude > MIN_SNR * system.noise.std) & (echoes.amplitude > 0.08 * top)
-    good &= echoes.amplitude <= _highest(block, system, echoes.amplitude[good])
-    good &= (echoes.flags & np.uint16(UNCLEAN & ~int(EchoFlag.OVERLAPPED))) == 0
-    gap = np.diff(echoes.time) / system.sigma_ref
-    close = (np.diff(echoes.waveform) == 0) & (gap < SEPARATE)
-    good[1:] &= ~(close & (echoes.amplitude[:-1] > ALONE * echoes.amplitude[1:]))
-    good[:-1] &= ~(close & (echoes.amplitude[1:] > ALONE * echoes.amplitude[:-1]))
-    return np.flatnonzero(good)
 
 
 def find_strong(echoes: EchoTable, least: int = FEW) -> EchoTable:
@@ -253,7 +187,10 @@ def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float
     width = system.sigma_ref / spacing
     far = np.abs(stack.lag - fit.datum) > 4 * width
     ringing = float(np.abs(stack.value[far]).max(initial=0.0))
-    system = replace(system, ringing=ringing, kappa=fit.kappa, components=())
+    # What the model misses of the stack beyond chance, in the kernel's terms: its energy over that of a Gaussian.
+    missed = max(fit.rms**2 - float(np.mean(stack.error**2)), 0.0)
+    misfit = float(np.sqrt(missed * (stack.lag[-1] - stack.lag[0]) / (SQRT_PI * width)))
+    system = replace(system, ringing=ringing, kappa=fit.kappa, components=(), misfit=misfit)
     if len(fit.components) > 1:
         components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
         system = replace(system, components=components)

@@ -85,6 +85,15 @@ def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known:
     return replace(system, sigma_ref=width * block.spacing)
 
 
+def list_widths(block: WaveformBlock) -> list[float]:
+    """Widths of Gaussians to begin with where no echoes stand alone, in steps of 2 [samples].
+
+    From the narrowest that a sample can show to an eighth of a waveform: a wider pulse leaves no sample without signal.
+    """
+    most = max(block.samples.shape[1] / 8, 1.0)
+    return [0.75 * 2.0**step for step in range(int(np.log2(most / 0.75)) + 1)]
+
+
 def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
     """A Gaussian of a width that is known [samples], and the noise outside of the echoes."""
     saturation = find_saturation(block.samples, block.digitizer.max_count)

@@ -1,36 +1,21 @@
-"""Share of a strip's echoes that another pulse, misfit or noise, as likely, does not find (docs/algorithms.md R2)."""
+"""Whether the pulse or the noise of a survey is a guess, for `survey` and `run`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import StripWarning
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import log
-from wavebatch.kernels.signal.noise import estimate_noise, keep_longest
-from wavebatch.kernels.signal.signal import transpose_samples
-from wavebatch.stages.flags import find_unexplained, list_neighbours
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.stages.flags import find_unexplained
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import measure_misfit
-from wavebatch.surveying.measuring.noise_and_width import FEW, SMALL
-from wavebatch.surveying.measuring.residuals import decompose_sample, hides_noise
+from wavebatch.surveying.measuring.noise_and_width import FEW
+from wavebatch.surveying.measuring.residuals import hides_noise
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import find_source
-
-PULSE_SAMPLES = 2.5
-"""Quiet samples, in widths of the pulse, that say as much of the noise of a pulse as one value."""
-
-WEAKER, REACH = 0.5, 15
-"""Height over that of a stronger echo, and distance from it [system widths], up to which one may be a part of it."""
-
-SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
-"""Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
-
 
 MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
 """Share of the echoes in doubt, because another pulse, misfit or noise serves as well, from which a survey's pulse is
@@ -44,7 +29,7 @@ def doubt_survey(system: SystemPulse, figures: Figures) -> Iterator[StripWarning
     alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
     if alone is None:
         return
-    known = figures.pulse_cost is not None and find_source(system) is not None
+    known = find_source(system) is not None
     most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
     reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
     if alone < FEW and not (known or system.components):
@@ -67,94 +52,8 @@ def doubt_survey(system: SystemPulse, figures: Figures) -> Iterator[StripWarning
         )  # fmt: skip
 
 
-def measure_doubt(
-    block: WaveformBlock,
-    part: WaveformBlock,
-    systems: tuple[SystemPulse, SystemPulse],
-    strong: EchoTable,
-    echoes: EchoTable,
-) -> float:
-    """Measure the share of the echoes that is in doubt.
-
-    Parameters
-    ----------
-    block, part : WaveformBlock
-        What was surveyed, and the waveforms of it that were decomposed.
-    systems : tuple of SystemPulse
-        Before and after the misfit was measured.
-    strong : EchoTable
-        The strongest single echoes of the block.
-    echoes : EchoTable
-        Of the part.
-
-    Returns
-    -------
-    float
-        The largest share of those that docs/algorithms.md R2 names; of long strips without those of small ones.
-    """
-    unsure, system = systems
-    learned, number = find_source(system) is None, max(len(echoes), 1)
-    shares = [_unexplained(system, echoes, block.spacing)]
-    if learned and system.misfit:
-        shares.append(_depend_on_misfit(part, system) / (2 * number))
-    if len(block) < SMALL:
-        shares.append(_depend_on_noise(block, unsure, system, strong, len(echoes)) / number)
-        if learned:
-            shares.append(2 * _repeat(echoes, system.sigma_ref) / number)
-    return max(shares)
-
-
-def _unexplained(system: SystemPulse, echoes: EchoTable, spacing: float) -> float:
+def share_unexplained(system: SystemPulse, echoes: EchoTable, spacing: float) -> float:
     """Share of the clear echoes whose samples the pulse and the noise do not explain; 0 with too few of them."""
     clear = echoes.amplitude > MIN_SNR * system.noise.std
     unexplained = find_unexplained(echoes, system, spacing)[clear] > 1
     return float(np.mean(unexplained)) if len(unexplained) >= FEW else 0.0
-
-
-def _depend_on_misfit(block: WaveformBlock, system: SystemPulse) -> int:
-    """How many more echoes there are with half the misfit than with twice as much: halves of a strip differ as far."""
-    fewest, most = (len(decompose_sample(block, replace(system, misfit=system.misfit * by))) for by in (2.0, 0.5))
-    return max(most - fewest, 0)
-
-
-def _depend_on_noise(
-    block: WaveformBlock, unsure: SystemPulse, system: SystemPulse, strong: EchoTable, number: int
-) -> int:
-    """How many echoes of a small strip more or fewer there may be: the larger of what noise and misfit leave in doubt.
-
-    The noise is two standard errors larger or smaller, by its quiet samples. What few strong echoes miss a pulse of
-    the strip's own by is all misfit where it is larger: it may change from shot to shot, and have nothing in common.
-    unsure: the system before its misfit was measured. number: of the echoes that were found.
-    """
-    width = system.sigma_ref / block.spacing
-    missing = None if block.missing is None else keep_longest(block.missing.T)
-    quiet = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing).share
-    error = min(2 * np.sqrt(PULSE_SAMPLES * width / (2 * max(quiet * block.samples.size, 1))), 0.5)
-    if find_source(system) is None:
-        unsure = measure_misfit(block, unsure, strong, bounded=False)
-    fewest, most = (
-        len(decompose_sample(block, replace(one, noise=replace(one.noise, std=float(one.noise.std * factor)))))
-        for one, factor in ((unsure, 1 + error), (system, 1 - error))
-    )
-    return max(number - fewest, most - number)
-
-
-def _repeat(echoes: EchoTable, width: float) -> float:
-    """How many echoes more than chance stand beside stronger ones at one lag, and so many times as low.
-
-    A pulse that few echoes show only roughly leaves such parts of it, each at its place.
-    """
-    pairs = []
-    for row, other, lag in list_neighbours(echoes):
-        ratio = echoes.amplitude[row] / echoes.amplitude[other]
-        near = (ratio < WEAKER) & (np.abs(lag) < REACH * width)
-        pairs.append(np.stack([lag[near] / width, log(ratio[near])]))
-    lags, ratios = np.concatenate(pairs, axis=1) if pairs else np.empty((2, 0))
-    most = 0.0
-    for centre in np.arange(-REACH, REACH, 0.5):
-        here = np.abs(lags - centre) <= 1
-        if np.count_nonzero(here) >= FEW:
-            alike = np.abs(ratios - np.median(ratios[here])) < SAME_RATIO
-            chance = max(np.mean(alike[~here]), 0.1) if np.count_nonzero(~here) >= FEW else CHANCE_RATIO
-            most = max(most, np.count_nonzero(alike & here) - chance * np.count_nonzero(here))
-    return most

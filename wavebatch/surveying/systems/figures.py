@@ -72,9 +72,15 @@ class Figures:
     """Its skew."""
     misfit_gaussians: Mapping[int, float] = field(default_factory=dict)
     """Misfits of sums of Gaussians, by their number."""
-    pulse_cost: float | None = None
-    """What waveforms cost with the chosen pulse, where it is not the one of the isolated echoes; and with that."""
-    isolated_pulse_cost: float | None = None
+    description_nats: float | None = None
+    """Length of a waveform's description with the chosen pulse, and with a Gaussian."""
+    gaussian_nats: float | None = None
+    pulse_change: float | None = None
+    """Of the shape, from shot to shot, as a share of the amplitude: what describes the waveforms best."""
+    false_in_noise_share: float | None = None
+    """Of the echoes, in stretches without signal, by mirrored residuals; and of the strong ones, the false ones beside
+    them that the pulse's misfit makes."""
+    false_by_misfit_share: float | None = None
     echoes_in_doubt: float | None = None
     """Share of the echoes that another pulse, misfit or noise, as likely, does not find, or whose samples it misses."""
     spacing_ns: float | None = None

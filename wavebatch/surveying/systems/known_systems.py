@@ -16,7 +16,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.order import robust_std
-from wavebatch.core.units import MEDIAN_ERROR, SQRT_PI
+from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
@@ -26,12 +26,8 @@ from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
-from wavebatch.surveying.measuring.misfit import measure_misfit
-from wavebatch.surveying.measuring.narrow_pulse import BEYOND, Cost, draw_together, measure_cost, scale_pulse
-from wavebatch.surveying.measuring.noise_and_width import FEW, SMALL
 from wavebatch.surveying.measuring.residuals import subtract_echoes
 from wavebatch.surveying.measuring.trial import TRIAL
-from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.system_table import read_system
 
 LEAST_ECHOES = 8
@@ -43,28 +39,6 @@ LEAST_SNR = 10.0
 MOST_ECHOES = 200
 """Echoes, the strongest ones, in which pulses are compared; more do not change the answer."""
 
-COMPARED = 256
-"""Waveforms in which pulses are compared."""
-
-SURE, SCALES, STEEP = 1.05, (0.88, 1.12), 1.06
-"""Cost of the strip's pulse over that of a known one (`measure_cost`), times what the known one costs more at the best
-of these widths, from which it is taken: a pulse that serves as well stretched is another one. It is 1.05 to 2.5 for the
-right one in strips of all sizes. Where the strip's is a guess, the second factor alone must be STEEP: any pulse with a
-tail serves better than a guess."""
-
-CROWDED = 1.5
-"""Echoes per waveform from which a learned pulse may have taken neighbours for a tail, however well it fits."""
-
-NEARLY = 1.03
-"""Cost of a narrower known pulse, over that of a learned one, up to which it is taken where it is STEEP: slopes within
-a large footprint widen all echoes of a strip, so that they explain themselves as well."""
-
-ALMOST = 1.1
-"""Cost of a known pulse, over that of the strip's drawn together, up to which it is taken in its place: in a canopy a
-pulse that is too narrow costs hardly more than the right one."""
-
-SHORT = 5.0
-"""Misfit in chi2 per echo from which a learned pulse is doubted: a third of what pays for one more echo."""
 
 BEFORE, AFTER = 4.0, 9.0
 """Widths of the pulse before and after an echo in which the misfit is measured: both shipped pulses with their
@@ -73,9 +47,6 @@ after-pulses lie within."""
 SAME_SPACING = 0.01
 """How far the spacing of a strip may be from that of a known sensor, as a share of it."""
 
-WIDTHS = 0.6, 1.25
-"""Width of a known pulse, over that of the isolated echoes, within which it is tried: echoes of a canopy are wider than
-the pulse."""
 
 ALIKE = 0.05
 """Difference of two pulses, as `compare_pulses` measures it, up to which one looks like the other ..."""
@@ -120,6 +91,12 @@ def _load(path: Path) -> KnownSystem:
     table = parse_toml(read_text(path, "system file"), str(path))
     spacing = table.table("figures").number("spacing_ns", 1e-3, 1e3)
     return KnownSystem(path.stem, table.get("sensor", str), spacing, read_system(table.table("system")))
+
+
+def list_known(block: WaveformBlock, system: SystemPulse) -> dict[str, SystemPulse]:
+    """The system with the pulse of each shipped sensor whose samples are as far apart, by name."""
+    near = (known for known in known_systems() if abs(block.spacing / known.spacing - 1) < SAME_SPACING)
+    return {known.name: with_pulse(system, known.system) for known in near}
 
 
 def find_lone(block: WaveformBlock, system: SystemPulse, most: int = MOST_ECHOES) -> EchoTable:
@@ -167,186 +144,22 @@ def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tup
     return np.where(number > 0, np.sqrt(power.sum(axis=1) / np.maximum(number, 1)), NO_FIT), left, lag
 
 
-def guess_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> SystemPulse:
-    """Take a careful Gaussian where echoes are too few to learn a pulse from.
+def guess_width(block: WaveformBlock, system: SystemPulse) -> SystemPulse | None:
+    """Return the Gaussian of the narrower single echoes; None with fewer than LEAST_ECHOES of them.
 
-    Parameters
-    ----------
-    block : WaveformBlock
-    system : SystemPulse
-        Noise and the Gaussian of the isolated echoes' width.
-    guess : bool
-        Whether this width is a guess, because even for it there were too few echoes.
-
-    Returns
-    -------
-    SystemPulse
-        With the width of the strongest single echoes if it was a guess. What they all show at one lag after them is
-        ringing, so that echoes there get the flag RINGING_SUSPECT (docs/algorithms.md R2).
+    The lower quartile, without what noise takes off it: widths of one surface then give their median. Of all echoes:
+    noise makes the strongest of many weak ones both high and narrow.
     """
-    lone = find_lone(block, system)
+    lone = find_lone(block, system, len(block))
     if len(lone) < LEAST_ECHOES:
-        return system
-    if guess:
-        # Not below half a sample, as for isolated echoes: spikes are no pulses.
-        # The lower quartile, without what noise takes off it: widths of one surface then give their median. Of all
-        # echoes: noise makes the strongest of many weak ones both high and narrow.
-        every = find_lone(block, system, len(block))
-        low, middle = np.quantile(every.sigma, (0.25, 0.5))
-        width = min(low + 0.674 * float(np.median(every.sigma_err)), middle)
-        system = replace(system, sigma_ref=max(float(width), 0.5 * block.spacing))
-        lone = find_lone(block, system)
-    return replace(system, ringing=_find_ringing(block, system, lone))
+        return None
+    low, middle = np.quantile(lone.sigma, (0.25, 0.5))
+    width = min(low + 0.674 * float(np.median(lone.sigma_err)), middle)
+    # Not below half a sample, as for isolated echoes: spikes are no pulses.
+    return replace(system, sigma_ref=max(float(width), 0.5 * block.spacing))
 
 
-def choose_pulse(
-    block: WaveformBlock, system: SystemPulse, strong: EchoTable, *, learned: bool, figures: Figures
-) -> SystemPulse:
-    """Compare the strip's pulse with those of known sensors, and with itself drawn together.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-    system : SystemPulse
-        With the pulse of the isolated echoes.
-    strong : EchoTable
-        The strongest single echoes of the block.
-    learned : bool
-        Whether it was learned; a Gaussian that is a guess is never drawn together.
-    figures : Figures
-        Gets the costs of the two pulses, where one was taken for another, and the share of the echoes that is in doubt
-        because the two cost about the same.
-
-    Returns
-    -------
-    SystemPulse
-
-    Notes
-    -----
-    A pulse is right if it explains all waveforms, not only isolated echoes, with the fewest echoes and the least misfit
-    (`measure_cost`): in a canopy an isolated echo is often several, and their pulse too wide. Nothing is
-    tried where a learned pulse leaves less than SHORT per echo and no echoes are narrower; but where echoes are CROWDED
-    or waveforms few it may be a Gaussian all the same. Else the simplest is taken of those that cost no more, as wide
-    as the narrowest echoes; where these do not show it, the widest that costs no more (`_drop_tail`, `draw_together`).
-    Where the learned one leaves more, a known pulse of the strip's spacing is taken if it costs less
-    than the strip's, and less than it does when it is stretched or drawn together (SURE); if it is narrower and costs
-    hardly more (NEARLY); or where the strip's must be drawn together and costs hardly less then (ALMOST). A pulse
-    learned from few waveforms has their noise: there a known pulse is taken too if the learned one looks like it
-    (ALIKE) and waveforms do not cost more with it beyond chance.
-    """
-    part = _spread(_with_level(block, system), COMPARED)
-    own = cost = measure_cost(part, system)
-    clear = learned and own.misfit < SHORT * own.echoes
-    enough = own.echoes < CROWDED * len(part) and len(block) >= SMALL
-    if own.echoes < LEAST_ECHOES or (clear and enough and not own.is_narrower):
-        return system
-    pulse = _drop_tail(block, system, strong) if learned else system
-    if pulse is not system:
-        cost = measure_cost(part, pulse)
-    if learned:
-        pulse, cost = draw_together(part, pulse, cost, clear=clear)
-        if len(block) < SMALL:
-            pulse, cost = _prefer_gaussian(part, pulse, cost)
-    if not clear:
-        certain = learned and len(block) >= SMALL
-        pulse, cost = _compare_known(part, (system, own), (pulse, cost), certain=certain)
-    if pulse is not system:
-        figures.pulse_cost, figures.isolated_pulse_cost = cost.typical, own.typical
-        if own.exceeds(cost) < BEYOND and find_source(pulse) is None:
-            figures.echoes_in_doubt = abs(own.echoes / max(cost.echoes, 1) - 1)
-    return pulse
-
-
-def _compare_known(
-    part: WaveformBlock, own: tuple[SystemPulse, Cost], best: tuple[SystemPulse, Cost], *, certain: bool
-) -> tuple[SystemPulse, Cost]:
-    """The known pulse that serves better than the strip's and its cost, or the best of the strip's and its cost.
-
-    own: the pulse of the isolated echoes and its cost; certain: it was learned from many.
-    """
-    (system, own_cost), (pulse, cost) = own, best
-    drawn = pulse.sigma_ref < system.sigma_ref
-    tried = []
-    for known in known_systems():
-        ratio = known.system.sigma_ref / system.sigma_ref
-        if abs(part.spacing / known.spacing - 1) < SAME_SPACING and WIDTHS[0] < ratio < WIDTHS[1]:
-            taken = with_pulse(system, known.system)
-            found = measure_cost(part, taken)
-            alike = not certain and compare_pulses(system, known.system) < ALIKE and found.exceeds(own_cost) < BEYOND
-            if alike or found.typical < NEARLY * own_cost.typical and (
-                (drawn and found.typical < ALMOST * cost.typical)
-                or _is_sure(part, taken, found.typical, own_cost.typical, learned=certain, narrower=ratio < 1)
-            ):
-                tried.append((found.typical, known.name, taken, found))
-    return min(tried, key=lambda one: one[:2])[2:] if tried else best
-
-
-def _with_level(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
-    """The waveforms whose level is known to the noise, or all: a wrong level passes for a narrow pulse and an echo."""
-    error = pooled_noise(block, system).baseline_err
-    if error is None:
-        return block
-    known = np.flatnonzero(error <= system.noise.std)
-    return block.rows(known) if len(known) >= FEW else block
-
-
-def _spread(block: WaveformBlock, number: int) -> WaveformBlock:
-    """At most so many waveforms, spread over the block."""
-    return block.rows(np.unique(np.linspace(0, len(block) - 1, number).astype(np.int64)))
-
-
-def _drop_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
-    """The learned pulse as a plain Gaussian where strong echoes have no tail in common, else the system itself.
-
-    In a canopy the neighbours of echoes become a tail of the learned pulse. They are at another lag in every waveform.
-    """
-    if len(strong) < FEW or not (system.components or system.kappa):
-        return system
-    plain = _make_plain(system)
-    missed = measure_misfit(block, plain, strong, reach=RINGING_REACH).misfit
-    ratio = float(np.median(strong.amplitude)) / system.noise.std
-    energy = SQRT_PI * ratio**2 * system.sigma_ref / block.spacing
-    return plain if missed**2 * energy < system.acceptance else system
-
-
-def _prefer_gaussian(part: WaveformBlock, pulse: SystemPulse, cost: Cost) -> tuple[SystemPulse, Cost]:
-    """A plain Gaussian and its cost where waveforms cost clearly less with it: few wide echoes make odd pulses."""
-    if not (pulse.components or pulse.kappa):
-        return pulse, cost
-    plain = _make_plain(pulse)
-    plain, found = draw_together(part, plain, measure_cost(part, plain), clear=False)
-    return (plain, found) if found.exceeds(cost) < -BEYOND else (pulse, cost)
-
-
-def _make_plain(system: SystemPulse) -> SystemPulse:
-    """The system with a Gaussian as wide as its pulse."""
-    return replace(system, components=(), kappa=0.0, ringing=0.0)
-
-
-def _is_sure(
-    part: WaveformBlock, taken: SystemPulse, cost: float, own: float, *, learned: bool, narrower: bool
-) -> bool:
-    """Whether a known pulse serves better than the strip's, of cost `own`, and only at its width."""
-    rest = min(measure_cost(part, scale_pulse(taken, scale)).typical for scale in SCALES)
-    steep = rest > STEEP * cost
-    return (learned and narrower and steep) or (cost < own and own * rest > SURE * cost**2 and (learned or steep))
-
-
-def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
-    """Return a strip's system with the pulse of another one, and with how far strong echoes deviate from it."""
-    names = ("sigma_ref", "kappa", "components", "ringing", "acceptance", "misfit", "tail_misfit")
-    widths = replace(system.widths, scatter=known.widths.scatter)
-    return replace(system, widths=widths, **{name: getattr(known, name) for name in names})
-
-
-def find_source(system: SystemPulse) -> KnownSystem | None:
-    """Return the known sensor whose pulse a system has, bit for bit; None for a pulse of its own."""
-    pulse = (system.components, system.kappa, system.sigma_ref)
-    same = (one for one in known_systems() if (one.system.components, one.system.kappa, one.system.sigma_ref) == pulse)
-    return next(same, None) if system.components or system.kappa else None
-
-
-def _find_ringing(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> float:
+def find_ringing(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> float:
     """Largest after-pulse that echoes show together at one lag, as a share of them; 0 where there is none.
 
     Second targets are at another distance in every waveform, an after-pulse is not: the median shows it alone. Its
@@ -368,6 +181,20 @@ def _find_ringing(block: WaveformBlock, system: SystemPulse, lone: EchoTable) ->
         if middle > max(LEAST_RINGING, RINGING_ERRORS * error):
             largest = max(largest, float(np.quantile(value, 0.9)))
     return min(largest, LARGEST_RINGING)
+
+
+def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
+    """Return a strip's system with the pulse of another one, and with how far strong echoes deviate from it."""
+    names = ("sigma_ref", "kappa", "components", "ringing", "acceptance", "misfit", "tail_misfit")
+    widths = replace(system.widths, scatter=known.widths.scatter)
+    return replace(system, widths=widths, **{name: getattr(known, name) for name in names})
+
+
+def find_source(system: SystemPulse) -> KnownSystem | None:
+    """Return the known sensor whose pulse a system has, bit for bit; None for a pulse of its own."""
+    pulse = (system.components, system.kappa, system.sigma_ref)
+    same = (one for one in known_systems() if (one.system.components, one.system.kappa, one.system.sigma_ref) == pulse)
+    return next(same, None) if system.components or system.kappa else None
 
 
 class Likeness(NamedTuple):

@@ -35,6 +35,7 @@ NUMBERS: dict[str, Key] = {
     "ringing": Key("ringing", 0.0, 1.0, "largest after-pulse, as a share of the amplitude"),
     "saturation_dn": Key("saturation", 1.0, 1e10, "count at which the digitizer clips", optional=True),
     "acceptance": Key("acceptance", 1.0, 1e6, "least fall of chi2 for which an echo is added"),
+    "significance": Key("significance", 0.0, 1e3, "least energy of an echo, where that is more than the chain's", True),
     "misfit": Key("misfit", 0.0, 1.0, "of strong echoes to the pulse, as a share of them", optional=True),
     "level_variance_ns2": Key("widths.variance", -1e8, 0.0, "of level ground's echoes less the pulse's", True),
     "level_error_ns2": Key("widths.error", 0.0, 1e8, "standard deviation of level_variance", True),
@@ -52,6 +53,10 @@ ROWS: dict[str, Rows] = {
     "correlation": Rows(
         "noise.correlation", ((-1.0, 1.0),), "numbers",
         "of the noise of two samples 1, 2, ... spacings apart; empty: white noise",
+    ),
+    "whitening": Rows(
+        "noise.whitening", ((-2.0, 2.0),), "numbers",
+        "what predicts the noise of a sample from the two before it; empty: fits take noise for white", optional=True,
     ),
     "pattern_dn": Rows(
         "defects.pattern", ((-1e6, 1e6),), "numbers", "offsets that repeat along the samples, taken off; empty: none"
@@ -129,6 +134,7 @@ def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
     own = parts[""]
     own["seams"] = dict(own.get("seams", ()))
     _check_components(own["components"], f"{table.where}: components")
+    _check_whitening(parts["noise"].get("whitening", ()), f"{table.where}: whitening")
     return SystemPulse(
         **own,
         noise=ReceiverNoise(by_kind=read_numbers(table.table(_NOISE), low=0.0), **parts["noise"]),
@@ -143,6 +149,11 @@ def _check_components(components: tuple[tuple[float, ...], ...], where: str) -> 
         raise ConfigError(f"{where} must be empty or hold 2 to {MOST_COMPONENTS} Gaussians, it holds {len(components)}")
     if components and components[0][0] < 0.01:
         raise ConfigError(f"{where} row 1 is the main Gaussian, its weight must be positive, it is {components[0][0]}")
+
+
+def _check_whitening(whitening: tuple[float, ...], where: str) -> None:
+    if whitening and not (len(whitening) == 2 and abs(whitening[1]) < 1 and abs(whitening[0]) < 1 - whitening[1]):
+        raise ConfigError(f"{where} must be empty or hold two shares a, b of steady noise: |a| < 1 - b and |b| < 1")
 
 
 def read_numbers(table: TomlTable, low: float = -MOST_FIGURE) -> dict[str, float]:

@@ -33,14 +33,14 @@ def draw_survey(survey: Survey) -> str:
         pulses.append(draw_counts(counts, title="Waveforms of the survey", label="echoes in them"))
     components = [list(map(significant, component)) for component in system.components]
     learned = table(["weight", "delay ns", "sigma ns"], components, caption="Gaussians of the learned pulse")
-    misfits = [(f"{number} Gaussian{'s' * (number > 1)}", significant(misfit, 3))
-               for number, misfit in sorted(found.misfit_gaussians.items())]  # fmt: skip
-    others = {"goal": found.misfit_goal, "skewed": found.misfit_skewed}
-    misfits += [(name, significant(misfit, 3)) for name, misfit in others.items() if misfit is not None]
-    tried = table(["pulse model", "misfit, share of the amplitude"], misfits, caption="Models that were tried")
+    rows = [(one.name, significant(one.fwhm_ns, 4), f"{100 * one.change:.1f} %", significant(one.nats, 5),
+             significant(one.echoes_per_waveform, 4), "chosen" if one.chosen else f"{one.longer_by:.1f}")
+            for one in survey.candidates]  # fmt: skip
+    names = ["pulse", "full width ns", "change from shot to shot", "nats per waveform", "echoes", "longer by, errors"]
+    tried = table(names, rows, caption="Pulses that were tried: the fewest nats describe a waveform best")
     return "\n".join(
         [facts(_list_figures(survey)), figures(pulses), learned if components else "",
-         tried if misfits else ""]
+         tried if rows else ""]
     )  # fmt: skip
 
 

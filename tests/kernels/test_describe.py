@@ -1,0 +1,109 @@
+"""The judge's kernels: descriptions, shared volumes, changes of shape, and the pulse of all echoes together."""
+
+import naive_describe as naive
+import numpy as np
+import pytest
+
+from wavebatch.kernels.fit.describe import (
+    SampleNoise,
+    Sums,
+    count_echoes,
+    describe_left,
+    gather_pulse,
+    measure_changes,
+    render_pulses,
+)
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
+
+SHAPES = [PulseShape(), PulseShape(kappa=0.15), PulseShape(components=((0.2, 4.0, 5.0), (-0.05, 1.0, -0.8)))]
+NOISES = [SampleNoise(1.3), SampleNoise(0.9, 0.02, (0.7, 0.4, 0.1))]
+
+
+def _problem(shape, rng, n=12, s=70):
+    """Waveforms with 0 to 4 echoes, the third quarter of one waveform not recorded."""
+    waveform = np.repeat(np.arange(n), rng.integers(0, 5, n))
+    m = len(waveform)
+    main = np.stack([rng.uniform(5, 90, m), rng.uniform(8, 55, m), rng.uniform(1.5, 3.0, m)], axis=1)
+    model = render_pulses(shape, n, s, waveform, main)
+    used = np.ones((n, s), bool)
+    used[3, 35:52] = False
+    left = np.where(used, rng.standard_normal((n, s)), 0).astype(np.float32)
+    return Sums(shape, count_echoes(waveform, n), main, left, model, used)
+
+
+def _echoes(sums, i):
+    return [tuple(row) for row in sums.main[sums.first[i] : sums.first[i + 1]]]
+
+
+def _evaluate(shape):
+    return lambda x, time, width: evaluate_pulse(shape, x, np.array(time), np.array(width))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_sum_of_echoes_is_that_of_a_loop(shape, rng):
+    sums = _problem(shape, rng)
+    for i, row in enumerate(sums.model):
+        np.testing.assert_allclose(row, naive.render(_evaluate(shape), len(row), _echoes(sums, i)), atol=1e-3)
+
+
+@pytest.mark.parametrize("change", [0.0, 0.02])
+@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_descriptions_are_those_of_a_loop(shape, noise, change, rng):
+    sums = _problem(shape, rng)
+    length, volume = describe_left(sums, noise, change)
+    for i in range(len(sums.left)):
+        planes = (sums.left[i].astype(float), sums.model[i].astype(float), sums.used[i])
+        expected = naive.describe(_evaluate(shape), *planes, _echoes(sums, i), *noise, change)
+        np.testing.assert_allclose(length[i], expected[0], rtol=1e-5)
+        # In single precision the matrices of echoes that overlap most are known to a hundredth.
+        np.testing.assert_allclose(volume[i], expected[1], rtol=0.01, atol=0.02)
+
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_changes_are_those_of_a_loop(noise, rng):
+    sums = _problem(SHAPES[2], rng)
+    change, precision = measure_changes(sums, noise)
+    for i in range(len(sums.left)):
+        if not _echoes(sums, i):
+            assert not precision[i].any()
+            continue
+        planes = (sums.left[i].astype(float), sums.model[i].astype(float), sums.used[i])
+        expected = naive.measure_change(_evaluate(SHAPES[2]), *planes, _echoes(sums, i), *noise)
+        np.testing.assert_allclose(change[i], expected[0], rtol=5e-3, atol=1e-4)
+        np.testing.assert_allclose(precision[i], expected[1], rtol=5e-3)
+
+
+def test_normal_equations_are_those_of_a_loop(rng):
+    sums = _problem(SHAPES[2], rng)
+    delay, sigma, noise = np.arange(-4.0, 9.0), np.full(13, 1.4), SampleNoise(1.1, 0.03)
+    matrix, right = gather_pulse(sums, noise, 0.01, delay, sigma, 2.0, 3)
+    expected = [
+        naive.gather(sums.left[i].astype(float), sums.model[i].astype(float), sums.used[i], _echoes(sums, i), 1.1, 0.03,
+                     0.01, delay, sigma, 2.0)
+        for i in range(len(sums.left)) if 0 < len(_echoes(sums, i)) <= 3
+    ]  # fmt: skip
+    np.testing.assert_allclose(matrix, sum(one for one, _ in expected), rtol=1e-3, atol=1e-2)
+    np.testing.assert_allclose(right, sum(one for _, one in expected), rtol=1e-3, atol=1e-1)
+
+
+def test_many_echoes_of_a_long_waveform_take_time_in_proportion(rng):
+    """Two thousand echoes in 65,535 samples: groups of echoes are taken together, each in its own stretch."""
+    m = 2000
+    main = np.stack([rng.uniform(5, 90, m), np.sort(rng.uniform(0, 65_535, m)), np.full(m, 2.0)], axis=1)
+    model = render_pulses(PulseShape(), 1, 65_535, np.zeros(m, int), main)
+    sums = Sums(PulseShape(), np.array([0, m]), main, np.zeros_like(model), model, np.ones(model.shape, bool))
+    length, volume = describe_left(sums, SampleNoise(1.0), 0.01)
+    assert np.isfinite(length).all() and np.isfinite(volume).all()
+
+
+def test_arrays_that_the_library_would_read_beyond_are_refused(rng):
+    sums = _problem(PulseShape(), rng)
+    for wrong in (
+        {"first": sums.first[:-1]}, {"first": sums.first + 1}, {"left": sums.left[:, 1:]}, {"used": sums.used[1:]},
+        {"main": sums.main * [1, 1, 0]}, {"main": sums.main * np.nan},
+    ):  # fmt: skip
+        with pytest.raises(ValueError):
+            describe_left(sums._replace(**wrong), NOISES[0], 0.0)
+    with pytest.raises(ValueError):
+        describe_left(sums, SampleNoise(0.0), 0.0)

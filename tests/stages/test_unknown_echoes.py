@@ -1,0 +1,64 @@
+"""An echo is known or it is not there: what errors that hold more than noise leave of a decomposition."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.system import ReceiverNoise
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.noise import pooled
+
+N, SIGMA, STD = 600, 2.0, float(np.hypot(1, 1 / np.sqrt(12)))
+SYSTEM = SystemPulse(SIGMA, noise=ReceiverNoise(baseline=20.0, std=STD))
+
+
+def record(*echoes, seed=1):
+    """Waveforms of echoes (height, widths after the first), noise of 1 count."""
+    rng = np.random.default_rng(seed)
+    place, x = 40 + rng.random(N), np.arange(96)
+    y = 20 + rng.standard_normal((N, 96))
+    for height, after in echoes:
+        y += height * np.exp(-0.5 * ((x - place[:, None]) / SIGMA - after) ** 2)
+    return WaveformBlock.from_samples(np.rint(y).astype(np.uint16))
+
+
+def find(block, system=SYSTEM):
+    noise = pooled(block, system)
+    return adaptive(block, noise, system, maximum(block, noise, system))
+
+
+@pytest.mark.parametrize(("variance", "number"), [(0.0, 2), (400.0, 1)])
+def test_an_echo_that_more_than_noise_explains_is_left_out(variance, number):
+    """12 counts beside 200: sure in noise, but not where as much is left beside strong echoes."""
+    block = record((200.0, 0.0), (12.0, 3.0))
+    found = find(block, replace(SYSTEM, beside=((-20.0, variance), (20.0, variance))))
+    assert (found.count(N) == number).mean() > 0.9
+    assert (found.amplitude >= found.amplitude_err).all() and found.count(N).min() >= 1
+    lone = found.alone(N)
+    assert not (found.flags[lone] & int(EchoFlag.OVERLAPPED)).any()
+
+
+def test_rows_stay_sorted_and_other_waveforms_as_they_are():
+    """Half of the waveforms hold echoes that are asked again: the others are those of a block without them."""
+    system = replace(SYSTEM, beside=((-20.0, 400.0), (20.0, 400.0)))
+    pairs, lone = record((200.0, 0.0), (12.0, 3.0)), record((200.0, 0.0), (150.0, 9.0), seed=2)
+    both = WaveformBlock.from_samples(np.stack([pairs.samples, lone.samples], axis=1).reshape(2 * N, -1))
+    found, alone = find(both, system), find(lone, system)
+    assert (np.diff(found.waveform) >= 0).all()
+    assert (np.diff(found.time)[np.diff(found.waveform) == 0] > 0).all()
+    own = found.take(found.waveform % 2 == 1)
+    for name in ("time", "amplitude", "sigma", "time_err", "amplitude_err", "sigma_err", "flags"):
+        np.testing.assert_array_equal(getattr(own, name), getattr(alone, name))
+    assert found.attributes == {}
+
+
+def test_no_pulse_loses_its_only_echo():
+    """Clipped or far from the pulse, with errors above the amplitude: a cluster's last echo stays."""
+    block = record((300.0, 0.0), (300.0, 1.0), (300.0, 2.0), (300.0, 3.0))
+    clipped = replace(SYSTEM, saturation=60.0, beside=((-20.0, 1e4), (20.0, 1e4)), misfit=0.2)
+    cut = WaveformBlock.from_samples(np.minimum(block.samples, 60))
+    assert find(cut, clipped).count(N).min() >= 1

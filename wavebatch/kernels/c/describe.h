@@ -1,0 +1,311 @@
+/* How long the description of waveforms is with their echoes, and the pulse that all echoes of a sample ask for: the
+   survey's judge and its learning, docs/algorithms.md R2. Plain loops, one waveform after the other. */
+
+static const double FREEDOM = 4;               /* of Student's law: what no pulse explains must not decide */
+static const double NEARLY_SINGULAR = 1e-6;    /* of a scaled matrix, which is no better known in float32 */
+static const double PEAK = 0.83698821678583584; /* -ln of Student's density at 0, of a scale of root 3/4 */
+static const double REACH = 6;                 /* widths beyond which nothing of a Gaussian is left */
+static const double NARROWEST = 0.1;           /* variance of a Gaussian under an echo narrower than the pulse, over its own */
+enum { CHANGED = 3, TOGETHER = 6 };            /* strongest echoes of a waveform whose shapes may change; echoes whose errors
+                                                  are taken together, so that time grows with their number */
+
+typedef struct { /* n waveforms of `length` samples, and their echoes: first[i] .. first[i + 1] - 1 are those of waveform i */
+    int64_t n, length;
+    const float *left, *model;                 /* samples less level and model; sum of the echoes */
+    const uint8_t *used;                       /* samples that count */
+    const int64_t *first;
+    const double *amplitude, *time, *width;    /* of the pulse's main component [samples] */
+    Pulse pulse;
+    double variance, gain;                     /* noise of a sample, and its growth with the signal */
+    double change;                             /* of the pulse from shot to shot, as a share of its amplitude */
+    double ahead[2], left_over;                /* prediction from the last two samples, variance that it leaves */
+} Described;
+
+typedef struct {
+    int64_t vectors;
+    lanes *x, *weight, *rest, *rows, *modes;
+    double *gram, *matrix, *pivot, *column;
+} Desk;
+
+static int furnish(Desk *d, int64_t rows, int64_t vectors) {
+    const size_t row = vectors * sizeof(lanes), n = rows;
+    d->vectors = vectors;
+    return enlarge(&d->x, row) && enlarge(&d->weight, row) && enlarge(&d->rest, row) && enlarge(&d->rows, n * row)
+        && enlarge(&d->modes, 6 * row) && enlarge(&d->gram, n * n * sizeof(double)) && enlarge(&d->matrix, n * n * sizeof(double))
+        && enlarge(&d->pivot, n * sizeof(double)) && enlarge(&d->column, n * sizeof(double));
+}
+
+static void clear_desk(Desk *d) {
+    free(d->x); free(d->weight); free(d->rest); free(d->rows); free(d->modes);
+    free(d->gram); free(d->matrix); free(d->pivot); free(d->column);
+}
+
+/* Positions of the samples that count, OUTSIDE for others; their weights, one over the noise; and what is left, in noise.
+   Returns the sum of the logarithms of the noises. */
+static double lay_out(const Described *w, int64_t i, Desk *d) {
+    float *x = (float *)d->x, *weight = (float *)d->weight, *rest = (float *)d->rest;
+    const int64_t begin = i * w->length;
+    double sum = 0;
+    for (int64_t t = 0; t < d->vectors * LANES; t++) {
+        int counts = t < w->length && w->used[begin + t];
+        double variance = counts ? w->variance + w->gain * fmax(w->model[begin + t], 0) : 1;
+        x[t] = counts ? t : OUTSIDE;
+        weight[t] = counts ? 1 / sqrt(variance) : 0;
+        rest[t] = counts ? w->left[begin + t] * weight[t] : 0;
+        if (counts) sum += 0.5 * log_double(variance * w->left_over);
+    }
+    return sum;
+}
+
+/* What the two samples before do not predict, in place. */
+static void innovate(const Described *w, lanes *row, int64_t vectors) {
+    float *y = (float *)row;
+    const float one = w->ahead[0], two = w->ahead[1], scale = 1 / sqrt(w->left_over);
+    float before = 0, last = 0;
+    for (int64_t t = 0; t < vectors * LANES; t++) {
+        float here = y[t];
+        y[t] = (here - one * last - two * before) * scale;
+        before = last; last = here;
+    }
+}
+
+static double dot(const lanes *a, const lanes *b, int64_t vectors) {
+    lanes sum = ALL(0);
+    for (int64_t v = 0; v < vectors; v++) sum += a[v] * b[v];
+    return sum_lanes(sum);
+}
+
+/* Rows of an echo at the positions x: pulse, and derivatives by time and width. */
+static void draw_echo(const Described *w, int64_t echo, const lanes *x, int64_t vectors, lanes *rows) {
+    Echo one = {1, w->time[echo], w->width[echo], 0};
+    Basis basis = {rows, rows + vectors, rows + 2 * vectors, NULL};
+    evaluate_pulse(&w->pulse, 0, &one, x, vectors, basis);
+}
+
+/* How far a pulse of this width reaches before and after its time [samples]. */
+static void find_reach(const Pulse *shape, double width, double *before, double *after) {
+    *before = *after = (shape->kind == SUM_OF_GAUSSIANS ? REACH : 4 * REACH) * width;
+    for (int64_t c = 0; c < shape->n_components; c++) {
+        const double *part = shape->components + 3 * c, wide = REACH * sqrt(width * width + part[2]);
+        *before = fmax(*before, wide - part[1]);
+        *after = fmax(*after, wide + part[1]);
+    }
+}
+
+/* Half the negative logarithm of the determinant of the correlations of all that is fitted of k echoes: those that share
+   their samples are worth less than their errors say. */
+static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t k) {
+    const int64_t p = 3 * k;
+    double sum = 0, low = INFINITY, high = -INFINITY;
+    for (int64_t j = first; j < first + k; j++) {
+        double before, after;
+        find_reach(&w->pulse, w->width[j], &before, &after);
+        low = fmin(low, w->time[j] - before);
+        high = fmax(high, w->time[j] + after);
+    }
+    const int64_t from = fmin(fmax(low, 0), w->length - 1) / LANES, to = VECTORS((int64_t)fmin(fmax(high, 0), w->length - 1) + 1);
+    const int64_t vectors = to - from;
+    for (int64_t j = 0; j < k; j++) draw_echo(w, first + j, d->x + from, vectors, d->rows + 3 * j * vectors);
+    for (int64_t r = 0; r < p; r++) {
+        lanes *row = d->rows + r * vectors;
+        for (int64_t v = 0; v < vectors; v++) row[v] *= d->weight[from + v];
+        innovate(w, row, vectors);
+    }
+    multiply_rows(p, vectors, d->rows, d->gram);
+    for (int64_t r = 0; r < p; r++) d->column[r] = 1 / sqrt(fmax(d->gram[r * p + r], 1e-12));
+    for (int64_t r = 0; r < p; r++)
+        for (int64_t c = 0; c <= r; c++)
+            d->matrix[r * p + c] = d->gram[r * p + c] * d->column[r] * d->column[c] + (r == c ? NEARLY_SINGULAR : 0);
+    factor(p, d->matrix, d->pivot, 0.1 * NEARLY_SINGULAR);
+    for (int64_t r = 0; r < p; r++) {
+        for (int64_t c = 0; c < p; c++) d->column[c] = c == r;
+        solve(p, d->matrix, d->pivot, d->column);
+        sum += 0.5 * (log_double(fmax(d->column[r], 1)) + log_double(fmin(d->pivot[r], 2)));
+    }
+    return sum;
+}
+
+/* Takes a change of an echo's shape off what is left, as far as it is likely, and returns what it costs. The two
+   directions are the next after those of the fit, as in `hermite_moments`. */
+static double change_shape(const Described *w, Desk *d, int64_t echo, double *heights, double *energies) {
+    const int64_t vectors = d->vectors;
+    const float time = w->time[echo], inverse = 1 / w->width[echo];
+    double cost = 0, energy = 0;
+    draw_echo(w, echo, d->x, vectors, d->modes);
+    for (int64_t v = 0; v < vectors; v++) {
+        lanes z = least_of(most_of((d->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
+        d->modes[3 * vectors + v] = d->modes[2 * vectors + v] * z;
+        d->modes[4 * vectors + v] = d->modes[3 * vectors + v] * z;
+    }
+    for (int64_t r = 0; r < 5; r++) {
+        lanes *row = d->modes + r * vectors;
+        for (int64_t b = 0; b < r; b++) {
+            const float share = dot(row, d->modes + b * vectors, vectors);
+            for (int64_t v = 0; v < vectors; v++) row[v] -= d->modes[b * vectors + v] * share;
+        }
+        double norm = sqrt(dot(row, row, vectors));
+        if (!r) energy = norm;
+        for (int64_t v = 0; v < vectors; v++) row[v] *= (float)(1 / fmax(norm, 1e-9));
+    }
+    for (int64_t r = 3; r < 5; r++) {
+        lanes *row = d->modes + r * vectors;
+        for (int64_t v = 0; v < vectors; v++) row[v] *= d->weight[v] * (float)(energy * w->amplitude[echo]);
+        innovate(w, row, vectors);
+        double own = dot(row, row, vectors), height = dot(row, d->rest, vectors) / (own + 1 / (w->change * w->change));
+        if (heights) { heights[r - 3] = height; energies[r - 3] = own; continue; }
+        for (int64_t v = 0; v < vectors; v++) d->rest[v] -= row[v] * (float)height;
+        cost += 0.5 * (height / w->change) * (height / w->change) + 0.5 * log_double(1 + w->change * w->change * own);
+    }
+    return cost;
+}
+
+/* The strongest echo of a waveform that is weaker than `last`, or its first equal after `at`; -1 where there is none. */
+static int64_t next_strongest(const Described *w, int64_t first, int64_t end, int64_t last) {
+    int64_t best = -1;
+    for (int64_t j = first; j < end; j++) {
+        int later = last < 0 || w->amplitude[j] < w->amplitude[last] || (w->amplitude[j] == w->amplitude[last] && j > last);
+        if (later && (best < 0 || w->amplitude[j] > w->amplitude[best])) best = j;
+    }
+    return best;
+}
+
+/* Length of what the echoes leave of each waveform, with what its shapes cost, and the volume that echoes share. */
+EXPORT int64_t describe_waveforms(const Described *w, double *length, double *volume) {
+    Desk d = {0};
+    const int64_t vectors = VECTORS(w->length);
+    int good = furnish(&d, 3 * TOGETHER, vectors);
+    for (int64_t i = 0; i < w->n && good; i++) {
+        const int64_t first = w->first[i], end = w->first[i + 1];
+        double sum = lay_out(w, i, &d), product = 1;
+        innovate(w, d.rest, vectors);
+        int64_t echo = -1;
+        for (int64_t j = 0; w->change > 0 && j < CHANGED && (echo = next_strongest(w, first, end, echo)) >= 0; j++)
+            sum += change_shape(w, &d, echo, NULL, NULL);
+        const float *rest = (const float *)d.rest;
+        for (int64_t t = 0; t < w->length; t++) {
+            if (!w->used[i * w->length + t]) continue;
+            product *= 1 + (double)rest[t] * rest[t] / (0.75 * FREEDOM);
+            if (product > 1e200) { sum += 0.5 * (FREEDOM + 1) * log_double(product); product = 1; }
+            sum += PEAK;
+        }
+        length[i] = sum + 0.5 * (FREEDOM + 1) * log_double(product);
+        volume[i] = 0;
+        for (int64_t j = first; j < end; j += TOGETHER) volume[i] += shared_volume(w, &d, j, end - j < TOGETHER ? end - j : TOGETHER);
+    }
+    clear_desk(&d);
+    return good ? 0 : -1;
+}
+
+/* Change of the shape of the strongest echo of each waveform in two directions, as a share of its amplitude, and one over
+   the variance of each, (n, 2); 0 where there is no echo. */
+EXPORT int64_t measure_changes(const Described *w, double *heights, double *energies) {
+    Desk d = {0};
+    int good = furnish(&d, 1, VECTORS(w->length));
+    memset(heights, 0, 2 * w->n * sizeof(double));
+    memset(energies, 0, 2 * w->n * sizeof(double));
+    for (int64_t i = 0; i < w->n && good; i++) {
+        int64_t echo = next_strongest(w, w->first[i], w->first[i + 1], -1);
+        if (echo < 0) continue;
+        lay_out(w, i, &d);
+        innovate(w, d.rest, d.vectors);
+        change_shape(w, &d, echo, heights + 2 * i, energies + 2 * i);
+    }
+    clear_desk(&d);
+    return good ? 0 : -1;
+}
+
+/* Normal equations of a pulse that is a sum of `number` Gaussians of given delays and variances, and of an offset of the
+   levels, from all waveforms: matrix (number + 1, number + 1), and right-hand side. An echo that is wider than the
+   reference, or narrower, changes all of their variances by the same. Samples far out count less, by Student's law. */
+EXPORT int64_t learn_pulse(const Described *w, int64_t number, const double *delay, const double *variance, double reference,
+                           int64_t most, double *matrix, double *right) {
+    Desk d = {0};
+    const int64_t vectors = VECTORS(w->length), rows = number + 2;
+    int good = furnish(&d, rows, vectors);
+    memset(matrix, 0, (number + 1) * (number + 1) * sizeof(double));
+    memset(right, 0, (number + 1) * sizeof(double));
+    for (int64_t i = 0; i < w->n && good; i++) {
+        const int64_t first = w->first[i], end = w->first[i + 1], begin = i * w->length;
+        if (end == first || end - first > most) continue;
+        lay_out(w, i, &d);
+        float *weight = (float *)d.weight, *y = (float *)(d.rows + (number + 1) * vectors);
+        for (int64_t t = 0; t < vectors * LANES; t++) {
+            int counts = t < w->length && w->used[begin + t];
+            double model = counts ? w->model[begin + t] : 0, rest = counts ? w->left[begin + t] : 0;
+            double spread = w->variance + w->gain * fmax(model, 0) + w->change * w->change * model * model;
+            weight[t] = counts ? sqrt((FREEDOM + 1) / (FREEDOM + rest * rest / spread) / spread) : 0;
+            y[t] = counts ? rest + model : 0;
+        }
+        for (int64_t c = 0; c < number; c++) {
+            lanes *row = d.rows + c * vectors;
+            for (int64_t v = 0; v < vectors; v++) row[v] = ALL(0);
+            for (int64_t j = first; j < end; j++) {
+                double wide = w->width[j], more = wide * wide - reference * reference;
+                double sigma = sqrt(fmax(variance[c] + more, NARROWEST * variance[c]));
+                double place = w->time[j] + delay[c];
+                float whole = rint(place), part = place - rint(place), inverse = 1 / sigma, height = w->amplitude[j] * wide / sigma;
+                int64_t from = fmin(fmax(place - REACH * sigma, 0), w->length) / LANES;
+                int64_t to = VECTORS((int64_t)fmin(fmax(place + REACH * sigma + 1, 0), w->length));
+                for (int64_t v = from; v < to; v++) {
+                    lanes z = distance(d.x[v], whole, part, inverse);
+                    row[v] += exp_lanes(z * z * -0.5f) * height;
+                }
+            }
+        }
+        for (int64_t v = 0; v < vectors; v++) d.rows[number * vectors + v] = ALL(1);
+        for (int64_t r = 0; r < rows; r++)
+            for (int64_t v = 0; v < vectors; v++) d.rows[r * vectors + v] *= d.weight[v];
+        multiply_rows(rows, vectors, d.rows, d.gram);
+        for (int64_t r = 0; r <= number; r++) {
+            for (int64_t c = 0; c <= r; c++) matrix[r * (number + 1) + c] += d.gram[r * rows + c];
+            right[r] += d.gram[(number + 1) * rows + r];
+        }
+    }
+    for (int64_t r = 0; r <= number; r++)
+        for (int64_t c = r + 1; c <= number; c++) matrix[r * (number + 1) + c] = matrix[c * (number + 1) + r];
+    clear_desk(&d);
+    return good ? 0 : -1;
+}
+
+/* The sum of the echoes of each waveform, (n, length). */
+EXPORT int64_t render_pulses(const Described *w, float *out) {
+    Desk d = {0};
+    const int64_t vectors = VECTORS(w->length);
+    int good = furnish(&d, 3, vectors);
+    for (int64_t t = 0; t < vectors * LANES && good; t++) ((float *)d.x)[t] = t;
+    for (int64_t i = 0; i < w->n && good; i++) {
+        for (int64_t v = 0; v < vectors; v++) d.rest[v] = ALL(0);
+        for (int64_t j = w->first[i]; j < w->first[i + 1]; j++) {
+            double before, after;
+            find_reach(&w->pulse, w->width[j], &before, &after);
+            const int64_t from = fmin(fmax(w->time[j] - before, 0), w->length) / LANES;
+            const int64_t count = VECTORS((int64_t)fmin(fmax(w->time[j] + after + 1, 0), w->length)) - from;
+            if (count > 0) draw_echo(w, j, d.x + from, count, d.rows);
+            for (int64_t v = 0; v < count; v++) d.rest[from + v] += d.rows[v] * (float)w->amplitude[j];
+        }
+        memcpy(out + i * w->length, d.rest, w->length * sizeof(float));
+    }
+    clear_desk(&d);
+    return good ? 0 : -1;
+}
+
+/* Pairs of quiet samples `lag` apart of waveforms in columns, signal (s, n): number, and sum of squared differences, of
+   all pairs, of those with a sample of `high`, of `low`, and of both: out (4, 2). Without masks only the first. */
+EXPORT int64_t pair_differences(int64_t s, int64_t n, const float *signal, const uint8_t *quiet, const uint8_t *high,
+                                const uint8_t *low, int64_t lag, double *out) {
+    memset(out, 0, 8 * sizeof(double));
+    for (int64_t t = 0; t + lag < s; t++) {
+        const int64_t a = t * n, b = (t + lag) * n;
+        for (int64_t i = 0; i < n; i++) {
+            if (!(quiet[a + i] & quiet[b + i])) continue;
+            const double step = signal[b + i] - signal[a + i], square = step * step;
+            out[0] += 1; out[1] += square;
+            if (!high) continue;
+            const int is_high = high[a + i] | high[b + i], is_low = low[a + i] | low[b + i];
+            if (is_high) { out[2] += 1; out[3] += square; }
+            if (is_low) { out[4] += 1; out[5] += square; }
+            if (is_high & is_low) { out[6] += 1; out[7] += square; }
+        }
+    }
+    return 0;
+}

@@ -1,0 +1,192 @@
+"""How long waveforms are to describe with their echoes, and the pulse that all echoes together ask for.
+
+The survey's judge and its learning call it; the loops are C (kernels/c/describe.h).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.kernels import library
+from wavebatch.kernels.fit.decompose import as_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape
+from wavebatch.kernels.library import call, place
+
+LEAST_LEFT = 0.02
+"""Least share of the noise's variance that the two samples before leave open: an estimated correlation may be none."""
+
+
+UNBOUND = 1e3
+"""Change of a shape that bounds nothing."""
+
+
+class Sums(NamedTuple):
+    """n waveforms of s samples, and sums of pulses in them."""
+
+    shape: PulseShape
+    first: np.ndarray
+    """First echo of each waveform and the number of echoes, int64 (n + 1,)."""
+    main: np.ndarray
+    """Amplitude, time and width of the pulse's main component [count, samples], float64 (m, 3)."""
+    left: np.ndarray
+    """Samples less level and echoes, float32 (n, s) [count]."""
+    model: np.ndarray
+    """The echoes, float32 (n, s) [count]."""
+    used: np.ndarray
+    """Samples that count, bool (n, s)."""
+
+
+class SampleNoise(NamedTuple):
+    """Noise of a sample."""
+
+    std: float
+    """[count]."""
+    gain: float = 0.0
+    """Growth of the variance per count of signal [count]."""
+    correlation: tuple[float, ...] = ()
+    """Of two samples 1, 2, ... apart; the first two count."""
+
+
+def render_pulses(shape: PulseShape, n: int, s: int, waveform: np.ndarray, main: np.ndarray) -> np.ndarray:
+    """Return the sum of the pulses of each waveform, float32 (n, s) [count].
+
+    Parameters
+    ----------
+    shape : PulseShape
+    n, s : int
+        Waveforms, and samples of each.
+    waveform : int (m,)
+        Row of each echo, ascending.
+    main : float64 (m, 3)
+        Amplitude, time and width of the pulse's main component [count, samples].
+    """
+    out = np.zeros((n, s), np.float32)
+    empty = np.zeros((n, s), np.float32)
+    sums = Sums(shape, count_echoes(waveform, n), main, empty, empty, np.zeros((n, s), bool))
+    call("render_pulses", _as_structure(sums, SampleNoise(1.0), 0.0), out)
+    return out
+
+
+def count_echoes(waveform: np.ndarray, n: int) -> np.ndarray:
+    """Return the first echo of each of n waveforms, and the number of echoes, int64 (n + 1,)."""
+    return np.cumsum(np.r_[0, np.bincount(waveform, minlength=n)], dtype=np.int64)
+
+
+def describe_left(sums: Sums, noise: SampleNoise, change: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return how long the description of what echoes leave is, and how much less their errors say together than alone.
+
+    Parameters
+    ----------
+    sums : Sums
+    noise : SampleNoise
+    change : float
+        How much the pulse's shape changes from shot to shot, as a share of its amplitude: the three strongest echoes of
+        a waveform may leave so much in the two directions (Gauss-Hermite h3 and h4) that follow those of the fit.
+
+    Returns
+    -------
+    length : float64 (n,)
+        Negative logarithm of the likelihood [nats], by Student's law with four degrees of freedom of what the two
+        samples before do not predict; with the cost of the changes.
+    volume : float64 (n,)
+        Half the negative logarithm of the determinant of the correlation matrix of all parameters [nats].
+
+    References
+    ----------
+    docs/algorithms.md R2.
+    """
+    length, volume = np.zeros(len(sums.left)), np.zeros(len(sums.left))
+    call("describe_waveforms", _as_structure(sums, noise, change), length, volume)
+    return length, volume
+
+
+def measure_changes(sums: Sums, noise: SampleNoise) -> tuple[np.ndarray, np.ndarray]:
+    """Return how the shape of the strongest echo of each waveform differs from the pulse.
+
+    Parameters
+    ----------
+    sums : Sums
+    noise : SampleNoise
+
+    Returns
+    -------
+    change : float64 (n, 2)
+        In the two directions of `describe_left`, as a share of the echo's energy; by least squares.
+    precision : float64 (n, 2)
+        One over the variance of each; 0 for a waveform without an echo.
+    """
+    change, precision = np.zeros((len(sums.left), 2)), np.zeros((len(sums.left), 2))
+    call("measure_changes", _as_structure(sums, noise, UNBOUND), change, precision)
+    return change, precision
+
+
+def gather_pulse(
+    sums: Sums, noise: SampleNoise, change: float, delay: np.ndarray, sigma: np.ndarray, reference: float, most: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return normal equations of a pulse that is a sum of Gaussians, from all echoes of all waveforms.
+
+    Parameters
+    ----------
+    sums : Sums
+    noise : SampleNoise
+    change : float
+        Misfit that is expected, as a share of the model: it weighs strong echoes down.
+    delay, sigma : float64 (k,)
+        Of the Gaussians [samples].
+    reference : float
+        Width of the present pulse's main component [samples]: an echo that is wider is widened by its target.
+    most : int
+        Echoes of a waveform from which it says nothing of the pulse.
+
+    Returns
+    -------
+    matrix : float64 (k + 1, k + 1)
+        The last unknown is an offset of all levels.
+    right : float64 (k + 1,)
+    """
+    k = len(delay)
+    matrix, right = np.zeros((k + 1, k + 1)), np.zeros(k + 1)
+    delay, variance = np.ascontiguousarray(delay, np.float64), np.ascontiguousarray(np.square(sigma), np.float64)
+    structure = _as_structure(sums, noise, change)
+    call(
+        "learn_pulse", structure, ctypes.c_int64(k), delay, variance, ctypes.c_double(reference), ctypes.c_int64(most),
+        matrix, right,
+    )  # fmt: skip
+    return matrix, right
+
+
+def _as_structure(sums: Sums, noise: SampleNoise, change: float) -> library.Described:
+    """The structure, which holds its arrays; raises ValueError where the library would misuse memory."""
+    n, s = sums.left.shape
+    first = np.ascontiguousarray(sums.first, np.int64)
+    columns = np.ascontiguousarray(np.asarray(sums.main, np.float64).T.reshape(3, -1))
+    planes = [np.ascontiguousarray(plane, np.float32) for plane in (sums.left, sums.model)]
+    used = np.ascontiguousarray(sums.used, np.bool_)
+    if {plane.shape for plane in (*planes, used)} != {(n, s)} or first.shape != (n + 1,):
+        raise ValueError("residuals, models and echoes are not of the same waveforms")
+    if first[0] != 0 or first[-1] != columns.shape[1] or (np.diff(first) < 0).any():
+        raise ValueError("the first echoes of the waveforms do not ascend to their number")
+    if not np.isfinite(columns).all() or (columns[2] <= 0).any() or not noise.std > 0:
+        raise ValueError("echoes must be finite, and widths and noise above 0")
+    ahead, left_over = _predict(noise.correlation)
+    pulse = as_pulse(sums.shape)
+    structure = library.Described(
+        n, s, *(place(plane, np.float32) for plane in planes), place(used, np.bool_), place(first, np.int64),
+        *(place(column, np.float64) for column in columns), pulse, noise.std**2, noise.gain, change,
+        (ctypes.c_double * 2)(*ahead), left_over,
+    )  # fmt: skip
+    structure.arrays = planes, used, first, columns, pulse
+    return structure
+
+
+def _predict(correlation: tuple[float, ...]) -> tuple[tuple[float, float], float]:
+    """Factors of the last two samples that predict the next one best, and the share of the variance they leave."""
+    one, two = (*correlation, 0.0, 0.0)[:2]
+    whole = 1.0 - one * one
+    if whole < LEAST_LEFT:
+        return (one, 0.0), LEAST_LEFT
+    factors = one * (1.0 - two) / whole, (two - one * one) / whole
+    return factors, max(1.0 - factors[0] * one - factors[1] * two, LEAST_LEFT)

@@ -1,0 +1,278 @@
+"""Candidates for the system pulse, then one judge: the length of a description of waveforms (docs/algorithms.md R2).
+
+`survey` calls `choose_pulse` with the noise and the Gaussian of the isolated echoes, and `settle` with what it chose.
+Before you change it: no sensor's name and no threshold of one strip decides here; a candidate wins because waveforms
+that it was not learned from are shorter to describe with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
+from wavebatch.stages.pulse_tables import shape_limits
+from wavebatch.surveying.measuring.joint_pulse import learn_jointly
+from wavebatch.surveying.measuring.judge import describe_waveforms, explain, find_own_width, measure_change
+from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
+
+STRICT = 0.92
+"""Least width of an echo where a pulse is judged, over the pulse's: nothing reflects narrower, and widths scatter by up
+to 4 %."""
+
+SAMPLES, MOST, LEAST = 60_000, 384, 96
+"""Samples that candidates are judged on, as many waveforms at most, and as many at least where they are long."""
+
+SMALL = 120
+"""Waveforms below which halves are too few to learn a pulse from: the judge then sees what it was learned from."""
+
+CHANGES, STEP_OF_CHANGES = (0.0, 0.003, 0.01, 0.03), 3.4
+"""Changes of the pulse from shot to shot that are tried, as shares of the amplitude: in steps of a factor 3.4 at most,
+since the length changes little within a factor 2 of the best."""
+
+COVERED = 3.2
+"""Misfit over the change from shot to shot: two directions of change promise more than this squared to one echo in
+200 (chi2 with two degrees of freedom exceeds 10.6 so often)."""
+
+SURE, HOPELESS = 3.0, 8.0
+"""Standard errors by which a description must be shorter to be better; and by which it is longer where no change of
+shape is worth trying."""
+
+FEWEST = 48
+"""Waveforms on which each candidate is judged first."""
+
+FALSE_BESIDE, FALSE_QUIET = 0.005, 0.0075
+"""Mirrored echoes that are borne: per main echo beside it, and per echo elsewhere. A survey's user loses more points to
+a higher threshold than these add: echoes of 4 to 6 noises are some 2 % of a scene's."""
+
+STEP, LARGEST = 1.6, 0.1
+"""Factor by which the misfit grows at a time, and its largest value: what exceeds it is no pulse of this strip."""
+
+WORTH = 0.2
+"""Echoes in the mirror per echo that is false: misfit that leaves an echo of one sign has no twin there."""
+
+LEAST_MISFIT = 0.0005
+"""Misfit to begin with where there is none: half a noise at 1,000 noises."""
+
+SIGNIFICANCE, FINER, MOST_SIGNIFICANT = 4.5, 0.5, 6.5
+"""Least energy of an echo to begin with, step by which it grows, and where it ends [standard deviations]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A pulse with its noise and its change from shot to shot, and what waveforms cost with it."""
+
+    name: str
+    system: SystemPulse
+    change: float
+    """Of the shape, from shot to shot, as a share of the amplitude."""
+    length: np.ndarray
+    """Of the description of each waveform [nats], float64 (n,)."""
+    echoes: int
+    gaussians: int
+    """Of the pulse, as far as they had to be learned: 1 for one from elsewhere."""
+    seen: float
+    """Change of the shape that the median of the strongest echoes shows."""
+
+    @property
+    def typical(self) -> float:
+        """Mean length of a waveform's description; one in twenty, which no pulse explains, counts as the next lower."""
+        return float(np.minimum(self.length, np.quantile(self.length, 0.95)).mean())
+
+    def exceeds(self, other: Candidate) -> float:
+        """Standard errors by which descriptions are longer than with another candidate."""
+        more = self.length - other.length
+        more = np.clip(more, *np.quantile(more, (0.02, 0.98)))
+        return float(more.mean() / max(more.std() / np.sqrt(len(more)), 1e-9))
+
+
+class Tried(NamedTuple):
+    """A candidate in a line of `survey -v`."""
+
+    name: str
+    fwhm_ns: float
+    gaussians: int
+    """Of its sum; 1 also for a skewed pulse."""
+    change: float
+    """Of the shape, from shot to shot, as a share of the amplitude."""
+    nats: float
+    """That describe a waveform; and standard errors by which they are more than with the chosen pulse."""
+    longer_by: float
+    echoes_per_waveform: float
+    chosen: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """The candidate that was taken, and those that lost."""
+
+    best: Candidate
+    tried: tuple[Candidate, ...]
+    doubt: float
+    """Share by which the number of echoes differs between candidates that cost the same."""
+
+    def describe(self) -> tuple[Tried, ...]:
+        """Return the candidates for people, the best first."""
+        return tuple(
+            Tried(
+                one.name, one.system.sigma_ref * FWHM_PER_SIGMA, max(len(one.system.components), 1), one.change,
+                one.typical, one.exceeds(self.best), one.echoes / len(one.length), one.name == self.best.name,
+            )
+            for one in self.tried
+        )  # fmt: skip
+
+
+def choose_pulse(
+    block: WaveformBlock, starts: Mapping[str, SystemPulse], given: Mapping[str, SystemPulse] | None = None
+) -> Choice:
+    """Choose the pulse that describes waveforms in the fewest words.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        Cleaned waveforms.
+    starts : mapping of SystemPulse by name
+        Pulses learned from lone echoes. From the best of them pulses are learned from all echoes: first with one echo
+        per cluster, so that false echoes do not eat the pulse's tail, then with as many as it needs.
+    given : mapping of SystemPulse by name
+        Pulses known from elsewhere: shipped ones, the strip's outgoing pulse.
+
+    Returns
+    -------
+    Choice
+
+    Notes
+    -----
+    Pulses are learned on one half of the waveforms and judged on the other, where the pulse has to be written down too:
+    half the logarithm of the samples for each of its parameters; one from elsewhere is known. Of those that cost the
+    same, by SURE standard errors, the simplest pulse is taken, then the one with the fewest echoes: what is claimed
+    must be proven.
+    """
+    number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
+    part = thin_block(block, 2 * number)
+    part = part.rows(np.arange(min(len(part), 2 * number)))
+    small = len(part) < SMALL
+    learn, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
+    few = thin_block(held, FEWEST)
+    given = given or {}
+    every = {**starts, **given}
+    looked = [_judge(few, name, system, 0.003, known=name in given) for name, system in every.items()]
+    leader = min(looked, key=lambda one: one.typical)
+    hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
+    found = [_try_changes(held, one.name, one.system, known=one.name in given) for one in hopeful]
+    begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
+    found += [_try_changes(held, name, system) for name, system in _learn(learn, begin)]
+    return _decide(found, len(held))
+
+
+def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
+    """Pulses learned from one echo per cluster and from all echoes, two rounds each; before them a Gaussian."""
+    system = begin.system
+    if not (system.components or system.kappa):
+        every = explain(block, _bear(system, begin.change), width_prior=0.0)
+        own = find_own_width(every, shape_limits(system, block.spacing).ref)
+        yield "gaussian of all echoes", replace(system, sigma_ref=system.sigma_ref * own)
+    for name, options in (("one echo per cluster", {"max_echoes": 1}), ("all echoes", {})):
+        for last in (False, True):
+            explained = explain(block, _bear(system, begin.change), **options)
+            if len(explained.echoes) < ENOUGH_TO_LEARN:
+                return
+            system = learn_jointly(block, system, explained, begin.change, last=last)
+        yield name, system
+
+
+def _bear(system: SystemPulse, change: float) -> SystemPulse:
+    """The system with the misfit that a change of the pulse from shot to shot asks for, or what its model misses."""
+    return replace(system, misfit=max(COVERED * change, system.misfit), tail_misfit=(), beside=(), hidden=())
+
+
+def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, *, known: bool) -> Candidate:
+    """A pulse judged on waveforms; echoes narrower than the pulse are forbidden: nothing reflects so."""
+    borne = _bear(system, change)
+    explained = explain(block, borne, least_width=STRICT, width_prior=0.0)
+    gaussians = max(len(system.components), 1)
+    written = 0.0 if known else 3 * gaussians * 0.5 * log(max(np.count_nonzero(explained.sums.used), 1)) / len(block)
+    length = describe_waveforms(block, borne, explained, change) + written
+    return Candidate(
+        name, system, change, length, len(explained.echoes), 1 if known else gaussians, measure_change(borne, explained)
+    )
+
+
+def _try_changes(block: WaveformBlock, name: str, system: SystemPulse, *, known: bool = False) -> Candidate:
+    """The pulse with the least change of shape that no other one beats surely, of those that its echoes show.
+
+    Neighbours too close to be found change the shape of some echoes, which is no change from shot to shot.
+    """
+    tried = [_judge(block, name, system, change, known=known) for change in CHANGES]
+    tried = [one for one in tried if one.change <= STEP_OF_CHANGES * one.seen]
+    best = min(tried, key=lambda one: one.typical)
+    return next(one for one in tried if one.exceeds(best) < SURE)
+
+
+def _decide(found: list[Candidate], number: int) -> Choice:
+    """The candidate with the simplest pulse, then the fewest echoes, that no other one beats surely."""
+    ordered = sorted(found, key=lambda one: (one.gaussians, one.echoes, one.name))
+    best = ordered[0]
+    for one in ordered[1:]:
+        if best.exceeds(one) > SURE:
+            best = one
+    tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
+    # The mirror says how much more than the change itself is asked for.
+    best = replace(best, system=_bear(best.system, best.change / COVERED))
+    doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
+    return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
+
+
+def settle(block: WaveformBlock, system: SystemPulse) -> tuple[SystemPulse, Mirror]:
+    """Raise misfit and significance until mirrored residuals hold no more echoes than may be false.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        Cleaned waveforms.
+    system : SystemPulse
+        With the misfit that the judge chose.
+
+    Returns
+    -------
+    system : SystemPulse
+        With `misfit` and `significance`.
+    mirror : Mirror
+        What is left.
+
+    Notes
+    -----
+    Near strong echoes the pulse's misfit, which echoes absorb, shows in the mirror; in quiet stretches noise does. Each
+    is raised while the mirror shows more than it may, and stays where the echoes that are found less those that are
+    false are most: where mirrored echoes do not follow, what they show is not cured so.
+    """
+    part = thin_block(block, int(np.clip(4 * SAMPLES // block.samples.shape[1], 2 * LEAST, 2048)))
+    tried = [(system, look_in_mirror(part, system))]
+    while tried[-1][1].beside > bound(FALSE_BESIDE, tried[-1][1].mains) and tried[-1][0].misfit < LARGEST:
+        harder = replace(system, misfit=min(max(STEP * tried[-1][0].misfit, LEAST_MISFIT), LARGEST))
+        tried.append((harder, look_in_mirror(part, harder)))
+    system, mirror = max(tried, key=_worth)
+    tried = [(system, mirror)]
+    for significance in np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER):
+        if tried[-1][1].quiet <= bound(FALSE_QUIET, tried[-1][1].echoes):
+            break
+        harder = replace(system, significance=float(significance))
+        tried.append((harder, look_in_mirror(part, harder)))
+    return max(tried, key=_worth)
+
+
+def _worth(tried: tuple[SystemPulse, Mirror]) -> float:
+    """Echoes that are found, less those that are false by the mirror."""
+    _, mirror = tried
+    return mirror.echoes - (mirror.beside + mirror.quiet) / WORTH
+
+
+def bound(share: float, number: int) -> float:
+    """Events of this probability that `number` tries show without being more than chance: one standard deviation."""
+    return share * number + np.sqrt(share * number)

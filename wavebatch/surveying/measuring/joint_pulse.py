@@ -1,0 +1,169 @@
+"""The system pulse from all echoes of a sample together, also of waveforms with several (docs/algorithms.md R2).
+
+`choose_pulse` calls it in turn with decompositions of the sample. Before you change it: the pulse must not depend on
+where the alternation begins, nor have the scene in its tail.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import exp, solve
+from wavebatch.kernels.fit.describe import gather_pulse
+from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, refine_gaussians
+from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
+from wavebatch.surveying.measuring.judge import Explained, find_own_width, sample_noise
+from wavebatch.surveying.measuring.trial import TRIAL
+
+BEFORE, CORE, AFTER = 5.0, 4.0, 40.0
+"""Widths of the pulse before its peak where it may begin; after it up to which it is drawn in fine steps; and at which
+it ends."""
+
+FINE, NARROW = 0.5, 0.6
+"""Distance and width of the Gaussians of the core [widths]: their sum can bend as fast as a pulse of 0.8 widths."""
+
+GROWTH = 0.22
+"""Distance of the Gaussians in the tail, over their lag: receivers forget more slowly the longer it is."""
+
+SMOOTH = 0.08
+"""How far the weight of a Gaussian may be from the line between its neighbours [largest weight], one standard
+deviation: a fifth of what the second difference of a Gaussian pulse is there."""
+
+EARLY, LATE = 0.02, 0.15
+"""The same far before and after the core, over its value: before a pulse there is hardly anything."""
+
+STEP = 0.2
+"""Steps of the lag at which the core is drawn [samples]."""
+
+LEAST_CHANGE = 0.003
+"""Least misfit that is expected of the strongest echoes, so that a few do not decide alone."""
+
+MOST_ECHOES = 8
+"""Echoes of a waveform from which it says nothing of the pulse: what is one echo is then a guess."""
+
+LEAST_ERROR = 2e-4
+"""Least error of the pulse, over its peak: its Gaussians are no better known."""
+
+ALIKE = 1.1
+"""Misfit of a sum of Gaussians, over that of the best, at which a simpler one is taken."""
+
+
+def learn_jointly(
+    block: WaveformBlock, system: SystemPulse, explained: Explained, change: float, *, last: bool
+) -> SystemPulse:
+    """Learn the pulse that describes all waveforms best, given where their echoes are.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+        With the present pulse.
+    explained : Explained
+        The block decomposed with it.
+    change : float
+        Of the pulse from shot to shot, as a share of its amplitude.
+    last : bool
+        Whether the pulse is final; else it only has to separate echoes, and few Gaussians serve.
+
+    Returns
+    -------
+    SystemPulse
+        With the new pulse, its ringing, and as misfit what the Gaussians miss of it.
+
+    Notes
+    -----
+    The pulse is linear in the weights of Gaussians of fixed places and widths. An echo that is wider than the pulse has
+    all of them widened by the same variance. The weights are smooth, and small far from the core; where nothing is
+    known they are 0. The kernels then get the sum of the fewest free Gaussians that serves as well.
+    """
+    spacing = block.spacing
+    stack = stack_jointly(system, explained, change, spacing)
+    half = stack.lag[stack.value > 0.5]
+    width = float(half[-1] - half[0]) / FWHM_PER_SIGMA
+    if len(system.components) > 1 and not last:
+        fits = [refine_gaussians(stack, np.array(system.components) / [1, spacing, spacing])]
+    else:
+        fits = fit_gaussians(stack, width, min(TRIAL.get().most_components, MOST_COMPONENTS if last else 3), 0.0)
+    missed = [float(np.mean(_miss(fit, stack) ** 2)) for fit in fits]
+    best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
+    core = np.abs(stack.lag - best.datum) < CORE * width
+    misfit = misfit_of(_miss(best, stack)[core], STEP, width)
+    system = replace(system, kappa=0.0, components=(), ringing=0.0, misfit=misfit)
+    if len(best.components) == 1:
+        return replace(system, sigma_ref=float(best.components[0, 2]) * spacing)
+    far = np.abs(stack.lag - best.datum) > 4 * width
+    components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in best.components)
+    system = replace(system, components=components, ringing=float(np.abs(stack.value[far]).max(initial=0.0)))
+    limits = shape_limits(system, spacing)
+    table = pulse_measures(pulse_shape(system, spacing), limits)
+    full = float(np.interp(limits.ref, table.width, table.half_width))
+    return replace(system, sigma_ref=full / FWHM_PER_SIGMA * spacing)
+
+
+def misfit_of(left: np.ndarray, step: float, width: float) -> float:
+    """Return the misfit of a pulse that leaves these shares of its height at lags `step` apart [samples].
+
+    As the kernel counts it: root of the energy that is left over that of a Gaussian of this width [samples].
+    """
+    return float(np.sqrt(np.sum(left * left) * step / (SQRT_PI * width)))
+
+
+def stack_jointly(system: SystemPulse, explained: Explained, change: float, spacing: float) -> Stack:
+    """Return the pulse with its errors by lag [samples]."""
+    s = explained.sums.left.shape[1]
+    width = system.sigma_ref / spacing
+    reference = shape_limits(system, spacing).ref
+    reference *= find_own_width(explained, reference)
+    delay, sigma = _place_gaussians(width, s)
+    noise = sample_noise(system)
+    matrix, right = gather_pulse(
+        explained.sums, noise, max(change, LEAST_CHANGE), delay, sigma, reference, MOST_ECHOES
+    )
+    # Coloured noise: so many samples say as much as one of white noise.
+    share = (system.noise.std / max(system.noise.quiet, 1e-6)) ** 2
+    matrix, right = matrix / share, right / share
+    # Height 1 means the amplitude of the present main component; areas of narrower Gaussians are drawn higher.
+    matrix[:-1, :-1] += _expect(delay / width, sigma)
+    matrix += 1e-9 * np.trace(matrix) / len(delay) * np.eye(len(matrix))
+    inverse = solve(matrix, np.eye(len(matrix)))
+    weight = np.einsum("ij,j->i", inverse, right)
+    lag = np.r_[np.arange(-6 * width, 8 * width, STEP), np.arange(8 * width, min(AFTER * width, 0.8 * s), 1.0)]
+    rows = exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2) / sigma
+    value = np.einsum("lk,k->l", rows, weight[:-1])
+    error = np.sqrt(np.maximum(np.einsum("lk,kj,lj->l", rows, inverse[:-1, :-1], rows), 0.0))
+    top = float(value.max())
+    return Stack(lag, value / top, np.maximum(error / top, LEAST_ERROR))
+
+
+def _place_gaussians(width: float, s: int) -> tuple[np.ndarray, np.ndarray]:
+    """Delays and sigmas of the Gaussians [samples] of a pulse of this width in waveforms of s samples."""
+    core = np.arange(-BEFORE, CORE, FINE)
+    far, wide = [CORE], [1.0]
+    while far[-1] < min(AFTER, 0.7 * s / width):
+        wide.append(GROWTH * far[-1])
+        far.append(far[-1] + wide[-1])
+    narrow = max(NARROW * width, NARROW)
+    sigma = np.r_[np.full(len(core), narrow), np.maximum(np.array(wide) * width, narrow)]
+    return np.r_[core, far] * width, sigma
+
+
+def _expect(lag: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """What is known of the weights before any waveform, as a matrix of normal equations; lag in widths."""
+    away = np.where(
+        np.abs(lag) < 2.5, 1.0, np.maximum(exp(-(np.abs(lag) - 2.5) / 3.0), np.where(lag > 0, LATE, EARLY))
+    )
+    # Weights are areas: those of a pulse of height 1 are about its sigma times the distance of two Gaussians.
+    spread = SMOOTH * away * sigma / sigma[0]
+    bend = np.diff(np.eye(len(lag)), 2, axis=0) / (0.5 * spread[1:-1])[:, None]
+    return np.einsum("ki,kj->ij", bend, bend) + np.diag((np.abs(lag) > 2.5) / (3 * spread) ** 2)
+
+
+def _miss(fit: PulseFit, stack: Stack) -> np.ndarray:
+    """What a sum of Gaussians leaves of the pulse at each lag, over its height."""
+    weight, delay, sigma = fit.components.T
+    drawn = np.einsum("lc,c->l", exp(-0.5 * ((stack.lag[:, None] - fit.datum - delay) / sigma) ** 2), weight)
+    return drawn / drawn.max() - stack.value

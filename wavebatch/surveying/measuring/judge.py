@@ -1,0 +1,204 @@
+"""What a strip's waveforms cost to write down with a pulse: the one number by which pulses and noises are compared.
+
+`choose_pulse` calls `explain` and `describe_waveforms` with each candidate. Before you change it: the number must fall
+only for what shortens the description of waveforms that nothing was learned from (docs/algorithms.md R2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import SQRT_2PI, SQUARED_NORMAL_MEDIAN
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import exp, log
+from wavebatch.kernels.fit.describe import (
+    SampleNoise,
+    Sums,
+    count_echoes,
+    describe_left,
+    measure_changes,
+    render_pulses,
+)
+from wavebatch.stages.clean import clean_block
+from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.detect.maximum import matched_filter
+from wavebatch.stages.flags import use_noise_errors
+from wavebatch.stages.noise import pooled as pooled_noise
+from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
+from wavebatch.surveying.measuring.noise_and_width import find_edge
+
+WIDER = 1.0 + 0.02 * 2.0 ** np.arange(-0.5, 9.0)
+"""Upper ends of the uniform laws, from the pulse's own width on, that make up the widths' density: any density that
+falls from there on is a sum of such [widths of the pulse]."""
+
+ANYWHERE = 0.01
+"""Share of the widths that may be anything up to the widest: one in a hundred echoes is no echo."""
+
+SCATTERS = 0.01, 0.02, 0.04, 0.06
+"""Scatter of the widths of level ground beyond their errors that is tried [widths]: no pulse model is exact, and pulses
+change from shot to shot."""
+
+KNOWN, LEAST_KNOWN = 0.15, 10
+"""Largest error of a width that tells of the density of widths, as a share of it; and fewest widths that do."""
+
+_DOUBTFUL = np.uint16(EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED | EchoFlag.MERGED)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Explained:
+    """Waveforms, and what echoes of one pulse explain of them."""
+
+    echoes: EchoTable
+    sums: Sums
+
+
+def explain(block: WaveformBlock, system: SystemPulse, **options: float) -> Explained:
+    """Decompose cleaned waveforms, with options of `decompose.adaptive`.
+
+    Errors are those of noise alone: while a pulse is looked for, what a fit misses says nothing about an echo.
+    """
+    block = clean_block(block, system)
+    noise = pooled_noise(block, system)
+    echoes = adaptive(block, noise, system, matched_filter(block, noise, system), **options)
+    echoes = use_noise_errors(echoes, system, block.spacing)
+    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
+    whole = np.stack([echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1)
+    main = model_parameters(shape, limits, whole.astype(np.float64))
+    n, s = block.samples.shape
+    model = render_pulses(shape, n, s, echoes.waveform, main)
+    used = block.samples < clip_level(block, system)
+    if block.missing is not None:
+        used &= ~block.missing
+    left = np.where(used, block.samples - noise.level - model, np.float32(0))
+    return Explained(echoes, Sums(shape, count_echoes(echoes.waveform, n), main, left, model, used))
+
+
+def sample_noise(system: SystemPulse) -> SampleNoise:
+    """Return the noise of a quiet sample."""
+    return SampleNoise(system.noise.quiet, system.noise.gain, system.noise.correlation)
+
+
+def measure_change(system: SystemPulse, explained: Explained) -> float:
+    """Measure how much the pulse changes from shot to shot, as a share of its amplitude.
+
+    By the median over the strongest echoes of the waveforms: a pulse that changes does so in each of them, neighbours
+    that are too close to be found change the shape of some. 0 with too few of them, or where noise explains all.
+    """
+    change, precision = measure_changes(explained.sums, sample_noise(system))
+    known = precision > 0
+    if np.count_nonzero(known) < 2 * LEAST_KNOWN:
+        return 0.0
+    square, noise = change[known] ** 2, 1 / precision[known]
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        more = np.median(square / (middle * middle + noise)) > SQUARED_NORMAL_MEDIAN
+        low, high = (middle, high) if more else (low, middle)
+    return low
+
+
+def describe_waveforms(
+    block: WaveformBlock, system: SystemPulse, explained: Explained, change: float = 0.0
+) -> np.ndarray:
+    """Measure how long the description of each waveform is: its echoes, and what they leave.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+    explained : Explained
+        The block decomposed with this system.
+    change : float
+        Of the pulse from shot to shot, as a share of its amplitude (`describe_left`).
+
+    Returns
+    -------
+    float64 array, shape (n,)
+        [nats].
+
+    Notes
+    -----
+    An echo costs the logarithm of what it could have been over what is known of it: its time anywhere in the waveform,
+    its amplitude by a law with heavy tails about the strip's mean, its width by a density that falls from the pulse's
+    own width on. Nothing reflects narrower than the pulse, so a pulse that is too narrow finds no echo where the
+    density is highest. Their number follows a geometric law with the strip's mean.
+    """
+    echoes, sums = explained.echoes, explained.sums
+    n, s = sums.left.shape
+    length, volume = describe_left(sums, sample_noise(system), change)
+    ref = shape_limits(system, block.spacing).ref
+    ratio, error, known = _measure_widths(explained, ref)
+    amplitude = echoes.amplitude.astype(np.float64)
+    typical = max(float(np.mean(amplitude)), 1.0) if len(amplitude) else 1.0
+    by_time = np.clip(np.nan_to_num(echoes.time_err / block.spacing, nan=s), 1e-3, s)
+    by_amplitude = np.maximum(np.nan_to_num(echoes.amplitude_err, nan=typical), 1e-3 * system.noise.quiet)
+    cost = np.maximum(log(s / (SQRT_2PI * by_time)), 0.0)
+    cost += np.maximum(log(typical / (SQRT_2PI * by_amplitude)), 0.0) + log(1.0 + (amplitude / typical) ** 2)
+    cost += _describe_widths(ratio, error, known)
+    number = np.diff(sums.first)
+    mean = max(float(number.mean()), 0.01) if n else 1.0
+    # Of k echoes in any order: their factorial is the number of orders.
+    orders = np.r_[0.0, np.cumsum(log(np.arange(1.0, max(int(number.max(initial=0)), 1) + 1)))]
+    count = log(1 + mean) - number * log(mean / (1 + mean)) - orders[number]
+    return length + volume + count + np.bincount(echoes.waveform, cost, minlength=n)
+
+
+def find_own_width(explained: Explained, ref: float) -> float:
+    """Find the narrowest width that strong echoes repeat (`find_edge`), over the pulse's own width `ref` [samples].
+
+    Of those at least half as high as the strongest of their waveform: what a wrong pulse makes of its after-pulses
+    repeats too, and is narrower. 1 with too few widths that are known.
+    """
+    ratio, error, known = _measure_widths(explained, ref)
+    echoes = explained.echoes
+    strongest = np.zeros(len(explained.sums.left), np.float32)
+    np.maximum.at(strongest, echoes.waveform, echoes.amplitude)
+    known &= echoes.amplitude >= 0.5 * strongest[echoes.waveform]
+    return find_edge(ratio[known], error[known]) if np.count_nonzero(known) >= LEAST_KNOWN else 1.0
+
+
+def _measure_widths(explained: Explained, ref: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Widths over the pulse's, their errors, and which of them are known (m,)."""
+    echoes, ratio = explained.echoes, explained.sums.main[:, 2] / ref
+    with np.errstate(invalid="ignore"):
+        error = np.nan_to_num(echoes.sigma_err / np.maximum(echoes.sigma, 1e-6), nan=2.0).astype(np.float64)
+    error = np.clip(error, 1e-3, 2.0) * ratio
+    return ratio, error, ((echoes.flags & _DOUBTFUL) == 0) & (error < KNOWN * ratio)
+
+
+def _describe_widths(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Cost of each width (m,) by the density of those that are known, with the scatter that serves best; 0 for few."""
+    if np.count_nonzero(known) < LEAST_KNOWN:
+        return np.zeros(len(ratio))
+    costs = [_describe_scattered(ratio, np.hypot(error, scatter), known) for scatter in SCATTERS]
+    return min(costs, key=lambda cost: float(np.sum(cost[known]))) - log(SQRT_2PI * error)
+
+
+def _describe_scattered(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) -> np.ndarray:
+    laws = _laws(ratio, error)
+    share = np.full(laws.shape[1], 1.0 / laws.shape[1])
+    for _ in range(15):
+        weight = laws[known] * share
+        weight /= np.maximum(np.einsum("mk->m", weight), 1e-300)[:, None]
+        share = (np.einsum("mk->k", weight) + 0.5) / (np.count_nonzero(known) + 0.5 * len(share))
+    density = (1 - ANYWHERE) * np.einsum("mk,k->m", laws, share) + ANYWHERE / WIDER[-1]
+    return -log(density)
+
+
+def _laws(ratio: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Density of each width (m,) by each law through its error (m, k): the pulse's own width, and uniform ones."""
+    from_own = _normal((ratio - 1.0) / error)
+    uniform = (from_own[:, None] - _normal((ratio[:, None] - WIDER) / error[:, None])) / (WIDER - 1.0)
+    own = exp(-0.5 * np.minimum(((ratio - 1.0) / error) ** 2, 1400.0)) / (SQRT_2PI * error)
+    return np.concatenate([own[:, None], uniform], axis=1)
+
+
+def _normal(z: np.ndarray) -> np.ndarray:
+    """Share of normal values below z, exact to 1e-7 (Abramowitz and Stegun 26.2.17)."""
+    t = 1.0 / (1.0 + 0.2316419 * np.abs(z))
+    series = t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))))
+    above = exp(-0.5 * np.minimum(z * z, 1400.0)) / SQRT_2PI * series
+    return np.where(z > 0, 1.0 - above, above)

@@ -1,0 +1,71 @@
+"""Echoes of mirrored residuals: how many of those that were found are false (docs/algorithms.md R2).
+
+`settle` in choose_pulse.py calls it. Before you change it: it must need no truth and no second pulse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.stages.score import match_echoes
+from wavebatch.surveying.measuring.judge import explain
+
+STRONG = 30.0
+"""Amplitude of a main echo, over the noise: a misfit of 3 % is then no more than noise."""
+
+ZONE, SAME = 2.0, 1.0
+"""Distance from a main echo up to which what is false is its misfit, and distance up to which an echo of the mirror is
+that of the waveform [full widths at half maximum]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mirror:
+    """Counts of echoes, and of those in the mirror that match none."""
+
+    mains: int
+    """Echoes above STRONG noises that are the strongest of their waveform."""
+    beside: int
+    """Unmatched ones within ZONE of a main echo."""
+    echoes: int
+    quiet: int
+    """Unmatched ones further than ZONE from any echo."""
+
+
+def look_in_mirror(block: WaveformBlock, system: SystemPulse) -> Mirror:
+    """Decompose samples less twice their residual, and count the echoes that match none of the waveforms' own.
+
+    Noise makes as many echoes up as down; so does a pulse that misses its echoes. Close targets are in the mirror too.
+    Waveforms with clipped samples are left out: what is beyond the limit has no residual.
+    """
+    block = block.rows(np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1)))
+    explained = explain(block, system)
+    mirrored = (block.samples - 2 * explained.sums.left).astype(np.float32)
+    echoes, other = explained.echoes, explain(replace(block, samples=mirrored), system).echoes
+    width = system.sigma_ref * FWHM_PER_SIGMA
+    rest = np.ones(len(other), bool)
+    rest[match_echoes(other, echoes, SAME * width).found] = False
+    rest = other.take(np.flatnonzero(rest))
+    top = np.zeros(len(block), np.float32)
+    np.maximum.at(top, echoes.waveform, echoes.amplitude)
+    strong = (echoes.amplitude == top[echoes.waveform]) & (echoes.amplitude > STRONG * system.noise.std)
+    mains = echoes.take(np.flatnonzero(strong))
+    beside = _count_near(rest, mains, ZONE * width)
+    return Mirror(len(mains), beside, len(echoes), len(rest) - _count_near(rest, echoes, ZONE * width))
+
+
+def _count_near(rest: EchoTable, echoes: EchoTable, reach: float) -> int:
+    """How many echoes of the mirror lie within reach of any of these."""
+    if not len(rest) or not len(echoes):
+        return 0
+    span = float(max(rest.time.max(), echoes.time.max()) + 4 * reach)
+    place = np.sort(echoes.waveform * span + echoes.time)
+    at = rest.waveform * span + rest.time
+    after = np.searchsorted(place, at)
+    nearest = np.minimum(np.abs(place[np.minimum(after, len(place) - 1)] - at), np.abs(place[after - 1] - at))
+    return int(np.count_nonzero(nearest <= reach))

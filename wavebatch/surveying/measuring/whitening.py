@@ -1,0 +1,59 @@
+"""Whether the fits of a strip whiten its noise (docs/algorithms.md H11); the survey asks once pulse and noise stand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.core.echoes import UNCLEAN
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.noise import predict_noise
+from wavebatch.surveying.measuring.noise_and_width import FEW
+from wavebatch.surveying.measuring.residuals import decompose_sample
+
+LEAST_NOISE = 0.5
+"""Noise of a sample below which rounding makes what a filter of neighbours sees [count]."""
+
+LEAST_PREDICTED = 0.1
+"""Share of the noise's variance that two samples must predict of the next one: below it, the errors of close echoes
+fall by less than 5 %, which the time of the fits is not worth."""
+
+STRONG = 20.0
+"""Amplitude over noise from which lone echoes tell whether the filter makes what their fits leave white."""
+
+MOST_LEFT = 1.3
+"""chi2 per sample of these fits up to which it does: beyond, the pulse misses its echoes by more than the noise, and a
+filter for noise makes more of that."""
+
+
+def choose_whitening(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
+    """Let fits whiten the noise where it is coloured, and where lone echoes then leave white noise.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        A sample of the strip.
+    system : SystemPulse
+        Its pulse and noise.
+
+    Returns
+    -------
+    SystemPulse
+        With `noise.whitening`: two shares, or empty where fits are to take the noise for white.
+    """
+    plain = replace(system, noise=replace(system.noise, whitening=()))
+    whitening = predict_noise(system.noise.correlation)
+    if whitening is None or system.noise.quiet < LEAST_NOISE or _predicted(whitening) < LEAST_PREDICTED:
+        return plain
+    whitened = replace(system, noise=replace(system.noise, whitening=whitening))
+    echoes = decompose_sample(block, whitened)
+    strong = echoes.alone(len(block)) & (echoes.amplitude > STRONG * system.noise.std)
+    left = echoes.residual[strong & ((echoes.flags & np.uint16(UNCLEAN)) == 0)].astype(np.float64) ** 2
+    return whitened if len(left) >= FEW and np.median(left) <= MOST_LEFT else plain
+
+
+def _predicted(whitening: tuple[float, float]) -> float:
+    """Share of the noise's variance that two samples predict of the next one."""
+    near, far = whitening
+    return 1 - (1 - (near / (1 - far)) ** 2) * (1 - far * far)
