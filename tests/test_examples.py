@@ -29,6 +29,23 @@ def test_example_chains_run(chain, tiny_strip, tmp_path):
     assert len(cloud) > 300
 
 
+def test_the_notebook_runs(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib").use("Agg")
+    from matplotlib import pyplot
+
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((ROOT / "examples" / "strip_to_cloud.ipynb").read_text("utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(not cell.get("outputs") for cell in notebook["cells"])  # made by the reader's version, not kept
+    space: dict = {}
+    for number, cell in enumerate(cells):
+        exec(compile(cell, f"cell {number}", "exec"), space)
+    drawn = [len(pyplot.figure(number).axes) for number in pyplot.get_fignums()]
+    pyplot.close("all")
+    assert drawn == [1, 2] and space["mine"].sum() > 2
+    assert space["known"].sum() > 3000 and space["result"].failed == 0
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):

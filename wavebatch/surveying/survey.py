@@ -44,6 +44,7 @@ from wavebatch.surveying.measuring.residuals import decompose_sample, measure_re
 from wavebatch.surveying.systems.doubt import measure_doubt
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import choose_pulse, find_source, guess_pulse
+from wavebatch.surveying.systems.shown import Shown
 from wavebatch.surveying.systems.skew import measure_skew
 
 SAMPLE = 8192
@@ -97,8 +98,8 @@ class Decision:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class Survey:
+@dataclass(frozen=True, slots=True, repr=False)
+class Survey(Shown):
     """What a sample of a strip says of sensor and scene."""
 
     system: SystemPulse

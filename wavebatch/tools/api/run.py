@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from wavebatch.batch.job import StripJob, choose_columns, name_columns
 from wavebatch.batch.options import RunOptions, describe_options
@@ -32,11 +32,18 @@ from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
 from wavebatch.tools.api.chain import AUTO, load_chain
 
+if TYPE_CHECKING:
+    from wavebatch.tools.api.run_keywords import RunKeywords
+
 Strips = Iterable[Path | str] | Path | str
 
 
 def run(
-    strips: Strips, output: Path | str, *, on_event: Callable[[dict[str, Any]], None] | None = None, **options: Any
+    strips: Strips,
+    output: Path | str,
+    *,
+    on_event: Callable[[dict[str, Any]], None] | None = None,
+    **options: Unpack[RunKeywords],
 ) -> BatchResult:
     """Write a point cloud and a report for every strip; what `wavebatch run` does.
 
