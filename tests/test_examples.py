@@ -71,7 +71,7 @@ def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
     told = subprocess.run(
         [*command, "-n", f"CHAIN={chain}"], check=True, env=environment, capture_output=True, text=True
     )
-    assert told.stdout.count(f"--chain {chain} --resume --quiet '{strips.name}/b.las'") == 1
+    assert told.stdout.count(f"--chain '{chain}' --resume --quiet '{strips.name}/b.las'") == 1
     (strips / "b.las").rename(strips / "b.LAS")
     (strips / "c.laz").write_bytes(b"no strip")
     (out / "summary.json").unlink()
@@ -88,5 +88,11 @@ def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
         subprocess.run(command, check=True, env=environment, capture_output=True)
         assert (out / "two words ü.laz").exists() and (out / "-dash.laz").exists()
     assert len(json.loads((out / "summary.json").read_text())["strips"]) == 4
+    elsewhere = tmp_path / "some where"
+    shutil.copytree(strips, elsewhere / "my strips")
+    for folder in (elsewhere / "clouds", elsewhere / "my clouds"):
+        given = ["STRIPS=my strips", f"OUT={folder.name}"]
+        subprocess.run([*command, *given], check=True, env={**environment, "PWD": str(elsewhere)}, capture_output=True)
+        assert len(json.loads((folder / "summary.json").read_text())["strips"]) == 4 and (folder / "a.laz").exists()
     nothing = subprocess.run([*command, "STRIPS=none"], env=environment, capture_output=True, text=True)
     assert nothing.returncode != 0 and "none holds no .las or .laz file; say STRIPS=FOLDER" in nothing.stderr

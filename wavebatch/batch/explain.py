@@ -6,6 +6,7 @@ Before you change it: remarks depend on the strip and its counts alone, so that 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 
 from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
@@ -228,6 +229,14 @@ def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
         yield (
             f"{', '.join(prepared.layout.copied)}: kept; {added} added echoes have the value of the nearest return of "
             "their packet, because no value is free for no-data"
+        )
+    marked = [f"{one.record.name} {one.record.no_data[0]:g}" for one in prepared.layout.carried
+              if not (one.copied or prepared.layout.whole or one.record.no_data is None)
+              and math.isfinite(one.record.no_data[0])]  # fmt: skip
+    if added and marked:
+        yield (
+            f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
+            "value: leave these points out before a mean (flag ADDED)"
         )
 
 

@@ -187,7 +187,8 @@ def draw_values(
     """Values with their errors, side by side."""
     middle, spread = np.asarray(values, np.float64), np.nan_to_num(np.asarray(errors, np.float64))
     # Small constants: a power of ten in the label, so that ticks differ and stay short.
-    power = int(np.floor(np.log10(max(float(np.abs(middle).max()), 1e-300))))
+    largest = float(np.abs(middle).max())
+    power = int(np.floor(np.log10(largest))) if largest else 0
     if abs(power) > 3:
         middle, spread, label = middle / 10.0**power, spread / 10.0**power, f"1e{power} {label}"
 
