@@ -89,6 +89,10 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _doubt_units(prepared)
     lines += _name_height(prepared)
     lines += [*_name_model(prepared), *_name_raised(prepared)]
+    last, lost = report.last_left_out, report.left_out.get("where", 0)
+    if last:
+        lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
+                     "the ground: return numbers stay those of the whole pulse")  # fmt: skip
     lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
