@@ -7,6 +7,7 @@
 #   make bench BASE=REV                    run times of this checkout and of revision REV, in turn; more options of
 #                  either, as --pulses or --scene: BENCH_OPTIONS="--scene open" (tests/bench/against.py, release.py)
 #   make dist      wheels for Linux, macOS and Windows and the source distribution, in dist/: zig compiles for all
+#   make figures   what README and docs print, made anew by their commands
 #   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
 #   make attack    signals to running commands and their workers at random instants, RUNS=1000 SEED=1
@@ -22,7 +23,7 @@ MINUTES ?= 10
 RUNS   ?= 1000
 SEED   ?= 1
 
-.PHONY: demo test slow test-all readers papers bench fuzz attack docs dist man lint clean
+.PHONY: demo test slow test-all readers papers bench fuzz attack docs dist figures man lint clean
 .DELETE_ON_ERROR:
 # Without cached bytecode every process compiles all of its modules anew: a second each.
 unexport PYTHONDONTWRITEBYTECODE
@@ -105,6 +106,9 @@ dist: $(VENV)/.test
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check ziglang
 	@rm -rf dist
 	$(BIN)/python tests/wheels.py dist
+
+figures: $(VENV)/.test
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/figures.py
 
 man: $(VENV)/.test
 	$(BIN)/wavebatch --man-pages build/man
