@@ -11,7 +11,7 @@
 #   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
 #   make attack    signals to running commands and their workers at random instants, RUNS=1000 SEED=1
-#   make lint      ruff                    make clean      remove what was made
+#   make lint      ruff, mypy              make clean      remove what was made
 
 PYTHON ?= python3
 KERNELS := $(wildcard wavebatch/kernels/c/*) wavebatch/kernels/build_kernels.py
@@ -115,6 +115,7 @@ man: $(VENV)/.test
 
 lint: $(VENV)/.test
 	$(BIN)/python -m ruff check .
+	$(BIN)/python -m mypy
 
 clean:
 	rm -rf $(VENV) papers.html $(DEMO) $(BENCH) site build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
