@@ -6,10 +6,12 @@
 #   make readers   other programs' LAS readers, from PyPI and npm as far as these have them, for `make test`
 #   make bench BASE=REV                    run times of this checkout and of revision REV, in turn; more options of
 #                  either, as --pulses or --scene: BENCH_OPTIONS="--scene open" (tests/bench/against.py, release.py)
+#   make dist      wheels for Linux, macOS and Windows and the source distribution, in dist/: zig compiles for all
+#   make figures   what README and docs print, made anew by their commands
 #   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
 #   make attack    signals to running commands and their workers at random instants, RUNS=1000 SEED=1
-#   make lint      ruff                    make clean      remove what was made
+#   make lint      ruff, mypy              make clean      remove what was made
 
 PYTHON ?= python3
 KERNELS := $(wildcard wavebatch/kernels/c/*) wavebatch/kernels/build_kernels.py
@@ -21,7 +23,7 @@ MINUTES ?= 10
 RUNS   ?= 1000
 SEED   ?= 1
 
-.PHONY: demo test slow test-all readers papers bench fuzz attack docs man lint clean
+.PHONY: demo test slow test-all readers papers bench fuzz attack docs dist figures man lint clean
 .DELETE_ON_ERROR:
 # Without cached bytecode every process compiles all of its modules anew: a second each.
 unexport PYTHONDONTWRITEBYTECODE
@@ -62,13 +64,16 @@ readers: $(VENV)/.test
 	  copc@0.0.8 laz-perf@0.0.7 @loaders.gl/core@4.4.5 @loaders.gl/las@4.5.1
 
 # A file at a time for each process: its strips and surveys are then made once. tests/conftest.py orders the files.
-BY_FILE := -n auto --dist loadfile --no-loadscope-reorder
+# Messages of compilers and names of files are those of a plain UTF-8 terminal, whatever the user's is.
+PYTEST := LC_ALL=C.UTF-8 PYTHONUTF8=1 $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -q $(BY_FILE) -m 'not slow'
+	@echo "The fast tests: about 4 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
+	$(PYTEST) -m 'not slow'
 
 slow: $(VENV)/.test
-	$(BIN)/python -m pytest -q $(BY_FILE) -m slow
+	@echo "The slow tests: about 10 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
+	$(PYTEST) -m slow
 
 test-all: test slow
 
@@ -97,11 +102,20 @@ docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "site: site/index.html; with its search: $(BIN)/python -m http.server --directory site"
 
+dist: $(VENV)/.test
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check ziglang
+	@rm -rf dist
+	$(BIN)/python tests/wheels.py dist
+
+figures: $(VENV)/.test
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/figures.py
+
 man: $(VENV)/.test
 	$(BIN)/wavebatch --man-pages build/man
 
 lint: $(VENV)/.test
 	$(BIN)/python -m ruff check .
+	$(BIN)/python -m mypy
 
 clean:
 	rm -rf $(VENV) papers.html $(DEMO) $(BENCH) site build dist *.egg-info .pytest_cache .hypothesis .ruff_cache

@@ -1,11 +1,13 @@
 """The public API: `import wavebatch as wb` from a strip to a cloud, lazily, typed, and the same as the commands."""
 
 import ast
+import importlib.util
 import inspect
 import json
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import laspy
 import numpy as np
@@ -140,6 +142,38 @@ def test_echoes_become_a_structured_array(strips):
     np.testing.assert_array_equal(rows["echo_width"], echoes.attributes["echo_width"])
 
 
+def test_a_prompt_shows_a_few_lines(strips):
+    with wb.open_strip(strips[0]) as strip:
+        survey = wb.survey(strip)
+        chain = wb.auto_chain(survey)
+        echoes = chain.run(next(strip.blocks()), survey.system)
+    for value, words in (
+        (survey, (f"{survey.waveforms} waveforms", f"{survey.system.noise.std:.3f} DN", "Gaussian")),
+        (chain, ("noise.pooled", "detect.maximum")),
+        (echoes, (f"{len(echoes)} echoes", "amplitude", "range_err")),
+    ):
+        text = repr(value)
+        assert len(text.splitlines()) < 12 and len(text) < 600, text
+        assert all(word in text for word in words), text
+    page = ElementTree.fromstring(survey._repr_html_())
+    cells = {row.find("th").text: row.find("td").text for row in page.iter("tr")}
+    assert f"{survey.system.noise.std:.3f} DN" in cells["noise"] and "Gaussian" in cells["system pulse"]
+    pulse = [float(point.split(",")[1]) for point in page.find(".//polyline").get("points").split()]
+    assert min(pulse) == pytest.approx(2.0, abs=0.2) and pulse[0] == pytest.approx(142.0, abs=0.5)  # peak, and level
+
+
+def test_echoes_become_a_frame(strips, monkeypatch):
+    with wb.open_strip(strips[0]) as strip:
+        echoes = wb.load_chain("fast").run(next(strip.blocks()), wb.survey(strip).system)
+    if importlib.util.find_spec("pandas") is not None:
+        frame = echoes.to_frame()
+        assert tuple(frame.columns) == echoes.to_numpy().dtype.names and len(frame) == len(echoes)
+        np.testing.assert_array_equal(frame["amplitude"], echoes.amplitude)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(wb.StageError, match="a DataFrame needs pandas: .*pip.* install .*pandas.*; or use to_numpy"):
+        echoes.to_frame()
+
+
 def test_survey_takes_a_path_and_says_what_the_command_says(strips):
     survey = wb.survey(strips[0], waveforms=500)
     assert survey.waveforms == 500
@@ -224,6 +258,9 @@ def test_a_strip_that_fails_is_in_the_result(strips, tmp_path):
     result = wb.run([bad, strips[0]], tmp_path / "out", chain="fast")
     assert result.failed == 1
     assert isinstance(result.outcomes[0].error, wb.InputError) and result.outcomes[1].status == "written"
+    with pytest.raises(wb.InputError, match=r"bad.las: .* \(1 of 2 strips have no cloud\)$"):
+        result.raise_for_failures()
+    wb.run(strips[0], tmp_path / "good", chain="fast").raise_for_failures()
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,23 @@ def test_example_chains_run(chain, tiny_strip, tmp_path):
     assert len(cloud) > 300
 
 
+def test_the_notebook_runs(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib").use("Agg")
+    from matplotlib import pyplot
+
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((ROOT / "examples" / "strip_to_cloud.ipynb").read_text("utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(not cell.get("outputs") for cell in notebook["cells"])  # made by the reader's version, not kept
+    space: dict = {}
+    for number, cell in enumerate(cells):
+        exec(compile(cell, f"cell {number}", "exec"), space)
+    drawn = [len(pyplot.figure(number).axes) for number in pyplot.get_fignums()]
+    pyplot.close("all")
+    assert drawn == [1, 2] and space["mine"].sum() > 2
+    assert space["known"].sum() > 3000 and space["result"].failed == 0
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
@@ -54,7 +71,7 @@ def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
     told = subprocess.run(
         [*command, "-n", f"CHAIN={chain}"], check=True, env=environment, capture_output=True, text=True
     )
-    assert told.stdout.count(f"--chain {chain} --resume --quiet '{strips.name}/b.las'") == 1
+    assert told.stdout.count(f"--chain '{chain}' --resume --quiet '{strips.name}/b.las'") == 1
     (strips / "b.las").rename(strips / "b.LAS")
     (strips / "c.laz").write_bytes(b"no strip")
     (out / "summary.json").unlink()
@@ -71,5 +88,11 @@ def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
         subprocess.run(command, check=True, env=environment, capture_output=True)
         assert (out / "two words ü.laz").exists() and (out / "-dash.laz").exists()
     assert len(json.loads((out / "summary.json").read_text())["strips"]) == 4
+    elsewhere = tmp_path / "some where"
+    shutil.copytree(strips, elsewhere / "my strips")
+    for folder in (elsewhere / "clouds", elsewhere / "my clouds"):
+        given = ["STRIPS=my strips", f"OUT={folder.name}"]
+        subprocess.run([*command, *given], check=True, env={**environment, "PWD": str(elsewhere)}, capture_output=True)
+        assert len(json.loads((folder / "summary.json").read_text())["strips"]) == 4 and (folder / "a.laz").exists()
     nothing = subprocess.run([*command, "STRIPS=none"], env=environment, capture_output=True, text=True)
     assert nothing.returncode != 0 and "none holds no .las or .laz file; say STRIPS=FOLDER" in nothing.stderr

@@ -10,9 +10,14 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import laspy
+import numpy as np
 import pytest
 
+import wavebatch
 from wavebatch.core.echoes import COLUMNS
+from wavebatch.files.las.checked_header import read_checked_header
+from wavebatch.files.las.crs import read_crs_definition
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "recipes.md").read_text("utf-8")
 BLOCKS = dict(re.findall(r'(?ms)^```\w+ title="([^"]+)"\n(.*?)^```$', PAGE))
@@ -100,6 +105,10 @@ def test_recipe(folder, title):
     for name in ("clouds", *(path.name for path in folder.glob("*.tif"))):
         path = folder / name
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    if "to_copc.py" in text:
+        pytest.importorskip("copclib", reason="copclib is not installed (make readers)")
+        for made in folder.glob("*.copc.laz"):
+            made.unlink()
     if "CloudCompare" in text and not _opens_las(folder):
         pytest.skip("the CloudCompare here has no LAS plugin")
     if "copc" in title and "pdal" in text and "writers.copc" not in _run(folder, "pdal --drivers"):
@@ -114,3 +123,23 @@ def test_recipe(folder, title):
         assert 2 < float(shown) < 20
     if title == "lidr":
         assert "Median" in shown
+
+
+@pytest.mark.parametrize("most", [50_000, 60])
+def test_copc_by_copclib_keeps_points_columns_and_crs(folder, riegl, most):
+    """Also with nodes of a few points: readers find each node by way of those above it."""
+    pytest.importorskip("copclib", reason="copclib is not installed (make readers)")
+    cloud, target = folder / f"{most}" / f"{riegl.stem}.laz", folder / f"{most}.copc.laz"
+    assert wavebatch.run(riegl, cloud.parent, profile="fast").failed == 0
+    _run(folder, f"python examples/gis/to_copc.py {cloud} {target} {most}")
+    old = laspy.read(cloud)
+    with laspy.CopcReader.open(target) as reader:
+        new = reader.query()
+        assert len(new) == len(old)
+        rows = [np.lexsort([part[name] for name in ("gps_time", "X", "Y", "Z")]) for part in (old, new)]
+        for name in old.point_format.dimension_names:
+            np.testing.assert_array_equal(np.asarray(new[name])[rows[1]], np.asarray(old[name])[rows[0]], err_msg=name)
+        written = [(one.name, one.description, one.no_data) for one in reader.header.point_format.extra_dimensions]
+    assert str(written) == str([(one.name, one.description, one.no_data) for one in old.point_format.extra_dimensions])
+    texts = [read_crs_definition(path, read_checked_header(path, waveforms=False).header) for path in (cloud, target)]
+    assert texts[0] == texts[1] is not None

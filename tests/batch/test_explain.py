@@ -236,3 +236,10 @@ def test_survey_prints_the_doubts_of_a_run(many):
     assert f"warning           {one['text']}" in CliRunner().invoke(main, ["survey", str(many / "d.las")]).stdout
     together = CliRunner().invoke(main, ["survey", str(many / "a.las"), str(many / "b.las"), "--json"])
     assert all("warnings" in strip for strip in json.loads(together.stdout)["strips"])
+
+
+def test_no_data_of_the_strip_in_added_echoes_is_said(riegl, tmp_path):
+    (line,) = [line for line in remarks(riegl, tmp_path) if "added echoes have for no-data" in line]
+    cloud = wavebatch.read_cloud(tmp_path / f"{riegl.stem}.laz")
+    added = (cloud["echo_flags"] & int(wavebatch.EchoFlag.ADDED)) != 0
+    assert added.sum() > 100 and line.split(" added echoes")[0].endswith(str(added.sum()))

@@ -192,6 +192,11 @@ def test_columns_of_a_second_pass_decide_after_it(riegl, tmp_path):
         some, report = _run(riegl, tmp_path / name, where="incidence_angle_normals < 20", **more)
         np.testing.assert_array_equal(some.points.array["Z"], las.points.array["Z"][chosen])
         assert report["counts"]["left_out"]["where"] == np.count_nonzero(~chosen)
+        last = np.asarray(las.return_number) == np.asarray(las.number_of_returns)
+        lost = int(np.count_nonzero(last & ~chosen))
+        assert report["quality"]["last_echoes_left_out"] == lost
+        told = [line for line in report["remarks"] if f"--where: {lost} of the {np.count_nonzero(~chosen)}" in line]
+        assert len(told) == (lost > 0)
         _check_sums(report, int(chosen.sum()))
     first, _ = _run(riegl, tmp_path / "c", where="incidence_angle_normals < 20", columns=columns)
     np.testing.assert_array_equal(first["incidence_angle_normals"], las["incidence_angle_normals"][chosen])

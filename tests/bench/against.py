@@ -26,8 +26,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.process import ONE_THREAD
 from wavebatch.tools.bench.report import write_texts
-from wavebatch.tools.bench.scenes import find_bench_scene
-from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate import find_scene, simulate_strip
 
 SCENES = ("mixed", "open", "forest", "empty")
 
@@ -129,7 +128,7 @@ def simulate_strips(scenes: Sequence[str], pulses: int, seed: int, folder: Path)
     strips = {}
     for name in scenes:
         strips[name] = folder / f"{name}.las"
-        simulate_strip(find_bench_scene(name), strips[name], pulses=pulses, seed=seed)
+        simulate_strip(find_scene(name), strips[name], pulses=pulses, seed=seed)
     return strips
 
 

@@ -13,10 +13,9 @@ from typing import Any
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.tools.bench.figures import median_range
-from wavebatch.tools.bench.scenes import find_bench_scene
 from wavebatch.tools.bench.speed import run_file
 from wavebatch.tools.bench.worker import Worker, peak_memory
-from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate import find_scene, simulate_strip
 
 
 def measure_system(
@@ -27,7 +26,7 @@ def measure_system(
     pulses: of the strip for memory; the one for jobs is five times as long.
     large: also measure memory with 100 times as many.
     """
-    chain, scene = load_profile("accurate"), find_bench_scene("open")
+    chain, scene = load_profile("accurate"), find_scene("open")
     progress("timing wavebatch --help")
     start, memory = time_start(), []
     with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:

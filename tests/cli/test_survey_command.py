@@ -44,8 +44,8 @@ def test_the_text_has_every_measure_and_every_decision(flat_strip, surveyed):
     folder, result = surveyed
     lines = result.stdout.splitlines()
     for name in ("strip", "samples", "ADC range", "vectors", "baseline", "noise", "signal noise", "system pulse",
-                 "pulses tried", "false echoes", "kappa", "ringing", "acceptance", "saturation", "waveforms", "amplitudes",
-                 "widths", "decisions"):  # fmt: skip
+                 "pulses tried", "false echoes", "kappa", "ringing", "acceptance", "saturation", "waveforms",
+                 "amplitudes", "widths", "decisions"):  # fmt: skip
         assert any(line.startswith(name) for line in lines), name
     found = load_survey(folder / "SYSTEM.toml").survey
     for kind, value in found.system.noise.by_kind.items():

@@ -70,8 +70,28 @@ def test_files_of_other_kinds_say_what_to_give(place):
     (place / "strip.pls").write_bytes(b"PulseWavesPulse\0" + b"\0" * 300)
     line = _say("run", "strip.pls", "-o", "o")
     assert "it is PulseWaves: `wavebatch import strip.pls` makes a strip of it, or give strip.las" in line
+    (place / "strip.pls").rename(place / "strip.plz")
+    line = _say("info", "strip.plz")
+    assert "`pulsezip -i strip.plz -o strip.pls`" in line and "then `wavebatch import strip.pls`" in line
     (place / "empty.las").touch()
     assert "it is empty" in _say("info", "empty.las")
+
+
+def test_simulate_and_bench_have_the_same_scenes(place):
+    for words in (("simulate", "opne", "-o", "s.las"), ("bench", "--scene", "opne")):
+        assert "did you mean 'open'?" in _say(*words)
+    done = CliRunner().invoke(main, ["simulate", "open", "-o", "open.las", "--pulses", "50"])
+    assert done.exit_code == 0, done.output
+
+
+def test_an_unknown_stage_lists_those_of_its_kind(place):
+    for stage, words in (
+        ("detect.qqqqqqqqqqqqqqqq", "known are detect."),
+        ("xyz", "names begin with noise., detect., decompose., attribute.; `wavebatch stages` lists them"),
+    ):
+        (place / "c.toml").write_text(f'[[chain]]\nstage = "{stage}"\n')
+        line = _say("run", "strip.las", "-o", "o", "-c", "c.toml")
+        assert words in line and "attribute.position" not in line
 
 
 def test_the_home_folder_is_found_in_lists_and_quotes(place, monkeypatch):

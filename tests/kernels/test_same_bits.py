@@ -1,5 +1,6 @@
 """Builds of the C by several compilers for several processors print the same bits of the same fits (tests/c/fits.c)."""
 
+import os
 import platform
 import shutil
 import subprocess
@@ -82,6 +83,21 @@ def test_aarch64_gives_the_same_bits(plain, zig, tmp_path):
     target = ["-target", "aarch64-linux-musl", "-static", "-mcpu=baseline"]
     printed = build_and_run([*command, *target, *STRICT], tmp_path / "fits", [emulator], environment)
     assert printed == plain
+
+
+def test_windows_gives_the_same_bits(plain, zig, tmp_path):
+    wine = shutil.which("wine64") or shutil.which("wine")
+    if wine is None:
+        pytest.skip("needs wine: apt-get install wine64")
+    command, environment = zig
+    target = ["-target", "x86_64-windows-gnu", "-mcpu=baseline"]
+    call = [*command, *target, *STRICT, str(PROGRAM), "-o", str(tmp_path / "fits.exe")]
+    done = subprocess.run(call, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    home = {**os.environ, "WINEPREFIX": str(tmp_path / "wine"), "WINEDEBUG": "-all", "DISPLAY": ""}
+    done = subprocess.run([wine, str(tmp_path / "fits.exe")], capture_output=True, text=True, env=home)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.replace("\r", "") == plain
 
 
 def test_no_memory_is_misused_or_left(plain, tmp_path):

@@ -34,9 +34,9 @@ from wavebatch.tools.bench import command, report
 from wavebatch.tools.bench.accuracy import Group, Tally, make_group, make_groups
 from wavebatch.tools.bench.command import BenchOptions, run_bench
 from wavebatch.tools.bench.report import format_document
-from wavebatch.tools.bench.scenes import find_bench_scene, shape_scene
+from wavebatch.tools.bench.scenes import shape_scene
 from wavebatch.tools.bench.worker import Worker, WorkerDied, peak_memory
-from wavebatch.tools.simulate import Recording, simulate_block, simulate_blocks, simulate_strip
+from wavebatch.tools.simulate import Recording, find_scene, simulate_block, simulate_blocks, simulate_strip
 
 SMALL = BenchOptions(
     scenes=("flat",),
@@ -184,7 +184,7 @@ def test_strip_that_is_none(tmp_path):
 
 def test_scene_is_shaped_like_the_strip(tmp_path):
     recording = Recording(noise_std=1.6, baseline=30.0, bits=16, n_samples=64)
-    scene = replace(find_bench_scene("open"), recording=recording)
+    scene = replace(find_scene("open"), recording=recording)
     simulate_strip(scene, tmp_path / "a.las", pulses=3000, seed=1)
     like = shape_scene(tmp_path / "a.las", load_profile("accurate"))
     shaped = like.recording
@@ -208,14 +208,14 @@ def test_strip_too_short_to_resample(tmp_path):
 
 
 def test_groups_differ_and_are_surveyed():
-    groups = make_groups(find_bench_scene("flat"), 1600, 3)
+    groups = make_groups(find_scene("flat"), 1600, 3)
     assert [len(group.block) for group in groups] == [200] * 8
     assert not np.array_equal(groups[0].block.samples, groups[1].block.samples)
     assert all(group.system.sigma_ref == pytest.approx(2.0, rel=0.05) for group in groups)
 
 
 def known_group(n=300) -> Group:
-    scene = find_bench_scene("flat")
+    scene = find_scene("flat")
     ((block, truth),) = simulate_blocks(scene, n, seed=2, size=n)
     return make_group(scene, 0, block, truth, Survey(SystemPulse(2.0, noise=ReceiverNoise(std=1.04)), n))
 
@@ -341,7 +341,7 @@ def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     (tmp_path / "gdecomp.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(peers, "PATIENCE", 10.0)
-    scene = replace(find_bench_scene("flat"), recording=Recording(bits=16))
+    scene = replace(find_scene("flat"), recording=Recording(bits=16))
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()
     samples[7, 40], samples[20, 40] = 950, 850

@@ -152,6 +152,19 @@ def test_without_useful_times_nearest_neighbours_are_matched(tmp_path, times_are
     assert np.isnan(result.exact_count)
 
 
+def test_times_that_formats_round_differently_match_by_position(tmp_path):
+    _, times, xyz, ray = make_pulses(3000)
+    rounded = np.where(np.arange(len(times)) < 5, times, times + 0.25e-6)
+    write_cloud(tmp_path / "a.las", rounded, xyz + 0.3 * SPEED * ray)
+    write_cloud(tmp_path / "b.las", times, xyz)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert result.matched_by == "position" and result.matched > len(times) - 10
+    write_cloud(tmp_path / "c.las", times[: len(times) // 2], xyz[: len(times) // 2])
+    for pair in (("b", "c"), ("c", "b")):
+        half = compare_clouds(*(tmp_path / f"{name}.las" for name in pair))
+        assert half.matched_by == "gps_time" and half.matched == len(times) // 2
+
+
 @pytest.mark.parametrize("by", ["time", "place"])
 def test_buckets_do_not_change_the_result(tmp_path, monkeypatch, by):
     _, times, xyz, ray = make_pulses(4000)

@@ -207,6 +207,11 @@ def test_equal_pictures_are_equal_bytes():
     assert one == other
 
 
+def test_values_of_zero_have_an_axis_without_a_power_of_ten():
+    _, words = read_svg(draw_values(["only"], [0.0], [0.0], title="Drift", label="%"))
+    assert "%" in words and not any("e-" in word for word in words)
+
+
 @pytest.mark.parametrize("values", [[6.012e-9, 6.033e-9], [0.9991, 1.0004], [5e7, 5.1e7], [2.0], [0.0]])
 def test_ticks_differ_from_each_other(values):
     errors = [0.001 * abs(value) for value in values]

@@ -276,3 +276,16 @@ def _by_pulse(path):
             pulse = round(float(block.gps_time[row]) * 1e6)
             found.setdefault(pulse, []).append((block.samples[row].astype(int), block.origin[row]))
     return found
+
+
+def test_few_outgoing_pulses_have_an_energy_but_no_width(tmp_path, rng):
+    path = _make(tmp_path, list(_flight(rng, number=1)))
+    done = CliRunner().invoke(main, ["import", str(path)])
+    assert done.exit_code == 0 and "nan" not in done.output and "1 points" not in done.output, done.output
+
+
+def test_a_crs_that_stays_in_geotiff_keys_is_named(tmp_path, rng):
+    keys = struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 31467)  # Gauss-Krueger, no UTM zone
+    path = _make(tmp_path, list(_flight(rng, number=3)), appended=[("PulseWaves_Proj", 34735, keys)])
+    notes = import_file(path, tmp_path / "o.las", ImportOptions()).notes
+    assert any("the CRS stays as GeoTIFF keys" in note for note in notes)

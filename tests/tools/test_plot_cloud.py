@@ -190,6 +190,9 @@ def test_each_cloud_has_its_series_and_all_together_are_their_sum(cloud, tmp_pat
     one = count_values([cloud, other], Selection("amplitude"), bins=30, limits=(0.0, 200.0))
     assert np.array_equal(one.counts[0], both.counts.sum(axis=0)) and one.total == both.total
     assert both.percentiles[1].tolist() == [50.0, 50.0, 50.0]
+    late = write_cloud(tmp_path / "late.las", wb_amplitude=(np.full(POINTS, 50, "f4"), None, None, "[DN]"))
+    for clouds in ([late, other], [other, late]):
+        assert count_values(clouds, Selection("amplitude"), each=True).facts.name == "amplitude"
     wrong = write_cloud(tmp_path / "dB.las", amplitude=(np.ones(POINTS, "f4"), None, None, "of the echo [dB]"))
     with pytest.raises(ConfigError, match=r"dB.las.*\[dB\].*cloud.laz.*\[DN\]"):
         count_values([cloud, wrong], Selection("amplitude"))

@@ -100,6 +100,8 @@ class RunReport:
     """Echoes per column that can lack values and per reason in no_data.NoData; KNOWN counts those with a value."""
     above_one: int = 0
     """Echoes that reflect more than a white matt surface, level or facing the sensor."""
+    last_left_out: int = 0
+    """Points of left_out["where"] that are the last echo of their pulse."""
     remarks: tuple[str, ...] = ()
     """Lines about the strip as a whole, from `explain`."""
     warnings: tuple[StripWarning, ...] = ()
@@ -191,6 +193,7 @@ class RunReport:
             "quality": {
                 "echoes_per_waveform": [int(n) for n in self.echoes_per_waveform],
                 "reflectance_above_one": self.above_one,
+                "last_echoes_left_out": self.last_left_out,
                 **{name: _histogram_json(_BINS[name], counts) for name, counts in histograms.items()},
             },
         }
@@ -211,6 +214,7 @@ class RunReport:
             remarks=tuple(str(line) for line in document["remarks"]),
             warnings=tuple(StripWarning(str(one["code"]), str(one["text"])) for one in document["warnings"]),
             above_one=int(quality.get("reflectance_above_one", 0)),
+            last_left_out=int(quality.get("last_echoes_left_out", 0)),
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
             amplitude=amplitude,
             echo_width=echo_width,

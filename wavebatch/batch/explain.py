@@ -6,6 +6,7 @@ Before you change it: remarks depend on the strip and its counts alone, so that 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 
 from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
@@ -88,6 +89,10 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _doubt_units(prepared)
     lines += _name_height(prepared)
     lines += [*_name_model(prepared), *_name_raised(prepared)]
+    last, lost = report.last_left_out, report.left_out.get("where", 0)
+    if last:
+        lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
+                     "the ground: return numbers stay those of the whole pulse")  # fmt: skip
     lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
@@ -228,6 +233,14 @@ def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
         yield (
             f"{', '.join(prepared.layout.copied)}: kept; {added} added echoes have the value of the nearest return of "
             "their packet, because no value is free for no-data"
+        )
+    marked = [f"{one.record.name} {one.record.no_data[0]:g}" for one in prepared.layout.carried
+              if not (one.copied or prepared.layout.whole or one.record.no_data is None)
+              and math.isfinite(one.record.no_data[0])]  # fmt: skip
+    if added and marked:
+        yield (
+            f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
+            "value: leave these points out before a mean (flag ADDED)"
         )
 
 

@@ -67,6 +67,13 @@ class BatchResult:
         """Number of strips without a cloud."""
         return sum(outcome.status == "failed" for outcome in self.outcomes)
 
+    def raise_for_failures(self) -> None:
+        """Raise InputError where a strip has no cloud: how many, and the first reason; nothing else."""
+        errors = [outcome.error for outcome in self.outcomes if outcome.error is not None]
+        if errors:
+            others = f" ({len(errors)} of {len(self.outcomes)} strips have no cloud)" if len(self.outcomes) > 1 else ""
+            raise InputError(f"{' '.join(str(errors[0]).split())}{others}") from errors[0]
+
     @property
     def report(self) -> RunReport:
         """The sum of the strips' reports."""

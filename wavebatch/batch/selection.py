@@ -170,10 +170,18 @@ class RowSelector:
         numbers = np.bincount(left, minlength=len(LEFT_OUT) + 1)[1:].tolist()
         report = RunReport(
             counts={"points_out": int(np.count_nonzero(kept))},
+            last_left_out=self._count_last(rows, left),
             left_out={name: number for name, number in zip(LEFT_OUT, numbers, strict=True) if number},
             flags=count_flags(columns["echo_flags"][kept]),
         )
         return rows if kept.all() else rows[kept], report
+
+    def _count_last(self, rows: np.ndarray, left: np.ndarray) -> int:
+        """Rows (m,) that are the last of their pulse and left out by --where; left: number of the reason (m,)."""
+        header, form = self.layout.source.header, self.layout.point_format
+        lost = rows[left == len(LEFT_OUT)]
+        number, last = (read_field(lost, form, name, header) for name in ("return_number", "number_of_returns"))
+        return int(np.count_nonzero(number == last))
 
     def _test(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> Iterator[np.ndarray | bool]:
         """Whether rows (m,) are written as far as each reason of LEFT_OUT is concerned, bool (m,) or for all."""

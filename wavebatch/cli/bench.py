@@ -26,7 +26,8 @@ _REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "lo
 @click.command()
 @click.argument("files", nargs=-1, type=shared.INPUT, metavar="[STRIP...] [CHAIN...]")
 @click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete_scenes,
-              help="Simulate this scene: mixed, open, forest, empty, flat or stiff; may be repeated.")
+              help="Simulate this scene, e.g. mixed, open or forest; `wavebatch simulate --help` lists all; may be "
+              "repeated.")
 @shared.options_of(BenchOptions, "waveforms", "pulses", "repeats")
 @shared.seed_option("Seed of the simulated waveforms.")
 @shared.declared("tolerance", "Name the cheapest chain whose range error of isolated echoes is at most this, "

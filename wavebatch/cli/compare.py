@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 EXIT_VIOLATED = 1
 """A threshold was not met."""
 
-FEW_COMMON = 0.05
-"""Share of the fewer echoes in common below which two results may be of two strips; by chance they share 1 %."""
+FEW_COMMON = 0.5
+"""Share of the fewer echoes in common below which two results may be of two strips: chains share far more."""
 
 _SHARE = {"type": click.FloatRange(0.0, 1.0), "metavar": "SHARE"}
 _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
@@ -113,7 +113,10 @@ def compare(
     fewer = min(between.echoes_a, between.echoes_b)
     if fewer and between.matched <= fewer * (FEW_COMMON if options["within"] is None else 0.0):
         common = f"{between.matched} of {fewer} echoes" if between.matched else "no echo"
-        talk(f"warning: A and B have {common} in common; are they results of one strip, in one CRS?")
+        talk(
+            f"warning: A and B have {common} in common; are they results of one strip, in one CRS? "
+            "Positions of two formats may differ: try a larger --within"
+        )
     broken = _check_thresholds(between, options)
     _write_page(html_file, result, broken)
     for line in broken:

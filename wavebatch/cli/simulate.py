@@ -18,6 +18,7 @@ from wavebatch.cli.messages import count, counting, print_summary
 from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.tools.simulate import (
     CANOPIES,
+    OTHER_NAMES,
     PULSES,
     SCENES,
     DiscreteReceiver,
@@ -42,6 +43,7 @@ _SEEN = 0.001
 
 _SCENE_LINES = "\n\n".join(
     [f"{name}: {scene.meaning}." for name, scene in SCENES.items()]
+    + [f"{name}: another name of {scene}." for name, scene in OTHER_NAMES.items()]
     + [f"canopy.{name}: {meaning}." for name, (meaning, _) in CANOPIES.items()]
 )
 

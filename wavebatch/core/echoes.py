@@ -9,11 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntFlag
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wavebatch.core.errors import StageError
+from wavebatch.core.optional import need
 from wavebatch.core.order import find_order
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 class EchoFlag(IntFlag):
@@ -138,7 +143,7 @@ _FIELDS: dict[str, type] = {
 """Core columns and their dtypes."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class EchoTable:
     """m echoes sorted by waveform, then time: found, fitted or simulated.
 
@@ -173,6 +178,10 @@ class EchoTable:
     def __len__(self) -> int:
         """Number of echoes."""
         return len(self.waveform)
+
+    def __repr__(self) -> str:
+        """Two lines: the number of echoes, and the columns."""
+        return f"<EchoTable: {len(self)} echoes>\n  {', '.join(_FIELDS | dict(self.attributes))}"
 
     @classmethod
     def build(
@@ -268,6 +277,17 @@ class EchoTable:
         for name, values in columns.items():
             rows[name] = values
         return rows
+
+    def to_frame(self) -> DataFrame:
+        """The table as a pandas DataFrame, with the columns of `to_numpy`.
+
+        Raises
+        ------
+        StageError
+            pandas is not installed; the message says how to install it.
+        """
+        pandas = need("pandas", lambda advice: StageError(f"a DataFrame needs pandas: {advice}; or use to_numpy()"))
+        return pandas.DataFrame(self.to_numpy())
 
     @classmethod
     def concatenate(cls, tables: Iterable[EchoTable | tuple[EchoTable, int]]) -> EchoTable:

@@ -134,9 +134,17 @@ def _raise_again(lost: sys.UnraisableHookArgs) -> None:
         return
     _State.raised = -_PAUSE
     number = next(number for number in _SIGNALS if signal.getsignal(number) is _handle)
-    timer = threading.Timer(_SOON, os.kill, (os.getpid(), number))
+    timer = threading.Timer(_SOON, _send, (number,))
     timer.daemon = True
     timer.start()
+
+
+def _send(number: int) -> None:
+    """Send this process a signal; `os.kill` of Windows would end it at once."""
+    if os.name == "nt":
+        signal.raise_signal(number)
+    else:
+        os.kill(os.getpid(), number)
 
 
 def _handle_with(handler: Any, *kept: Any) -> None:

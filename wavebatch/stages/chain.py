@@ -231,7 +231,7 @@ class Solved(NamedTuple):
         return self._replace(block=self.block.without_samples(), noise=replace(self.noise, of_sample=None))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Chain:
     """Checked, ordered steps: one noise stage, one detector, one decomposer, then any attributes."""
 
@@ -279,6 +279,14 @@ class Chain:
         for step in self.steps:
             if step.stage.check is not None and (wrong := step.stage.check(step, self, system)):
                 raise ConfigError(f"chain {self.name or '(unnamed)'}: {step.stage.name}: {wrong}")
+
+    def __repr__(self) -> str:
+        """A line per step, with the parameters that the chain sets."""
+        lines = [f"<Chain {self.name or '(unnamed)'}>"]
+        for step in self.steps:
+            given = ", ".join(f"{name}={value!r}" for name, value in step.parameters.items())
+            lines.append(f"  {step.stage.name:30}{given}".rstrip())
+        return "\n".join(lines)
 
     @property
     def makes(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import functools
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
-from wavebatch.stages.chain import STAGES, Stage
+from wavebatch.stages.chain import KINDS, STAGES, Stage
 
 GROUP = "wavebatch.stages"
 
@@ -62,5 +62,10 @@ def find_stage(name: str, where: str) -> Stage:
     if name not in STAGES:
         failures = load_plugins()
         if name not in STAGES:
-            raise ConfigError("; ".join([f"{where}: unknown stage {name!r}", nearest(name, STAGES), *failures]))
+            kind = f"{name.partition('.')[0]}."
+            same = [known for known in STAGES if known.startswith(kind)]
+            advice = nearest(name, same or STAGES)
+            if not same and advice.startswith("known"):
+                advice = f"names begin with {', '.join(f'{one}.' for one in KINDS)}; `wavebatch stages` lists them"
+            raise ConfigError("; ".join([f"{where}: unknown stage {name!r}", advice, *failures]))
     return STAGES[name]

@@ -44,6 +44,7 @@ from wavebatch.surveying.measuring.whitening import choose_whitening
 from wavebatch.surveying.systems.doubt import share_unexplained
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known
+from wavebatch.surveying.systems.shown import Shown
 from wavebatch.surveying.systems.skew import measure_skew
 
 SAMPLE = 8192
@@ -93,8 +94,8 @@ class Decision:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class Survey:
+@dataclass(frozen=True, slots=True, repr=False)
+class Survey(Shown):
     """What a sample of a strip says of sensor and scene."""
 
     system: SystemPulse

@@ -5,6 +5,7 @@ Only reads options and prints; the work is in `wavebatch.tools.archives.import_f
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -74,7 +75,7 @@ def _say(summary: ImportSummary) -> None:
     sent = summary.outgoing
     if sent is not None:
         spread, error = 100 * sent["energy_scatter"], 100 * sent["energy_error"]
-        width = f"{sent['fwhm_ns']:.3f} ns wide at half maximum"
-        tell(f"{summary.output}: outgoing pulses {width}, energies vary by {spread:.2f} %, known to {error:.2f} %")
+        width = f" {sent['fwhm_ns']:.3f} ns wide at half maximum," if math.isfinite(sent["fwhm_ns"]) else ":"
+        tell(f"{summary.output}: outgoing pulses{width} energies vary by {spread:.2f} %, known to {error:.2f} %")
     for note in summary.notes:
         tell(f"{summary.output}: {note}")

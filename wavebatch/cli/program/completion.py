@@ -78,9 +78,9 @@ def complete_stages(context: click.Context, parameter: click.Parameter, incomple
 
 def complete_scenes(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the scenes of `simulate` and `bench`."""
-    from wavebatch.tools.simulate.scenes import SCENES
+    from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES
 
-    return [name for name in SCENES if name.startswith(incomplete)]
+    return [name for name in (*SCENES, *OTHER_NAMES) if name.startswith(incomplete)]
 
 
 def _complete_last(incomplete: str, names: Iterable[str], *, upper: bool = False) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -184,7 +184,10 @@ def select_points(
 
 
 def check_alike(readers: Iterable[tuple[Path, ColumnFacts]]) -> ColumnFacts:
-    """Return the facts of a column that several clouds have; raises ConfigError if their units differ."""
+    """Return the facts of a column that several clouds have; raises ConfigError if their units differ.
+
+    Its name is the shortest: one cloud may have `wb_amplitude` beside an `amplitude` of its strip.
+    """
     readers = list(readers)
     first_path, first = readers[0]
     for path, facts in readers[1:]:
@@ -193,4 +196,4 @@ def check_alike(readers: Iterable[tuple[Path, ColumnFacts]]) -> ColumnFacts:
                 f"{path}: {facts.name} is in [{facts.unit}], {first.name} of {first_path} in [{first.unit}]; plot them "
                 "one by one"
             )
-    return first
+    return replace(first, name=min((facts.name for _, facts in readers), key=len))

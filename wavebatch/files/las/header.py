@@ -190,6 +190,9 @@ def _guess(path: Path, front: bytes) -> str:
     """What a file is that is no LAS file, and what to give in its place; empty where that is not known."""
     beside = (path.with_suffix(end) for end in (".las", ".laz", ".LAS", ".LAZ"))
     strip = next((one for one in beside if one.is_file()), None)
+    if front.startswith(b"PulseWaves") and path.suffix.lower() == ".plz":
+        return f"; it is compressed PulseWaves: `pulsezip -i {path.name} -o {path.stem}.pls` of the PulseWaves tools " \
+            f"decompresses it, then `wavebatch import {path.stem}.pls` makes a strip of it"
     if front.startswith(b"PulseWaves"):
         return f"; it is PulseWaves: `wavebatch import {path}` makes a strip of it" + f", or give {strip}" * bool(strip)
     if path.suffix.lower() in (".wdp", ".wdz"):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -83,7 +84,7 @@ class _TableReader(ColumnReader):
             return np.dtype(np.float64)
         record = self.extra.get(stored)
         if record is None:
-            fields = STANDARD_DTYPES[self.point_format].fields
+            fields: Mapping[str, Any] = STANDARD_DTYPES[self.point_format].fields or {}
             return fields[stored][0] if stored in fields else np.dtype(np.uint8)  # a part of a field
         kept = record.scaling is None and (record.dtype.kind == "f" or record.no_data is None)
         return record.dtype if kept else np.dtype(np.float64)

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from wavebatch.batch.job import StripJob, choose_columns, name_columns
 from wavebatch.batch.options import RunOptions, describe_options
@@ -32,11 +32,18 @@ from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
 from wavebatch.tools.api.chain import AUTO, load_chain
 
+if TYPE_CHECKING:
+    from wavebatch.tools.api.run_keywords import RunKeywords
+
 Strips = Iterable[Path | str] | Path | str
 
 
 def run(
-    strips: Strips, output: Path | str, *, on_event: Callable[[dict[str, Any]], None] | None = None, **options: Any
+    strips: Strips,
+    output: Path | str,
+    *,
+    on_event: Callable[[dict[str, Any]], None] | None = None,
+    **options: Unpack[RunKeywords],
 ) -> BatchResult:
     """Write a point cloud and a report for every strip; what `wavebatch run` does.
 
@@ -72,7 +79,7 @@ def _sign(function: Callable) -> None:
     keywords = inspect.signature(RunOptions).parameters
     shown = [given["strips"], given["output"], given["on_event"]]
     shown += [one.replace(kind=one.KEYWORD_ONLY) for one in list(keywords.values())[1:]]
-    function.__signature__ = inspect.Signature(shown, return_annotation=BatchResult)
+    function.__signature__ = inspect.Signature(shown, return_annotation=BatchResult)  # type: ignore[attr-defined]
     before, mark, after = (function.__doc__ or "").partition("    **options\n")
     lines = "".join(f"    {line}\n" for line in describe_options().split("\n"))
     function.__doc__ = before + lines + after[after.find("\n\n") + 1 :] if mark else before
@@ -153,11 +160,11 @@ def find_request(options: RunOptions) -> tuple[Chain, Request]:
     ConfigError
         For a chain or a saved survey that cannot be read.
     """
-    system, asked = options.system, options.chain or options.profile or AUTO
-    if system is not None:
-        system = SavedSurvey(system) if isinstance(system, Survey) else load_survey(system)
+    given, asked, saved = options.system, options.chain or options.profile or AUTO, None
+    if given is not None:
+        saved = SavedSurvey(given) if isinstance(given, Survey) else load_survey(given)
     auto = asked == AUTO and options.tolerance is None
-    request = Request(auto, options.tolerance, system, options.survey == "flight", options.force)
+    request = Request(auto, options.tolerance, saved, options.survey == "flight", options.force)
     if asked == AUTO:
         return widest(request), request
     return asked if isinstance(asked, Chain) else load_chain(asked), request

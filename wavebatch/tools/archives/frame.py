@@ -20,6 +20,11 @@ SCALE = 0.001
 ROUND = 1000.0
 """Offsets of coordinates are multiples of this [m]."""
 
+_NO_WKT = (
+    "the CRS stays as GeoTIFF keys: it is no UTM zone that wavebatch writes as WKT, which programs expect in LAS 1.4: "
+    "give them the CRS by hand"
+)
+
 _ZONES = {4326: 32600, 4979: 32600, 4258: 25800, 4269: 26900}
 """EPSG code of zone 0 north by the code of the geographic CRS."""
 
@@ -67,7 +72,8 @@ def find_frame(reader: PulseReader) -> Frame:
     else:
         code = keys.sure_code
         scales = tuple(min(abs(float(scale)), SCALE) for scale in header.scales)
-        wkt, notes = (build_utm(code) if code else None), _note(keys)
+        wkt = build_utm(code) if code else None
+        notes = _note(keys) or (() if wkt else (_NO_WKT,))
         frame = Frame(0, False, scales, (0.0,) * 3, wkt, header.projection, notes)
     return replace(frame, offsets=tuple(float(value) for value in np.floor(first[0] / ROUND) * ROUND))
 

@@ -22,9 +22,9 @@ from wavebatch.stages.chain import Chain
 from wavebatch.tools.bench.accuracy import Group, Tally, derive_seed, describe_found, make_groups
 from wavebatch.tools.bench.chains import AUTO, choose_chains, find_twin, list_methods, load_chains
 from wavebatch.tools.bench.figures import choose_cheapest, find_front, median_range
-from wavebatch.tools.bench.scenes import find_bench_scene, shape_scene
+from wavebatch.tools.bench.scenes import shape_scene
 from wavebatch.tools.bench.speed import Laps, time_chains
-from wavebatch.tools.simulate import Scene, simulate_blocks, simulate_strip
+from wavebatch.tools.simulate import Scene, find_scene, simulate_blocks, simulate_strip
 
 SCHEMA = "wavebatch.bench/1"
 
@@ -64,7 +64,7 @@ def run_bench(
     Raises ConfigError for unknown scenes and chains that cannot run, InputError for a strip that cannot be used.
     """
     chains = load_chains(options.chains)
-    scenes: list[Scene] = [find_bench_scene(name) for name in options.scenes]
+    scenes: list[Scene] = [find_scene(name) for name in options.scenes]
     if options.strip is not None:
         progress(f"surveying {options.strip}")
         scenes.insert(0, shape_scene(options.strip, chains["accurate"]))

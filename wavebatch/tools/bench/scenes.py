@@ -6,7 +6,7 @@ that sample with small changes, so that counts, amplitudes, widths and gaps of i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +21,8 @@ from wavebatch.stages.chain import Chain
 from wavebatch.surveying import SAMPLE, survey_blocks
 from wavebatch.surveying.survey import pool_blocks
 from wavebatch.tools.bench.truth import smoothed_power
-from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene
+from wavebatch.tools.simulate import PulseModel, Recording, Scene
 from wavebatch.tools.simulate.draws import Drawn
-
-OTHER_NAMES = {"open": "urban"}
-"""Scenes of tools.simulate with another name in the benchmark."""
 
 LEAST_WAVEFORMS = 200
 """Least waveforms of a strip whose echoes can be resampled."""
@@ -35,11 +32,6 @@ JITTER = 0.05
 
 STRONG = 20.0
 """Signal to noise from which measured widths show the true spread of widths."""
-
-
-def find_bench_scene(name: str) -> Scene:
-    """The scene of that name; raises ConfigError with the nearest name when there is none."""
-    return replace(find_scene(OTHER_NAMES.get(name, name)), name=name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

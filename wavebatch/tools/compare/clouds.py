@@ -26,6 +26,9 @@ from wavebatch.tools.return_stats.returns import pulses_told_apart
 from wavebatch.tools.simulate.truth import TruthReader
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
+LEAST_SHARED = 0.05
+"""Share of the pulses that two clouds of one strip have in common at least; else echoes are matched by position."""
+
 PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
 """A pulse that counts even if neither side has an echo in it."""
 
@@ -86,11 +89,19 @@ def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5, where: Con
 
 
 def _share_times(first: CloudReader, second: CloudReader) -> bool:
-    """Whether any pulse of the first piece of the shorter cloud is in the other cloud."""
+    """Whether enough pulses of the first piece of the shorter cloud are in the other cloud.
+
+    Formats round times differently: those of one flight in two formats are equal by chance only.
+    """
     short, long = sorted((first, second), key=lambda reader: reader.point_count)
     rows = next(short.read_pieces(), np.empty(0, CLOUD_DTYPE))
     times = np.unique(rows["gps_time"])
-    return not len(rows) or any(np.isin(piece["gps_time"], times).any() for piece in long.read_pieces())
+    found = np.zeros(len(times), bool)
+    for piece in long.read_pieces():
+        found |= np.isin(times, piece["gps_time"])
+        if found.mean() > LEAST_SHARED:
+            return True
+    return not len(rows)
 
 
 def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.figure_file import has_matplotlib, open_svg, plain_text
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
-from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.surveying.systems.shown import full_width, sample_pulse
 from wavebatch.tools.html.markup import text
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, draw_cells
 from wavebatch.tools.plots.draw_sheet import HEAD, LEGEND, draw_waveforms, sheet_size
@@ -77,13 +76,7 @@ def figures(parts: Sequence[str], kind: str = "") -> str:
 
 def draw_pulse(system: SystemPulse, spacing: float, title: str = "System pulse") -> str:
     """The pulse that is fitted, height 1 at its peak, with a Gaussian of its width and the distance of samples."""
-    wide = 4 * system.sigma_ref
-    delays = [delay + 3 * sigma for _, delay, sigma in system.components]
-    time = np.linspace(-wide, max([2 * wide, *delays]), 400)
-    shape = pulse_shape(system, spacing)
-    described = np.array([[1.0, 0.0, system.sigma_ref / spacing]])
-    amplitude, centre, width = model_parameters(shape, shape_limits(system, spacing), described).T
-    pulse = float(amplitude[0]) * evaluate_pulse(shape, time / spacing, centre[0], width[0])[0]
+    time, pulse = sample_pulse(system, spacing)
     gaussian = evaluate_pulse(GAUSSIAN, time / system.sigma_ref, np.float64(0.0), np.float64(1.0))[0]
     at = np.arange(np.ceil(time[0] / spacing), np.floor(time[-1] / spacing) + 1) * spacing
 
@@ -94,8 +87,7 @@ def draw_pulse(system: SystemPulse, spacing: float, title: str = "System pulse")
         axes.set(xlim=(time[0], time[-1]), ylim=(min(0.0, float(pulse.min())) - 0.05, 1.35))
         axes.legend(loc="upper right", fontsize=7.5, borderaxespad=0.2)
 
-    full = system.sigma_ref * FWHM_PER_SIGMA
-    words = f"Full width at half maximum {full:.3f} ns; dots are {spacing:g} ns apart, as samples are."
+    words = f"Full width at half maximum {full_width(system):.3f} ns; dots are {spacing:g} ns apart, as samples are."
     return chart(title, ("time after the peak [ns]", "height"), draw, words)
 
 
@@ -195,7 +187,8 @@ def draw_values(
     """Values with their errors, side by side."""
     middle, spread = np.asarray(values, np.float64), np.nan_to_num(np.asarray(errors, np.float64))
     # Small constants: a power of ten in the label, so that ticks differ and stay short.
-    power = int(np.floor(np.log10(max(float(np.abs(middle).max()), 1e-300))))
+    largest = float(np.abs(middle).max())
+    power = int(np.floor(np.log10(largest))) if largest else 0
     if abs(power) > 3:
         middle, spread, label = middle / 10.0**power, spread / 10.0**power, f"1e{power} {label}"
 

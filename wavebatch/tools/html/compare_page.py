@@ -41,12 +41,13 @@ def write_compare_page(
 
 
 def _echo_parts(result: Comparison | Matchup, one: Any, broken: Sequence[str]) -> Iterator[str]:
-    yield markup.section("Summary", markup.bullets(broken, "warning"), _summarise(one))
-    yield markup.section("Sums", _sums(one))
+    found = {"in both": one.matched, "only in A": one.extra, "only in B": one.missed}
+    charts = [draw_counts(found, title="Echoes", label="")]
     if one.pulses:
-        charts = [draw_counts(_named(counts), title=f"Echoes per pulse, {side}", label="echoes")
-                  for side, counts in (("A", one.counts_a), ("B", one.counts_b))]  # fmt: skip
-        yield markup.section("Echoes per pulse", figures(charts))
+        charts += [draw_counts(_named(counts), title=f"Echoes per pulse, {side}", label="echoes")
+                   for side, counts in (("A", one.counts_a), ("B", one.counts_b))]  # fmt: skip
+    yield markup.section("Summary", markup.bullets(broken, "warning"), figures(charts), _summarise(one))
+    yield markup.section("Sums", _sums(one))
     rows = [[name, *_spread(spread)] for name, spread in one.differences.items()]
     head = ["A - B", *_SPREAD]
     yield markup.section("Differences", markup.paragraph("Times and widths in ns, amplitudes in DN."),

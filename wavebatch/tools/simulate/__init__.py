@@ -18,12 +18,12 @@ from wavebatch.tools.simulate.canopy import CANOPIES
 from wavebatch.tools.simulate.pulses import PULSES, PulseModel, find_pulse, shape_pulse
 from wavebatch.tools.simulate.render import Recording
 from wavebatch.tools.simulate.returns import DiscreteReceiver
-from wavebatch.tools.simulate.scenes import SCENES, Scene, find_scene
+from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES, Scene, find_scene
 from wavebatch.tools.simulate.strip import ReturnSummary, StripOptions, StripSummary, simulate_returns, simulate_strip
 from wavebatch.tools.simulate.truth import TruthReader
 
 __all__ = [
-    "CANOPIES", "PULSES", "SCENES",
+    "CANOPIES", "OTHER_NAMES", "PULSES", "SCENES",
     "DiscreteReceiver", "PulseModel", "Recording", "ReturnSummary", "Scene", "StripOptions", "StripSummary",
     "TruthReader", "find_pulse", "find_scene", "flag_truth",
     "shape_pulse", "simulate_block", "simulate_blocks", "simulate_returns", "simulate_strip",

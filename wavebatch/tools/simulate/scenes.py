@@ -172,6 +172,9 @@ _SCENES = (
 SCENES: dict[str, Scene] = {scene.name: scene for scene in _SCENES}
 """Every scene by name."""
 
+OTHER_NAMES = {"open": "urban"}
+"""Other names of scenes, which tables of the benchmark use."""
+
 
 def find_scene(name: str | Scene) -> Scene:
     """The scene of that name, also `stiff.<hazard>` and `canopy.<stand>`; a Scene is returned as it is.
@@ -182,6 +185,8 @@ def find_scene(name: str | Scene) -> Scene:
         return name
     if name in SCENES:
         return SCENES[name]
+    if name in OTHER_NAMES:
+        return replace(SCENES[OTHER_NAMES[name]], name=name)
     head, _, hazard = name.partition(".")
     if head == "stiff" and hazard in HAZARDS:
         doc = (HAZARDS[hazard].__doc__ or "").strip()
@@ -190,5 +195,6 @@ def find_scene(name: str | Scene) -> Scene:
         meaning, canopy = CANOPIES[hazard]
         window = Recording(n_samples=8 * -(-int(canopy.duration + 48.0) // 8))
         return Scene(name, meaning, canopy=canopy, recording=window)
-    names = [*SCENES, *(f"stiff.{known}" for known in HAZARDS), *(f"canopy.{known}" for known in CANOPIES)]
+    parts = [*(f"stiff.{known}" for known in HAZARDS), *(f"canopy.{known}" for known in CANOPIES)]
+    names = [*SCENES, *OTHER_NAMES, *parts]
     raise ConfigError(f"scene {name!r} is unknown; {nearest(name, names)}")

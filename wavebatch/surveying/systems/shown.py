@@ -1,0 +1,89 @@
+"""How a prompt and a notebook show a survey: a few lines, and the same as HTML with a picture of the pulse.
+
+`Survey` inherits it. The picture needs no matplotlib, so that a notebook shows it everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
+from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+
+WIDE, HIGH, MARGIN = 320, 140, 16
+"""Size of the picture, and the strip below it for the times [pixels]."""
+
+
+class Shown:
+    """Text and HTML of a survey."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        lines = (f"  {name:14}{text}" for name, text in _describe(self))
+        return "\n".join(["<Survey>", *lines])
+
+    def _repr_html_(self) -> str:
+        """Table of the same lines beside the pulse; what Jupyter shows."""
+        rows = "".join(f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in _describe(self))
+        system, spacing = self.system, self.figures.spacing_ns or 1.0  # type: ignore[attr-defined]
+        return f'<div style="display:flex;gap:1em"><table>{rows}</table>{_draw(*sample_pulse(system, spacing))}</div>'
+
+
+def _describe(survey: Any) -> Iterator[tuple[str, str]]:
+    """Name and text of each line."""
+    system, figures = survey.system, survey.figures
+    yield "surveyed", f"{survey.waveforms} waveforms"
+    yield "noise", f"{system.noise.std:.3f} DN, baseline {system.noise.baseline:.3f} DN"
+    yield "system pulse", f"{name_model(system)}; full width at half maximum {full_width(system):.3f} ns"
+    if figures.echoes_per_waveform is not None:
+        yield "echoes", f"{figures.echoes_per_waveform:.3f} per waveform, 99 % below {figures.amplitude_99:.1f} DN"
+    needed = ", ".join(decision.part for decision in survey.decisions if decision.needed)
+    yield "needed", needed or "nothing beyond the plainest chain"
+
+
+def name_model(system: SystemPulse) -> str:
+    """The kind of pulse that is fitted."""
+    if system.components:
+        return f"learned, {len(system.components)} Gaussians"
+    return f"skewed, kappa {system.kappa:.4f}" if system.kappa else "Gaussian"
+
+
+def full_width(system: SystemPulse) -> float:
+    """Full width of the echo of a flat target at half of its maximum [ns]."""
+    return system.sigma_ref * FWHM_PER_SIGMA
+
+
+def sample_pulse(system: SystemPulse, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times after the peak [ns] and heights of the pulse that is fitted, 1 at its peak; f8 (400,)."""
+    wide = 4 * system.sigma_ref
+    delays = [delay + 3 * sigma for _, delay, sigma in system.components]
+    time = np.linspace(-wide, max([2 * wide, *delays]), 400)
+    shape = pulse_shape(system, spacing)
+    described = np.array([[1.0, 0.0, system.sigma_ref / spacing]])
+    amplitude, centre, width = model_parameters(shape, shape_limits(system, spacing), described).T
+    return time, float(amplitude[0]) * evaluate_pulse(shape, time / spacing, centre[0], width[0])[0]
+
+
+def _draw(time: np.ndarray, height: np.ndarray) -> str:
+    """The pulse over its time, as SVG."""
+    low, high = min(0.0, float(height.min())), float(height.max())
+    across = WIDE * (time - time[0]) / (time[-1] - time[0])
+    down = HIGH * (high - height) / (high - low) + 2
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down, strict=True))
+    ground = HIGH * high / (high - low) + 2
+    texts = "".join(
+        f'<text x="{place}" y="{HIGH + MARGIN}" text-anchor="{anchor}" font-size="11">{words}</text>'
+        for place, anchor, words in ((0, "start", f"{time[0]:.1f} ns"), (WIDE, "end", f"{time[-1]:.1f} ns"))
+    )
+    return (
+        f'<svg role="img" aria-label="system pulse" fill="currentColor" width="{WIDE}" height="{HIGH + MARGIN + 4}">'
+        f'<path d="M0 {ground:.1f}H{WIDE}" stroke="#8a8a8a"/>'
+        f'<polyline points="{points}" fill="none" stroke="#1f77b4" stroke-width="1.5"/>{texts}</svg>'
+    )
