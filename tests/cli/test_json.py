@@ -97,7 +97,6 @@ CASES = {
     "grid CLOUD --column z --column echo_width --no-data nan --where z>0 -o w.tif -q": "grid/1",
     "bench --scene flat --waveforms 500 --pulses 300 --repeat 1 --tolerance 2cm": "bench/1",
     "bench --scene empty --waveforms 800 --pulses 0 --repeat 1": "bench/1",
-    "bench --real STRIP": "bench-real/1",
     "plot waveform STRIP -o w.png -q --profile fast --random 2": "plot-waveform/1",
     "stats CLOUD": "stats/1",
     "compare CLOUD STRIP": "compare/1",

@@ -426,30 +426,11 @@ def _call_slow_starter(self, function, *arguments):
     return laps.get(function, jobs.Lap(1.0, 0.5, 1.0, 2000))
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--real a.las --scene flat", "--scene has no meaning with --real"),
-        ("--real a.las --tolerance 2cm", "--tolerance has no meaning with --real"),
-        ("--real a.las --all-methods", "--all-methods has no meaning"),
-    ],
-)  # fmt: skip
-def test_options_that_real_does_not_use_are_refused(words, message):
-    result = CliRunner().invoke(main, ["bench", *words.split()])
-    assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1, result.output
-
-
 def test_a_small_strip_that_fails_is_no_time(tmp_path):
     broken = tmp_path / "broken.las"
     broken.write_bytes(b"LASF")
     with pytest.raises(InputError, match=r"0\.las"):
         jobs.run_small(broken, tmp_path / "small")
-
-
-def test_real_takes_a_log_file(tmp_path):
-    log = tmp_path / "night.log"
-    result = CliRunner().invoke(main, ["bench", "--real", str(tmp_path / "no.las"), "--log-file", str(log)])
-    assert "no.las" in result.stderr and "has no meaning" not in result.stderr and "no.las" in log.read_text()
 
 
 def test_the_slowest_part_bounds_many_jobs():

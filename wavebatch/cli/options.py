@@ -356,14 +356,9 @@ def from_options(kind: type[_Options], options: Mapping[str, Any], **more: Any) 
     return kind(**{**given_options(options, [field.name for field in fields(kind)]), **more})
 
 
-def for_each(
-    paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False, alone: bool = False
-) -> tuple[list[Any], int]:
-    """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr.
-
-    alone: a single one that fails is such a line too.
-    """
-    if len(paths) == 1 and not alone:
+def for_each(paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False) -> tuple[list[Any], int]:
+    """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr."""
+    if len(paths) == 1:
         return [work(paths[0])], 0
     results, failed = [], 0
     for path in paths:
