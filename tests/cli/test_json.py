@@ -101,8 +101,6 @@ CASES = {
     "stats CLOUD": "stats/1",
     "compare CLOUD STRIP": "compare/1",
     "compare fast --strip STRIP --limit 50": "compare-chains/1",
-    "compare CLOUD --angles": "compare-angles/1",
-    "compare CLOUD CLOUD --overlap": "compare-overlap/1",
     "info STRIP": "info/1",
     "info CLOUD": "info/1",
     "check STRIP": "check/1",

@@ -15,8 +15,6 @@ from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader
 from wavebatch.files.las.header import STANDARD_DTYPES
 from wavebatch.tools.api.cloud import read_cloud
-from wavebatch.tools.compare.angles import ANGLE_DTYPE
-from wavebatch.tools.compare.overlap import OVERLAP_DTYPE
 
 
 def write_cloud(path, point_format, n=300, extra=()):
@@ -127,7 +125,7 @@ def test_no_reader_takes_several_numbers_for_a_column_that_the_account_names(tmp
     names = ("amplitude", "echo_width", "amplitude_err", "range_err", "incidence_angle", "reflectance", "echo_flags")
     types = dict.fromkeys(names, kind) | {"echo_time": "f4"}
     path = write_renamed(tmp_path / "a.las", types, {name: name for name in types} | {"not_known": "echo_time"})
-    for dtype in (CLOUD_DTYPE, RETURN_DTYPE, ANGLE_DTYPE, OVERLAP_DTYPE):
+    for dtype in (CLOUD_DTYPE, RETURN_DTYPE):
         with CloudReader(path, dtype) as cloud:
             (rows,) = cloud.read_pieces()
             assert len(rows) == 4 and set(cloud.written) <= {"echo_time", "not_known"}
