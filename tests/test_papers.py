@@ -26,7 +26,7 @@ SCRIPTS = sorted(path.stem for path in FOLDER.glob("s?_*.py"))
 
 
 @pytest.fixture
-def load(monkeypatch, paper_stages):
+def load(monkeypatch):
     """`load(name)`: a module of the examples."""
     monkeypatch.syspath_prepend(str(FOLDER))
     return importlib.import_module

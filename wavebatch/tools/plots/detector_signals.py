@@ -20,11 +20,19 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
-from wavebatch.kernels.signal.filters import curvature_taps, filter_energy, filter_symmetric, gaussian_taps
+from wavebatch.kernels.signal.filters import (
+    curvature_taps,
+    filter_antisymmetric,
+    filter_energy,
+    filter_symmetric,
+    gaussian_taps,
+    slope_taps,
+)
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121
 from wavebatch.kernels.signal.square_differences import pad_samples, slide_taps, square_differences
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.detect.candidates import signal_above
+from wavebatch.stages.detect.classic import INFLECTED
 from wavebatch.stages.detect.maximum import LEAST_BLUR, choose_smoothing
 from wavebatch.stages.detect.wavelet import BACKGROUND, spike_reach, transform
 from wavebatch.stages.reference_pulse import reference_pulse
@@ -147,6 +155,12 @@ def _see_smoothed(scene: _Scene) -> DetectorSignal:
                           level * SMOOTH_GAIN * scene.std)  # fmt: skip
 
 
+def _see_samples(scene: _Scene) -> DetectorSignal:
+    one = scene.options
+    rule = f"runs above {one.level:g} std for {one.duration:g} pulses"
+    return DetectorSignal("above the baseline [DN]", rule, scene.signal, one.level * scene.std)
+
+
 def _see_matched(scene: _Scene) -> DetectorSignal:
     taps = gaussian_taps(scene.ref)
     energy = filter_energy(taps)
@@ -204,16 +218,33 @@ def _see_curvature(scene: _Scene) -> DetectorSignal:
     return DetectorSignal("- second derivative [DN/sample2]", rule, filter_symmetric(scene.signal, taps), least)
 
 
+def _see_crossings(scene: _Scene) -> DetectorSignal:
+    one = scene.options
+    blur = max(one.scale * scene.ref, LEAST_BLUR)
+    high = f"where the smoothed signal is above {one.level:g} std"
+    if one.derivative == "first":
+        values = filter_antisymmetric(scene.signal, slope_taps(blur))
+        least = np.full(values.shape[1], np.nan)
+        return DetectorSignal("derivative [DN/sample]", f"falls through zero {high}", values, least)
+    taps = curvature_taps(blur)
+    least = INFLECTED * np.sqrt(filter_energy(taps)) * scene.std
+    values = filter_symmetric(scene.signal, taps)
+    return DetectorSignal("- second derivative [DN/sample2]", f"middle of two zeros {high}", values, least)
+
+
 _SIGNALS: Mapping[str, tuple[str, Callable[[_Scene], DetectorSignal]]] = {
     "detect.maximum": ("", _see_maximum),
     "detect.threshold": ("", _see_smoothed),
     "detect.constant_fraction": ("", _see_smoothed),
+    "detect.center_of_gravity": ("", _see_smoothed),
+    "detect.sustained_threshold": ("", _see_samples),
     "detect.asdf": ("asdf", _see_asdf),
     "detect.wavelet": ("wavelet", _see_wavelet),
     "detect.correlation": ("correlation", _see_correlation),
     "detect.matched_filter": ("correlation", _see_matched),
     "detect.richardson_lucy": ("deconvolved", _see_spikes),
     "detect.second_derivative": ("derivative", _see_curvature),
+    "detect.zero_crossing": ("derivative", _see_crossings),
 }
 """Per detector the kind of its signal, as --show names it, and the function that computes it."""
 
