@@ -132,7 +132,7 @@ def run_batch(
     workers: Workers | Cluster = Workers(options.jobs)
     if options.scheduler is not None:
         files = sorted({file for job in jobs for file in job.files})
-        workers = Cluster(options.scheduler, options.folder, files, on_event)
+        workers = Cluster(options.scheduler, options.folder, files)
     with protecting(find_inputs(jobs)), workers:
         with reporting(options.folder):
             options.folder.mkdir(parents=True, exist_ok=True)

@@ -73,8 +73,6 @@ class Progress:
                 self._tell(f"{strip}: {line}")
         elif kind == "skipped":
             self._tell(f"{strip}: is up to date, skipped")
-        elif kind == "worker":
-            self._say(printable(f"{strip}: warning: {event['warning']}"))
         elif kind == "flight" and self._level > 0:
             self._say(printable(f"{strip}: survey of {count(event['strips'], 'strip')} together"))
 
