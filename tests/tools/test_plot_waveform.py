@@ -32,7 +32,6 @@ from wavebatch.tools.html.strip_views import measure_residuals
 from wavebatch.tools.plots.draw_sheet import draw_sheet
 from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels, draw_waveforms
 from wavebatch.tools.plots.echo_table import list_echoes
-from wavebatch.tools.plots.labels import place_labels
 from wavebatch.tools.plots.packets import MOST, Place, Wanted, find_places
 from wavebatch.tools.plots.waveform import add_ranges, build_views, read_views
 
@@ -69,7 +68,11 @@ def gaussian(time, amplitude, centre, width):
     return amplitude * np.exp(-0.5 * ((time - centre) / width) ** 2)
 
 
-@pytest.mark.parametrize("name", [name for name in STAGES if name.startswith("decompose.") and name[10:] != "none"])
+# The log-normal as printed has the skew of its origin, whatever the pulse is: tests/stages/test_paper_stages.py.
+OTHERS = ("decompose.none", "decompose.log_normal")
+
+
+@pytest.mark.parametrize("name", [name for name in STAGES if name.startswith("decompose.") and name not in OTHERS])
 def test_curves_are_the_fit_of_every_decomposer(name):
     shape, system, parameters = PulseShape(), PULSE, {}
     if name == "decompose.skewed":
@@ -80,7 +83,7 @@ def test_curves_are_the_fit_of_every_decomposer(name):
     block = simulate(shape, [(100.0, 30.3, 2.0)])
     views = build_views(block, make_chain(name, **parameters), system, range(len(block)))
     assert len(views) == 20
-    worst = {"decompose.asdf_only": 4.0}.get(name, 1.25)
+    worst = {"decompose.asdf_only": 4.0, "decompose.asdf_mixed": 4.0}.get(name, 1.25)
     for view in views:
         assert len(view.echoes) == 1 and view.curves.shape == (1, len(view.fine))
         near = np.abs(view.time - 30) <= 5
@@ -364,7 +367,7 @@ def test_long_texts_lose_their_middle():
     assert plain_text(" a\n\x00 b\t") == "a b" and plain_text("abc", 3) == "abc"
 
 
-def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
+def test_the_benchs_plot_names_every_point(tmp_path):
     pytest.importorskip("matplotlib")
     points = {
         "fast": (8.0, 0.1),
@@ -380,16 +383,9 @@ def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
     ]  # fmt: skip
     with open_picture(tmp_path / "b.png", (5.5, 4.6)) as figure:
         axes = figure.subplots()
-        labels = _draw_panel(axes, rows, "wrong", 100.0, "wrong [%]")
-        figure.draw_without_rendering()
-        place_labels(axes, labels, keep=True)
-        boxes = [text.get_window_extent() for text in axes.texts]
-        frame = axes.get_window_extent()
-    assert len(boxes) == 5
-    for number, box in enumerate(boxes):
-        assert frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
-        for other in boxes[number + 1 :]:
-            assert not box.overlaps(other)
+        _draw_panel(axes, rows, "wrong", 100.0, "wrong [%]")
+        shown = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert sorted(shown) == sorted(["Pareto front", *points])
 
 
 @pytest.mark.slow
