@@ -13,7 +13,7 @@ from wavebatch.files import figure_file
 from wavebatch.files.figure_file import open_picture
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.tools.plots import labels
-from wavebatch.tools.plots.draw_waveform import draw_waveforms
+from wavebatch.tools.plots.draw_waveform import draw_waveform_panels
 from wavebatch.tools.plots.labels import fit_parts, fit_text, text_width
 from wavebatch.tools.plots.waveform import build_views
 
@@ -74,7 +74,7 @@ def test_waveforms_with_crowded_echoes(texts, tmp_path, number, show):
     flagged = [replace(view, echoes=replace(view.echoes, flags=np.full(len(view.echoes), 0x7FFF, np.uint16)))
                for view in views]  # fmt: skip
     for name, each in (("plain", views), ("flagged", flagged)):
-        draw_waveforms(each, tmp_path / f"{name}.png", strip=LONG, chain="auto: detect.maximum " * 8, table=True)
+        draw_waveform_panels(each, tmp_path / f"{name}.png", strip=LONG, chain="auto: detect.maximum " * 8, table=True)
     check(texts)
 
 

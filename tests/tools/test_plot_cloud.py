@@ -20,7 +20,7 @@ from wavebatch.files.cloud import echo_reader as io_cloud
 from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots import raster, values
-from wavebatch.tools.plots.histogram import count_flags, count_values, place_edges
+from wavebatch.tools.plots.histogram import count_points_by_flag, count_values, place_edges
 from wavebatch.tools.plots.raster import grid_values
 from wavebatch.tools.plots.section_data import cut_section
 from wavebatch.tools.plots.values import Selection, robust_limits
@@ -290,7 +290,7 @@ def test_clouds_far_apart_are_refused(tmp_path, cloud):
 
 def test_flags_select_and_are_counted(cloud):
     _, _, amplitude, flags = read_plainly(cloud)
-    counted = count_flags([cloud], Selection("echo_flags"))
+    counted = count_points_by_flag([cloud], Selection("echo_flags"))
     for name, count in zip(counted.names, counted.counts, strict=True):
         assert count == np.sum((flags & int(EchoFlag[name])) != 0)
     assert counted.clean == np.sum(flags == 0)
@@ -552,7 +552,7 @@ def test_groups_of_few_values_are_points(tmp_path, monkeypatch):
     points, plot = [], Axes.plot
     keep = lambda axes, x, y, *look, **more: points.append(y) or plot(axes, x, y, *look, **more)  # noqa: E731
     monkeypatch.setattr(Axes, "plot", keep)
-    draw_cloud.draw_histogram(found, tmp_path / "h.png")
+    draw_cloud.draw_cloud_histogram(found, tmp_path / "h.png")
     assert [sum(heights) for heights in points] == [100.0]
 
 
@@ -572,7 +572,7 @@ def test_more_than_six_groups_have_axes_of_their_own(tmp_path):
     drawn = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", lambda figure, *args, **more: drawn.extend(figure.axes) or args[0].write(b"x"))
-        draw_cloud.draw_histogram(found, tmp_path / "h.png")
+        draw_cloud.draw_cloud_histogram(found, tmp_path / "h.png")
     assert len(drawn) == 8 and matplotlib
     few = count_values([path], Selection("z"), by=None)
     assert draw_cloud._split_series(few) == [few]

@@ -28,9 +28,9 @@ from wavebatch.surveying import survey_block
 from wavebatch.tools.bench.plot import _draw_panel
 from wavebatch.tools.compare.chains import ChainRun
 from wavebatch.tools.compare.goodness import measure_fit
-from wavebatch.tools.html.strip_views import measure_residuals
-from wavebatch.tools.plots.draw_sheet import draw_sheet
-from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels, draw_waveforms
+from wavebatch.tools.html.strip_views import measure_view_residuals
+from wavebatch.tools.plots.draw_sheet import draw_waveform_sheet
+from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels, draw_waveform_panels
 from wavebatch.tools.plots.echo_table import list_echoes
 from wavebatch.tools.plots.packets import MOST, Place, Wanted, find_places
 from wavebatch.tools.plots.waveform import add_ranges, build_views, read_views
@@ -57,7 +57,7 @@ def test_residuals_are_those_of_the_cleaned_samples():
     views = build_views(block, chain, system, range(1000))
     residual = np.array([np.sqrt(np.nanmean(view.residual**2)) for view in views])
     assert np.median(residual) == pytest.approx(1.0, abs=0.1)
-    np.testing.assert_allclose(measure_residuals(block, chain, system), residual, rtol=1e-3)
+    np.testing.assert_allclose(measure_view_residuals(block, chain, system), residual, rtol=1e-3)
     found = ChainRun(chain, system, 1.0)
     solved = found.find(block)
     misfit, floor = measure_fit(solved.block, solved.noise, solved.system, chain.steps[2], solved.echoes)
@@ -419,7 +419,7 @@ def test_titles_name_every_flag_of_many_echoes(tmp_path):
     peaks = [(100.0, 20.3 + 8 * k, 2.0) for k in range(3)]
     (view,) = build_views(simulate(PulseShape(), peaks, n=1), make_chain("decompose.gaussian"), PULSE, [0])
     view.echoes.flags[:] = int(EchoFlag.SATURATED | EchoFlag.OVERLAPPED | EchoFlag.AMPLITUDE_UNRELIABLE)
-    draw_waveforms([view] * 3, tmp_path / "w.svg", strip="s", chain="c")
+    draw_waveform_panels([view] * 3, tmp_path / "w.svg", strip="s", chain="c")
     text = (tmp_path / "w.svg").read_text("utf-8")
     for name in ("SATURATED", "OVERLAPPED", "AMPLITUDE_UNRELIABLE"):
         assert text.count(f"{name} 1,2") == 3
@@ -431,7 +431,7 @@ def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):
         simulate(PulseShape(), [(400.0, 30.3, 2.0)], n=2), make_chain("decompose.gaussian"), PULSE, [0, 1]
     )
     views += build_views(simulate(PulseShape(), [(0.1, 30.3, 2.0)], n=1), make_chain("decompose.none"), PULSE, [2])
-    draw_sheet(views, tmp_path / "s.svg", strip="a.las", chain="test")
+    draw_waveform_sheet(views, tmp_path / "s.svg", strip="a.las", chain="test")
     text = (tmp_path / "s.svg").read_text("utf-8")
     assert "SATURATED" in text and "no echo" in text and "3 waveforms" in text
 

@@ -44,7 +44,7 @@ class Pulse(ctypes.Structure):
     SUM_OF_GAUSSIANS, SKEWED, POWER, TABLE, LOG_NORMAL = range(5)
 
 
-class Settings(ctypes.Structure):
+class CSettings(ctypes.Structure):
     """`Settings` of kernels/c/types.h."""
 
     _fields_ = [
@@ -70,7 +70,7 @@ class Block(ctypes.Structure):
     ]
 
 
-class Clusters(ctypes.Structure):
+class CClusters(ctypes.Structure):
     """`Clusters` of kernels/c/types.h."""
 
     _fields_ = [
@@ -88,7 +88,7 @@ class Echoes(ctypes.Structure):
     ]
 
 
-class Candidates(ctypes.Structure):
+class CCandidates(ctypes.Structure):
     """`Candidates` of kernels/c/signal.h."""
 
     _fields_ = [*_fields(ctypes.c_int64, "room"), *_fields(_POINTER, "waveform amplitude time width")]
@@ -110,7 +110,7 @@ class Grouping(ctypes.Structure):
     _fields_ = [*_fields(ctypes.c_int64, "margin reach most"), *_fields(_POINTER, "tail")]
 
 
-class Groups(ctypes.Structure):
+class CGroups(ctypes.Structure):
     """`Groups` of kernels/c/signal.h."""
 
     _fields_ = _fields(_POINTER, "waveform low high first number")

@@ -16,7 +16,7 @@ from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.workers.dask_client import connected, one_line, silent
+from wavebatch.batch.workers.dask_client import connected, shorten_error, silent
 from wavebatch.batch.workers.futures import end_future, wait_uninterrupted
 from wavebatch.batch.workers.worker_check import compare_workers, describe_worker, list_sizes
 from wavebatch.core.errors import ConfigError, InputError
@@ -131,7 +131,7 @@ class Cluster:
             self._client.run_on_scheduler(describe_worker)
         except Exception as error:
             raise ConfigError(
-                f"--scheduler {self.address}: the scheduler cannot load wavebatch ({one_line(error)}); "
+                f"--scheduler {self.address}: the scheduler cannot load wavebatch ({shorten_error(error)}); "
                 "install the same there"
             ) from error
 
@@ -159,7 +159,8 @@ class Cluster:
             return self._client.run(function, *arguments, workers=list(self._workers))
         except Exception as error:
             raise ConfigError(
-                f"--scheduler {self.address}: a worker cannot be asked: {one_line(error)}; it needs the same wavebatch"
+                f"--scheduler {self.address}: a worker cannot be asked: {shorten_error(error)}; "
+                "it needs the same wavebatch"
             ) from error
 
     def _translate(self, error: BaseException) -> BaseException:
@@ -177,7 +178,7 @@ class Cluster:
         return error
 
     def _lost(self, reason: object) -> BrokenExecutor:
-        return BrokenExecutor(f"{self.address}: the cluster is lost ({one_line(reason)}); {_ADVICE}")
+        return BrokenExecutor(f"{self.address}: the cluster is lost ({shorten_error(reason)}); {_ADVICE}")
 
 
 class _Promise(Future):

@@ -27,7 +27,7 @@ def find_clouds(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
 
 
 def draws_clouds(
-    *own: Callable, name: str | None = None, find: Callable[..., list[Path]] = find_clouds
+    *options_here: Callable, name: str | None = None, find: Callable[..., list[Path]] = find_clouds
 ) -> Callable[[Callable[..., tuple[str, dict[str, Any]]]], click.Command]:
     """A command that draws clouds: with its options, and those that all such commands share.
 
@@ -45,7 +45,7 @@ def draws_clouds(
             answer({"output": str(output), "clouds": [str(path) for path in paths], **found})
 
         common = shared.selection_options, shared.common_options("overwrite", "json")
-        every = shared.clouds_argument, shared.declared("recursive"), output_option, *own, *common
+        every = shared.clouds_argument, shared.declared("recursive"), output_option, *options_here, *common
         return click.command(name or draw.__name__)(shared.together(*every)(command))
 
     return decorate
@@ -104,7 +104,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.tools.plots.histogram import count_flags, count_values
+    from wavebatch.tools.plots.histogram import count_points_by_flag, count_values
     from wavebatch.tools.plots.values import Clouds
 
     selection = select(options["column"], options)
@@ -113,7 +113,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
             if options[name]:
                 option = "--range" if name == "limits" else f"--{name}"
                 raise ConfigError(f"{option} is of no use for flags, which are counted by name")
-        flags = count_flags(clouds, selection)
+        flags = count_points_by_flag(clouds, selection)
         from wavebatch.tools.plots.draw_cloud import draw_flags
 
         draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
@@ -121,9 +121,9 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
         text += f", {total.left_out} left out" * bool(total.left_out)
     else:
         found = count_values(clouds, selection, **{name: options[name] for name in ("bins", "limits", "each", "by")})
-        from wavebatch.tools.plots.draw_cloud import draw_histogram
+        from wavebatch.tools.plots.draw_cloud import draw_cloud_histogram
 
-        draw_histogram(found, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
+        draw_cloud_histogram(found, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
         total, text = found.total, describe_tally(found.total, int(found.below.sum() + found.above.sum()))
     return text, {"column": options["column"], **list_tally(total)}
 
@@ -151,9 +151,9 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
     column, statistic = options["column"], options["statistic"]
     selection = select(column, options)
     found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bbox"])
-    from wavebatch.tools.plots.draw_cloud import draw_map
+    from wavebatch.tools.plots.draw_cloud import draw_cloud_map
 
-    draw_map(found, output, overwrite=options["overwrite"])
+    draw_cloud_map(found, output, overwrite=options["overwrite"])
     grid = found.grid
     more = {"statistic": statistic, "outside": found.outside, "columns": grid.columns, "rows": grid.rows,
             "size": grid.size, "unit": found.crs.unit}  # fmt: skip

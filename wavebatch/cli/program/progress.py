@@ -87,13 +87,13 @@ class Progress:
         if self._level >= 0:
             self._say(printable(line))
         else:
-            log_file.log(printable(line))
+            log_file.log_text(printable(line))
 
     def _say(self, line: str) -> None:
         if self._bar is not None:
             self._bar.clear()
         write_message(line)
-        log_file.log(line)
+        log_file.log_text(line)
         if self._bar is not None:
             self._bar.refresh()
 

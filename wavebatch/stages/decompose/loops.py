@@ -19,7 +19,7 @@ from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference
 from wavebatch.stages.decompose.rebuild import render_table
-from wavebatch.stages.decompose.skew import fit_skewed, skewed
+from wavebatch.stages.decompose.skew import skew_system, skewed
 from wavebatch.stages.decompose.solve import EchoLimits, fit_gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
 from wavebatch.stages.detect.maximum import maximum
@@ -52,7 +52,7 @@ def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse
     model = loop_model(system, parameters["model"])
     if model == "learned":
         return system
-    return fit_skewed(system, {"kappa": 0.0}) if model == "skewed" else fit_gaussian(system, {})
+    return skew_system(system, {"kappa": 0.0}) if model == "skewed" else fit_gaussian(system, {})
 
 
 @stage("decompose", fits=_fit_loop, shares=EchoLimits())

@@ -52,7 +52,7 @@ def system_skew(system: SystemPulse) -> float:
     return system.skew
 
 
-def fit_skewed(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
+def skew_system(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
     """Return the system with the pulse that `skewed` fits.
 
     Parameters
@@ -71,7 +71,7 @@ def fit_skewed(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPuls
     return replace(system, components=(), kappa=0.0 if kappa == "free" else kappa or system_skew(system))
 
 
-@stage("decompose", fits=fit_skewed, shares=FIT)
+@stage("decompose", fits=skew_system, shares=FIT)
 def skewed(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     kappa: Annotated[float, Range(-0.9, 0.9)] | Literal["free"] = 0.0,
@@ -92,7 +92,7 @@ def skewed(
     ----------
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 0, 1.2.
     """
-    shape = pulse_shape(fit_skewed(system, {"kappa": 0.0 if kappa == "free" else kappa}), block.spacing)
+    shape = pulse_shape(skew_system(system, {"kappa": 0.0 if kappa == "free" else kappa}), block.spacing)
     fit = replace(FIT, **options)
     settings = make_settings(block, system, shape, fit, grow=False)
     if kappa != "free":

@@ -16,7 +16,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.score import ISOLATED, QUANTITIES, find_isolated, list_pairs, match_echoes
 from wavebatch.surveying import Survey, survey_block
-from wavebatch.tools.bench.figures import Figure, root_mean_square, share
+from wavebatch.tools.bench.figures import Figure, root_mean_square, share_figure
 from wavebatch.tools.bench.truth import describe_truth, find_bounds
 from wavebatch.tools.simulate import Scene, simulate_blocks
 
@@ -119,7 +119,7 @@ def describe_found(found: EchoTable) -> EchoTable:
 
 
 @dataclass(slots=True)
-class Tally:
+class AccuracyTally:
     """Collects the echoes found in groups; `figures` summarises them."""
 
     _waveforms: list[dict[str, np.ndarray]] = field(default_factory=list)
@@ -169,14 +169,14 @@ class Tally:
         group, true, found = w["group"], w["true"], w["found"]
         one, none = true == 1, true == 0
         return {
-            "completeness": share(w["matched"], true, group),
-            "correctness": share(w["matched"], found * true.any(), group),
-            "exact_count": share(found == true, np.ones(len(true)), group),
-            "false_splits": share(one & (found > 1), one, group),
-            "false_alarms": share(none & (found > 0), none, group),
-            "found_isolated": share(w["isolated_matched"], w["isolated"], group),
-            "found_overlapped": share(w["overlapped_matched"], w["overlapped"], group),
-            "wrong": share(true + found - 2 * w["matched"], (true + found) * true.any(), group),
+            "completeness": share_figure(w["matched"], true, group),
+            "correctness": share_figure(w["matched"], found * true.any(), group),
+            "exact_count": share_figure(found == true, np.ones(len(true)), group),
+            "false_splits": share_figure(one & (found > 1), one, group),
+            "false_alarms": share_figure(none & (found > 0), none, group),
+            "found_isolated": share_figure(w["isolated_matched"], w["isolated"], group),
+            "found_overlapped": share_figure(w["overlapped_matched"], w["overlapped"], group),
+            "wrong": share_figure(true + found - 2 * w["matched"], (true + found) * true.any(), group),
         }
 
     def _errors(self) -> dict[str, Figure]:
@@ -190,13 +190,13 @@ class Tally:
             clear = rows & e["clear"]
             ratios = np.stack([e[f"{name}_ratio"] for name in QUANTITIES])
             gross = np.abs(ratios).max(axis=0) > GROSS
-            figures[f"gross_{kind}"] = share(clear & gross, clear, e["group"])
+            figures[f"gross_{kind}"] = share_figure(clear & gross, clear, e["group"])
             for name in QUANTITIES:
                 figures[f"{name}_ratio_{kind}"] = _spread(e, f"{name}_ratio", clear & ~gross)
                 known = np.isfinite(e[f"{name}_scaled"])
                 figures[f"{name}_calibration_{kind}"] = _spread(e, f"{name}_scaled", clear & ~gross & known)
         known = e["clear"] & np.isfinite(e["time_scaled"])
-        figures["hidden"] = share(known & e["hidden"], known, e["group"])
+        figures["hidden"] = share_figure(known & e["hidden"], known, e["group"])
         for kind in ("flagged", "hidden"):
             for name, rows in ((kind, e[kind]), (f"not_{kind}", ~e[kind])):
                 figures[f"time_calibration_{name}"] = _spread(e, "time_scaled", known & rows)

@@ -18,7 +18,7 @@ from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 from wavebatch.tools.html.markup import text
 from wavebatch.tools.plots.draw_cloud import MARKERS, SERIES, add_colorbar, draw_cells
-from wavebatch.tools.plots.draw_sheet import HEAD, LEGEND, draw_waveforms, sheet_size
+from wavebatch.tools.plots.draw_sheet import HEAD, LEGEND, draw_small_waveforms, sheet_size
 from wavebatch.tools.plots.raster import Raster
 from wavebatch.tools.plots.waveform import WaveformView
 
@@ -103,7 +103,8 @@ def draw_sheet(views: Sequence[WaveformView], title: str, notes: Sequence[str] =
     columns = min(SHEET_COLUMNS, len(views)) or 1
     wide, high = sheet_size(len(views), columns)
     size = (wide, high - HEAD)
-    return picture(title, size, lambda figure: draw_waveforms(figure, views, columns, notes=notes, head=0.0), LEGEND)
+    draw = lambda figure: draw_small_waveforms(figure, views, columns, notes=notes, head=0.0)  # noqa: E731
+    return picture(title, size, draw, LEGEND)
 
 
 def draw_histogram(edges: np.ndarray, counts: np.ndarray, *, title: str, label: str, log: bool = False,

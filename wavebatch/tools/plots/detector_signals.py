@@ -67,28 +67,28 @@ class DetectorSignal:
 
 def choose_step(chain: Chain, show: str) -> Step:
     """The detector whose signal is shown: that of the chain if it searches in this kind, else the kind's first one."""
-    own = chain.steps[1]
+    step = chain.steps[1]
     if show == "detector":
-        if own.stage.name not in _SIGNALS:
-            raise ConfigError(f"--show detector: {own.stage.name} has no known signal; choose {', '.join(KINDS)}")
-        return own
+        if step.stage.name not in _SIGNALS:
+            raise ConfigError(f"--show detector: {step.stage.name} has no known signal; choose {', '.join(KINDS)}")
+        return step
     names = [name for name, (kind, _) in _SIGNALS.items() if kind == show]
     if not show or not names:
         raise ConfigError(f"--show {show!r}: must be one of {', '.join(('detector', *KINDS))}")
-    return own if own.stage.name in names else Step(STAGES[names[0]])
+    return step if step.stage.name in names else Step(STAGES[names[0]])
 
 
 def see_block(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, step: Step, *, own: bool = True
+    block: WaveformBlock, noise: Noise, system: SystemPulse, step: Step, *, in_chain: bool = True
 ) -> list[DetectorSignal]:
     """What the detector of a step sees in each waveform of a block, with the echoes that it finds there.
 
-    own: whether it is the detector of the chain; the title then does not say that it is another one.
+    in_chain: whether it is the detector of the chain; the title then does not say that it is another one.
     """
     scene = _Scene(block, noise, system, SimpleNamespace(**step.effective()))
     whole = _SIGNALS[step.stage.name][1](scene)
     found = step.stage.function(block, noise, system, **step.parameters)
-    name = describe_step(step) + ("" if own else ", which the chain does not use")
+    name = describe_step(step) + ("" if in_chain else ", which the chain does not use")
     time = (whole.first + np.arange(len(whole.values))) * block.spacing
     return [
         replace(whole, values=whole.values[:, row], least=np.float64(whole.least[row]), time=time, stage=name,
@@ -249,4 +249,4 @@ _SIGNALS: Mapping[str, tuple[str, Callable[[_Scene], DetectorSignal]]] = {
 """Per detector the kind of its signal, as --show names it, and the function that computes it."""
 
 KINDS = tuple(dict.fromkeys(kind for kind, _ in _SIGNALS.values() if kind))
-"""Kinds of signal; --show draws that of the chain's own detector, or of the first one that searches in this kind."""
+"""Kinds of signal; --show draws that of the chain's detector, or of the first one that searches in this kind."""

@@ -36,13 +36,13 @@ FEWEST_IN_LINE = 5
 """Series of fewer values are points: two values make a line of two needles."""
 
 _NARROW = 4.0
-"""Maps so many times as high as wide have a place of its own for the scale of colours: it would shrink with them."""
+"""Maps so many times as high as wide have a separate place for the scale of colours: it would shrink with them."""
 
 _LONG = 8.0
 """Longer side of a map [inches]."""
 
 
-def draw_histogram(
+def draw_cloud_histogram(
     found: Histogram, target: Path, *, log: bool = False, counts: bool = False, overwrite: bool = False
 ) -> None:
     """Writes a picture of a histogram.
@@ -67,10 +67,10 @@ def _split_series(found: Histogram) -> list[Histogram]:
     """The histogram, or one for each of its series where these are too many for one picture."""
     if len(found.names) <= MOST_TOGETHER:
         return [found]
-    own = ("counts", "below", "above", "values", "percentiles", "means")
+    by_series = ("counts", "below", "above", "values", "percentiles", "means")
     parts = []
     for row, name in enumerate(found.names):
-        rows = {key: getattr(found, key)[row : row + 1] for key in own}
+        rows = {key: getattr(found, key)[row : row + 1] for key in by_series}
         parts.append(replace(found, names=(name,), clouds=(name,), total=Tally(values=int(rows["values"][0])), **rows))
     return parts
 
@@ -164,7 +164,7 @@ def draw_flags(
         axes.set_title(fit_text(figure, title, 6.0, size=10.5))
 
 
-def draw_map(found: Raster, target: Path, *, overwrite: bool = False) -> None:
+def draw_cloud_map(found: Raster, target: Path, *, overwrite: bool = False) -> None:
     """Writes a picture of a map. Raises as figure_file.open_picture does."""
     grid = found.grid
     ratio = grid.rows / grid.columns

@@ -1,7 +1,7 @@
 """Pictures of waveforms with their fit, residual and echoes, drawn with matplotlib.
 
-`wavebatch plot waveform` calls `draw_waveforms` with the views of `waveform.read_views`. Style and files are those of
-`files.figure_file`; the same views give the same bytes.
+`wavebatch plot waveform` calls `draw_waveform_panels` with the views of `waveform.read_views`. Style and files are
+those of `files.figure_file`; the same views give the same bytes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _LETTER = 0.085
 """Width of a letter of a title [inches]."""
 
 
-def draw_waveforms(
+def draw_waveform_panels(
     views: Sequence[WaveformView],
     target: Path,
     *,
@@ -155,7 +155,7 @@ def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, 
     for curve in view.curves:
         axes.fill_between(view.fine, level, level + curve, color=PULSE, alpha=0.15, linewidth=0)
     draw_samples(axes, view, times, dot=(2.4 if small else 3.4) * (1.0 if len(view.time) <= _MANY else 0.6))
-    _draw_errors(axes, view, times, fit_height(axes, view, times))
+    _draw_errors(axes, view, times, fit_signal_panel(axes, view, times))
 
 
 def draw_samples(
@@ -190,7 +190,7 @@ def shade_gaps(axes: Axes, view: WaveformView) -> None:
                      label="not recorded")  # fmt: skip
 
 
-def find_peaks(view: WaveformView) -> np.ndarray:
+def find_echo_heights(view: WaveformView) -> np.ndarray:
     """Heights of the echoes in the signal panel [DN], f8 (k,)."""
     level = np.interp(view.echoes.time, view.time, view.level)
     return level + view.echoes.amplitude.astype(np.float64)
@@ -198,7 +198,7 @@ def find_peaks(view: WaveformView) -> np.ndarray:
 
 def _draw_errors(axes: Axes, view: WaveformView, times: tuple[float, float], heights: tuple[float, float]) -> None:
     """Draws the echoes with error bars; a bar that would leave the panel ends at its edge with an arrowhead."""
-    time, peak = view.echoes.time.astype(np.float64), find_peaks(view)
+    time, peak = view.echoes.time.astype(np.float64), find_echo_heights(view)
     shown = (time >= times[0]) & (time <= times[1])
     axes.plot(time[shown], peak[shown], "D", markersize=4, markerfacecolor="none", color=ECHO, zorder=4, label="echoes")
     errors = [np.nan_to_num(error.astype(np.float64)) for error in (view.echoes.time_err, view.echoes.amplitude_err)]
@@ -222,7 +222,8 @@ def _number_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:
     (low, high), size = axes.get_xlim(), 7.5 if small else 9.0
     room = 1.3 * size / 72 * axes.figure.dpi / axes.get_window_extent().width * (high - low)
     last = -np.inf
-    for row, (time, height) in enumerate(zip(view.echoes.time.tolist(), find_peaks(view).tolist(), strict=True), 1):
+    peaks = zip(view.echoes.time.tolist(), find_echo_heights(view).tolist(), strict=True)
+    for row, (time, height) in enumerate(peaks, 1):
         if max(low, last + room * len(str(row))) <= time <= high:
             axes.annotate(str(row), (time, height), textcoords="offset points", xytext=(0, 5), ha="center",
                           annotation_clip=False, color=ECHO, fontsize=size, weight="bold").set_in_layout(False)
@@ -273,14 +274,14 @@ def _draw_residual(axes: Axes, view: WaveformView, times: tuple[float, float]) -
     axes.set_ylim(-height, height)
 
 
-def fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> tuple[float, float]:
+def fit_signal_panel(axes: Axes, view: WaveformView, times: tuple[float, float]) -> tuple[float, float]:
     """Scales the signal panel to what is shown, with error bars up to half of its height; returns its limits."""
 
     def inside(time: np.ndarray) -> np.ndarray:
         return (time >= times[0]) & (time <= times[1])
 
     echoes = inside(view.echoes.time)
-    peak, error = find_peaks(view)[echoes], np.nan_to_num(view.echoes.amplitude_err[echoes].astype(np.float64))
+    peak, error = find_echo_heights(view)[echoes], np.nan_to_num(view.echoes.amplitude_err[echoes].astype(np.float64))
     values = [view.samples[inside(view.time)], [view.baseline - view.std, view.baseline + view.std], peak]
     if view.fit is not None:
         values.append(view.fit[inside(view.fine)])

@@ -1,7 +1,7 @@
 """Histograms of a column over clouds of any size, and counts of points per flag.
 
-`wavebatch plot histogram` calls `count_values` or `count_flags` and draws the result with `draw_cloud`. Clouds are read
-twice: for the limits, then for the counts.
+`wavebatch plot histogram` calls `count_values` or `count_points_by_flag` and draws the result with `draw_cloud`. Clouds
+are read twice: for the limits, then for the counts.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ def place_edges(sample: np.ndarray, low: float, high: float, step: float, bins: 
     return np.unique(np.linspace(low, high, number + 1))
 
 
-def count_flags(paths: Sequence[Path], selection: Selection) -> FlagCounts:
+def count_points_by_flag(paths: Sequence[Path], selection: Selection) -> FlagCounts:
     """Counts the points of the clouds per flag. Raises InputError without any point."""
     counts, clean, total = np.zeros(len(EchoFlag), np.int64), 0, Tally()
     clouds = Clouds(paths, selection)

@@ -22,7 +22,7 @@ from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.tools.plots.values import Clouds, Selection, check_statistic
 from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, check_cells
-from wavebatch.tools.rasters.tiles import Placed, compute_tiles, is_inside
+from wavebatch.tools.rasters.tiles import Placed, compute_tiles, is_in_tile
 
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
 """Most cells along a side, and of the raster (300 km x 300 km at 1 m): more is damage of coordinates, clouds of several
@@ -138,7 +138,7 @@ def _find_extent(clouds: Clouds, options: GridOptions) -> tuple[Box, int, np.nda
     low, high, points = np.full(2, np.inf), np.full(2, -np.inf), 0
     largest = np.zeros(1 + len(clouds.other_facts))
     for _, rows, _ in clouds.read_all():
-        rows = rows[is_inside(rows, options.bbox)]
+        rows = rows[is_in_tile(rows, options.bbox)]
         if len(rows):
             places = np.stack([rows["x"], rows["y"]], axis=1)
             low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))

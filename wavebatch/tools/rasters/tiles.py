@@ -61,7 +61,7 @@ def _across(grid: Grid) -> int:
     return -(-grid.columns // TILE)
 
 
-def is_inside(rows: np.ndarray, bounds: Box | None) -> np.ndarray:
+def is_in_tile(rows: np.ndarray, bounds: Box | None) -> np.ndarray:
     """Points with a position within the bounds, bool (n,)."""
     inside = np.isfinite(rows["x"]) & np.isfinite(rows["y"])
     if bounds is not None:
@@ -74,7 +74,7 @@ def _fill(clouds: Clouds, bounds: Box | None, grid: Grid, entries: Spool, result
     """Put every point with a value into the bucket of its tile."""
     counted = np.zeros(1 + len(clouds.other_facts), np.int64)
     for _, rows, left_out in clouds.read_all():
-        inside = is_inside(rows, bounds)
+        inside = is_in_tile(rows, bounds)
         result.points += len(rows) + left_out
         result.left_out += left_out
         row, column, in_grid = grid.place(rows["x"], rows["y"])
