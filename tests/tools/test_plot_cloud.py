@@ -22,9 +22,9 @@ from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots import raster, values
 from wavebatch.tools.plots.histogram import count_points_by_flag, count_values, place_edges
 from wavebatch.tools.plots.raster import grid_values
-from wavebatch.tools.plots.section_data import cut_section
+from wavebatch.tools.plots.sections import cut_section
 from wavebatch.tools.plots.values import Selection, robust_limits
-from wavebatch.tools.rasters import tiles
+from wavebatch.tools.rasters import cells
 
 
 @pytest.fixture(scope="module")
@@ -307,7 +307,7 @@ def test_flags_select_and_are_counted(cloud):
 
 @pytest.mark.parametrize("statistic", ["mean", "median", "min", "max", "count", "density"])
 def test_map_is_that_of_a_loop_over_cells(cloud, monkeypatch, statistic):
-    monkeypatch.setattr(tiles, "HELD", 700)
+    monkeypatch.setattr(cells, "HELD", 700)
     found = grid_values([cloud], Selection("amplitude"), statistic, size=2.5)
     x, y, amplitude, _ = read_plainly(cloud)
     grid = found.grid

@@ -30,7 +30,7 @@ from wavebatch.tools.compare.chains import ChainRun
 from wavebatch.tools.compare.goodness import measure_fit
 from wavebatch.tools.html.strip_views import measure_view_residuals
 from wavebatch.tools.plots.draw_sheet import draw_waveform_sheet
-from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels, draw_waveform_panels
+from wavebatch.tools.plots.draw_waveform import _draw_panels, draw_waveform_panels
 from wavebatch.tools.plots.echo_table import list_echoes
 from wavebatch.tools.plots.packets import MOST, Place, Wanted, find_places
 from wavebatch.tools.plots.waveform import add_ranges, build_views, read_views
@@ -304,21 +304,17 @@ def test_the_signal_is_shown_and_the_whole_on_request(tiny_strip):
     assert len(view.echoes) or view.span == (-0.5, 99.5)
 
 
-def test_error_bars_stay_inside_and_cut_ones_are_marked(tmp_path):
+@pytest.mark.parametrize("error", [20.0, 1e5, 1e30, np.inf, np.nan])
+def test_no_error_bar_presses_the_waveform_into_a_line(tmp_path, error):
     pytest.importorskip("matplotlib")
     block = simulate(PulseShape(), [(100.0, 30.3, 2.0)], n=1)
     (view,) = build_views(block, make_chain("decompose.gaussian"), PULSE, [0])
-    for error, heads in ((20.0, {"_"}), (1e5, {"^", "v"})):
-        table = replace(view.echoes, amplitude_err=np.array([error], np.float32))
-        with open_picture(tmp_path / "e.png", (6, 5), overwrite=True) as figure:
-            panels = _draw_panels(figure, figure.add_gridspec(1, 1)[0], replace(view, echoes=table), view.span,
-                                  small=False, room=5.0)  # fmt: skip
-        low, high = panels[0].get_ylim()
-        lines = [line for line in panels[0].lines if line.get_color() == ECHO]
-        for line in lines:
-            assert low <= np.min(line.get_ydata()) and np.max(line.get_ydata()) <= high
-        assert heads <= {line.get_marker() for line in lines}
-        assert high - low < 400
+    table = replace(view.echoes, amplitude_err=np.array([error], np.float32))
+    with open_picture(tmp_path / "e.png", (6, 5), overwrite=True) as figure:
+        panels = _draw_panels(figure, figure.add_gridspec(1, 1)[0], replace(view, echoes=table), view.span,
+                              small=False, room=5.0)  # fmt: skip
+    low, high = panels[0].get_ylim()
+    assert 100 < high - low < 400
 
 
 def test_echoes_are_listed_and_written(tiny_strip, tmp_path):

@@ -18,7 +18,7 @@ from wavebatch.files.las.geotiff_wkt import build_utm
 from wavebatch.files.las.header import build_wkt
 from wavebatch.files.strip.packet_vectors import DirectionTally, decide_direction
 from wavebatch.tools.html.cloud_pictures import picture_cloud
-from wavebatch.tools.plots.section_data import cut_section, measure_profile
+from wavebatch.tools.plots.sections import cut_section, measure_profile
 from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.simulate import simulate_strip
 

@@ -31,6 +31,9 @@ INK, GREY = "#222222", "#8a8a8a"
 FIT, PULSE, ECHO, VENDOR, CLIPPED = "#0072b2", "#56b4e9", "#d55e00", "#009e73", "#e69f00"
 """Colours of Okabe and Ito, which colour-blind readers can distinguish."""
 
+_LONGEST_BAR = 1e6
+"""Longer error bars leave every panel all the same, and could overflow [ns, DN]."""
+
 _MANY = 150
 """Waveforms with more samples get smaller dots."""
 _LEAST_SCALE = 5.0
@@ -155,7 +158,8 @@ def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, 
     for curve in view.curves:
         axes.fill_between(view.fine, level, level + curve, color=PULSE, alpha=0.15, linewidth=0)
     draw_samples(axes, view, times, dot=(2.4 if small else 3.4) * (1.0 if len(view.time) <= _MANY else 0.6))
-    _draw_errors(axes, view, times, fit_signal_panel(axes, view, times))
+    _draw_errors(axes, view, times)
+    fit_signal_panel(axes, view, times)
 
 
 def draw_samples(
@@ -196,25 +200,15 @@ def find_echo_heights(view: WaveformView) -> np.ndarray:
     return level + view.echoes.amplitude.astype(np.float64)
 
 
-def _draw_errors(axes: Axes, view: WaveformView, times: tuple[float, float], heights: tuple[float, float]) -> None:
-    """Draws the echoes with error bars; a bar that would leave the panel ends at its edge with an arrowhead."""
-    time, peak = view.echoes.time.astype(np.float64), find_echo_heights(view)
-    shown = (time >= times[0]) & (time <= times[1])
-    axes.plot(time[shown], peak[shown], "D", markersize=4, markerfacecolor="none", color=ECHO, zorder=4, label="echoes")
-    errors = [np.nan_to_num(error.astype(np.float64)) for error in (view.echoes.time_err, view.echoes.amplitude_err)]
-    for place, fixed, error, (low, high), heads in (
-        (time, peak, errors[0], times, ("<", ">")), (peak, time, errors[1], heights, ("v", "^")),
-    ):  # fmt: skip
-        for row in np.flatnonzero(shown & (error > 0)):
-            ends = np.clip([place[row] - error[row], place[row] + error[row]], low, high)
-            along, across = ends, np.full(2, fixed[row])
-            flat = heads[0] == "<"
-            axes.plot(*((along, across) if flat else (across, along)), color=ECHO, linewidth=1.2, zorder=4)
-            for end, sign, head in zip(ends, (-1, 1), heads, strict=True):
-                cut = sign * (place[row] + sign * error[row] - end) > 1e-9 * max(abs(end), 1.0)
-                mark = head if cut else "|" if flat else "_"
-                at = (end, fixed[row]) if flat else (fixed[row], end)
-                axes.plot(*at, marker=mark, color=ECHO, markersize=4, zorder=4, clip_on=False)
+def _draw_errors(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
+    """Draws the echoes with error bars."""
+    shown = (view.echoes.time >= times[0]) & (view.echoes.time <= times[1])
+    time, amplitude = (
+        np.minimum(np.nan_to_num(error[shown].astype(np.float64)), _LONGEST_BAR)
+        for error in (view.echoes.time_err, view.echoes.amplitude_err)
+    )
+    axes.errorbar(view.echoes.time[shown].astype(np.float64), find_echo_heights(view)[shown], yerr=amplitude, xerr=time,
+                  fmt="D", markersize=4, markerfacecolor="none", color=ECHO, capsize=2, zorder=4, label="echoes")
 
 
 def _number_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:
@@ -274,8 +268,8 @@ def _draw_residual(axes: Axes, view: WaveformView, times: tuple[float, float]) -
     axes.set_ylim(-height, height)
 
 
-def fit_signal_panel(axes: Axes, view: WaveformView, times: tuple[float, float]) -> tuple[float, float]:
-    """Scales the signal panel to what is shown, with error bars up to half of its height; returns its limits."""
+def fit_signal_panel(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
+    """Scales the signal panel to what is shown, with error bars up to half of its height."""
 
     def inside(time: np.ndarray) -> np.ndarray:
         return (time >= times[0]) & (time <= times[1])
@@ -290,9 +284,7 @@ def fit_signal_panel(axes: Axes, view: WaveformView, times: tuple[float, float])
     room = _ERROR_ROOM * (high - low)
     low = min(low, float((peak - np.minimum(error, room)).min(initial=low)))
     high = max(high, float((peak + np.minimum(error, room)).max(initial=high)), low + 6 * view.std)
-    limits = low - 0.05 * (high - low), high + 0.17 * (high - low)
-    axes.set_ylim(limits)
-    return limits
+    axes.set_ylim(low - 0.05 * (high - low), high + 0.17 * (high - low))
 
 
 def _place_legend(figure: Figure, width: float) -> None:
