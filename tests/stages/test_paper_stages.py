@@ -215,7 +215,7 @@ def test_the_printed_formula_has_the_skew_of_its_origin(origin, low, high):
     if origin == "waveform":
         np.testing.assert_allclose(skew, found.sigma / (found.time + 1.0), rtol=1e-4)
     for refused in ("pulse_deviation", "incidence_angle"):
-        with pytest.raises(ConfigError, match="of its own|skew per echo"):
+        with pytest.raises(ConfigError, match="fits another shape|skew per echo"):
             parse_chain(chain_text("log_normal", "[[chain]]", 'stage = "attribute.position"', "[[chain]]",
                                    f'stage = "attribute.{refused}"'), "c")  # fmt: skip
 

@@ -233,7 +233,7 @@ def _name_stranger(prepared: Prepared) -> tuple[str, ...]:
     """The line about a strip that does not belong to its flight."""
     if not prepared.stranger:
         return ()
-    return (f"does not belong to the flight that was surveyed: {prepared.stranger}; it got a survey of its own",)
+    return (f"does not belong to the flight that was surveyed: {prepared.stranger}; it was surveyed alone",)
 
 
 def _close_scan(future: Future) -> None:

@@ -77,7 +77,7 @@ def _call_in_time(seconds: float, function: Callable) -> Any:
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Silence dask's own messages on stderr: wavebatch reports the same in one line."""
+    """Silence dask's messages on stderr: wavebatch reports the same in one line."""
     import dask
     import distributed  # noqa: F401 - creates the loggers that are silenced below
 

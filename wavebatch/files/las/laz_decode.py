@@ -24,7 +24,7 @@ MAX_CHUNKS = 2_000_000
 """Most chunks of a file: 10^11 points in chunks of 50,000, the usual size."""
 MAX_CHUNK_POINTS = 5_000_000
 MAX_CHUNK_BYTES = 1 << 28
-"""Largest chunk: it is held in memory, compressed and decompressed."""
+"""Largest chunk: it is kept in memory, compressed and decompressed."""
 MAX_POINTS_PER_BYTE = 1000
 """More points per byte of file than any compression reaches; real files have fewer than one."""
 _PIECE = 50_000

@@ -1,6 +1,6 @@
 """How well chains find the simulated echoes: groups of waveforms with their truth, and the figures over all groups.
 
-`command` and `stability` make groups and add what a chain found to a Tally. Each group has its own seed and survey,
+`command` and `stability` make groups and add what a chain found to AccuracyTally. Each group has one seed and survey,
 because the survey of a strip is a source of error too.
 """
 
@@ -27,7 +27,7 @@ GROSS = 10.0
 """Errors above this many bounds are gross: they are counted, but left out of error/bound."""
 
 GROUPS = 8
-"""Groups of a scene; each has its own survey, like the strips of a project."""
+"""Groups of a scene; each has one survey, like the strips of a project."""
 
 CM_PER_NS = 100 * HALF_C
 
@@ -68,7 +68,7 @@ def derive_seed(*numbers: int) -> int:
 def make_groups(
     scene: Scene, waveforms: int, seed: int, progress: Callable[[str], None] = lambda text: None
 ) -> list[Group]:
-    """`waveforms` waveforms of the scene in GROUPS groups, each with its own seed and survey."""
+    """`waveforms` waveforms of the scene in GROUPS groups, each with another seed and survey."""
     size = max(waveforms // GROUPS, 1)
     groups = []
     for place in range(GROUPS):
