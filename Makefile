@@ -8,6 +8,7 @@
 #                  either, as --pulses or --scene: BENCH_OPTIONS="--scene open" (tests/bench/against.py, release.py)
 #   make dist      wheels for Linux, macOS and Windows and the source distribution, in dist/: zig compiles for all
 #   make figures   what README and docs print, made anew by their commands
+#   make bench-real STRIP=...              echoes injected into the waveforms of real strips: what is found, in bench
 #   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
 #   make attack    signals to running commands and their workers at random instants, RUNS=1000 SEED=1
@@ -23,7 +24,7 @@ MINUTES ?= 10
 RUNS   ?= 1000
 SEED   ?= 1
 
-.PHONY: demo test slow test-all readers papers bench fuzz attack docs dist figures man lint clean
+.PHONY: demo test slow test-all readers papers bench bench-real fuzz attack docs dist figures man lint clean
 .DELETE_ON_ERROR:
 # Without cached bytecode every process compiles all of its modules anew: a second each.
 unexport PYTHONDONTWRITEBYTECODE
@@ -91,6 +92,9 @@ else
 	-@$(BIN)/python -c 'import gdecomp' 2>/dev/null || $(BIN)/python -m pip install --quiet gdecomp
 	PYTHONPATH=tests $(BIN)/python -m bench.release -o $(BENCH) $(BENCH_OPTIONS)
 endif
+
+bench-real: $(VENV)/.plot $(VENV)/.test
+	PYTHONPATH=tests $(BIN)/python -m bench.real $(STRIP) -o $(BENCH) --seed $(SEED)
 
 fuzz: $(VENV)/.test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/fuzzing.py --minutes $(MINUTES) --seed $(SEED)

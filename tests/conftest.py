@@ -1,9 +1,7 @@
 """What many tests need: a seeded generator, the real files, tiny strips."""
 
 import fnmatch
-import importlib
 import os
-import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +13,6 @@ from bench_tools import time_here
 from child_signals import give_children_default_signals
 from hypothesis import HealthCheck, settings
 
-from wavebatch.stages.chain import STAGES
 from wavebatch.tools.simulate import simulate_strip
 
 give_children_default_signals()
@@ -63,17 +60,6 @@ def pytest_runtest_setup(item):
 def rng():
     """The same random numbers in every run."""
     return np.random.default_rng(20261121)
-
-
-@pytest.fixture
-def paper_stages():
-    """The plug-in of examples/papers, for one test: other tests list the stages of wavebatch alone."""
-    before = dict(STAGES)
-    yield importlib.import_module("paper_stages")
-    STAGES.clear()
-    STAGES.update(before)
-    for name in [name for name in sys.modules if name.partition(".")[0] == "paper_stages"]:
-        del sys.modules[name]
 
 
 @pytest.fixture(scope="session")

@@ -65,8 +65,6 @@ stats {input} --where "echo_width > 4 and not amplitude < 20"
 compare {input} {base}/strip.las
 compare {base}/cloud.laz {input} --json
 compare {input} --truth {base}/truth.npz
-compare {input} {base}/cloud.laz --overlap
-compare {input} --angles
 synthesize {input} -o {out}/a.las -q
 synthesize {input} -o {out}/a.las --intensity reflectance --sensor-height 900 -q
 check {input}
@@ -94,7 +92,6 @@ _CARRIED = """
 grid {input} --column Energy --column Deviation --statistic mean --size 5 -o {out}/a.tif
 stats {input} --polygon {base}/polygons.geojson --where "Energy > 1 or Deviation < 3"
 compare {input} {base}/carried.las
-compare {input} --angles
 info {input} -v --json
 synthesize {input} -o {out}/a.las -q
 plot map {input} --column Deviation -o {out}/a.png

@@ -23,7 +23,7 @@ def simulate(shape, echoes, *, n=20, s=80, seed=1, top=255):
 
 def make_chain(decomposer, **parameters):
     attributes = [STAGES[f"attribute.{name}"] for name in ("amplitude", "echo_width")]
-    detector = "detect.asdf" if decomposer == "decompose.asdf_only" else "detect.maximum"
+    detector = "detect.asdf" if decomposer.startswith("decompose.asdf") else "detect.maximum"
     steps = [Step(STAGES["noise.pooled"]), Step(STAGES[detector]), Step(STAGES[decomposer], parameters)]
     return Chain((*steps, *map(Step, attributes)), "test")
 

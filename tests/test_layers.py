@@ -132,7 +132,7 @@ def test_kernels_know_arrays_only():
 
 def test_only_io_knows_laspy():
     for path in MODULES:
-        if _outside(path) & {"laspy", "lazrs", "laszip"}:
+        if _outside(path) & {"laspy", "lazrs"}:
             assert _part(path) == "files", path
 
 
@@ -142,13 +142,9 @@ def test_only_batch_knows_executors():
             assert _part(path) == "batch", path
 
 
-SCRIPTS = {ROOT / "files" / "las" / "laszip_child.py"}
-"""Run as processes of their own, so that they have an exit code."""
-
-
 def test_only_the_command_line_knows_click_prints_or_exits():
     for path in MODULES:
-        if _part(path) in {"cli", "__main__"} or path in SCRIPTS:
+        if _part(path) in {"cli", "__main__"}:
             continue
         assert not _outside(path) & {"click", "tqdm"}, path
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -159,7 +155,7 @@ def test_only_the_command_line_knows_click_prints_or_exits():
 
 
 def test_no_other_dependency_at_run_time():
-    allowed = {"laspy", "lazrs", "laszip", "numpy", "scipy", "click", "tqdm", "wavebatch"}
+    allowed = {"laspy", "lazrs", "numpy", "scipy", "click", "tqdm", "wavebatch"}
     import sys
 
     for path in MODULES:

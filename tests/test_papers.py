@@ -26,7 +26,7 @@ SCRIPTS = sorted(path.stem for path in FOLDER.glob("s?_*.py"))
 
 
 @pytest.fixture
-def load(monkeypatch, paper_stages):
+def load(monkeypatch):
     """`load(name)`: a module of the examples."""
     monkeypatch.syspath_prepend(str(FOLDER))
     return importlib.import_module
@@ -230,7 +230,7 @@ def drop_from_section(monkeypatch, load):
 
 def forget_the_skew(monkeypatch, load):
     monkeypatch.setattr(skew, "system_skew", lambda system: 0.0)
-    monkeypatch.setattr(skew, "fit_skewed", lambda system, _: replace(system, components=(), kappa=0.0))
+    monkeypatch.setattr(skew, "skew_system", lambda system, _: replace(system, components=(), kappa=0.0))
     return load("s1_wang").table_of_estimates(600, 0)
 
 

@@ -69,7 +69,6 @@ MADE_BEFORE = {
 }
 """Files that a line reads, and what makes them."""
 ELSEWHERE = (
-    "wavebatch bench --real 100429_152240_2535pt_UTM.las simple1_3_full_internal.las -o real",
     "wavebatch plot waveform 100429_152240_2535pt_UTM.las --random 64 --seed 1 --sheet -o sheet.png",
     "wavebatch calibrate strips/*.laz --targets targets.csv -o cal.toml --report cal.json --html cal.html",
 )

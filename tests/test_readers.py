@@ -21,7 +21,7 @@ from click.testing import CliRunner
 import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.core.echoes import COLUMNS
-from wavebatch.files.cloud.column_names import name_columns
+from wavebatch.files.cloud.column_names import style_columns
 from wavebatch.files.las.header import read_header
 
 SCRIPTS = Path(__file__).parent / "readers"
@@ -163,10 +163,10 @@ def test_no_column_of_ours_has_a_name_that_pdal_joins_with_another():
     """PDAL joins names that differ in case only, and turns signs into `_`: `echo width` would be `echo_width`."""
     taken = {name.lower() for name in like_pdal.FIELDS}
     for style in STYLES:
-        fixed = [_fix(one.record.name).lower() for one in name_columns(list(COLUMNS), style, [])]
+        fixed = [_fix(one.record.name).lower() for one in style_columns(list(COLUMNS), style, [])]
         assert len(set(fixed)) == len(fixed) > 20 and not taken & set(fixed), style
     vendor = ["echo width", "Echo-Width2", "ECHO_WIDTH_ERR", "amplitude.err", "range/err", "wb_echo width"]
-    written = name_columns(["echo_width", "echo_width_err", "amplitude_err", "range_err"], "wavebatch", vendor)
+    written = style_columns(["echo_width", "echo_width_err", "amplitude_err", "range_err"], "wavebatch", vendor)
     fixed = [_fix(one.record.name).lower() for one in written]
     assert fixed == ["wb2_echo_width", "wb_echo_width_err", "wb_amplitude_err", "wb_range_err"]
     assert not set(fixed) & {_fix(name).lower() for name in vendor}

@@ -100,9 +100,10 @@ PAPERS = (
                 "plot section out/village.laz --column echo_width --line 500006,5399890,500006,5400110 --width 3"),
         Picture("Which width means which angle, and how sure that is.",
                 "survey village.laz --divergence 1.1", "--angles"),
-        Picture("Angles on the roofs, from widths and from the normals of surfaces, with means; roofs of 60 degrees "
-                "give few normals.", "plot histogram out/village.laz --column incidence_angle --column "
-                "incidence_angle_normals --where 'z > 123.5'"),
+        Picture("Angles on the roofs from widths, with their mean.",
+                "plot histogram out/village.laz --column incidence_angle --where 'z > 123.5'"),
+        Picture("The same from the normals of surfaces; roofs of 60 degrees give few.",
+                "plot histogram out/village.laz --column incidence_angle_normals --where 'z > 123.5'"),
     )),
     Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2, 4, 6, 7", (
         Picture("Figures 1 and 2: a pulse with four returns, and the waveform that `synthesize` models from them.",

@@ -14,8 +14,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
-from paper_stages.classic import sustained_threshold
-from paper_stages.gauss_newton import gauss_newton
 from published import PULSE_SIGMA, paint_slice
 from table import Table, main, scatter
 
@@ -26,6 +24,8 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
 from wavebatch.kernels.fit.problem import Settings
+from wavebatch.stages.decompose.fit import gauss_newton
+from wavebatch.stages.detect.classic import sustained_threshold
 from wavebatch.stages.detect.maximum import matched_filter
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import GROUND

@@ -29,7 +29,7 @@ from wavebatch.kernels.geometry.normals import Gap
 from wavebatch.stages.chain import STAGES, Stage, Step
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.geometry import START_TIME, Flight, trace_rays
+from wavebatch.tools.simulate.geometry import START_TIME, FlightLine, trace_rays
 
 STAGE = "attribute.incidence_angle_normals"
 COLUMNS = ["incidence_angle_normals", "incidence_angle_normals_err"]
@@ -66,7 +66,8 @@ def clouds(strips, tmp_path_factory):
 def test_angles_of_known_surfaces(clouds, scene, terrain):
     folder, reports = clouds
     cloud = laspy.read(folder / f"{scene}.laz")
-    rays = trace_rays(Flight(), terrain, np.rint((np.asarray(cloud.gps_time) - START_TIME) * Flight().pulse_rate))
+    line = FlightLine()
+    rays = trace_rays(line, terrain, np.rint((np.asarray(cloud.gps_time) - START_TIME) * line.pulse_rate))
     angle, error = (np.asarray(cloud[name], np.float64) for name in COLUMNS)
     known = angle != -9999
     np.testing.assert_array_equal(known, error != -9999)
@@ -88,7 +89,8 @@ def test_plants_are_no_surface(tmp_path):
     simulate_strip("forest", tmp_path / "s.las", pulses=16_000, seed=2)
     run_strip(tmp_path / "s.las", tmp_path / "out")
     cloud = laspy.read(tmp_path / "out" / "s.laz")
-    rays = trace_rays(Flight(), "hills", np.rint((np.asarray(cloud.gps_time) - START_TIME) * Flight().pulse_rate))
+    line = FlightLine()
+    rays = trace_rays(line, "hills", np.rint((np.asarray(cloud.gps_time) - START_TIME) * line.pulse_rate))
     above = np.linalg.norm(np.asarray(cloud.xyz) - rays.ground, axis=1)
     known = np.asarray(cloud[COLUMNS[0]]) != -9999
     assert known[above < 0.2].mean() > 0.4

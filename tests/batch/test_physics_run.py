@@ -21,7 +21,7 @@ from wavebatch.surveying.calibration import (
     with_physics,
 )
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.geometry import START_TIME, Flight, trace_rays
+from wavebatch.tools.simulate.geometry import START_TIME, FlightLine, trace_rays
 
 FOUND = Calibration(2.6e-8, 0.02, 0.3, 1.1, "strip.laz", "2026-11-21", "said by a test")
 
@@ -124,7 +124,7 @@ def test_a_beam_that_tells_no_angle_is_told_in_words_and_numbers(tmp_path):
 
 def write_trajectory(path):
     time = START_TIME + np.arange(-1.0, 2.0, 0.05)
-    rays = trace_rays(Flight(), "flat", (time - START_TIME) * Flight().pulse_rate)
+    rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * FlightLine().pulse_rate)
     sensor = rays.ground - rays.direction / HALF_C / 0.9997 * rays.distance[:, None]
     rows = np.column_stack([time, sensor])
     path.write_text("time,x,y,z\n" + "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows))
@@ -304,7 +304,7 @@ def test_chains_get_what_is_known_and_nothing_twice():
 @pytest.mark.parametrize(("first", "last", "share"), [(-1.0, 0.25, 55), (0.1, 3.0, 18), (-1.0, 0.7, 0)])
 def test_a_trajectory_that_does_not_cover_the_strip_is_told_with_counts(tmp_path, wide_strip, first, last, share):
     time = START_TIME + np.arange(first, last + 1e-9, 0.0005)
-    rays = trace_rays(Flight(), "flat", (time - START_TIME) * Flight().pulse_rate)
+    rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * FlightLine().pulse_rate)
     sensor = rays.ground - rays.direction / HALF_C / 0.9997 * rays.distance[:, None]
     rows = np.column_stack([time, sensor])
     lines = [",".join(map(repr, row)) for row in rows.tolist()]

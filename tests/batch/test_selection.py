@@ -283,7 +283,7 @@ def test_api_refuses_a_wrong_condition(riegl, tmp_path):
 def test_the_workers_of_a_cluster_need_not_see_the_polygons(tiny_strip, tmp_path, monkeypatch):
     """They are read before anything starts, and may lie on this machine alone; files of the work must be there."""
 
-    def refuse(address, folder, files, tell):
+    def refuse(address, folder, files):
         seen.extend(files)
         raise ConfigError("stop")
 

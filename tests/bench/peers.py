@@ -23,10 +23,10 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled
-from wavebatch.tools.bench.accuracy import Group, Tally
+from wavebatch.tools.bench.accuracy import AccuracyTally, Group
 from wavebatch.tools.bench.command import make_row
 from wavebatch.tools.bench.speed import Laps
-from wavebatch.tools.bench.worker import Worker, WorkerDied
+from wavebatch.tools.bench.worker import BenchWorkerDied, Worker
 from wavebatch.tools.simulate import Scene
 
 PEER_GROUPS = 6
@@ -66,7 +66,7 @@ def measure_peers(
     rows = []
     for name in list_peers():
         progress(f"{scene.name}: {name} on {n * len(parts)} waveforms")
-        tally, times, failures = Tally(), [], 0
+        tally, times, failures = AccuracyTally(), [], 0
         for part in parts:
             result = run_peer(name, part.block, part.system)
             tally.add(part, result.found)
@@ -171,7 +171,7 @@ def _drive_gdecomp(signal: Path, results: Path, n: int, height: float) -> int:
             try:
                 _wait(call, results, place)
                 break
-            except WorkerDied:
+            except BenchWorkerDied:
                 pass
         done = np.load(results, mmap_mode="r")[place:, 0]
         place += int(np.argmax(np.isnan(done))) + 1 if np.isnan(done).any() else n
@@ -189,7 +189,7 @@ def _wait(call: Future, results: Path, place: int) -> None:
         except TimeoutError:
             now = int(np.isfinite(np.load(results, mmap_mode="r")[place:, 0]).sum())
             if now == before:
-                raise WorkerDied("no progress") from None
+                raise BenchWorkerDied("no progress") from None
             before = now
 
 

@@ -19,7 +19,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import Survey, survey_block
-from wavebatch.tools.bench.accuracy import Group, Tally, derive_seed, describe_found, make_group
+from wavebatch.tools.bench.accuracy import AccuracyTally, Group, derive_seed, describe_found, make_group
 from wavebatch.tools.bench.chains import AUTO, find_twin
 from wavebatch.tools.simulate import Recording, Scene, find_scene, simulate_blocks
 from wavebatch.tools.simulate.draws import LogUniform, Mixture
@@ -106,7 +106,7 @@ def _make_case(case: Case, survey: Survey, n: int, seed: int, place: int) -> Gro
 
 
 def _measure(chains: list[Chain], groups: list[Group]) -> dict[str, Any]:
-    tally = Tally()
+    tally = AccuracyTally()
     flags = {flag.name: 0 for flag in EchoFlag}
     failures = dict.fromkeys(FAILURES, 0)
     echoes = 0

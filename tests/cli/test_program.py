@@ -77,7 +77,7 @@ def test_run_has_the_options_of_runoptions_and_python_the_same():
     keywords = inspect.signature(wb.run).parameters
     for name, one in OPTIONS.items():
         assert max(names[name].opts, key=len) == f"--{name.replace('_', '-')}"
-        assert name in keywords and names[name].help.startswith(one.told.help.split("  [")[0])
+        assert name in keywords and names[name].help.startswith(one.words.help.split("  [")[0])
         if name != "output":
             assert f"{name} : " in wb.run.__doc__ and keywords[name].default == getattr(RunOptions(), name)
     extra = {"strips", "dry_run", "fail_on", "report", "html_file", "progress", "verbose", "as_json", "quiet",

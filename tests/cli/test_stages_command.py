@@ -23,7 +23,10 @@ def test_the_list_has_every_stage_with_its_summary():
         assert any(line.split()[0] == stage.name and stage.summary in line for line in lines)
 
 
-PARTNERS = {"decompose.asdf_only": {"detect": "detect.asdf"}, "attribute.skew": {"decompose": "decompose.skewed"}}
+PARTNERS = {
+    "decompose.asdf_only": {"detect": "detect.asdf"}, "decompose.asdf_mixed": {"detect": "detect.asdf"},
+    "attribute.skew": {"decompose": "decompose.skewed"},
+}  # fmt: skip
 """Stages that refuse a chain without another one; their texts say which."""
 MORE = {"attribute.skew": {"decompose": 'kappa = "free"\n'}}
 """Parameters that it must have."""

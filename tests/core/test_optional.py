@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 
 def test_versions_are_those_of_the_package():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    wanted = {line for name in ("plot", "gis", "cluster", "laszip") for line in extras[name]}
+    wanted = {line for name in ("plot", "gis", "cluster") for line in extras[name]}
     wanted |= {line for line in extras["test"] if line.startswith("pandas")}  # only to_frame() uses it
     assert set(PACKAGES.values()) == wanted
     assert all(re.split(r"[>=]", line)[0] == name for name, line in PACKAGES.items())

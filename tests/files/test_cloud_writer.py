@@ -30,7 +30,6 @@ from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.publish import remove_stale
-from wavebatch.files.las import laz_encode
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, read_header
 from wavebatch.tools.api.cloud import read_cloud
@@ -499,22 +498,12 @@ def multi_channel(path):
     return points
 
 
-def test_several_scanner_channels_go_through_laszip(tmp_path):
-    points = multi_channel(tmp_path / "a.las")
-    layout = plan_output(tmp_path / "a.las", COLUMNS, packets=facts_of(tmp_path / "a.las"))
-    rows = make_rows(layout, points)
-    write(layout, tmp_path / "out.laz", rows)
-    for backend in BACKENDS:
-        assert read_raw(tmp_path / "out.laz", backend).tobytes() == rows.tobytes()
-
-
-def test_several_scanner_channels_are_refused_without_laszip(tmp_path, monkeypatch):
-    monkeypatch.setattr(laz_encode, "laszip", None)
+def test_several_scanner_channels_with_packets_are_refused_as_laz(tmp_path):
     points = multi_channel(tmp_path / "a.las")
     layout = plan_output(tmp_path / "a.las", [], packets=facts_of(tmp_path / "a.las"))
     rows = layout.rows(points)
     with (
-        pytest.raises(InputError, match=r"out.laz: points of several scanner channels .* pip install 'laszip>=0.3'"),
+        pytest.raises(InputError, match=r"out.laz: points of several scanner channels .*; write LAS"),
         CloudWriter(layout, tmp_path / "out.laz", provenance={}) as cloud,
     ):
         cloud.write(rows)
@@ -671,14 +660,6 @@ def test_more_points_than_an_old_header_counts(tmp_path):
         cloud._statistics.count = 2**32 - 100
         with pytest.raises(InputError, match="LAS 1.3 holds at most 4294967295 points; use --las-version 1.4"):
             cloud.write(layout.rows(points))
-
-
-def test_laszip_is_optional():
-    code = (
-        "import sys; sys.modules['laszip'] = None; import wavebatch.files.las.laz_encode as module; "
-        "assert module.laszip is None"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[2])
 
 
 def test_every_format_and_suffix_in_hand_made_combinations(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.column_names import _SHORT as SHORT
-from wavebatch.files.cloud.column_names import STYLES, describe, describe_roundings, name_columns, normalise, resolve
+from wavebatch.files.cloud.column_names import STYLES, describe, describe_roundings, normalise, resolve, style_columns
 
 ALL = tuple(COLUMNS)
 WRITTEN = tuple(name for name, column in COLUMNS.items() if column.extra_bytes)
@@ -15,7 +15,7 @@ NUMBERS = tuple(name for name in WRITTEN if name != "echo_flags")
 
 @pytest.mark.parametrize("style", STYLES)
 def test_every_style_writes_every_column_under_a_name_of_its_own(style):
-    columns = name_columns(ALL, style, ())
+    columns = style_columns(ALL, style, ())
     assert tuple(column.column for column in columns) == WRITTEN
     names = [column.record.name for column in columns]
     assert len({normalise(name) for name in names}) == len(names)
@@ -38,13 +38,13 @@ def test_styles_name_columns_that_exist(style):
 
 @pytest.mark.parametrize("taken", ["Amplitude", "AMPLITUDE", "amplitude"])
 def test_the_inputs_name_stays_and_ours_gets_a_prefix(taken):
-    (column,) = name_columns(["amplitude"], "wavebatch", [taken])
+    (column,) = style_columns(["amplitude"], "wavebatch", [taken])
     assert column.record.name == "wb_amplitude"
 
 
 def test_collisions_with_prefixed_names_separators_and_standard_fields():
     def named(columns, style, taken):
-        return [column.record.name for column in name_columns(columns, style, taken)]
+        return [column.record.name for column in style_columns(columns, style, taken)]
 
     assert named(["amplitude"], "wavebatch", ["Amplitude", "wb_amplitude"]) == ["wb2_amplitude"]
     assert named(["echo_width"], "wavebatch", ["Echo Width"]) == ["wb_echo_width"]
@@ -58,14 +58,14 @@ def test_collisions_with_prefixed_names_separators_and_standard_fields():
 def test_names_with_a_prefix_are_identifiers():
     """PDAL takes only identifiers in its expressions."""
     for style in STYLES:
-        taken = [column.record.name for column in name_columns(list(COLUMNS), style, [])]
-        again = [column.record.name for column in name_columns(list(COLUMNS), style, taken)]
+        taken = [column.record.name for column in style_columns(list(COLUMNS), style, [])]
+        again = [column.record.name for column in style_columns(list(COLUMNS), style, taken)]
         assert all(name.isidentifier() and name.startswith("wb_") for name in again), again
 
 
 def test_no_data_of_floating_point_columns_can_be_nan():
     plain, nan = (
-        {column.column: column.record for column in name_columns(list(COLUMNS), "asprs", [], no_data)}
+        {column.column: column.record for column in style_columns(list(COLUMNS), "asprs", [], no_data)}
         for no_data in ("-9999", "nan")
     )
     for name, record in plain.items():
@@ -74,33 +74,33 @@ def test_no_data_of_floating_point_columns_can_be_nan():
         else:
             assert record == nan[name]
     with pytest.raises(ConfigError, match="no_data '0': must be one of -9999, nan"):
-        name_columns(["amplitude"], "wavebatch", [], "0")
+        style_columns(["amplitude"], "wavebatch", [], "0")
 
 
 def test_styles_that_round_say_so_with_step_and_limits():
-    (line,) = describe_roundings(name_columns(list(COLUMNS), "asprs", []))
+    (line,) = describe_roundings(style_columns(list(COLUMNS), "asprs", []))
     assert line.startswith("echo_width: written as 'pulse width', rounded to 0.1 ns and kept within 0 to 6553.5 ns")
-    assert [line.split(":")[0] for line in describe_roundings(name_columns(list(COLUMNS), "riegl", []))] == [
+    assert [line.split(":")[0] for line in describe_roundings(style_columns(list(COLUMNS), "riegl", []))] == [
         "echo_width",
         "reflectance",
     ]
     for style in ("wavebatch", "pdal", "opals"):
-        assert describe_roundings(name_columns(list(COLUMNS), style, [])) == []
+        assert describe_roundings(style_columns(list(COLUMNS), style, [])) == []
 
 
 def test_unknown_names_are_one_line():
     with pytest.raises(ConfigError, match="column 'amplitud' does not exist; did you mean 'amplitude'"):
-        name_columns(["amplitud"], "wavebatch", ())
+        style_columns(["amplitud"], "wavebatch", ())
     with pytest.raises(ConfigError, match="column 'qqq' does not exist; known are amplitude, "):
-        name_columns(["qqq"], "wavebatch", ())
+        style_columns(["qqq"], "wavebatch", ())
     with pytest.raises(ConfigError, match="names 'x': must be one of wavebatch, asprs"):
-        name_columns([], "x", ())
+        style_columns([], "x", ())
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_stored_values_times_scale_are_the_values(style):
     values = np.array([0.4, 4.449, 62.3, 99.99])
-    for column in name_columns(NUMBERS, style, ()):
+    for column in style_columns(NUMBERS, style, ()):
         stored = column.encode(values.astype(COLUMNS[column.column].dtype)).astype(float)
         scale = column.naming.scale or 1.0
         expected = 10 * np.log10(values) if column.naming.decibel else values
@@ -110,7 +110,7 @@ def test_stored_values_times_scale_are_the_values(style):
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("name", NUMBERS)
 def test_what_is_no_number_becomes_the_declared_no_data(style, name):
-    (column,) = name_columns([name], style, ())
+    (column,) = style_columns([name], style, ())
     empty = column.record.no_data
     assert empty is not None
     stored = column.encode(np.array([np.nan, np.inf, -np.inf, 5.0]))
@@ -118,18 +118,18 @@ def test_what_is_no_number_becomes_the_declared_no_data(style, name):
 
 
 def test_values_beyond_the_stored_type_become_its_nearest_value_never_no_data():
-    (width,) = name_columns(["echo_width"], "asprs", ())
+    (width,) = style_columns(["echo_width"], "asprs", ())
     assert list(width.encode(np.array([0.0, 0.01, 1e9, np.nan]))) == [1, 1, 65535, 0]
-    (reflectance,) = name_columns(["reflectance"], "riegl", ())
+    (reflectance,) = style_columns(["reflectance"], "riegl", ())
     assert list(reflectance.encode(np.array([1.0, 0.1, 1e-300, 1e300, 0.0, -1.0]))) == [
         0, -1000, -32767, 32767, -32768, -32768,
     ]  # fmt: skip
-    (amplitude,) = name_columns(["amplitude"], "wavebatch", ())
+    (amplitude,) = style_columns(["amplitude"], "wavebatch", ())
     assert list(amplitude.encode(np.array([1e300, 1.0]))) == [-9999.0, 1.0]
 
 
 def test_flags_keep_their_bits():
-    (flags,) = name_columns(["echo_flags"], "wavebatch", ())
+    (flags,) = style_columns(["echo_flags"], "wavebatch", ())
     assert flags.record.no_data is None
     assert list(flags.encode(np.array([0, 1, 65535], np.uint16))) == [0, 1, 65535]
 

@@ -21,7 +21,7 @@ from wavebatch.files.strip.ray_sample import measure_scale
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.basic import position
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.geometry import Flight
+from wavebatch.tools.simulate.geometry import FlightLine
 from wavebatch.tools.simulate.strip import WKT
 
 US = 1200 / 3937
@@ -244,7 +244,7 @@ def in_feet(source, target):
 
 @pytest.mark.parametrize("scene", ["urban", "flat"])
 def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
-    simulate_strip(scene, tmp_path / "m.las", pulses=30_000, seed=3, flight=Flight(pulse_rate=50_000))
+    simulate_strip(scene, tmp_path / "m.las", pulses=30_000, seed=3, flight=FlightLine(pulse_rate=50_000))
     feet = in_feet(tmp_path / "m.las", tmp_path / "feet.las")
     chain = tmp_path / "chain.toml"
     stages = ("noise.pooled", "detect.maximum", "decompose.closed_form", "attribute.position", "attribute.range")

@@ -1,83 +1,31 @@
-"""The plug-in of examples/papers: its detectors and decomposers, and that wavebatch finds it by its entry point."""
-
-import os
-import subprocess
-import sys
-from pathlib import Path
+"""Detectors and decomposers that reproduce what the papers compare with."""
 
 import naive
 import numpy as np
 import pytest
-from contract_tools import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
+from contract_tools import assert_same
 from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from published import PULSE_SIGMA as SIGMA
 
-from wavebatch import surveying
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.signal.runs import find_runs
+from wavebatch.kernels.signal.filters import filter_antisymmetric, slope_taps
+from wavebatch.kernels.signal.runs import find_runs, run_moments
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.stages.decompose.rebuild import rebuild_waveforms
 
-PAPERS = Path(__file__).resolve().parent.parent.parent / "examples" / "papers"
 SYSTEM = known_system(fine_recording(1.0, SIGMA))
-pytestmark = pytest.mark.usefixtures("paper_stages")
 
-METHODS = [
+DETECTORS = [
     ("detect.sustained_threshold", {}),
     ("detect.center_of_gravity", {}),
     ("detect.zero_crossing", {}),
     ("detect.zero_crossing", {"derivative": "second"}),
-    ("decompose.asdf_mixed", {}),
-    ("decompose.gauss_newton", {}),
-    ("decompose.log_normal", {}),
-    ("decompose.log_normal", {"origin": "waveform"}),
 ]
-
-
-def call(name, parameters, block, system):
-    noise, candidates, _ = inputs(block, system)
-    given = (candidates,) if name.startswith("decompose") else ()
-    return STAGES[name].function(block, noise, system, *given, **parameters)
-
-
-@pytest.mark.parametrize(("name", "parameters"), METHODS)
-def test_stages_keep_the_contract_on_any_waveforms(name, parameters):
-    for s in (1, 40):
-        for system in ("gaussian", "short"):
-            for samples in waveforms(s).values():
-                block = make_block(samples)
-                table = call(name, parameters, block, SYSTEMS[system])
-                check_echoes(table, block, SYSTEMS[system], fitted=name.startswith("decompose"))
-
-
-@pytest.mark.parametrize(("name", "parameters"), METHODS)
-def test_stages_give_the_same_bits_for_any_block_size(name, parameters):
-    block = scene_blocks()["mixed"].rows(slice(0, 29))
-    system = surveying.survey_block(block).system
-    whole = call(name, parameters, block, system)
-    assert len(whole) > 15
-    parts = [(call(name, parameters, block.rows(cut), system), cut.start) for cut in pieces(len(block), 7)]
-    assert_same(EchoTable.concatenate(parts), whole)
-
-
-def test_wavebatch_finds_the_plugin_by_its_entry_point(tmp_path):
-    """As `pip install examples/papers` leaves it: the package on the path, its metadata beside it."""
-    folder = tmp_path / "wavebatch_paper_stages-0.1.0.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: wavebatch-paper-stages\nVersion: 0.1.0\n")
-    (folder / "entry_points.txt").write_text("[wavebatch.stages]\npaper_stages = paper_stages\n")
-    declared = (PAPERS / "pyproject.toml").read_text("utf-8")
-    assert '[project.entry-points."wavebatch.stages"]\npaper_stages = "paper_stages"' in declared
-    path = os.pathsep.join([str(tmp_path), str(PAPERS), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, "-m", "wavebatch", "stages", "decompose.log_normal"]
-    shown = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True)
-    assert shown.returncode == 0 and "three parameters per echo" in shown.stdout
-    assert subprocess.run(command, capture_output=True, text=True).returncode == 2
 
 
 # Detectors.
@@ -96,7 +44,7 @@ def detect(name, block, noise, **parameters):
     return STAGES[f"detect.{name}"].function(block, noise, SYSTEM, **parameters)
 
 
-@pytest.mark.parametrize(("name", "parameters"), METHODS[:4])
+@pytest.mark.parametrize(("name", "parameters"), DETECTORS)
 def test_isolated_echoes_are_found_at_their_peak(name, parameters):
     time = np.linspace(30, 42, 200)
     for amplitude in (15, 60, 240):
@@ -149,10 +97,10 @@ def test_a_pulse_of_twenty_samples_per_ns_must_last_a_hundred_samples():
     assert detect("sustained_threshold", block, noise).waveform.tolist() == [1]
 
 
-def test_moments_of_runs_equal_those_of_a_loop(paper_stages):
+def test_moments_of_runs_equal_those_of_a_loop():
     signal = np.random.default_rng(17).integers(-1, 5, (17, 80)).astype(np.float32)
     level = np.random.default_rng(2).integers(-2, 4, 80).astype(np.float32)
-    mean, spread = paper_stages.classic.run_moments(signal, *find_runs(signal, level))
+    mean, spread = run_moments(signal, *find_runs(signal, level))
     expected = naive.find_runs(signal, level)
     assert len(mean) == len(expected) > 10
     for row, (w, a, b) in enumerate(expected):
@@ -164,18 +112,18 @@ def test_moments_of_runs_equal_those_of_a_loop(paper_stages):
 
 
 @pytest.mark.parametrize("s", [1, 4, 50])
-def test_antisymmetric_filters_equal_a_double_loop(s, paper_stages):
+def test_antisymmetric_filters_equal_a_double_loop(s):
     signal = np.random.default_rng(4).standard_normal((s, 5)).astype(np.float32)
-    taps = paper_stages.classic.slope_taps(1.2)
+    taps = slope_taps(1.2)
     expected = np.stack([naive.correlate_antisymmetric(column, taps) for column in signal.T], axis=1)
-    np.testing.assert_allclose(paper_stages.classic.filter_antisymmetric(signal, taps), expected, atol=1e-5)
+    np.testing.assert_allclose(filter_antisymmetric(signal, taps), expected, atol=1e-5)
 
 
-def test_slopes_of_straight_lines_are_exact(paper_stages):
+def test_slopes_of_straight_lines_are_exact():
     line = np.linspace(0, 30, 31, dtype=np.float32)[:, None] * 3
-    taps = paper_stages.classic.slope_taps(1.2)
+    taps = slope_taps(1.2)
     reach = len(taps)
-    slopes = paper_stages.classic.filter_antisymmetric(line, taps)
+    slopes = filter_antisymmetric(line, taps)
     np.testing.assert_allclose(slopes[reach:-reach], 3, rtol=1e-5)
 
 
@@ -267,7 +215,7 @@ def test_the_printed_formula_has_the_skew_of_its_origin(origin, low, high):
     if origin == "waveform":
         np.testing.assert_allclose(skew, found.sigma / (found.time + 1.0), rtol=1e-4)
     for refused in ("pulse_deviation", "incidence_angle"):
-        with pytest.raises(ConfigError, match="of its own|skew per echo"):
+        with pytest.raises(ConfigError, match="fits another shape|skew per echo"):
             parse_chain(chain_text("log_normal", "[[chain]]", 'stage = "attribute.position"', "[[chain]]",
                                    f'stage = "attribute.{refused}"'), "c")  # fmt: skip
 

@@ -132,7 +132,7 @@ def test_the_energy_of_a_generalized_gaussian_is_that_of_its_exponent(power):
 @pytest.mark.parametrize("decomposer", ["generalized_gaussian", "skewed"])
 def test_a_deviation_from_the_pulse_needs_one_pulse(decomposer):
     extra = '\nkappa = "free"' if decomposer == "skewed" else ""
-    with pytest.raises(ConfigError, match="shape of its own"):
+    with pytest.raises(ConfigError, match="fits another shape to every echo"):
         text = TEXT.replace("skewed", decomposer) + extra
         parse_chain(text + '\n[[chain]]\nstage = "attribute.pulse_deviation"', "c")
 

@@ -12,10 +12,10 @@ from wavebatch.core.trajectory import ADJUSTED
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
-from wavebatch.files.strip.ray_sample import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
+from wavebatch.files.strip.ray_sample import MOST_SLICES, RAYS_PER_SLICE, RaySample, sample_rays
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.sensor import SCANNER, UNKNOWN, SensorRequest, SensorSource, estimate_path, find_sensor
-from wavebatch.tools.simulate.geometry import START_TIME, Flight, trace_rays
+from wavebatch.tools.simulate.geometry import START_TIME, FlightLine, trace_rays
 
 
 def find(path, **request):
@@ -24,7 +24,7 @@ def find(path, **request):
 
 
 def true_sensor(gps_time):
-    rays = trace_rays(Flight(), "flat", (gps_time - START_TIME) * Flight().pulse_rate)
+    rays = trace_rays(FlightLine(), "flat", (gps_time - START_TIME) * FlightLine().pulse_rate)
     return rays.ground - rays.direction / HALF_C / 0.9997 * rays.distance[:, None]
 
 
@@ -146,11 +146,11 @@ def test_a_trajectory_of_something_else_is_refused(tmp_path, wide_strip, change,
 
 def test_pairs_of_returns():
     time = START_TIME + np.sort(np.random.default_rng(1).uniform(0.0, 3.0, 8000))
-    rays = trace_rays(Flight(), "flat", (time - START_TIME) * 1e5)
+    rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * 1e5)
     noise = 0.01 * np.random.default_rng(2).standard_normal((2, 8000, 3))
     first, last = rays.ground - 15 * rays.direction / HALF_C + noise[0], rays.ground + noise[1]
     apart = last - first
-    found = estimate_path(Rays(time, 0.5 * (first + last), apart, (apart**2).sum(axis=1)), "pairs of returns")
+    found = estimate_path(RaySample(time, 0.5 * (first + last), apart, (apart**2).sum(axis=1)), "pairs of returns")
     off = np.linalg.norm(found.trajectory.at(time) - true_sensor(time), axis=1)
     assert np.sqrt(np.mean(off**2)) < 1.0
     assert 0.02 < found.error < 1.0
@@ -159,8 +159,8 @@ def test_pairs_of_returns():
 def test_flights_with_a_break_have_no_positions_in_it():
     rng = np.random.default_rng(3)
     time = START_TIME + np.sort(np.r_[rng.uniform(0, 2, 4000), rng.uniform(60, 62, 4000)])
-    rays = trace_rays(Flight(), "flat", (time - START_TIME) * 1e5)
-    found = estimate_path(Rays(time, rays.ground, rays.direction, np.ones(8000)), "direction vectors")
+    rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * 1e5)
+    found = estimate_path(RaySample(time, rays.ground, rays.direction, np.ones(8000)), "direction vectors")
     assert np.abs(found.trajectory.at(time) - true_sensor(time)).max() < 0.02
     assert np.isnan(found.trajectory.at(START_TIME + np.array([30.0]))).all()
 
@@ -169,8 +169,8 @@ def test_flights_with_a_break_have_no_positions_in_it():
 def test_rays_that_say_nothing(seconds):
     time = np.linspace(0.0, seconds, 500)
     down = np.tile([0.0, 0.0, -1.0], (500, 1))
-    assert estimate_path(Rays(time, np.zeros((500, 3)), down, np.ones(500)), "direction vectors") is None
-    nothing = Rays(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    assert estimate_path(RaySample(time, np.zeros((500, 3)), down, np.ones(500)), "direction vectors") is None
+    nothing = RaySample(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     assert estimate_path(nothing, "direction vectors") is None
 
 
@@ -248,7 +248,7 @@ def fly_roughly(rng, *, seconds=5.0, level=0.0, mounting=0.0, attitude=0.0, view
         roll, pitch = (1e-4 * drift(rng, time, attitude) for _ in range(2))
     turned = np.stack([x + pitch * z, y - roll * z, z + roll * y - pitch * x], axis=1)
     vectors = (turned * 1.4986e-4).astype(np.float32).astype(np.float64)
-    rays = Rays(time, np.round(ground / rounding) * rounding, vectors, np.ones(len(time)))
+    rays = RaySample(time, np.round(ground / rounding) * rounding, vectors, np.ones(len(time)))
     found = estimate_path(rays, "direction vectors")
     far = np.linalg.norm(ground - found.trajectory.at(time), axis=1) - np.linalg.norm(ground - sensor, axis=1)
     seen = found.error**2 - (SCANNER * found.distance) ** 2  # this scanner has no mirror that moves

@@ -17,7 +17,7 @@ from wavebatch.kernels.geometry.planes import fit_planes
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.target_file import Target, load_targets
 from wavebatch.tools.simulate import find_scene, simulate_strip, strip
-from wavebatch.tools.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, Flight, trace_rays
+from wavebatch.tools.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, FlightLine, trace_rays
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS
 
 pytestmark = pytest.mark.kept_surveys
@@ -141,7 +141,7 @@ def test_targets_off_the_strip(tmp_path, ground):
 
 
 def test_a_lever_arm_leads_from_the_trajectory_to_the_scanner(tmp_path, ground):
-    flight = Flight()
+    flight = FlightLine()
     seconds = np.arange(-1.0, 2.0, 0.05)
     rays = trace_rays(flight, "flat", seconds * flight.pulse_rate)
     sensor = rays.ground - rays.direction / AIR_SPEED * rays.distance[:, None]

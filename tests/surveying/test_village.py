@@ -16,7 +16,7 @@ from wavebatch.surveying import survey_block
 from wavebatch.surveying.flat_ground import Slopes, measure_reference
 from wavebatch.tools.simulate import find_scene, simulate_strip
 from wavebatch.tools.simulate.blocks import simulate_seed_block
-from wavebatch.tools.simulate.geometry import AIR_SPEED, GROUND, NORTH, START_TIME, Flight, trace_rays
+from wavebatch.tools.simulate.geometry import AIR_SPEED, GROUND, NORTH, START_TIME, FlightLine, trace_rays
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS, ROOFS_REFLECT
 
 SCENE = find_scene("village")
@@ -128,7 +128,7 @@ def test_every_bin_of_angles_holds_on_longer_strips(tmp_path, seed):
 
 def see_swath(half_angle):
     """Level ground seen across a swath as slopes, and its survey with the beam's divergence."""
-    made = simulate_seed_block(replace(SCENE, flight=Flight(640.0, half_angle=half_angle, look_ahead=0.0)), 6, 0)
+    made = simulate_seed_block(replace(SCENE, flight=FlightLine(640.0, half_angle=half_angle, look_ahead=0.0)), 6, 0)
     back = made.rays.direction / AIR_SPEED * made.rays.distance[:, None]
     block = replace(made.block, sensor=made.rays.ground - back)
     surveyed = survey_block(block).system.with_radiometry(divergence=SCENE.divergence)

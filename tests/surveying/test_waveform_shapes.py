@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bench.real.pool import read_pool
 
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
@@ -15,7 +16,6 @@ from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.measuring import learn_pulse
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
-from wavebatch.tools.bench.real.pool import read_pool
 
 BASE = 12.0
 

@@ -15,7 +15,7 @@ from wavebatch.files.disk import buckets
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.tools.return_stats import areas as module
 from wavebatch.tools.return_stats import returns
-from wavebatch.tools.return_stats.areas import Grid, PolygonSet
+from wavebatch.tools.return_stats.areas import AreaGrid, PolygonSet
 from wavebatch.tools.return_stats.returns import count_returns
 
 
@@ -86,7 +86,7 @@ def check_sum(areas, total):
 def test_cells_as_a_loop_over_pulses_counts_them(tmp_path, monkeypatch, size, bucket):
     points = make_cloud(tmp_path / "c.las")
     monkeypatch.setattr(buckets, "BUCKET_ROWS", bucket)
-    (one,), total = count_returns([tmp_path / "c.las"], divisions=[Grid(size)])
+    (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(size)])
     naive = count_naively(*points, lambda x, y: (math.floor(x / size) * size, math.floor(y / size) * size))
     check_areas(one.areas, naive, lambda area: (area.x, area.y))
     check_sum(one.areas, one)
@@ -118,7 +118,7 @@ def test_polygons_first_come_and_what_is_outside(tmp_path):
 def test_cells_and_polygons_of_several_clouds(tmp_path):
     for seed, name in enumerate("ab"):
         make_cloud(tmp_path / f"{name}.las", seed=seed, east=300_000.0 + 50 * seed)
-    divisions = [Grid(20), PolygonSet([square(300_000, -30, 100)])]
+    divisions = [AreaGrid(20), PolygonSet([square(300_000, -30, 100)])]
     each, total = count_returns([tmp_path / "a.las", tmp_path / "b.las"], divisions=divisions)
     for one in (*each, total):
         for kinds in (("cell",), ("polygon", "outside")):
@@ -145,11 +145,11 @@ def test_damaged_coordinates_are_counted_outside(tmp_path, scale):
 def test_places_that_are_none_are_outside():
     x = np.array([5.0, np.nan, np.inf, 1e300, 1.0, -1e300])
     y = np.array([5.0, 1.0, 1.0, 1.0, np.nan, -np.inf])
-    for division in (Grid(10), PolygonSet([square(0, 0, 10)])):
+    for division in (AreaGrid(10), PolygonSet([square(0, 0, 10)])):
         found = division.find(x, y)
         assert (found[1:] == -1).all() and found[0] != -1
         assert division.describe(-1).name == "outside"
-    assert Grid(0.25).describe(int(Grid(0.25).find(np.array([-0.1]), np.array([0.3]))[0])).name == "-0.25 0.25"
+    assert AreaGrid(0.25).describe(int(AreaGrid(0.25).find(np.array([-0.1]), np.array([0.3]))[0])).name == "-0.25 0.25"
 
 
 def test_too_many_and_too_small_cells_are_one_line(tmp_path, monkeypatch):
@@ -162,7 +162,7 @@ def test_too_many_and_too_small_cells_are_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MOST_AREAS", 50_000)
     monkeypatch.setattr(returns, "MOST_AREAS", 50)
     with pytest.raises(ConfigError, match="more than 50 areas with it"):
-        count_returns([tmp_path / "c.las"] * 4, divisions=[Grid(30)])
+        count_returns([tmp_path / "c.las"] * 4, divisions=[AreaGrid(30)])
     for wrong in ("0", "-3", "nan", "inf"):
         result = CliRunner().invoke(stats, [str(tmp_path / "c.las"), "--area", wrong])
         assert result.exit_code == 2 and "must be above 0" in result.stderr
@@ -211,7 +211,7 @@ def test_wrong_polygons_are_one_line(tmp_path, features, words):
 
 def test_separations_by_rank_and_depth_of_pulses(tmp_path):
     pulse, xyz, number = make_cloud(tmp_path / "c.las")
-    (one,), total = count_returns([tmp_path / "c.las"], divisions=[Grid(25.0)])
+    (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(25.0)])
     cells, depths = {}, {}
     for each in np.unique(pulse):
         rows = np.flatnonzero(pulse == each)
@@ -277,7 +277,7 @@ def test_an_empty_cloud_has_no_area(tmp_path):
     cloud = laspy.read(tmp_path / "c.las")
     cloud.points = cloud.points[:0]
     cloud.write(tmp_path / "e.las")
-    (one,), total = count_returns([tmp_path / "e.las"], divisions=[Grid(10)])
+    (one,), total = count_returns([tmp_path / "e.las"], divisions=[AreaGrid(10)])
     assert one.areas == total.areas == ()
     result = CliRunner().invoke(stats, [str(tmp_path / "e.las"), "--area", "10", "-o", str(tmp_path / "e.csv")])
     assert result.exit_code == 0 and (tmp_path / "e.csv").read_text().count("\n") == 2
@@ -294,7 +294,7 @@ def test_pulses_without_a_place_are_counted_outside(tmp_path, monkeypatch, bad):
             yield rows
 
     monkeypatch.setattr(returns.CloudReader, "read_pieces", damage)
-    (one,), _ = count_returns([tmp_path / "c.las"], divisions=[Grid(10), PolygonSet([square(299_000, -500, 2000)])])
+    (one,), _ = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(10), PolygonSet([square(299_000, -500, 2000)])])
     for kinds in (("cell",), ("polygon",)):
         inside = [area for area in one.areas if area.kind in kinds]
         assert sum(area.pulses for area in inside) == 260

@@ -31,11 +31,11 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
 from wavebatch.tools.bench import command, report
-from wavebatch.tools.bench.accuracy import Group, Tally, make_group, make_groups
+from wavebatch.tools.bench.accuracy import AccuracyTally, Group, make_group, make_groups
 from wavebatch.tools.bench.command import BenchOptions, run_bench
 from wavebatch.tools.bench.report import format_document
 from wavebatch.tools.bench.scenes import shape_scene
-from wavebatch.tools.bench.worker import Worker, WorkerDied, peak_memory
+from wavebatch.tools.bench.worker import BenchWorkerDied, Worker, peak_memory
 from wavebatch.tools.simulate import Recording, find_scene, simulate_block, simulate_blocks, simulate_strip
 
 SMALL = BenchOptions(
@@ -221,7 +221,7 @@ def known_group(n=300) -> Group:
 
 
 def test_tally_of_perfect_echoes_and_of_none():
-    group, perfect, empty = known_group(), Tally(), Tally()
+    group, perfect, empty = known_group(), AccuracyTally(), AccuracyTally()
     perfect.add(group, group.truth)
     empty.add(group, EchoTable.empty())
     figures = perfect.figures()
@@ -232,19 +232,19 @@ def test_tally_of_perfect_echoes_and_of_none():
 
 
 def test_tally_measures_what_was_put_in():
-    group, tally = known_group(), Tally()
+    group, tally = known_group(), AccuracyTally()
     tally.add(group, replace(group.truth, time=group.truth.time + 2 * group.bounds[:, 0]))
     figures = tally.figures()
     assert figures["time_ratio_isolated"].value == pytest.approx(2, rel=1e-6)
     assert figures["gross_isolated"].value == 0
-    gross = Tally()
+    gross = AccuracyTally()
     gross.add(group, replace(group.truth, time=group.truth.time + 20 * group.bounds[:, 0]))
     assert gross.figures()["gross_isolated"].value == 1
 
 
 def test_reported_errors_are_measured_with_and_without_flags():
     """Every second echo is flagged and off by three of its errors, the others by one."""
-    group, tally = known_group(), Tally()
+    group, tally = known_group(), AccuracyTally()
     flagged = np.arange(len(group.truth)) % 2 == 1
     error = np.full(len(group.truth), 0.01)
     found = replace(group.truth, time=group.truth.time + np.where(flagged, 0.03, 0.01), time_err=error.astype("f4"))
@@ -312,7 +312,7 @@ def test_worker_answers_raises_and_dies():
             worker.call(os.stat, "/no/such/file")
         memory = worker.call(peak_memory)
         assert memory is None or 5e6 < memory < 1e9
-    with Worker() as worker, pytest.raises(WorkerDied):
+    with Worker() as worker, pytest.raises(BenchWorkerDied):
         worker.call(os._exit, 3)
 
 
@@ -320,7 +320,7 @@ def test_closing_a_worker_ends_a_call_that_hangs():
     with ThreadPoolExecutor(1) as caller, Worker() as worker:
         worker.call(os.getpid)
         call = caller.submit(worker.call, time.sleep, 600)
-    assert isinstance(call.exception(), WorkerDied)
+    assert isinstance(call.exception(), BenchWorkerDied)
 
 
 FAKE = """
@@ -350,7 +350,7 @@ def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     assert result.failures == 2 and result.waveforms == 38
     assert sorted(set(range(40)) - set(result.found.waveform.tolist())) == [7, 20]
     group = make_group(scene, 0, block, truth, Survey(SystemPulse(2.0), 40))
-    tally = Tally()
+    tally = AccuracyTally()
     tally.add(group, result.found)
     assert tally.figures()["completeness"].value == pytest.approx(38 / 40)
 
@@ -426,30 +426,11 @@ def _call_slow_starter(self, function, *arguments):
     return laps.get(function, jobs.Lap(1.0, 0.5, 1.0, 2000))
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--real a.las --scene flat", "--scene has no meaning with --real"),
-        ("--real a.las --tolerance 2cm", "--tolerance has no meaning with --real"),
-        ("--real a.las --all-methods", "--all-methods has no meaning"),
-    ],
-)  # fmt: skip
-def test_options_that_real_does_not_use_are_refused(words, message):
-    result = CliRunner().invoke(main, ["bench", *words.split()])
-    assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1, result.output
-
-
 def test_a_small_strip_that_fails_is_no_time(tmp_path):
     broken = tmp_path / "broken.las"
     broken.write_bytes(b"LASF")
     with pytest.raises(InputError, match=r"0\.las"):
         jobs.run_small(broken, tmp_path / "small")
-
-
-def test_real_takes_a_log_file(tmp_path):
-    log = tmp_path / "night.log"
-    result = CliRunner().invoke(main, ["bench", "--real", str(tmp_path / "no.las"), "--log-file", str(log)])
-    assert "no.las" in result.stderr and "has no meaning" not in result.stderr and "no.las" in log.read_text()
 
 
 def test_the_slowest_part_bounds_many_jobs():

@@ -19,7 +19,7 @@ from wavebatch.tools.bench.figures import (
     find_front,
     median_range,
     root_mean_square,
-    share,
+    share_figure,
 )
 from wavebatch.tools.bench.truth import describe_truth, effective_noise, find_bounds
 from wavebatch.tools.simulate import PULSES, PulseModel, Recording, simulate_blocks
@@ -31,7 +31,7 @@ def draw_share(rng, by_group=0.0):
     group = np.repeat(np.arange(8), 100)
     whole = rng.integers(1, 3, 800)
     chance = 0.7 + by_group * rng.standard_normal(8)[group]
-    return share(rng.binomial(whole, np.clip(chance, 0, 1)), whole, group)
+    return share_figure(rng.binomial(whole, np.clip(chance, 0, 1)), whole, group)
 
 
 def test_error_of_a_share_is_what_repetitions_show(rng):
@@ -50,11 +50,11 @@ def test_error_of_a_share_sees_what_groups_have_in_common(rng):
 
 def test_shares_of_nothing_keep_an_error():
     group = np.zeros(1000, int)
-    none = share(np.zeros(1000), np.ones(1000), group)
-    every = share(np.ones(1000), np.ones(1000), group)
+    none = share_figure(np.zeros(1000), np.ones(1000), group)
+    every = share_figure(np.ones(1000), np.ones(1000), group)
     assert none.value == 0 and every.value == 1
     assert none.error == pytest.approx(every.error) and 0.001 < none.error < 0.003
-    assert share(np.zeros(5), np.zeros(5), np.zeros(5, int)).to_json() == {"value": None, "error": None}
+    assert share_figure(np.zeros(5), np.zeros(5), np.zeros(5, int)).to_json() == {"value": None, "error": None}
 
 
 def test_error_of_a_root_mean_square_is_what_repetitions_show(rng):

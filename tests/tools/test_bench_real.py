@@ -1,16 +1,23 @@
-"""`wavebatch bench --real` on simulated strips, where what it should report is known, and on the real ones."""
+"""`make bench-real` on simulated strips, where what it should report is known, and on the real ones."""
 
 import json
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from bench.real import pool, templates
+from bench.real.__main__ import main
+from bench.real.agreement import compare_models, compare_solvers, find_sensor
+from bench.real.inject import add_signal, inject_echoes
+from bench.real.measure import measure_real
+from bench.real.noise import QuietNoise, measure_noise, unround
+from bench.real.pool import Pool, Solver, find_fill, read_pool
+from bench.real.report import format_report
+from bench.real.templates import learn_templates
 from scipy.signal import lfilter
 from strips import make_raw
 from writer_tools import data_file
 
-from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.system import ReceiverNoise
@@ -19,14 +26,6 @@ from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.measuring.trial import Trial, limit_surveys
 from wavebatch.surveying.systems.known_systems import find_source, known_systems
-from wavebatch.tools.bench.real import pool, templates
-from wavebatch.tools.bench.real.agreement import compare_models, compare_solvers, find_sensor
-from wavebatch.tools.bench.real.inject import add_signal, inject_echoes
-from wavebatch.tools.bench.real.measure import measure_real
-from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise, unround
-from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill, read_pool
-from wavebatch.tools.bench.real.report import format_report
-from wavebatch.tools.bench.real.templates import learn_templates
 from wavebatch.tools.simulate import simulate_strip
 
 
@@ -254,29 +253,18 @@ def test_a_strip_of_five_packets_gives_one_line(tmp_path):
     small = make_raw(5, n_samples=60).write(tmp_path / "five.las")
     with pytest.raises(InputError, match="too few to inject from; at least 16"):
         measure_real(small)
-    result = CliRunner().invoke(main, ["bench", "--real", str(small)])
-    assert result.exit_code == 1 and result.stderr.count("\n") == 1, result.output
-    assert "five.las" in result.stderr and "name a larger strip" in result.stderr
 
 
-def test_command_measures_strips_and_goes_on_after_one_that_fails(strip, tmp_path):
+def test_command_measures_strips_and_goes_on_after_one_that_fails(strip, tmp_path, capsys):
     small = make_raw(5, n_samples=60).write(tmp_path / "five.las")
-    words = ["bench", "--real", str(small), str(strip), "-o", str(tmp_path / "out")]
-    result = CliRunner().invoke(main, words)
-    assert result.exit_code == 1 and "== urban.las" in result.stdout and "five.las" in result.stderr
-    assert "error / reported error" in result.stdout
+    assert main([str(small), str(strip), "-o", str(tmp_path / "out")]) == 1
+    text, said = capsys.readouterr()
+    assert "== urban.las" in text and "error / reported error" in text
+    assert said.count("five.las") == 1 and "name a larger strip" in said
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"real-urban.json", "real-urban.txt"} <= names
     document = json.loads((tmp_path / "out" / "real-urban.json").read_text("utf-8"))
-    assert document["false_echoes"]["echoes"] > 0
-    result = CliRunner().invoke(main, ["bench", "--real", str(strip), "--json"])
-    assert result.exit_code == 0 and json.loads(result.stdout)["strips"][0]["strip"] == "urban.las"
-
-
-@pytest.mark.parametrize(("words", "message"), [("--real", "needs strips"), ("--real x.las fast.toml", "chain")])
-def test_wrong_usage_is_one_line(words, message):
-    result = CliRunner().invoke(main, ["bench", *words.split()])
-    assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1
+    assert document["false_echoes"]["echoes"] > 0 and document["strip"] == "urban.las"
 
 
 @pytest.mark.slow

@@ -75,6 +75,25 @@ def test_second_derivative_peaks_pass_its_threshold():
         assert (np.interp(signal.found.time, signal.time, signal.values) > 0.9 * signal.least).all()
 
 
+@pytest.mark.parametrize("name", ["detect.center_of_gravity", "detect.sustained_threshold"])
+def test_runs_above_the_level_hold_the_echoes(name):
+    found = 0
+    for signal in see(name):
+        at = np.rint(signal.found.time / BLOCK.spacing).astype(int)
+        assert (signal.values[at] > signal.least).all()
+        found += len(at)
+    assert found
+
+
+def test_slopes_fall_through_zero_and_curvatures_are_above_the_noise_at_echoes():
+    for signal in see("detect.zero_crossing"):
+        at = np.interp(signal.found.time, signal.time, np.arange(len(signal.time)))
+        before, after = signal.values[np.floor(at).astype(int)], signal.values[np.ceil(at).astype(int)]
+        assert len(at) and (before >= 0).all() and (after <= 0).all() and np.isnan(signal.least)
+    for signal in see("detect.zero_crossing", derivative="second"):
+        assert len(signal.found) and (np.interp(signal.found.time, signal.time, signal.values) > 0).all()
+
+
 def test_the_chains_own_detector_keeps_its_parameters():
     chain = make_chain("decompose.gaussian")
     assert choose_step(chain, "detector") is chain.steps[1]

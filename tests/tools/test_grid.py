@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from wavebatch.cli import main
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
-from wavebatch.tools.rasters import tiles as module
+from wavebatch.tools.rasters import cells as module
 from wavebatch.tools.rasters.cells import STATISTICS, compute_cells
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # inside rasterio

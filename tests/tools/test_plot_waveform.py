@@ -28,11 +28,10 @@ from wavebatch.surveying import survey_block
 from wavebatch.tools.bench.plot import _draw_panel
 from wavebatch.tools.compare.chains import ChainRun
 from wavebatch.tools.compare.goodness import measure_fit
-from wavebatch.tools.html.strip_views import measure_residuals
-from wavebatch.tools.plots.draw_sheet import draw_sheet
-from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels, draw_waveforms
+from wavebatch.tools.html.strip_views import measure_view_residuals
+from wavebatch.tools.plots.draw_sheet import draw_waveform_sheet
+from wavebatch.tools.plots.draw_waveform import _draw_panels, draw_waveform_panels
 from wavebatch.tools.plots.echo_table import list_echoes
-from wavebatch.tools.plots.labels import place_labels
 from wavebatch.tools.plots.packets import MOST, Place, Wanted, find_places
 from wavebatch.tools.plots.waveform import add_ranges, build_views, read_views
 
@@ -58,7 +57,7 @@ def test_residuals_are_those_of_the_cleaned_samples():
     views = build_views(block, chain, system, range(1000))
     residual = np.array([np.sqrt(np.nanmean(view.residual**2)) for view in views])
     assert np.median(residual) == pytest.approx(1.0, abs=0.1)
-    np.testing.assert_allclose(measure_residuals(block, chain, system), residual, rtol=1e-3)
+    np.testing.assert_allclose(measure_view_residuals(block, chain, system), residual, rtol=1e-3)
     found = ChainRun(chain, system, 1.0)
     solved = found.find(block)
     misfit, floor = measure_fit(solved.block, solved.noise, solved.system, chain.steps[2], solved.echoes)
@@ -69,7 +68,11 @@ def gaussian(time, amplitude, centre, width):
     return amplitude * np.exp(-0.5 * ((time - centre) / width) ** 2)
 
 
-@pytest.mark.parametrize("name", [name for name in STAGES if name.startswith("decompose.") and name[10:] != "none"])
+# The log-normal as printed has the skew of its origin, whatever the pulse is: tests/stages/test_paper_stages.py.
+OTHERS = ("decompose.none", "decompose.log_normal")
+
+
+@pytest.mark.parametrize("name", [name for name in STAGES if name.startswith("decompose.") and name not in OTHERS])
 def test_curves_are_the_fit_of_every_decomposer(name):
     shape, system, parameters = PulseShape(), PULSE, {}
     if name == "decompose.skewed":
@@ -80,7 +83,7 @@ def test_curves_are_the_fit_of_every_decomposer(name):
     block = simulate(shape, [(100.0, 30.3, 2.0)])
     views = build_views(block, make_chain(name, **parameters), system, range(len(block)))
     assert len(views) == 20
-    worst = {"decompose.asdf_only": 4.0}.get(name, 1.25)
+    worst = {"decompose.asdf_only": 4.0, "decompose.asdf_mixed": 4.0}.get(name, 1.25)
     for view in views:
         assert len(view.echoes) == 1 and view.curves.shape == (1, len(view.fine))
         near = np.abs(view.time - 30) <= 5
@@ -301,21 +304,17 @@ def test_the_signal_is_shown_and_the_whole_on_request(tiny_strip):
     assert len(view.echoes) or view.span == (-0.5, 99.5)
 
 
-def test_error_bars_stay_inside_and_cut_ones_are_marked(tmp_path):
+@pytest.mark.parametrize("error", [20.0, 1e5, 1e30, np.inf, np.nan])
+def test_no_error_bar_presses_the_waveform_into_a_line(tmp_path, error):
     pytest.importorskip("matplotlib")
     block = simulate(PulseShape(), [(100.0, 30.3, 2.0)], n=1)
     (view,) = build_views(block, make_chain("decompose.gaussian"), PULSE, [0])
-    for error, heads in ((20.0, {"_"}), (1e5, {"^", "v"})):
-        table = replace(view.echoes, amplitude_err=np.array([error], np.float32))
-        with open_picture(tmp_path / "e.png", (6, 5), overwrite=True) as figure:
-            panels = _draw_panels(figure, figure.add_gridspec(1, 1)[0], replace(view, echoes=table), view.span,
-                                  small=False, room=5.0)  # fmt: skip
-        low, high = panels[0].get_ylim()
-        lines = [line for line in panels[0].lines if line.get_color() == ECHO]
-        for line in lines:
-            assert low <= np.min(line.get_ydata()) and np.max(line.get_ydata()) <= high
-        assert heads <= {line.get_marker() for line in lines}
-        assert high - low < 400
+    table = replace(view.echoes, amplitude_err=np.array([error], np.float32))
+    with open_picture(tmp_path / "e.png", (6, 5), overwrite=True) as figure:
+        panels = _draw_panels(figure, figure.add_gridspec(1, 1)[0], replace(view, echoes=table), view.span,
+                              small=False, room=5.0)  # fmt: skip
+    low, high = panels[0].get_ylim()
+    assert 100 < high - low < 400
 
 
 def test_echoes_are_listed_and_written(tiny_strip, tmp_path):
@@ -364,7 +363,7 @@ def test_long_texts_lose_their_middle():
     assert plain_text(" a\n\x00 b\t") == "a b" and plain_text("abc", 3) == "abc"
 
 
-def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
+def test_the_benchs_plot_names_every_point(tmp_path):
     pytest.importorskip("matplotlib")
     points = {
         "fast": (8.0, 0.1),
@@ -380,16 +379,9 @@ def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
     ]  # fmt: skip
     with open_picture(tmp_path / "b.png", (5.5, 4.6)) as figure:
         axes = figure.subplots()
-        labels = _draw_panel(axes, rows, "wrong", 100.0, "wrong [%]")
-        figure.draw_without_rendering()
-        place_labels(axes, labels, keep=True)
-        boxes = [text.get_window_extent() for text in axes.texts]
-        frame = axes.get_window_extent()
-    assert len(boxes) == 5
-    for number, box in enumerate(boxes):
-        assert frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
-        for other in boxes[number + 1 :]:
-            assert not box.overlaps(other)
+        _draw_panel(axes, rows, "wrong", 100.0, "wrong [%]")
+        shown = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert sorted(shown) == sorted(["Pareto front", *points])
 
 
 @pytest.mark.slow
@@ -423,7 +415,7 @@ def test_titles_name_every_flag_of_many_echoes(tmp_path):
     peaks = [(100.0, 20.3 + 8 * k, 2.0) for k in range(3)]
     (view,) = build_views(simulate(PulseShape(), peaks, n=1), make_chain("decompose.gaussian"), PULSE, [0])
     view.echoes.flags[:] = int(EchoFlag.SATURATED | EchoFlag.OVERLAPPED | EchoFlag.AMPLITUDE_UNRELIABLE)
-    draw_waveforms([view] * 3, tmp_path / "w.svg", strip="s", chain="c")
+    draw_waveform_panels([view] * 3, tmp_path / "w.svg", strip="s", chain="c")
     text = (tmp_path / "w.svg").read_text("utf-8")
     for name in ("SATURATED", "OVERLAPPED", "AMPLITUDE_UNRELIABLE"):
         assert text.count(f"{name} 1,2") == 3
@@ -435,7 +427,7 @@ def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):
         simulate(PulseShape(), [(400.0, 30.3, 2.0)], n=2), make_chain("decompose.gaussian"), PULSE, [0, 1]
     )
     views += build_views(simulate(PulseShape(), [(0.1, 30.3, 2.0)], n=1), make_chain("decompose.none"), PULSE, [2])
-    draw_sheet(views, tmp_path / "s.svg", strip="a.las", chain="test")
+    draw_waveform_sheet(views, tmp_path / "s.svg", strip="a.las", chain="test")
     text = (tmp_path / "s.svg").read_text("utf-8")
     assert "SATURATED" in text and "no echo" in text and "3 waveforms" in text
 

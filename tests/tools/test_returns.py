@@ -206,7 +206,7 @@ def test_error_of_a_dead_zone_is_the_size_of_its_miss(rng, pairs, mean):
     for _ in range(300):
         distance = np.minimum(0.7 + rng.exponential(mean, pairs), 99.0)
         bins = np.bincount((100 * distance).astype(int), minlength=dead_zones.BINS)
-        found = dead_zones.find_zone(bins[: dead_zones.BINS])
+        found = dead_zones.find_dead_zone(bins[: dead_zones.BINS])
         misses.append((found.size - 0.7) / found.error)
     assert 0.4 < np.sqrt(np.mean(np.square(misses))) < 1.6
     assert np.min(misses) > -1.01

@@ -14,8 +14,8 @@ from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.tools.plots import section_data
-from wavebatch.tools.plots.section_data import cut_section, measure_profile
+from wavebatch.tools.plots import sections
+from wavebatch.tools.plots.sections import cut_section, measure_profile
 from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.slices.cube import align_pulses, build_cube, cut_cube
 from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
@@ -65,7 +65,7 @@ def test_a_section_has_the_points_beside_its_line(cloud):
 
 def test_a_section_of_many_points_is_an_even_sample_that_says_so(cloud, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(section_data, "MOST_POINTS", 300)
+    monkeypatch.setattr(sections, "MOST_POINTS", 300)
     found = cut_section([cloud], Selection("z"), line=LINE, width=10.0)
     assert len(found.value) <= 300 < found.inside
     assert run("plot", "section", cloud, "--width", 10, "-o", tmp_path / "s.svg", "--aspect", 2).exit_code == 0
@@ -326,7 +326,7 @@ def test_a_folder_with_clouds_and_tables_gives_the_clouds(cloud, tmp_path):
 def test_far_points_leave_the_frame_of_a_section_and_are_counted(tmp_path, monkeypatch, many):
     """One point 116 m below pressed the others into a line; what is near the others stays."""
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(section_data, "MOST_POINTS", 20_000)
+    monkeypatch.setattr(sections, "MOST_POINTS", 20_000)
     rng = np.random.default_rng(1)
     las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
     las.header.scales = [0.001] * 3
@@ -345,9 +345,9 @@ def test_a_tower_and_a_few_points_stay_in_the_section():
     ground = np.random.default_rng(1).normal(0, 0.2, 2000)
     for heights, far in ((np.linspace(0, 90, 30), 0), ([9.0], 0), ([90.0, -90.0], 2)):
         every = np.append(ground, heights)
-        low, high = section_data.choose_frame(every, 100.0)
+        low, high = sections.choose_frame(every, 100.0)
         assert np.count_nonzero((every < low) | (every > high)) == far
-    assert section_data.choose_frame(np.append(ground[:15], 90.0), 100.0) == (-np.inf, np.inf)
+    assert sections.choose_frame(np.append(ground[:15], 90.0), 100.0) == (-np.inf, np.inf)
 
 
 def test_logarithmic_profiles_have_plain_labels(cloud, tmp_path):
@@ -371,13 +371,13 @@ def test_tails_of_voxels_are_not_drawn(voxels):
     """Less than 2 % of the scale would look as solid as the ground."""
     from types import SimpleNamespace
 
-    from wavebatch.tools.plots import draw_section
+    from wavebatch.tools.plots import sections
 
     found = cut_section([voxels[0]], Selection("energy"), line=(10.0, 30.0, 30.0, 30.0), width=0.5)
     value = np.where(np.arange(len(found.value)) % 2, 50.0, 0.5)
     axes = SimpleNamespace(grid=lambda **_: None, imshow=lambda image, **_: image)
     for name, faint in (("energy", False), ("count", True)):
         facts = replace(found.facts, name=name)
-        image, _ = draw_section._draw_voxels(axes, replace(found, value=value, facts=facts, shown=(0.0, 60.0)))
+        image, _ = sections._draw_voxels(axes, replace(found, value=value, facts=facts, shown=(0.0, 60.0)))
         assert bool((image == 0.5).any()) is faint and (image == 50.0).any()
-    assert any("below 2 %" in part for part in draw_section._parts(found, 1.0))
+    assert any("below 2 %" in part for part in sections._parts(found, 1.0))

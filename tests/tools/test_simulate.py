@@ -12,7 +12,7 @@ from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.physics.radiometry import backscatter
 from wavebatch.tools.simulate import SCENES, PulseModel, Recording, find_pulse, find_scene, shape_pulse, simulate_block
 from wavebatch.tools.simulate.blocks import SEED_BLOCK, flag_truth, simulate_blocks
-from wavebatch.tools.simulate.geometry import AIR_SPEED, GROUND, TERRAINS, Flight, trace_rays
+from wavebatch.tools.simulate.geometry import AIR_SPEED, GROUND, TERRAINS, FlightLine, trace_rays
 from wavebatch.tools.simulate.hazards import HAZARDS
 from wavebatch.tools.simulate.pulses import PULSES, main_lobe, spread_lobes
 from wavebatch.tools.simulate.render import paint_echoes, record_counts
@@ -140,7 +140,7 @@ def test_scenes_have_their_shares_of_echoes(name):
 def test_slope_widens_and_weakens_echoes():
     scene = find_scene("slope")
     block, truth = make_block("slope", 30_000, seed=6)
-    rays = trace_rays(Flight(), scene.terrain, np.arange(30_000))
+    rays = trace_rays(FlightLine(), scene.terrain, np.arange(30_000))
     incidence = rays.incidence
     assert np.degrees(incidence).max() > 50
     expected = np.hypot(2.0, 0.5e-3 * scene.divergence * rays.distance * np.tan(incidence) / 0.299792458)
@@ -268,7 +268,7 @@ def test_tiny_windows_still_take_the_scene():
 
 @pytest.mark.parametrize("terrain", list(TERRAINS))
 def test_rays_and_slopes_fit_together(terrain):
-    rays = trace_rays(Flight(), terrain, np.arange(0, 50_000, 7))
+    rays = trace_rays(FlightLine(), terrain, np.arange(0, 50_000, 7))
     assert np.allclose(np.linalg.norm(rays.direction, axis=1), AIR_SPEED)
     assert (rays.direction[:, 2] < 0).all()
     assert (np.diff(rays.gps_time) > 0).all()

@@ -16,9 +16,9 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.files.las.crs import metres_per_unit, parse_wkt
 from wavebatch.files.las.geotiff_wkt import build_utm
 from wavebatch.files.las.header import build_wkt
-from wavebatch.files.strip.packet_vectors import DirectionTally, decide
+from wavebatch.files.strip.packet_vectors import DirectionTally, decide_direction
 from wavebatch.tools.html.cloud_pictures import picture_cloud
-from wavebatch.tools.plots.section_data import cut_section, measure_profile
+from wavebatch.tools.plots.sections import cut_section, measure_profile
 from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.simulate import simulate_strip
 
@@ -165,5 +165,5 @@ def test_geocentric_coordinates_have_no_height(clouds, tmp_path):
 
 def test_vectors_in_the_unit_of_the_coordinates_are_no_oddity():
     tally = DirectionTally("stored", [10, 0], [10, 0], [np.full(10, 1 / FOOT)])
-    assert decide(tally, "auto", FOOT).warnings == ()
-    assert "3.281 times c/2 long" in decide(tally, "auto").warnings[0]
+    assert decide_direction(tally, "auto", FOOT).warnings == ()
+    assert "3.281 times c/2 long" in decide_direction(tally, "auto").warnings[0]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.output_rows import NEEDED
-from wavebatch.batch.selection import WITHOUT_STAGE, Selection
+from wavebatch.batch.selection import WITHOUT_STAGE, RowFilter
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
@@ -42,7 +42,7 @@ class StripJob:
     calibration: Calibration | None = None
     attenuation: tuple[float, float] | None = None
     """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
-    selection: Selection = Selection()
+    selection: RowFilter = RowFilter()
     """What is written."""
 
     def extend(self, chain: Chain) -> Chain:
@@ -93,7 +93,7 @@ class StripJob:
         return StripReader(self.path, direction=self.options.direction, headerless=self.options.headerless)
 
 
-def name_columns(wanted: str | None) -> tuple[str, ...]:
+def list_column_names(wanted: str | None) -> tuple[str, ...]:
     """List the columns that a value of --columns names, in order."""
     return tuple(entry.removeprefix("+") for entry in _split_columns(wanted) if entry.strip(" +"))
 

@@ -256,9 +256,9 @@ def describe_options() -> str:
     """Return the options as the section Parameters of a docstring."""
     lines = []
     for one in fields(RunOptions)[1:]:  # the output is no keyword
-        told = OPTIONS[one.name].told
-        text = re.sub(r"--([a-z][a-z-]+)", lambda found: f"`{found[1].replace('-', '_')}`", told.help)
-        default = told.unset or ("" if one.default in (None, False) else repr(one.default))
+        words = OPTIONS[one.name].words
+        text = re.sub(r"--([a-z][a-z-]+)", lambda found: f"`{found[1].replace('-', '_')}`", words.help)
+        default = words.unset or ("" if one.default in (None, False) else repr(one.default))
         kind = re.sub(r"^Annotated\[(.*?), Range.*\]$", r"\1", str(one.type))
         lines += [f"{one.name} : {kind}", f"    {text}" + (f" Default: {default}." if default else "")]
     return "\n".join(lines)

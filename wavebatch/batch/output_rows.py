@@ -20,7 +20,7 @@ from wavebatch.core.no_data import count_reasons
 from wavebatch.core.order import find_order
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.disk.raw_bytes import take_records, widen
+from wavebatch.files.disk.raw_bytes import take_whole_records, widen
 from wavebatch.files.las.point_formats import locate, split_numbers
 from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, number_returns
 
@@ -192,7 +192,7 @@ def assemble_echoes(
     found[members.find(point[point >= 0])] = True
     rows = _place_rows(unit, members, table, echoes.nearest, found, owned)
 
-    records = take_records(members.source, rows.source)
+    records = take_whole_records(members.source, rows.source)
     xyz = np.stack([np.append(table.attributes[name], np.nan)[rows.echo] for name in "xyz"], axis=1)
     packet = np.where(rows.echo >= 0, np.append(table.waveform, -1)[rows.echo], members.packet[rows.source])
     direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0)[packet]

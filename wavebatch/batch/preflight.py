@@ -68,13 +68,13 @@ def plan_memory(options_jobs: int, memory: int | None) -> tuple[int, int | None]
 
 def check_outputs(jobs: Sequence[StripJob], options: RunOptions) -> None:
     """Raise ConfigError where an output would replace an input."""
-    with protecting(find_inputs(jobs)):
+    with protecting(list_read_files(jobs)):
         for job in jobs:
             for target in find_outputs(job, options.folder):
                 refuse_input(target)
 
 
-def find_inputs(jobs: Sequence[StripJob]) -> list[Path]:
+def list_read_files(jobs: Sequence[StripJob]) -> list[Path]:
     """Return the files that the jobs read, also those that are read already: no output may replace them."""
     read = {Path(job.selection.polygon) for job in jobs if job.selection.polygon is not None}
     return sorted(read.union(*(job.files for job in jobs)))

@@ -84,7 +84,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     }
 
 
-def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str, Any]:
+def describe_strip_result(prepared: Prepared, described: Mapping[str, Any]) -> dict[str, Any]:
     """Describe the results of scan and survey as plain values; `described` is from `describe_job`."""
     vectors = prepared.scan.vectors
     ratio = without_nan(vectors.ratio)
@@ -154,7 +154,7 @@ def build_document(
             "point_format": facts.header.point_format,
             "points": facts.header.point_count,
             "packets": {"file": file.name if file else None, "internal": packets.internal, "bytes": stored},
-            **describe_strip(prepared, described),
+            **describe_strip_result(prepared, described),
         },
         "command": job.options.command(job.path.name),
         "output": {
@@ -193,10 +193,10 @@ def build_timing(report: RunReport) -> dict[str, Any]:
 
 def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:
     """Write a JSON file, whole or not at all; raises InputError where it exists or cannot be written."""
-    write_text(path, format_json(document), overwrite=overwrite)
+    write_text(path, format_report(document), overwrite=overwrite)
 
 
-def format_json(document: Mapping[str, Any]) -> str:
+def format_report(document: Mapping[str, Any]) -> str:
     """Return the text of a JSON file."""
     text = json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False)
     # Bytes of file names that are not UTF-8 are lone surrogates in Python; JSON can escape them.

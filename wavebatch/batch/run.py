@@ -19,7 +19,7 @@ from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.options import RunOptions
-from wavebatch.batch.preflight import check_outputs, find_inputs, flight_path, load_flight, with_flight
+from wavebatch.batch.preflight import check_outputs, flight_path, list_read_files, load_flight, with_flight
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.workers.dask_cluster import Cluster
@@ -140,8 +140,8 @@ def run_batch(
     workers: Workers | Cluster = Workers(options.jobs)
     if options.scheduler is not None:
         files = sorted({file for job in jobs for file in job.files})
-        workers = Cluster(options.scheduler, options.folder, files, on_event)
-    with protecting(find_inputs(jobs)), workers:
+        workers = Cluster(options.scheduler, options.folder, files)
+    with protecting(list_read_files(jobs)), workers:
         with reporting(options.folder):
             options.folder.mkdir(parents=True, exist_ok=True)
         remove_stale(options.folder)

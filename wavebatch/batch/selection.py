@@ -1,6 +1,6 @@
 """Which rows of a strip are written: --drop-flags, --classes, --bbox, --polygon and --where of `wavebatch run`.
 
-`cli.run` and the public API build a `Selection`; workers apply it to the rows of each unit. Every row that is left
+`cli.run` and the public API build a `RowFilter`; workers apply it to the rows of each unit. Every row that is left
 out is counted by the first reason, in the order above.
 Before you change it: a row's values and its neighbours must not depend on what is written, only its return numbers do.
 """
@@ -36,7 +36,7 @@ WITHOUT_STAGE = ("echo_time", "echo_flags")
 
 
 @dataclass(frozen=True, slots=True)
-class Selection:
+class RowFilter:
     """What is written of a strip; picklable. By default everything."""
 
     drop_flags: int = 0
@@ -57,9 +57,9 @@ class Selection:
     """Rows must meet this."""
 
     def __bool__(self) -> bool:
-        return self != Selection()
+        return self != RowFilter()
 
-    def place(self, facts: CheckedHeader) -> Selection:
+    def place(self, facts: CheckedHeader) -> RowFilter:
         """Return the selection with its polygons in the coordinates of a strip; raises as `Polygon.place`."""
         if not self.polygons:
             return self
@@ -97,14 +97,14 @@ class Selection:
 class RowSelector:
     """A selection on the rows of one strip, from `plan`."""
 
-    selection: Selection
+    selection: RowFilter
     layout: OutputLayout
     """Of the cloud."""
     sources: Mapping[str, tuple[str, str]]
     """What each name of --where stands for: `computed`, `standard` or `carried`, and the column or field."""
 
     @classmethod
-    def plan(cls, selection: Selection, chain: Chain, layout: OutputLayout) -> RowSelector:
+    def plan(cls, selection: RowFilter, chain: Chain, layout: OutputLayout) -> RowSelector:
         """Return the selector of a strip.
 
         Parameters
@@ -205,7 +205,7 @@ class RowSelector:
         return read_field(rows, self.layout.point_format, found, self.layout.source.header)
 
 
-def build_selection(options: RunOptions) -> Selection:
+def build_selection(options: RunOptions) -> RowFilter:
     """Check the options of a selection.
 
     Parameters
@@ -229,7 +229,7 @@ def build_selection(options: RunOptions) -> Selection:
     box = None if bbox is None else tuple(map(float, bbox))
     if box is not None and not (len(box) == 4 and box[0] < box[2] < math.inf and box[1] < box[3] < math.inf):
         raise ConfigError(f"--bbox: {list(bbox)} must be west, south, east, north, with west < east and south < north")
-    return Selection(
+    return RowFilter(
         drop_flags=flags,
         classes=chosen,
         bbox=box,
@@ -239,7 +239,7 @@ def build_selection(options: RunOptions) -> Selection:
     )
 
 
-def describe_extent(layout: OutputLayout, selection: Selection) -> str:
+def describe_extent(layout: OutputLayout, selection: RowFilter) -> str:
     """Say that the areas lie outside the strip by its header; empty where they do not, or where there is none."""
     header = layout.source.header
     areas = [[ring for polygon in selection.areas for ring in polygon.rings]]

@@ -161,7 +161,7 @@ class StripTask:
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
         command = self.job.options.command(self.job.path.name)
         provenance = {**self._described, "command": command, **report_file.describe_chain(prepared)}
-        provenance |= report_file.describe_strip(prepared, self._described)
+        provenance |= report_file.describe_strip_result(prepared, self._described)
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite, threads=threads)
         if prepared.second_step is not None:
@@ -196,7 +196,7 @@ class StripTask:
         warnings = find_warnings(self.prepared, self._report, self._writer.dropped)
         self._report = replace(self._report, warnings=warnings)
         document = report_file.build_document(self.prepared, self._described, self._report, cloud, size)
-        draft = draft_text(report, report_file.format_json(document), overwrite=replaces)
+        draft = draft_text(report, report_file.format_report(document), overwrite=replaces)
         try:
             if replaces:
                 report.unlink(missing_ok=True)  # before the new cloud: an old report must not vouch for it
@@ -233,7 +233,7 @@ def _name_stranger(prepared: Prepared) -> tuple[str, ...]:
     """The line about a strip that does not belong to its flight."""
     if not prepared.stranger:
         return ()
-    return (f"does not belong to the flight that was surveyed: {prepared.stranger}; it got a survey of its own",)
+    return (f"does not belong to the flight that was surveyed: {prepared.stranger}; it was surveyed alone",)
 
 
 def _close_scan(future: Future) -> None:

@@ -65,7 +65,7 @@ class Prepared:
     """Timing of the preparation, and how many points have lost their packets."""
     sensor: SensorSource = UNKNOWN
     stranger: str = ""
-    """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
+    """Why the strip does not belong to its flight and was surveyed alone; empty where it does."""
     pulse_energy: PulseEnergy | None = None
     doubts: tuple[StripWarning, ...] = ()
     """Warnings about inputs that do not quite fit the strip, such as its calibration or the beam's divergence."""
@@ -197,7 +197,7 @@ def _see_level(
 
 
 def _take_reference(system: SystemPulse, seen: SystemPulse) -> SystemPulse:
-    """The system with the reference of angles, each digitizer with its own."""
+    """The system with the reference of angles, one for each digitizer."""
     others = {index: _take_reference(other, seen.digitizers[index]) for index, other in system.digitizers.items()}
     return replace(system, digitizers=others, widths=seen.widths)
 

@@ -6,21 +6,15 @@ Only reads options and prints; the measurements are in `wavebatch.tools.bench`.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
-from click.core import ParameterSource
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, print_result, talk
+from wavebatch.cli.messages import print_result, talk
 from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.tools.bench.command import BenchOptions, run_bench
-
-_REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "log_path", "log_level", "config", "debug")
-"""Options that --real uses."""
 
 
 @click.command()
@@ -33,8 +27,6 @@ _REAL = ("real", "files", "output", "html_file", "seed", "as_json", "quiet", "lo
 @shared.declared("tolerance", "Name the cheapest chain whose range error of isolated echoes is at most this, "
                  "e.g. 0.02m.")
 @shared.options_of(BenchOptions, "all_methods")
-@click.option("--real", is_flag=True,
-              help="Inject echoes into the waveforms of each STRIP and count those found, and count false echoes.")
 @shared.output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR",
                       required=False, folder=True)
 @shared.html_option
@@ -48,9 +40,6 @@ def bench(
     survey of it. Without STRIP, named scenes are simulated (default: mixed). The table has one row per chain and the
     standard error of each figure.
 
-    With --real nothing is simulated: clear echoes of each STRIP, scaled and shifted, are added to its other waveforms.
-    The tables show which of them are found, how right their errors are, and false echoes.
-
     Exit code: 0 done, 1 the strip cannot be read or the folder cannot be written, 2 wrong usage.
     """
     from wavebatch.tools.bench.report import format_document, write_outputs
@@ -59,12 +48,6 @@ def bench(
     strips = [path for path in files if path.suffix.lower() != ".toml"]
     silent = options["quiet"] or not sys.stderr.isatty()
     say = (lambda text: None) if silent else talk
-    if options["real"]:
-        _refuse_others(click.get_current_context())
-        if not strips or len(strips) < len(files):
-            raise click.UsageError("--real needs strips to measure, and no chain file: their surveys choose the chain")
-        _bench_real(strips, output, html_file, options, say)
-        return
     if len(strips) > 1:
         raise click.UsageError(f"one strip at a time, not {len(strips)}; chain files end in .toml")
     settings = shared.from_options(
@@ -85,39 +68,3 @@ def bench(
         write_bench_page(html_file, document, text)
         talk(f"{html_file}: written")
     print_result(options["as_json"], document, [text])
-
-
-def _refuse_others(context: click.Context) -> None:
-    """UsageError for options of the command line that --real does not use."""
-    for one in context.command.params:
-        if one.name not in _REAL and context.get_parameter_source(one.name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"{one.opts[0]} has no meaning with --real")
-
-
-def _bench_real(
-    strips: Sequence[Path], output: Path | None, html_file: Path | None, options: Mapping[str, Any],
-    say: Callable[[str], None],
-) -> None:  # fmt: skip
-    """Measures strip after strip; one that cannot be measured is named, and the others go on."""
-    from wavebatch.tools.bench.real.measure import measure_real
-    from wavebatch.tools.bench.real.report import format_report, write_report
-
-    def measure(path: Path) -> list[Any]:
-        found = measure_real(path, seed=options["seed"], say=say)
-        for report in found:
-            if output:
-                talk(write_report(report, output))
-            if not options["as_json"]:
-                click.echo(format_report(report) + "\n")
-        return found
-
-    each, failed = shared.for_each(strips, measure, debug=options["debug"], alone=True)
-    reports = sum(each, [])
-    if html_file is not None and reports:
-        from wavebatch.tools.html.bench_page import write_real_page
-
-        write_real_page(html_file, [(report.title, format_report(report)) for report in reports])
-        talk(f"{html_file}: written")
-    answer({"strips": [asdict(report) for report in reports]}, "real")
-    if failed:
-        sys.exit(1)

@@ -7,23 +7,20 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.compare_tables import list_angles, list_lines, list_match, list_overlap
+from wavebatch.cli.compare_tables import list_lines, list_match
 from wavebatch.cli.messages import print_result, talk, tell
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
 
 if TYPE_CHECKING:
-    from wavebatch.tools.compare.angles import AngleAgreement
     from wavebatch.tools.compare.chains import Matchup
-    from wavebatch.tools.compare.overlap import OverlapComparison
 
 EXIT_VIOLATED = 1
 """A threshold was not met."""
@@ -44,10 +41,6 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 @shared.system_option
 @click.option("--limit", type=click.IntRange(1), metavar="N",
               help="With --strip: use about N waveforms, spread over the strip, instead of all.")
-@click.option("--angles", is_flag=True,
-              help="Compare incidence angles from echo widths with those from normals: both of A, or of A and B.")
-@click.option("--overlap", is_flag=True,
-              help="Compare brightness and height of the clouds of two strips, A and B, where they overlap.")
 @shared.where_option("Compare at the points of both clouds, or at those of A with --truth (all true echoes count)")
 @click.option("--within", type=float, metavar="NS",
               help="Largest time difference of the same echo [ns].  [default: 1; with --truth: 1.5]")
@@ -65,8 +58,6 @@ def compare(
     b: Path | None,
     strip: Path | None,
     truth: Path | None,
-    angles: bool,
-    overlap: bool,
     html_file: Path | None,
     as_json: bool,
     output: Path | None,
@@ -82,26 +73,11 @@ def compare(
     the vendor's returns, and by their goodness of fit. One of them may be a cloud. Without B, A is compared with the
     vendor's returns.
 
-    With --angles, column incidence_angle is compared with incidence_angle_normals: both of A, or one of A and the other
-    of B.
-
-    With --overlap, A and B are clouds of two strips that overlap. On flat places with single echoes of both, columns
-    backscatter_coefficient and reflectance (or their relative ones) and heights are compared.
-
     Exit code: 0 done, 1 a threshold (--min-..., --max-...) is not met, 2 wrong usage or a file cannot be read.
     """  # fmt: skip
     shared.check_html(html_file)
     if output is not None:
-        if angles or overlap:
-            raise click.UsageError("-o has no meaning with --angles and --overlap; --json writes their figures")
         check_target(output, overwrite=overwrite)
-    if angles or overlap:
-        mode = "overlap" if overlap else "angles"
-        others = {"strip": strip, "truth": truth, "angles": angles and overlap}
-        found, lines = _measure(mode, a, b, {**options, **others})
-        print_result(as_json, found, lines, mode)
-        _write_page(html_file, found, [])
-        return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
     if output is not None:
@@ -201,24 +177,3 @@ def _check_thresholds(result: Comparison, options: dict) -> list[str]:
         if not fine:
             lines.append(f"threshold --{name.replace('_', '-')} {limit:g} is not met: {result.a} has {figure:.6g}")
     return lines
-
-
-def _measure(
-    mode: str, a: Path, b: Path | None, options: dict
-) -> tuple[AngleAgreement | OverlapComparison, Iterator[str]]:
-    """What --angles or --overlap finds, and its tables; UsageError for options that have no meaning with it."""
-    used = {"angles": ("debug", "quiet", "within"), "overlap": ("debug", "quiet")}[mode]
-    for name, value in options.items():
-        if value not in (None, False) and name not in used:
-            raise click.UsageError(f"--{name.replace('_', '-')} has no meaning with --{mode}")
-    if mode == "angles":
-        from wavebatch.tools.compare.angles import compare_angles
-
-        agreement = compare_angles(a, b, **_tolerance(options))
-        return agreement, list_angles(agreement)
-    if b is None:
-        raise click.UsageError("--overlap needs two clouds, A and B")
-    from wavebatch.tools.compare.overlap import compare_overlap
-
-    found = compare_overlap(a, b)
-    return found, list_overlap(found)

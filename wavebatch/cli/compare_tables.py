@@ -9,15 +9,9 @@ from typing import TYPE_CHECKING
 from wavebatch.cli.messages import count, row
 
 if TYPE_CHECKING:
-    from wavebatch.tools.compare.angles import AngleAgreement
     from wavebatch.tools.compare.chains import Matchup
     from wavebatch.tools.compare.clouds import Comparison
     from wavebatch.tools.compare.differences import Spread
-    from wavebatch.tools.compare.overlap import OverlapComparison
-
-_BAR = 40
-"""Characters of the longest bar of a histogram."""
-
 
 def list_lines(result: Comparison) -> Iterator[str]:
     """The tables of every comparison of echoes."""
@@ -101,55 +95,3 @@ def list_match(result: Matchup) -> Iterator[str]:
         if not classes:
             yield f"{side.upper()} no-data: a cloud does not hold the fitted model"
     yield "E = |f - y|^2 / |f|^2 of model f and waveform y; E0 is the E that noise alone gives"
-
-
-def list_overlap(result: OverlapComparison) -> Iterator[str]:
-    """A line for the height and for each column that both clouds have."""
-    yield from (f"A {result.a}", f"B {result.b}", f"flat cells of {result.cell:.1f} m with single echoes of both")
-    yield from ("", row(f"{'A against B':<26}", ("cells", "median", "error", "nmad", "stated")))
-    height = result.height
-    yield row(f"{'height, A - B, m':<26}", (height.cells, height.median, height.error, height.nmad, math.nan), ".4f")
-    for name, one in result.columns.items():
-        values = (100 * value for value in (one.median, one.error, one.nmad, one.stated))
-        yield row(f"{name + ', %':<26}", (one.cells, *values), ".3f")
-    if not result.columns:
-        yield "no calibrated or relative column is in both; run both strips with --calibration"
-    elif result.angles == "scan angle":
-        yield "backscatter is taken to a facing surface by the scan angle, on level cells; stated: error of one echo"
-    else:
-        yield "backscatter is taken to a facing surface by incidence_angle_normals; stated: error of one echo"
-
-
-def list_angles(result: AngleAgreement) -> Iterator[str]:
-    """Figures and histograms as text."""
-    yield from [f"A {result.a}"] + ([f"B {result.b}"] if result.b else [])
-    yield (
-        f"points        {result.points:>12}   with angle from width {result.with_widths}, from normals "
-        f"{result.with_normals}, both {result.number}"
-    )
-    if not result.number:
-        yield "no point has both angles; the report of the run gives the reasons"
-        return
-    share = "no errors" if math.isnan(result.within_error) else f"{100 * result.within_error:.1f} %"
-    yield f"bias          {result.bias:>12.3f}   deg, angle from width less angle from normals"
-    yield f"MAE           {result.mae:>12.3f}   deg"
-    yield f"median abs    {result.median_absolute:>12.3f}   deg"
-    yield f"rms           {result.rms:>12.3f}   deg"
-    yield f"within errors {share:>12}   of the differences within one standard deviation of both"
-    yield from ("", f"{'angle deg':>12}  from width", *_bars(result.edges, result.histogram_widths))
-    yield from (f"{'angle deg':>12}  from normals", *_bars(result.edges, result.histogram_normals))
-    difference = _bars(result.difference_edges, result.histogram_difference)
-    yield from (f"{'difference':>12}  width less normals", *difference)
-
-
-def _bars(edges: tuple[float, ...], counts: tuple[int, ...]) -> list[str]:
-    """A line per bin, from the first to the last that holds a thousandth of all; the rest in one line `beyond`."""
-    filled = [number for number, count in enumerate(counts) if 1000 * count >= sum(counts)]
-    most = max(counts)
-    beyond = sum(counts) - sum(counts[filled[0] : filled[-1] + 1])
-    lines = [
-        f"{edges[number]:>5.0f} to {edges[number + 1]:>3.0f} {counts[number]:>11} "
-        + "#" * math.ceil(_BAR * counts[number] / most)
-        for number in range(filled[0], filled[-1] + 1)
-    ]
-    return [*lines, f"{'beyond':>12} {beyond:>11}"] if beyond else lines

@@ -181,7 +181,7 @@ def _point_lines(facts: dict[str, Any]) -> Iterator[str]:
 
 
 def _record_lines(records: list[dict[str, Any]]) -> Iterator[str]:
-    """A line per VLR; the descriptors of packets have lines of their own."""
+    """A line per VLR; the descriptors of packets have a line each."""
     for one in records:
         if not (one["user"].startswith("LAS") and 100 <= one["id"] < 356):
             kind = "EVLR" if one["extended"] else "VLR "

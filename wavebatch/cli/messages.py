@@ -122,14 +122,14 @@ class NearestGroup(click.Group):
 def talk(message: str) -> None:
     """One line on stderr, and in the file of --log-file."""
     write_message(printable(message))
-    log_file.log(printable(message))
+    log_file.log_text(printable(message))
 
 
 def tell(message: str) -> None:
     """As `talk`; with --quiet in the file of --log-file only."""
     if not click.get_current_context().params["quiet"]:
         write_message(printable(message))
-    log_file.log(printable(message))
+    log_file.log_text(printable(message))
 
 
 def write_message(line: str) -> None:
@@ -264,7 +264,7 @@ def report_errors(failure: int = 1) -> Callable:
                 return function(*args, **options)
             except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError) as error:
                 if isinstance(error, click.ClickException):
-                    log_file.log(printable(error.format_message()), "error")
+                    log_file.log_text(printable(error.format_message()), "error")
                 raise
             except Exception as error:
                 if interrupts.arrived():  # compiled code may have turned KeyboardInterrupt into this

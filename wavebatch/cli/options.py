@@ -139,7 +139,7 @@ def bbox_option(text: str) -> Callable:
 
 _READERS: dict[str, Callable[[str], Any]] = {
     "bbox": lambda text: parse_floats(text, "WEST,SOUTH,EAST,NORTH"),
-    "lever_arm": lambda text: parse_floats(text, OPTIONS["lever_arm"].told.form),
+    "lever_arm": lambda text: parse_floats(text, OPTIONS["lever_arm"].words.form),
     "tolerance": lambda text: parse_length(text) / 100.0,
     "memory": _parse_size,
     "classes": _parse_classes,
@@ -173,15 +173,15 @@ class Text(click.ParamType):
 def declared(name: str, text: str = "", kind: type = RunOptions, **more: Any) -> Callable:
     """An option that is declared in a dataclass; text: its help in this command; more: what differs for click."""
     one = declared_options(kind)[name]
-    told, default = one.told, more.get("default", one.default)
-    parts = [text or told.help, f"[default: {told.unset}]" if told.unset and more.get("default") is None else ""]
-    how: dict[str, Any] = {"help": "  ".join(filter(None, parts)), "metavar": told.form or None}
+    words, default = one.words, more.get("default", one.default)
+    parts = [text or words.help, f"[default: {words.unset}]" if words.unset and more.get("default") is None else ""]
+    how: dict[str, Any] = {"help": "  ".join(filter(None, parts)), "metavar": words.form or None}
     how |= {"shell_complete": _COMPLETE.get(name), "required": default is MISSING}
     if default is not MISSING and not more.get("required"):
-        how |= {"default": default, "show_default": not told.unset and default is not None and one.kinds != (bool,)}
+        how |= {"default": default, "show_default": not words.unset and default is not None and one.kinds != (bool,)}
     how |= {"is_flag": True} if one.kinds == (bool,) else _find_type(name, one)
-    word = typed(told.name or name) + f"/--{told.opposite}" * bool(told.opposite)
-    return click.option(*[f"-{told.short}"] * bool(told.short), word, name, **{**how, **more})
+    word = typed(words.name or name) + f"/--{words.opposite}" * bool(words.opposite)
+    return click.option(*[f"-{words.short}"] * bool(words.short), word, name, **{**how, **more})
 
 
 def options_of(kind: type, *names: str, **more: Any) -> Callable:
@@ -197,7 +197,7 @@ def _find_type(name: str, one: Declared) -> dict[str, Any]:
             return {"type": numbers, "callback": lambda context, parameter, text: text and int(text)}
         return {"type": click.Choice(one.choices)}
     if name in _READERS:
-        return {"type": Text(one.told.form, _READERS[name])}
+        return {"type": Text(one.words.form, _READERS[name])}
     number = next((number for number in (int, float) if number in one.kinds), None)
     if one.limits is not None:
         kind = click.IntRange if number is int else click.FloatRange
@@ -217,7 +217,7 @@ def _plain(limit: float) -> float | None:
 
 def where_option(text: str) -> Callable:
     """`--where`; text: what is done with the points that meet the condition."""
-    return declared("where", OPTIONS["where"].told.help.replace("Write only points", text, 1))
+    return declared("where", OPTIONS["where"].words.help.replace("Write only points", text, 1))
 
 
 selection_options = together(

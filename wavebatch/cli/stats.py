@@ -23,7 +23,7 @@ from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.csv_table import format_csv
-from wavebatch.tools.return_stats.areas import RANKS, AreaStats, Grid, PolygonSet, Separation, describe_pairs
+from wavebatch.tools.return_stats.areas import RANKS, AreaGrid, AreaStats, PolygonSet, Separation, describe_pairs
 from wavebatch.tools.return_stats.dead_zones import BIN, BINS, LEAST_PAIRS, DeadZone
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 
@@ -62,7 +62,7 @@ def stats(
     files = shared.find_inputs(clouds, recursive=recursive)
     if output is not None:
         check_target(output, overwrite=overwrite)
-    divisions = [] if size is None else [Grid(size)]
+    divisions = [] if size is None else [AreaGrid(size)]
     divisions += [] if polygon is None else [PolygonSet(load_polygons(polygon))]
     failed: list[InputError] = []
 

@@ -20,7 +20,6 @@ PACKAGES = {
     "pyproj": "pyproj>=3.6",
     "rasterio": "rasterio>=1.3",
     "distributed": "distributed>=2024.1",
-    "laszip": "laszip>=0.3",
     "pandas": "pandas>=2.0",
 }
 """What pyproject.toml asks for of each optional package; `tests/test_docs.py` compares them."""

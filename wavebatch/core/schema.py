@@ -103,7 +103,7 @@ class Declared(NamedTuple):
     """An option with what its annotation says."""
 
     default: Any
-    told: Option
+    words: Option
     kinds: tuple[type, ...]
     choices: tuple[Any, ...] | None
     limits: Range | None
@@ -127,7 +127,7 @@ def typed(name: str) -> str:
 def check_options(options: Any) -> None:
     """Raise ConfigError for an option that is none of its choices, or outside of its range."""
     for name, one in declared_options(type(options)).items():
-        value, place = getattr(options, name), typed(one.told.name or name)
+        value, place = getattr(options, name), typed(one.words.name or name)
         if value is None and type(None) in one.kinds:
             continue
         if one.choices is not None and value not in one.choices:

@@ -158,9 +158,9 @@ def _project(
 ) -> list[np.ndarray]:
     """Rings of the CRS `source` in that of a strip, `definition`."""
     other = _code(definition)
-    own = f"is in {other}" if other else "does not name its CRS by a code"
+    stated = f"is in {other}" if other else "does not name its CRS by a code"
     pyproj = need("pyproj", lambda advice: ConfigError(
-        f"{file.path}: is in {source[:_LONGEST_NAME]}, and {strip} {own}; projecting it needs pyproj: {advice}; or "
+        f"{file.path}: is in {source[:_LONGEST_NAME]}, and {strip} {stated}; projecting it needs pyproj: {advice}; or "
         "write it in the coordinates of the strip, without a member crs"
     ))  # fmt: skip
     try:

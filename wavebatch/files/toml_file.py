@@ -143,8 +143,8 @@ def parse_toml(text: str, name: str) -> TomlTable:
 def _is_deep(document: dict[str, Any]) -> bool:
     level: list[Any] = [document]
     for _ in range(MOST_NESTED):
-        held = [value.values() if isinstance(value, dict) else value for value in level]
-        level = [item for items in held for item in items if isinstance(item, dict | list)]
+        tables = [value.values() if isinstance(value, dict) else value for value in level]
+        level = [item for items in tables for item in items if isinstance(item, dict | list)]
     return bool(level)
 
 

@@ -23,7 +23,7 @@ MOST_RECORDS = 400_000
 """Most positions that are kept of an SBET: 5 hours at 20 Hz; more of them do not make the interpolation better."""
 
 MOST_TEXT = 1 << 30
-"""Most bytes of a text file: it is held in memory."""
+"""Most bytes of a text file: it is kept in memory."""
 
 MOST_NAME = 100
 """Most characters of the name of a column."""

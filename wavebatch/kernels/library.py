@@ -45,7 +45,7 @@ class Pulse(ctypes.Structure):
     SUM_OF_GAUSSIANS, SKEWED, POWER, TABLE, LOG_NORMAL = range(5)
 
 
-class Settings(ctypes.Structure):
+class CSettings(ctypes.Structure):
     """`Settings` of kernels/c/types.h."""
 
     _fields_ = [
@@ -72,7 +72,7 @@ class Block(ctypes.Structure):
     ]
 
 
-class Clusters(ctypes.Structure):
+class CClusters(ctypes.Structure):
     """`Clusters` of kernels/c/types.h."""
 
     _fields_ = [
@@ -90,7 +90,7 @@ class Echoes(ctypes.Structure):
     ]
 
 
-class Described(ctypes.Structure):
+class CDescribed(ctypes.Structure):
     """`Described` of kernels/c/describe.h."""
 
     _fields_ = [
@@ -103,7 +103,7 @@ class Described(ctypes.Structure):
     ]
 
 
-class Candidates(ctypes.Structure):
+class CCandidates(ctypes.Structure):
     """`Candidates` of kernels/c/signal.h."""
 
     _fields_ = [*_fields(ctypes.c_int64, "room"), *_fields(_POINTER, "waveform amplitude time width")]
@@ -125,7 +125,7 @@ class Grouping(ctypes.Structure):
     _fields_ = [*_fields(ctypes.c_int64, "margin reach most"), *_fields(_POINTER, "tail")]
 
 
-class Groups(ctypes.Structure):
+class CGroups(ctypes.Structure):
     """`Groups` of kernels/c/signal.h."""
 
     _fields_ = _fields(_POINTER, "waveform low high first number")

@@ -78,8 +78,8 @@ class Stage:
     it, so that widths and areas are read as what they are. None: the survey's pulse."""
     shape: Callable[[SystemPulse, float, Mapping[str, Any]], PulseShape | None] | None = None
     """Of a decomposer: the pulse by which its echoes are drawn, from system, spacing [ns] and parameters; None where
-    nothing is fitted. Without this function it is the pulse of the system that `fits` returns. Echoes with a skew or an
-    exponent of their own carry it as a column."""
+    nothing is fitted. Without this function it is the pulse of the system that `fits` returns. Echoes whose skew or
+    exponent was fitted carry it as a column."""
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None
     """What is wrong with this stage in a chain and for a strip (None before the strip is known); empty if nothing."""
 

@@ -23,7 +23,7 @@ LEAST_QUIET, LOWEST_TENTH = 6, 1.28
 normal noise lies below its mean."""
 
 APART, MARGIN = 4.0, 0.5
-"""A recording has a level of its own if it differs from its waveform's baseline by APART standard errors and MARGIN
+"""A recording has another level if it differs from its waveform's baseline by APART standard errors and MARGIN
 times the noise, as much as the foot of an echo can raise its quiet samples."""
 
 MOST_RECORDINGS = 8
@@ -90,7 +90,7 @@ def pooled(
 
 
 def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit: float) -> Noise:
-    """The noise with a level of its own for each recording that differs from the baseline of its waveform.
+    """The noise with another level for each recording that differs from the baseline of its waveform.
 
     The level of a recording is that of its quiet samples. Where echoes leave fewer than LEAST_QUIET, it is that of its
     lowest samples: a level that is too high loses the foot of an echo, one that is too low makes false echoes.

@@ -16,7 +16,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.crs import read_crs_definition
-from wavebatch.files.strip.ray_sample import Rays, measure_scale, sample_rays
+from wavebatch.files.strip.ray_sample import RaySample, measure_scale, sample_rays
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
@@ -258,7 +258,7 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
     return ()
 
 
-def _from_file(reader: StripReader, rays: Rays, request: SensorRequest, several: bool) -> SensorSource:
+def _from_file(reader: StripReader, rays: RaySample, request: SensorRequest, several: bool) -> SensorSource:
     crs = request.crs or read_crs_definition(reader.facts.path, reader.facts.header, heights=True)
     known = read_trajectory(request.trajectory, crs=crs, lever_arm=request.lever_arm)
     times = rays.time[np.isfinite(rays.time) & (rays.time != 0)]
@@ -321,7 +321,7 @@ def _find_lag(known: Trajectory, path: Trajectory) -> tuple[float | None, float 
 
 
 def _compare_ranges(
-    distance: np.ndarray, rays: Rays, path: SensorSource | None
+    distance: np.ndarray, rays: RaySample, path: SensorSource | None
 ) -> tuple[float | None, float, float | None]:
     """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, root mean square, and
     the error of the latter; None, 0 and None where the vectors give no position."""
@@ -337,7 +337,7 @@ def _compare_ranges(
     return round(float(np.median(longer)), 3), error, round(path.error, 6)
 
 
-def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: Rays) -> float:
+def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> float:
     """Median angle between packet vectors and rays from the trajectory [rad]; InputError where it is too large."""
     with np.errstate(all="ignore"):
         ahead = ahead / distance[:, None]
@@ -355,7 +355,7 @@ def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: Rays) -> float:
     return angle
 
 
-def estimate_path(rays: Rays, kind: str) -> SensorSource | None:
+def estimate_path(rays: RaySample, kind: str) -> SensorSource | None:
     """Estimate the sensor's path from the points where its rays meet, in time windows along the flight.
 
     Parameters
@@ -395,7 +395,7 @@ def estimate_path(rays: Rays, kind: str) -> SensorSource | None:
     return SensorSource(kind, path, distance=distance, error=error, facts=facts)
 
 
-def _fit_window(rays: Rays, cells: np.ndarray, node: float) -> tuple[SensorFit | None, float, float]:
+def _fit_window(rays: RaySample, cells: np.ndarray, node: float) -> tuple[SensorFit | None, float, float]:
     """The fit around a node from the smallest window that gives one, and first and last time of the node's rays."""
     own = np.searchsorted(cells, [node, node + 1])
     low, high = float(rays.time[own[0]]), float(rays.time[own[1] - 1])
@@ -418,7 +418,7 @@ def _node_times(nodes: np.ndarray, node: float, low: float, high: float, middle:
     return np.unique(times)
 
 
-def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: Rays, distance: float) -> float:
+def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: RaySample, distance: float) -> float:
     """Root mean square of the range's error over all windows [m]: what the fits say, what they contradict, and what
     none of them can see."""
     squares, apart = [], []
@@ -447,7 +447,7 @@ def _contradiction(fit: SensorFit, later: SensorFit) -> np.ndarray:
 
 
 def _describe(
-    found: list[tuple[SensorFit, np.ndarray, np.ndarray]], path: Trajectory, rays: Rays
+    found: list[tuple[SensorFit, np.ndarray, np.ndarray]], path: Trajectory, rays: RaySample
 ) -> tuple[tuple[str, Any], ...]:
     """Height, speed, heading and smoothness of a path, for reports."""
     speed = np.sqrt((path.velocity**2).sum(axis=1))

@@ -39,7 +39,8 @@ def connected(address: str) -> Iterator[Any]:
         client = _call_in_time(_CONNECT + 0.5, lambda: Client(address, **options))
     except Exception as error:
         raise ConfigError(
-            f"--scheduler {address}: cannot be reached: {one_line(error)}; give the address that dask scheduler prints"
+            f"--scheduler {address}: cannot be reached: {shorten_error(error)}; "
+            "give the address that dask scheduler prints"
         ) from error
     try:
         yield client
@@ -76,7 +77,7 @@ def _call_in_time(seconds: float, function: Callable) -> Any:
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Silence dask's own messages on stderr: wavebatch reports the same in one line."""
+    """Silence dask's messages on stderr: wavebatch reports the same in one line."""
     import dask
     import distributed  # noqa: F401 - creates the loggers that are silenced below
 
@@ -93,6 +94,6 @@ def silent() -> Iterator[None]:
                 logging.getLogger(name).setLevel(level)
 
 
-def one_line(reason: object) -> str:
+def shorten_error(reason: object) -> str:
     """The text of an error on one line of bounded length."""
     return " ".join(str(reason).split())[:200] or type(reason).__name__

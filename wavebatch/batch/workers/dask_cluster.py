@@ -1,32 +1,24 @@
 """Workers of an existing dask cluster, for `wavebatch run --scheduler`; files must be visible to all machines.
 
-`Cluster` has the same methods as `processes.Workers`.
-Before you change it: the scheduler may lack wavebatch and NumPy, so it must see plain bytes only; and a cluster that
-is lost must end the run with a message, never hang it.
+`Cluster` has the same methods as `processes.Workers`. Work goes to the workers that are there when the run starts.
+Before you change it: calls and results travel as bytes, because dask takes tuples with functions for tasks and makes
+arrays read-only; and a cluster that is lost must end the run with a message, never hang it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib.util
 import pickle
-import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.workers.dask_client import connected, one_line, silent
+from wavebatch.batch.workers.dask_client import connected, shorten_error, silent
 from wavebatch.batch.workers.futures import end_future, wait_uninterrupted
-from wavebatch.batch.workers.worker_check import (
-    compare_workers,
-    describe_worker,
-    list_sizes,
-    travelling_call,
-    travelling_kind,
-)
+from wavebatch.batch.workers.worker_check import compare_workers, describe_worker, list_sizes
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.protect import list_packet_files
@@ -39,8 +31,6 @@ _WORKERS = 10.0
 """Seconds to wait for the first worker."""
 _POLL = 5.0
 """Seconds between two questions to the scheduler."""
-_MISFIT = "misfit"
-"""Answer of a worker that joined later and does not fit."""
 _ADVICE = "check that it runs, and run again with --resume: finished clouds are complete"
 
 
@@ -55,8 +45,6 @@ class Cluster:
         Of the outputs; temporary files that workers share lie in it.
     files : sequence of Path
         That all workers must see: `StripJob.files`.
-    tell : callable, optional
-        Called with the events of `run_batch`: here, of a worker that joins and does not fit.
 
     Raises
     ------
@@ -68,18 +56,10 @@ class Cluster:
     jobs = 1
     """Threads of this machine that compress."""
 
-    def __init__(
-        self,
-        address: str,
-        folder: Path,
-        files: Sequence[Path] = (),
-        tell: Callable[[dict[str, Any]], None] | None = None,
-    ) -> None:
+    def __init__(self, address: str, folder: Path, files: Sequence[Path] = ()) -> None:
         self.address, self._folder, self._files = address, folder.absolute(), files
-        self._tell = tell or (lambda event: None)
-        self._kind: dict[str, str] = {}
-        self._misfits: set[str] = set()
-        """Workers that get no call."""
+        self._workers: dict[str, int] = {}
+        """Threads of each worker that is known to fit; others get no call."""
         self.limit = 2
         self._client: Any = None
         self._scratch: Path | None = None
@@ -92,7 +72,8 @@ class Cluster:
         with contextlib.ExitStack() as stack:
             stack.enter_context(silent())
             self._client = stack.enter_context(connected(self.address))
-            self.limit = 2 * self._count_threads()
+            self._workers = self._find_workers()
+            self.limit = 2 * sum(self._workers.values())
             self._check_versions()
             with reporting(self._folder):
                 self._folder.mkdir(parents=True, exist_ok=True)
@@ -106,32 +87,16 @@ class Cluster:
 
     def submit(self, function: Callable, *arguments: Any) -> Future:
         """Return the future result of `function(*arguments)`; both must be picklable."""
-        call = pickle.dumps((_work, (self._scratch, function, arguments)), pickle.HIGHEST_PROTOCOL)
-        return _Promise(functools.partial(self._send, call), self._translate, self._put_aside)
+        call = pickle.dumps((self._scratch, function, arguments), pickle.HIGHEST_PROTOCOL)
+        try:
+            remote = self._client.submit(_work, call, pure=False, workers=list(self._workers))
+        except Exception as error:
+            raise self._lost(error) from error
+        return _Promise(remote, self._translate)
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
         """Yield `function(item)` of every item, in this process: short calls are slower on another machine."""
         return map(function, items)
-
-    def _send(self, call: bytes) -> Any:
-        """Give the pickled call to a worker; the remote future."""
-        try:
-            chosen = {}
-            if self._misfits:
-                chosen = {"workers": [worker for worker in self._client.nthreads() if worker not in self._misfits]}
-                if not chosen["workers"]:
-                    raise ValueError("no worker fits")
-            return self._client.submit(travelling_call(), call, self._kind, pure=False, **chosen)
-        except Exception as error:
-            raise self._lost(error) from error
-
-    def _put_aside(self, worker: str, kind: dict[str, str]) -> None:
-        """Take note of a worker that does not fit; it gets no further call."""
-        if worker not in self._misfits:
-            self._misfits.add(worker)
-            why = compare_workers(self._kind, kind)
-            line = f"worker {worker} {why}; it gets no work"
-            self._tell({"event": "worker", "strip": self.address, "warning": line})
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Wait for at least one future and return those done; BrokenExecutor where the cluster is lost."""
@@ -139,34 +104,36 @@ class Cluster:
         self._heard = time.monotonic()
         while not (done := wait_uninterrupted(futures, _POLL)):
             with contextlib.suppress(Exception):
-                if self._client.sync(self._client.scheduler.ncores, workers=None, callback_timeout=_POLL):
+                there = self._client.sync(self._client.scheduler.ncores, workers=None, callback_timeout=_POLL)
+                if self._workers.keys() & there.keys():
                     self._heard = time.monotonic()
             if self._client.status == "closed" or time.monotonic() - self._heard > PATIENCE:
                 raise self._lost("no worker answers")
         return done
 
     def restart(self) -> None:
-        """Do nothing: the cluster replaces workers that died."""
+        """Do nothing: calls of a worker that died go to the others."""
 
-    def _count_threads(self) -> int:
+    def _find_workers(self) -> dict[str, int]:
         try:
             self._client.wait_for_workers(1, timeout=_WORKERS)
         except Exception as error:
             raise ConfigError(f"--scheduler {self.address}: has no workers; start some: dask worker ADDRESS") from error
-        return sum(self._client.nthreads().values())
+        return dict(self._client.nthreads())
 
     def _check_versions(self) -> None:
-        """Raise ConfigError where a worker is not of the kind of this process."""
-        self._kind = describe_worker()
-        # First of all Python: code does not travel between its versions.
-        found = self._ask(platform.python_version_tuple)
-        self._refuse({worker: {**self._kind, "python": ".".join(version[:2])} for worker, version in found.items()})
-        self._refuse(self._ask(travelling_kind()))
-
-    def _refuse(self, kinds: dict[str, dict[str, str | None]]) -> None:
-        for worker, kind in sorted(kinds.items()):
-            if why := compare_workers(self._kind, kind):
+        """Raise ConfigError where the scheduler or a worker is not of the kind of this process."""
+        here = describe_worker()
+        for worker, kind in sorted(self._ask(describe_worker).items()):
+            if why := compare_workers(here, kind):
                 raise ConfigError(f"--scheduler {self.address}: worker {worker} {why}")
+        try:
+            self._client.run_on_scheduler(describe_worker)
+        except Exception as error:
+            raise ConfigError(
+                f"--scheduler {self.address}: the scheduler cannot load wavebatch ({shorten_error(error)}); "
+                "install the same there"
+            ) from error
 
     def _check_files(self) -> None:
         """Raise ConfigError where a worker does not see a strip, or sees another folder of the same name."""
@@ -189,9 +156,12 @@ class Cluster:
     def _ask(self, function: Callable, *arguments: Any) -> dict[str, Any]:
         """The answer of each worker."""
         try:
-            return self._client.run(function, *arguments)
+            return self._client.run(function, *arguments, workers=list(self._workers))
         except Exception as error:
-            raise ConfigError(f"--scheduler {self.address}: a worker cannot be asked: {one_line(error)}") from error
+            raise ConfigError(
+                f"--scheduler {self.address}: a worker cannot be asked: {shorten_error(error)}; "
+                "it needs the same wavebatch"
+            ) from error
 
     def _translate(self, error: BaseException) -> BaseException:
         """The error of a call, in the words of wavebatch where it comes from the cluster."""
@@ -208,32 +178,20 @@ class Cluster:
         return error
 
     def _lost(self, reason: object) -> BrokenExecutor:
-        return BrokenExecutor(f"{self.address}: the cluster is lost ({one_line(reason)}); {_ADVICE}")
+        return BrokenExecutor(f"{self.address}: the cluster is lost ({shorten_error(reason)}); {_ADVICE}")
 
 
 class _Promise(Future):
-    """A remote future with the interface of concurrent.futures; its call goes on to another worker from a misfit."""
+    """A remote future with the interface of concurrent.futures."""
 
-    def __init__(
-        self,
-        send: Callable[[], Any],
-        translate: Callable[[BaseException], BaseException],
-        put_aside: Callable[[str, dict[str, str]], None],
-    ) -> None:
+    def __init__(self, remote: Any, translate: Callable[[BaseException], BaseException]) -> None:
         super().__init__()
-        self._send, self._translate, self._put_aside = send, translate, put_aside
-        self._remote = send()
-        self._remote.add_done_callback(self._take)
+        self._remote, self._translate = remote, translate
+        remote.add_done_callback(self._take)
 
     def _take(self, remote: Any) -> None:
         try:
-            result, error = pickle.loads(remote.result())
-            if error == _MISFIT:
-                self._put_aside(*result)
-                if not self.cancelled():
-                    self._remote = self._send()
-                    self._remote.add_done_callback(self._take)
-                return
+            result, error = pickle.loads(remote.result()), None
         except BaseException as failure:
             result, error = None, self._translate(failure)
         end_future(self, result, error)
@@ -246,11 +204,12 @@ class _Promise(Future):
         return cancelled
 
 
-def _work(scratch: Path | None, function: Callable, arguments: tuple) -> Any:
-    """On a worker: the function's result; temporary files lie in a folder that all workers see."""
+def _work(call: bytes) -> bytes:
+    """On a worker: the pickled result of a call; temporary files lie in a folder that all workers see."""
+    scratch, function, arguments = pickle.loads(call)
     use_scratch(scratch)
     try:
-        return function(*arguments)
+        return pickle.dumps(function(*arguments), pickle.HIGHEST_PROTOCOL)
     finally:
         use_scratch(None)
 

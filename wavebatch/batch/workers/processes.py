@@ -171,7 +171,7 @@ def refuse_import() -> None:
 
 
 def start_early(jobs: int, needs_main: bool = False) -> None:
-    """Start processes that the next Workers will take: they import their modules while this process imports its own.
+    """Start processes that the next Workers will take: they import their modules while this process does the same.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ _early: list[_Process] = []
 
 
 class _Worker:
-    """A process, and the thread that hands it calls and takes its results through a pipe of its own.
+    """A process, and the thread that hands it calls and takes its results through a pipe.
 
     One pipe per process: a process that dies in the middle of a result cannot block the results of the others.
     """

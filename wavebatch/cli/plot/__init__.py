@@ -58,7 +58,7 @@ def plot() -> None:
 @click.option("--times", "shown", type=shared.Text("LOW:HIGH|all", _read_times), metavar="LOW:HIGH|all",
               help="Part of the waveforms to show [ns].  [default: the part with signal, of each waveform]")
 @click.option("--show", metavar="|".join(_SHOWN), help="Also draw the signal in which the detector searches, with its "
-              "threshold; detector: that of the chain's own detector.")
+              "threshold; detector: that of the chain's detector.")
 @click.option("--echoes", "table", is_flag=True,
               help="List amplitude, time, width, range and errors of all echoes below; -o FILE.csv writes only them.")
 @shared.chain_options
@@ -115,13 +115,13 @@ def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, opti
         end = max(view.time[-1] for view in views)
         raise ConfigError(f"--times {shown[0]:g}:{shown[1]:g}: no sample lies there; the waveforms end at {end:g} ns")
     if options["sheet"]:
-        from wavebatch.tools.plots.draw_sheet import draw_sheet
+        from wavebatch.tools.plots.draw_sheet import draw_waveform_sheet
 
-        draw_sheet(views, output, times=shown, **more)
+        draw_waveform_sheet(views, output, times=shown, **more)
         return
-    from wavebatch.tools.plots.draw_waveform import draw_waveforms
+    from wavebatch.tools.plots.draw_waveform import draw_waveform_panels
 
-    draw_waveforms(views, output, times=shown, table=options["table"], **more)
+    draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
 
 
 def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) -> tuple[list[Any], str]:
@@ -134,7 +134,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
     from wavebatch.surveying.prepare import Positions, prepare
     from wavebatch.tools.api.run import find_request
     from wavebatch.tools.plots.packets import find_places
-    from wavebatch.tools.plots.waveform import add_ranges, describe_chain, read_views
+    from wavebatch.tools.plots.waveform import add_ranges, name_chain, read_views
 
     chain, request = find_request(shared.from_options(RunOptions, options))
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
@@ -147,7 +147,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
             run, fill, error = add_ranges(choice.chain, reader, scan)
             system = system.with_radiometry(sensor_error=error)
         views = read_views(reader, scan, places, run, system, options["show"], fill)
-        return views, describe_chain(choice.chain)
+        return views, name_chain(choice.chain)
 
 
 for command in (histogram, map_, section, profile, cube):

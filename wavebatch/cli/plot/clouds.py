@@ -27,7 +27,7 @@ def find_clouds(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
 
 
 def draws_clouds(
-    *own: Callable, name: str | None = None, find: Callable[..., list[Path]] = find_clouds
+    *options_here: Callable, name: str | None = None, find: Callable[..., list[Path]] = find_clouds
 ) -> Callable[[Callable[..., tuple[str, dict[str, Any]]]], click.Command]:
     """A command that draws clouds: with its options, and those that all such commands share.
 
@@ -45,7 +45,7 @@ def draws_clouds(
             answer({"output": str(output), "clouds": [str(path) for path in paths], **found})
 
         common = shared.selection_options, shared.common_options("overwrite", "json")
-        every = shared.clouds_argument, shared.declared("recursive"), output_option, *own, *common
+        every = shared.clouds_argument, shared.declared("recursive"), output_option, *options_here, *common
         return click.command(name or draw.__name__)(shared.together(*every)(command))
 
     return decorate
@@ -80,9 +80,8 @@ def read_range(text: str) -> tuple[float, ...]:
 
 
 @draws_clouds(
-    click.option("--column", "columns", required=True, multiple=True, shell_complete=complete_columns,
-                 help="Extra dimension or standard field; echo_flags counts flags. May be repeated: columns of one "
-                 "unit share an axis, others get one of their own."),
+    click.option("--column", required=True, shell_complete=complete_columns,
+                 help="Extra dimension or standard field; echo_flags counts flags."),
     click.option("--by", metavar="COLUMN", shell_complete=complete_columns,
                  help="Draw one line per value of this column, e.g. number_of_returns or classification."),
     click.option("--bins", type=click.IntRange(1, 10_000), metavar="N",
@@ -96,66 +95,37 @@ def read_range(text: str) -> tuple[float, ...]:
                  help="Draw numbers also for several lines, not shares of each line's values."),
 )  # fmt: skip
 def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Draw histograms of columns of CLOUDs of any size.
+    """Draw the histogram of a column of CLOUDs of any size.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. Points without data are left
     out and counted. For a column with discrete values, each bin holds the same number of possible values.
 
-    Several lines (of --column, --by or --each) are drawn as shares of their values, so that they can be compared.
+    Several lines (of --by or --each) are drawn as shares of their values, so that they can be compared.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
+    from wavebatch.tools.plots.histogram import count_points_by_flag, count_values
     from wavebatch.tools.plots.values import Clouds
 
-    panels: dict[str, list[Any]] = {}
-    for column in dict.fromkeys(options["columns"]):
-        selection = select(column, options)
-        facts = Clouds(clouds, selection).facts
-        if facts.is_flags:
-            return _draw_flags(clouds, selection, output, options)
-        panels.setdefault(facts.unit, []).append(selection)
-    return _draw_histograms(clouds, panels, output, options)
+    selection = select(options["column"], options)
+    if Clouds(clouds, selection).facts.is_flags:
+        for name in ("bins", "limits", "each", "by", "counts"):
+            if options[name]:
+                option = "--range" if name == "limits" else f"--{name}"
+                raise ConfigError(f"{option} is of no use for flags, which are counted by name")
+        flags = count_points_by_flag(clouds, selection)
+        from wavebatch.tools.plots.draw_cloud import draw_flags
 
+        draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
+        total, text = flags.total, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
+        text += f", {total.left_out} left out" * bool(total.left_out)
+    else:
+        found = count_values(clouds, selection, **{name: options[name] for name in ("bins", "limits", "each", "by")})
+        from wavebatch.tools.plots.draw_cloud import draw_cloud_histogram
 
-def _draw_flags(
-    clouds: Sequence[Path], selection: Any, output: Path, options: dict[str, Any]
-) -> tuple[str, dict[str, Any]]:
-    """Draws the counts of flags; returns a summary, and the counts."""
-    from wavebatch.tools.plots.histogram import count_flags
-
-    columns = tuple(dict.fromkeys(options["columns"]))
-    if len(columns) > 1:
-        raise ConfigError(f"flags are counted by name, not by value: draw {', '.join(columns)} one by one")
-    for name in ("bins", "limits", "each", "by", "counts"):
-        if options[name]:
-            option = "--range" if name == "limits" else f"--{name}"
-            raise ConfigError(f"{option} is of no use for flags, which are counted by name")
-    counted = count_flags(clouds, selection)
-    from wavebatch.tools.plots.draw_cloud import draw_flags
-
-    draw_flags(counted, output, log=options["log"], overwrite=options["overwrite"])
-    text = f"{count(counted.total.values, 'point')}, {counted.clean} without a flag"
-    text += f", {counted.total.left_out} left out" * bool(counted.total.left_out)
-    return text, {"drawn": [{"columns": list(columns), **list_tally(counted.total)}]}
-
-
-def _draw_histograms(
-    clouds: Sequence[Path], panels: dict[str, list[Any]], output: Path, options: dict[str, Any]
-) -> tuple[str, dict[str, Any]]:
-    """Draws histograms, those of one unit in one axis; returns a summary, and the counts."""
-    from wavebatch.tools.plots.histogram import count_values
-
-    names = [[one.column for one in selections] for selections in panels.values()]
-    if len(panels) > 1 and options["limits"]:
-        raise ConfigError(f"--range is for one unit; {', '.join(sum(names, []))} are in {', '.join(panels)}")
-    how = {name: options[name] for name in ("bins", "limits", "each", "by")}
-    every = [count_values(clouds, selections, **how) for selections in panels.values()]
-    from wavebatch.tools.plots.draw_cloud import draw_histograms
-
-    draw_histograms(every, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
-    texts = [describe_tally(found.total, int(found.below.sum() + found.above.sum())) for found in every]
-    drawn = [{"columns": columns, **list_tally(found.total)} for columns, found in zip(names, every, strict=True)]
-    return "; ".join(texts), {"drawn": drawn}
+        draw_cloud_histogram(found, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
+        total, text = found.total, describe_tally(found.total, int(found.below.sum() + found.above.sum()))
+    return text, {"column": options["column"], **list_tally(total)}
 
 
 @draws_clouds(
@@ -181,9 +151,9 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
     column, statistic = options["column"], options["statistic"]
     selection = select(column, options)
     found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bbox"])
-    from wavebatch.tools.plots.draw_cloud import draw_map
+    from wavebatch.tools.plots.draw_cloud import draw_cloud_map
 
-    draw_map(found, output, overwrite=options["overwrite"])
+    draw_cloud_map(found, output, overwrite=options["overwrite"])
     grid = found.grid
     more = {"statistic": statistic, "outside": found.outside, "columns": grid.columns, "rows": grid.rows,
             "size": grid.size, "unit": found.crs.unit}  # fmt: skip

@@ -59,11 +59,11 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.tools.plots.section_data import cut_section
+    from wavebatch.tools.plots.sections import cut_section
 
     column = options["column"] or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
     found = cut_section(paths, select(column, options), line=options["line"], width=options["width"])
-    from wavebatch.tools.plots.draw_section import draw_section
+    from wavebatch.tools.plots.sections import draw_section
 
     draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
     kind = "voxel" if found.voxel else "point"
@@ -92,7 +92,7 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.tools.plots.section_data import measure_profile
+    from wavebatch.tools.plots.sections import measure_profile
     from wavebatch.tools.slices.read_segments import is_segments, profile_segments
 
     column = options["column"]
@@ -102,7 +102,7 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
         found = profile_segments(paths, column, statistic, **how)
     else:
         found = measure_profile(paths, select(column, options), statistic, **how)
-    from wavebatch.tools.plots.draw_section import draw_profile
+    from wavebatch.tools.plots.sections import draw_profile
 
     draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
     series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]

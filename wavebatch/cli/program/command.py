@@ -80,10 +80,10 @@ def group_options(command: click.Command, ctx: click.Context) -> Iterator[tuple[
     if len(records) < FEWEST:
         yield "Options", list(records.values())
         return
-    heading = {name: one.told.group for name, one in OPTIONS.items()}
+    heading = {name: one.words.group for name, one in OPTIONS.items()}
     heading |= {name: title for title, names in GROUPS.items() for name in names}
     if len(records) > MANY:
-        heading |= {name: USUAL for name, one in OPTIONS.items() if one.told.usual} | dict.fromkeys(ALSO_USUAL, USUAL)
+        heading |= {name: USUAL for name, one in OPTIONS.items() if one.words.usual} | dict.fromkeys(ALSO_USUAL, USUAL)
     of = getattr(command, "title", "")
     for title in ("Options", USUAL, *HEADINGS):
         found = [record for name, record in records.items()

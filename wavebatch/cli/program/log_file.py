@@ -65,7 +65,7 @@ def open_log(path: Path, level: str, command: str) -> None:
     except OSError as error:
         raise ConfigError(f"--log-file: {path}: cannot be written: {error.strerror or error}") from error
     _logger.setLevel(level.upper())
-    log(f"wavebatch {__version__}: {command}")
+    log_text(f"wavebatch {__version__}: {command}")
 
 
 def close_log() -> None:
@@ -81,7 +81,7 @@ def is_open() -> bool:
     return any(isinstance(one, _LogFile) for one in _logger.handlers)
 
 
-def log(message: str, level: str | None = None) -> None:
+def log_text(message: str, level: str | None = None) -> None:
     """A line with time and level; the level is found from the message if it is not given. Does nothing without a log.
     """
     if is_open():

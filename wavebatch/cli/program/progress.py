@@ -77,8 +77,6 @@ class Progress:
                 self._tell(f"{strip}: {line}")
         elif kind == "skipped":
             self._tell(f"{strip}: is up to date, skipped")
-        elif kind == "worker":
-            self._say(printable(f"{strip}: warning: {event['warning']}"))
         elif kind == "flight" and self._level > 0:
             self._say(printable(f"{strip}: survey of {count(event['strips'], 'strip')} together"))
 
@@ -93,13 +91,13 @@ class Progress:
         if self._level >= 0:
             self._say(printable(line))
         else:
-            log_file.log(printable(line))
+            log_file.log_text(printable(line))
 
     def _say(self, line: str) -> None:
         if self._bar is not None:
             self._bar.clear()
         write_message(line)
-        log_file.log(line)
+        log_file.log_text(line)
         if self._bar is not None:
             self._bar.refresh()
 

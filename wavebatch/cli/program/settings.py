@@ -2,9 +2,9 @@
 
 Click reads both (`envvar` of an option, `default_map` of a context): an option on the command line counts first, then
 the variable, then the file, then the default. Here is what click lacks: where the files lie, and what is said of them.
-A file that the user names or keeps in his own folder may give any option. A wavebatch.toml beside the inputs may have
-come with them: it gives only the options of HARMLESS. What changes results is never silent: the settings in force are
-printed in one line.
+A file that the user names or keeps in the personal folder may give any option. A wavebatch.toml beside the inputs may
+have come with them: it gives only the options of HARMLESS. What changes results is never silent: the settings in force
+are printed in one line.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def add_variables(command: click.Command, title: str) -> None:
         if isinstance(option, click.Option) and option.name not in NO_VARIABLE:
             words = re.sub("[- ]", "_", f"{title} {_option_name(option)}").upper()
             general = _option_name(option).replace("-", "_").upper()
-            own = [option.envvar] if isinstance(option.envvar, str) else []
-            option.envvar = [*own, f"{PREFIX}{words}", f"{PREFIX}{general}"]
+            known = [option.envvar] if isinstance(option.envvar, str) else []
+            option.envvar = [*known, f"{PREFIX}{words}", f"{PREFIX}{general}"]
 
 
 def read_settings(command: click.Command, title: str, context: click.Context, arguments: list[str]) -> None:
@@ -84,16 +84,16 @@ def read_settings(command: click.Command, title: str, context: click.Context, ar
         return  # the real parsing says what is wrong
     options = _list_options(command)
     named = parsed.get("config") or options["config"].resolve_envvar_value(context)
-    own = Path(named or os.path.join(click.get_app_dir("wavebatch"), FILE))
+    personal = Path(named or os.path.join(click.get_app_dir("wavebatch"), FILE))
     beside = None if named else _find_file(parsed)
     found: dict[Path, dict[str, Any]] = {}
     if beside is not None:
         found[beside] = _read_file(beside, title, options, is_users=False)
-    if named or os.path.isfile(own):
+    if named or os.path.isfile(personal):
         given = {name for values in found.values() for name in values}
         barred = given.union(*(rivals for rivals in EXCLUSIVE if given.intersection(rivals)))
-        values = _read_file(own, title, options, is_users=True)
-        found[own] = {name: value for name, value in values.items() if name not in barred}
+        values = _read_file(personal, title, options, is_users=True)
+        found[personal] = {name: value for name, value in values.items() if name not in barred}
     if found:
         context.meta[READ] = found
         context.default_map = {name: value for values in found.values() for name, value in values.items()}

@@ -1,6 +1,6 @@
 """Extra bytes that are copied unchanged from a strip to its output cloud.
 
-`layout.plan_output` calls it. Every dimension is kept. An added echo has no extra bytes of its own: it gets the "no
+`layout.plan_output` calls it. Every dimension is kept. An added echo has no extra bytes in the input: it gets the "no
 data" value of a dimension, or, where no value is free for that, the value of the nearest return of its packet, as the
 standard fields do. Before you change it: a dimension must never be dropped, vendors have no other place for their data.
 """

@@ -170,7 +170,7 @@ def describe(column: Column, unit: str | None = None) -> str:
     return meaning + tail
 
 
-def name_columns(
+def style_columns(
     columns: Sequence[str], style: str, taken: Collection[str], no_data: str = "-9999"
 ) -> list[WrittenColumn]:
     """Return the extra-bytes columns among `columns`, in order, as `style` writes them.

@@ -1,7 +1,7 @@
 """Columns of any point cloud, read in pieces: a wavebatch column, an extra dimension of the vendor, or a LAS field.
 
 `wavebatch plot` reads clouds with it. Units and meanings come from the file; wavebatch's declarations are used only
-for its own columns.
+for columns of wavebatch.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.carried_bytes import Carried, plan_carried
-from wavebatch.files.cloud.column_names import WrittenColumn, name_columns
+from wavebatch.files.cloud.column_names import WrittenColumn, style_columns
 from wavebatch.files.cloud.las_version import choose_version
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
@@ -220,7 +220,7 @@ def plan_output(
     path = checked.path
     chosen = choose_version(path, checked.header, las_version, point_format, packets is not None)
     carried = plan_carried(checked, points == "returns")
-    written = name_columns(columns, names, [entry.record.name for entry in carried], no_data)
+    written = style_columns(columns, names, [entry.record.name for entry in carried], no_data)
     dtype = build_dtype(chosen.point_format, [entry.record for entry in (*carried, *written)])
     if dtype.itemsize > 65535:
         raise InputError(f"{path}: its extra bytes leave no room for the columns in a 65535-byte record; choose fewer")

@@ -59,7 +59,7 @@ def reading_npz(path: Path, what: str, remedy: str) -> Iterator[None]:
         raise InputError(f"{path}: holds no {what}, or is damaged ({why}); {remedy}") from error
 
 
-def read_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+def read_array_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Return shape, whether in Fortran's order, and type of an array, as `.npy` of version 1.0 begins.
 
     Raises ValueError for anything else, also for objects, and SyntaxError where the description is no Python literal.
@@ -121,7 +121,7 @@ def read_npz(path: Path, names: Mapping[str, tuple[str, int]], what: str, remedy
 
 def _read_array(member: IO[bytes], size: int, name: str, kinds: str, axes: int) -> np.ndarray:
     """size: bytes of the member; a damaged description may claim more, for which memory would be taken."""
-    shape, in_fortran, dtype = read_header(member)
+    shape, in_fortran, dtype = read_array_header(member)
     if dtype.kind not in kinds or len(shape) != axes:
         raise ValueError(f"{name} is {dtype} with {len(shape)} axes")
     needed = math.prod(shape) * dtype.itemsize
@@ -131,12 +131,12 @@ def _read_array(member: IO[bytes], size: int, name: str, kinds: str, axes: int) 
     if len(data) != needed:
         raise ValueError(f"{name} ends too early")
     if dtype.kind == "U":
-        return np.array(read_text(data, dtype), object)
+        return np.array(read_array_text(data, dtype), object)
     member.read(1)  # zipfile compares the checksum at the end only
     return np.frombuffer(data, dtype).reshape(shape, order="F" if in_fortran else "C")
 
 
-def read_text(data: bytes, dtype: np.dtype) -> str:
+def read_array_text(data: bytes, dtype: np.dtype) -> str:
     """Return the text of an array without axes; raises ValueError where its bytes are none."""
     order = "be" if dtype.byteorder == ">" else "le"
     return data.decode(f"utf-32-{order}").rstrip("\0")

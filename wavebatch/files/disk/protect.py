@@ -82,7 +82,7 @@ def _number(path: Path) -> set[tuple[int, int]]:
 
 
 def _packet_files(path: Path) -> list[Path]:
-    """The files in which the packets of a strip may be; none for other files and for strips with their own packets."""
+    """The files in which the packets of a strip may be; none for other files and for strips that hold their packets."""
     if path.suffix.lower() not in (".las", ".laz") or not os.path.isfile(path):  # a pipe would block for ever
         return []
     try:

@@ -73,7 +73,7 @@ def _seek_read(fd: int, view: memoryview, at: int) -> int:
     return len(data)
 
 
-def take_records(records: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def take_whole_records(records: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return records[rows] of a structured array, copied as plain bytes.
 
     NumPy copies structured records field by field, which takes six times as long.

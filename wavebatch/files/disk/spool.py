@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.raw_bytes import read_exactly, take_records
+from wavebatch.files.disk.raw_bytes import read_exactly, take_whole_records
 from wavebatch.files.disk.temp_folders import make_folder, reporting_scratch
 
 MEMORY = 1 << 24
@@ -102,7 +102,7 @@ class Spool(Closing):
         entries = np.concatenate([part for _, part in pending])
         if np.any(bucket[1:] < bucket[:-1]):
             order = np.argsort(bucket, kind="stable")
-            bucket, entries = bucket[order], take_records(entries, order)
+            bucket, entries = bucket[order], take_whole_records(entries, order)
         return np.searchsorted(bucket, np.arange(self.buckets + 1)).astype(np.int64), entries
 
     def _flush(self) -> None:

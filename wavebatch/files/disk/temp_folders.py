@@ -1,6 +1,6 @@
 """Folders for temporary files that are removed when their process ends, or by the next run if it was killed.
 
-Everything that does not fit into memory goes through here. A folder is in use as long as its lock is held; nothing
+Everything that does not fit into memory goes through here. A folder is in use as long as it is locked; nothing
 else shows whether a process of another run is still alive.
 """
 

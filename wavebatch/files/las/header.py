@@ -23,7 +23,7 @@ HEADER_SIZES = {(1, 0): 227, (1, 1): 227, (1, 2): 227, (1, 3): 235, (1, 4): 375,
 SOFTWARE = f"wavebatch {__version__}".encode()
 """Generating software in the headers of all outputs."""
 MAX_FRONT = 1 << 26
-"""Most bytes of header and VLRs, because they are held in memory."""
+"""Most bytes of header and VLRs, because they are kept in memory."""
 MAX_VLRS = 1 << 16
 """Most VLRs: each costs time and memory even when it is empty."""
 MAX_FILE = 1 << 54

@@ -1,7 +1,7 @@
 """Points of LAZ files, chunk by chunk; all sizes are checked before the decoder gets any bytes.
 
-`read_points.open_points` calls it. lazrs and LASzip trust their input: a wrong size can make them crash, hang or
-allocate without limit, so each chunk is checked and passed on as a small file in memory.
+`read_points.open_points` calls it. lazrs trusts its input: a wrong size can make it crash, hang or allocate without
+limit, so each chunk is checked and passed on as a small file in memory.
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_panics, read_exactly
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.header import LasHeader, has_record
-from wavebatch.files.las.laszip_decode import LaszipPoints
 
 LASZIP_USER, LASZIP_ID = "laszip encoded", 22204
 MAX_CHUNKS = 2_000_000
 """Most chunks of a file: 10^11 points in chunks of 50,000, the usual size."""
 MAX_CHUNK_POINTS = 5_000_000
 MAX_CHUNK_BYTES = 1 << 28
-"""Largest chunk: it is held in memory, compressed and decompressed."""
+"""Largest chunk: it is kept in memory, compressed and decompressed."""
 MAX_POINTS_PER_BYTE = 1000
 """More points per byte of file than any compression reaches; real files have fewer than one."""
 _PIECE = 50_000
@@ -43,16 +42,25 @@ _BYTES = {0, 14}
 """Items of extra bytes."""
 
 
-def open_laz(checked: CheckedHeader) -> LazPoints | LaszipPoints:
-    """Return a reader of the points: lazrs, or the optional laszip for codings that lazrs does not know.
+NEWEST = 3
+"""Highest version of an item that lazrs decodes; the compression of LAS 1.5 has version 4."""
 
-    Raises InputError if the records of the compression are damaged or no installed library can decode them.
+
+def open_laz(checked: CheckedHeader) -> LazPoints:
+    """Return a reader of the points.
+
+    Raises InputError if the records of the compression are damaged, or are those of LAS 1.5.
     """
     coding = _read_coding(checked.path, checked.header)
     total = checked.header.point_count
     if total > checked.size * MAX_POINTS_PER_BYTE:  # a scan of points that cannot be there would never end
         raise damaged(checked.path, f"the header claims {total} points in {checked.size} bytes")
-    return LaszipPoints(checked) if coding.newest > 3 else LazPoints(checked, coding)
+    if coding.newest > NEWEST:
+        raise InputError(
+            f"{checked.path}: has the compression of LAS 1.5, which wavebatch does not read; "
+            "decompress it first: laszip -i IN.laz -o OUT.las"
+        )
+    return LazPoints(checked, coding)
 
 
 class _Coding(NamedTuple):

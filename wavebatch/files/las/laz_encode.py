@@ -1,7 +1,7 @@
-"""Point records written to a file: plain, or compressed by lazrs or LASzip, whichever writes the format correctly.
+"""Point records written to a file: plain, or compressed by lazrs.
 
-`write_points.PointFile` calls it. lazrs and LASzip each have a defect with waveform formats 9 and 10 (see the two
-classes); test changes by reading the output with both libraries.
+`write_points.PointFile` calls it. lazrs has defects with waveform formats (see `_LazrsEncoder` and `_patch_wave_item`);
+test changes by reading the output with LASzip too.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import replace
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import lazrs
@@ -18,19 +16,11 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
-from wavebatch.core.optional import advise_install
-from wavebatch.files.las.header import HEADER_SIZES, STANDARD_DTYPES, LasHeader, Vlr, read_header_of
-
-try:
-    import laszip
-except ImportError:  # optional: only formats 9 and 10 with several scanner channels need it
-    laszip = None
-
-_ERRORS: tuple[type[Exception], ...] = (lazrs.LazrsError, *([laszip.LaszipError] if laszip else []))
+from wavebatch.files.las.header import STANDARD_DTYPES, LasHeader, Vlr
 
 _WAVE_ITEM, _BROKEN_VERSION, _READABLE_VERSION = 9, 2, 1
 CHUNK_POINTS = 50_000
-"""Points of a LAZ chunk: what LASzip and lazrs write."""
+"""Points of a LAZ chunk: what lazrs writes."""
 _ITEMS_AT = 34
 """Offset of the list of items in the "laszip encoded" record."""
 
@@ -57,8 +47,6 @@ def open_encoder(file: BinaryIO, header: LasHeader, threads: int = 1) -> PointEn
     """
     if not header.compressed:
         return PointEncoder(file, header)
-    if header.point_format in (9, 10) and laszip is not None:
-        return _LaszipEncoder(file, header)
     return _LazrsEncoder(file, header, threads)
 
 
@@ -87,7 +75,7 @@ class _WatchedFile:
         try:
             with uninterrupted():
                 yield
-        except _ERRORS as error:
+        except lazrs.LazrsError as error:
             raise self._error or InputError(f"the points cannot be compressed: {error}") from error
 
 
@@ -133,41 +121,14 @@ class _LazrsEncoder(PointEncoder):
             self._channel = int(channels[0])
         if np.any(channels != self._channel):
             raise InputError(
-                "points of several scanner channels with packets cannot be written as LAZ by lazrs; "
-                f"{advise_install('laszip')}, write LAS, or leave --keep-packets out"
+                "points of several scanner channels with packets cannot be written as LAZ; write LAS, or leave "
+                "--keep-packets out"
             )
 
     def finish(self) -> None:
         self._compress()
         with self._watched.explaining():
             self._compressor.done()
-
-
-class _LaszipEncoder(PointEncoder):
-    """LASzip 3.5 writes LAS 1.5 in a coding that lazrs cannot read, so it gets a LAS 1.4 header of the same size."""
-
-    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
-        version = min(header.version, (1, 4))
-        longer = HEADER_SIZES[header.version] - HEADER_SIZES[version]
-        shown = replace(header, compressed=False, version=version, user_bytes=bytes(longer) + header.user_bytes)
-        self._file, self._header = file, header
-        self._watched = _WatchedFile(file)
-        with self._watched.explaining():
-            self._zipper = laszip.LasZipper(self._watched, shown.encode())
-
-    def write(self, rows: np.ndarray) -> None:
-        with self._watched.explaining():
-            self._zipper.compress(rows.view(np.uint8))
-
-    def finish(self) -> None:
-        with self._watched.explaining():
-            self._zipper.done()
-        self._file.flush()
-        written = read_header_of(self._file, Path(str(self._file.name)))
-        self._header.vlrs.append(written.vlrs[-1])
-        self._header.encode()
-        if self._header.offset_to_points != written.offset_to_points:
-            raise InputError("LASzip changed the records of the header; write LAS, or leave --keep-packets out")
 
 
 def _patch_wave_item(payload: bytes) -> bytes:

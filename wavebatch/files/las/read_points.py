@@ -9,14 +9,13 @@ import numpy as np
 
 from wavebatch.files.disk.raw_bytes import guarded, read_exactly, reading
 from wavebatch.files.las.checked_header import CheckedHeader
-from wavebatch.files.las.laszip_decode import LaszipPoints
 from wavebatch.files.las.laz_decode import LazPoints, open_laz
 
 
 def open_points(checked: CheckedHeader) -> PointSource:
-    """Return a reader of the points of a checked file: plain LAS, or LAZ by lazrs or laszip.
+    """Return a reader of the points of a checked file: plain LAS, or LAZ.
 
-    Raises InputError if the records of the compression are damaged or no installed library can decode them.
+    Raises InputError if the records of the compression are damaged, or are those of LAS 1.5.
     """
     with reading(checked.path):
         return open_laz(checked) if checked.header.compressed else _PlainPoints(checked)
@@ -41,5 +40,5 @@ class _PlainPoints:
         self._file.close()
 
 
-PointSource = _PlainPoints | LazPoints | LaszipPoints
+PointSource = _PlainPoints | LazPoints
 """A reader of points by index."""

@@ -114,11 +114,11 @@ def find_waves(path: Path) -> Path:
         if path.with_suffix(suffix).is_file():
             return path.with_suffix(suffix)
     if any(path.with_suffix(suffix).is_file() for suffix in (".wvz", ".WVZ")):
-        raise refuse_compressed(path)
+        raise refuse_packed_waves(path)
     raise InputError(f"{path}: its waves are missing: put {path.with_suffix('.wvs').name} next to it")
 
 
-def refuse_compressed(path: Path) -> InputError:
+def refuse_packed_waves(path: Path) -> InputError:
     """Return the error for compressed PulseWaves, with the command that decompresses them."""
     return InputError(
         f"{path}: it is compressed PulseWaves (.plz, .wvz), which wavebatch does not read; decompress it first with "
@@ -142,7 +142,7 @@ def _read(file: BinaryIO, path: Path, front: bytes) -> PulseHeader:
      time_scale, time_offset, _, _, *numbers) = _NUMBERS.unpack_from(front, 168)  # fmt: skip
     size = os.fstat(file.fileno()).st_size
     if compression or path.suffix.lower() == ".plz":
-        raise refuse_compressed(path)
+        raise refuse_packed_waves(path)
     if major or form:
         raise InputError(f"{path}: PulseWaves {major}.{minor}, pulse format {form}; wavebatch reads 0.3, format 0")
     if not (_HEADER_SIZE <= header_size <= start <= size < MAX_FILE) or start > MAX_FRONT or records > MAX_VLRS:
@@ -217,7 +217,7 @@ def _check_waves(path: Path, waves: Path) -> int:
     if len(head) < WAVES_HEADER_SIZE or not head.startswith(WAVES_SIGNATURE):
         raise damaged(path, f"{waves.name} does not begin with PulseWavesWaves")
     if struct.unpack_from("<I", head, 16)[0]:
-        raise refuse_compressed(path)
+        raise refuse_packed_waves(path)
     if size >= MAX_FILE:
         raise damaged(path, f"{waves.name} has {size} bytes")
     return size
@@ -244,7 +244,7 @@ def _read_sampling(path: Path, index: int, payload: bytes, at: int) -> Sampling:
     (_, _, kind, channel, _, duration_bits, scale, offset, segment_bits, length_bits, segments, samples, bits, _,
      spacing, compression) = _SAMPLING.unpack_from(payload, at)  # fmt: skip
     if compression:
-        raise refuse_compressed(path)
+        raise refuse_packed_waves(path)
     widths = duration_bits in _INTEGERS and segment_bits in _INTEGERS[:3] and length_bits in _INTEGERS[:3]
     counts = (segment_bits or segments <= MOST_SEGMENTS) and (length_bits or samples <= MAX_SAMPLES)
     times = abs(scale) < LARGEST_OFFSET and abs(offset) < LARGEST_OFFSET and LEAST_SPACING <= spacing <= MAX_SPACING

@@ -32,7 +32,7 @@ _ENOUGH = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class VectorDecision:
     """Meaning of the packet vectors of a strip."""
 
     direction: str
@@ -51,7 +51,7 @@ class DirectionTally:
     """Votes for both directions, collected in parts; each part counts with at most a few hundred points."""
 
     form: str
-    """See `Decision`."""
+    """See `VectorDecision`."""
     pairs: list[int] = field(default_factory=lambda: [0, 0])
     """Pairs of returns that vote for toward, for away."""
     heights: list[int] = field(default_factory=lambda: [0, 0])
@@ -115,14 +115,14 @@ def read_toward(points: np.ndarray, direction: str, form: str) -> np.ndarray:
     return vectors if direction == "toward" else -vectors
 
 
-def decide(tally: DirectionTally, option: str, metres: float = 1.0) -> Decision:
+def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) -> VectorDecision:
     """Return the decision by the votes; with `auto`, contradicting or missing votes are a problem of the strip.
 
     metres: of a unit of the coordinates, in which vectors may be, too.
     """
     if not any(len(part) for part in tally.ratios):
         chosen = "toward" if option == "auto" else option
-        return Decision(chosen, tally.form, float("nan"), "no waveform to decide from", (), ())
+        return VectorDecision(chosen, tally.form, float("nan"), "no waveform to decide from", (), ())
     ratio = float(np.median(np.concatenate(tally.ratios)))
     warnings, problems = list(_judge_length(ratio, tally.form, metres)), []
     (toward, away), (up, down) = tally.pairs, tally.heights
@@ -139,7 +139,7 @@ def decide(tally: DirectionTally, option: str, metres: float = 1.0) -> Decision:
         if chosen != option or problems:
             warnings.append(f"--direction {option} overrides the evidence of the file: {evidence}")
         chosen, problems, evidence = option, [], f"given; {evidence}"
-    return Decision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
+    return VectorDecision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
 
 
 def _judge_length(ratio: float, form: str, metres: float) -> Iterator[str]:

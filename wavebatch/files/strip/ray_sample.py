@@ -39,7 +39,7 @@ _LEAST_PAIR = 2.0
 """Least distance of two returns [m] that give a direction: returns are placed to a few cm."""
 
 
-class Rays(NamedTuple):
+class RaySample(NamedTuple):
     """n rays in order of time."""
 
     time: np.ndarray
@@ -52,7 +52,7 @@ class Rays(NamedTuple):
     """Relative weight (inverse variance) of the direction, f8 (n,)."""
 
 
-def sample_rays(reader: StripReader, scan: StripScan) -> tuple[Rays, Rays]:
+def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySample]:
     """Return the rays of a strip from packet vectors, and those from pulses with two returns.
 
     At most RAYS_PER_SLICE rays at each of about MOST_SLICES places.
@@ -114,29 +114,29 @@ def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
     return [(int(borders[i]), int(borders[i + 1])) for i in chosen.tolist() if borders[i + 1] > borders[i]]
 
 
-def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> Rays:
+def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> RaySample:
     with np.errstate(all="ignore"):
         away = -read_toward(points, scan.vectors.direction, scan.vectors.form)
         ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
         good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
     good &= np.isfinite(time) & np.isfinite(xyz).all(axis=1)
     rows = np.flatnonzero(good)
-    return Rays(time[rows], xyz[rows], away[rows], np.ones(len(rows)))
+    return RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)))
 
 
-def _pair_returns(xyz: np.ndarray, time: np.ndarray) -> Rays:
+def _pair_returns(xyz: np.ndarray, time: np.ndarray) -> RaySample:
     """Rays from neighbouring returns of one pulse; returns far apart get a large weight."""
     place = np.flatnonzero(time[1:] == time[:-1])
     apart = xyz[place + 1] - xyz[place]
     square = (apart * apart).sum(axis=1)
     far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
     middle = 0.5 * (xyz[place[far]] + xyz[place[far] + 1])
-    return Rays(time[place[far]], middle, apart[far], square[far])
+    return RaySample(time[place[far]], middle, apart[far], square[far])
 
 
-def _join(parts: list[Rays]) -> Rays:
+def _join(parts: list[RaySample]) -> RaySample:
     if not parts:
-        return Rays(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+        return RaySample(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     joined = [np.concatenate(values) for values in zip(*parts, strict=True)]
     order = np.argsort(joined[0], kind="stable")
-    return Rays(*(values[order] for values in joined))
+    return RaySample(*(values[order] for values in joined))

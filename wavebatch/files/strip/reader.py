@@ -17,15 +17,15 @@ from wavebatch.core.order import even_places
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.raw_bytes import reading, take_records, widen
+from wavebatch.files.disk.raw_bytes import reading, take_whole_records, widen
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
 from wavebatch.files.strip.packet_owner import compare_returns, is_strange, sample_size
-from wavebatch.files.strip.packet_vectors import OPTIONS, Decision, read_toward
+from wavebatch.files.strip.packet_vectors import OPTIONS, VectorDecision, read_toward
 from wavebatch.files.strip.packets import PacketFile, block_rows
-from wavebatch.files.strip.sample_form import PLAIN, SampleForm, read_samples
+from wavebatch.files.strip.sample_form import PLAIN, SampleForm, read_packet_samples
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.files.strip.scanner import scan_strip, unique_entries
 from wavebatch.files.strip.shared_packets import expand, group_keys
@@ -88,7 +88,7 @@ class Unit:
     """Row of `packets` for each context point, i4 (k,)."""
     point_flags: np.ndarray
     """EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET or 0, u2 (n,)."""
-    vectors: Decision
+    vectors: VectorDecision
     forms: Mapping[int, SampleForm]
     """How samples are stored, by descriptor index; see `StripScan.forms`."""
 
@@ -309,7 +309,7 @@ class StripReader(Closing):
             step = block_rows(size, n_samples, 8 * digitizer.width)
             for begin in range(0, len(same), step):
                 chosen = same[begin : begin + step]
-                samples = read_samples(self._packets, table.offset[chosen], n_samples, stored, packed, form)
+                samples = read_packet_samples(self._packets, table.offset[chosen], n_samples, stored, packed, form)
                 yield samples, digitizer, chosen
 
 
@@ -346,7 +346,7 @@ class _Geometry:
         xyz = locate(records, self._facts.header)
         location = widen(records["return_point_wave_location"])
         owner = np.cumsum(counts) - counts
-        lead = take_records(records, owner)
+        lead = take_whole_records(records, owner)
         toward = read_toward(lead, self._unit.vectors.direction, self._unit.vectors.form)
         owners = self._unit.packets.owner[rows]
         return WaveformBlock(
@@ -367,10 +367,10 @@ class _Geometry:
     def _take(self, entries: np.ndarray) -> np.ndarray:
         unit = self._unit
         if not len(unit.context):
-            return take_records(unit.points, entries)
+            return take_whole_records(unit.points, entries)
         if self._all is None:
             self._all = np.concatenate([unit.points, unit.context])
-        return take_records(self._all, entries)
+        return take_whole_records(self._all, entries)
 
 
 def read_scanner(records: np.ndarray) -> np.ndarray | None:

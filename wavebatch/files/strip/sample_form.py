@@ -1,7 +1,7 @@
 """How the samples of a strip are stored: the order of packed bits, and whether counts go down where light comes in.
 
 The scan decides both once per descriptor, from packets spread over the strip, because neither stands in the file;
-`StripReader.read_rows` reads all samples through `read_samples`. docs/las-waveforms.md 1.2.
+`StripReader.read_rows` reads all samples through `read_packet_samples`. docs/las-waveforms.md 1.2.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class SampleForm:
     """What was decided and why, for users."""
 
     def digitizer(self, stored: Digitizer, packed: bool) -> Digitizer:
-        """Return the digitizer of the counts that `read_samples` gives."""
+        """Return the digitizer of the counts that `read_packet_samples` gives."""
         if not packed:
             # Whole bytes may hold more bits than the descriptor says.
             stored = replace(stored, bits=8 * stored.width)
@@ -49,7 +49,7 @@ class SampleForm:
 PLAIN = SampleForm()
 
 
-def read_samples(
+def read_packet_samples(
     packets: PacketFile, offsets: np.ndarray, n_samples: int, stored: Digitizer, packed: bool, form: SampleForm
 ) -> np.ndarray:
     """Read the samples of packets that were checked before.
@@ -215,7 +215,7 @@ def find_forms(digitizers: Mapping[int, Digitizer], packets: PacketFile, sample:
     for (index, length, packed), offsets in kinds.items():
         stored = digitizers[index]
         form = SampleForm(little=little[index][0] if packed else False)
-        samples = read_samples(packets, offsets, length, stored, packed, form)
+        samples = read_packet_samples(packets, offsets, length, stored, packed, form)
         tops = (stored.max_count, form.digitizer(stored, packed).max_count)
         votes.setdefault(index, _Votes()).add(samples, tops)
     forms = {}
@@ -254,7 +254,7 @@ def _find_orders(
 def _decide_direction(
     digitizers: Mapping[int, Digitizer], votes: Mapping[int, _Votes], index: int
 ) -> tuple[bool, str]:
-    """Whether the signal of a descriptor goes down, and why; where its own waveforms do not show it, all that have its
+    """Whether the signal of a descriptor goes down, and why; where its waveforms do not show it, all that have its
     sign of the gain do."""
     negative = digitizers[index].gain < 0
     mine = votes[index]

@@ -14,7 +14,7 @@ from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Reason
-from wavebatch.files.strip.packet_vectors import Decision
+from wavebatch.files.strip.packet_vectors import VectorDecision
 from wavebatch.files.strip.sample_form import SampleForm
 
 
@@ -39,7 +39,7 @@ class StripScan(Closing):
     """Points with a packet, by descriptor index."""
     reach: int
     """Largest distance in the file, in points, of two points that share a packet."""
-    vectors: Decision
+    vectors: VectorDecision
     borders: np.ndarray
     """First point of each unit, then the number of points, i8 (units + 1,)."""
     overfull: np.ndarray

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.raw_bytes import take_records
+from wavebatch.files.disk.raw_bytes import take_whole_records
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.las.crs import metres_per_unit
 from wavebatch.files.las.point_formats import locate
@@ -21,11 +21,11 @@ from wavebatch.files.las.read_points import PointSource
 from wavebatch.files.strip import shared_packets
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Judge, Judged, Reason
-from wavebatch.files.strip.packet_vectors import DirectionTally, decide, find_form
+from wavebatch.files.strip.packet_vectors import DirectionTally, decide_direction, find_form
 from wavebatch.files.strip.packets import PacketFile
 from wavebatch.files.strip.sample_form import FormSample, find_forms
 from wavebatch.files.strip.scan_result import StripScan, describe_hopeless, describe_oddities
-from wavebatch.files.strip.shared_packets import MAX_RETURNS, Groups, NearSharing, find_far, group_keys
+from wavebatch.files.strip.shared_packets import MAX_RETURNS, NearSharing, PacketGroups, find_far, group_keys
 
 LONGEST_RUN = 64
 """Shorter runs of points with one GPS time (a pulse) are not cut by a border; longer ones are no pulses."""
@@ -121,20 +121,20 @@ class _Scanner:
     def _cut_units(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yields first index and points of each unit, and collects the borders."""
         step, count = self._unit_points, self._facts.header.point_count
-        held = np.empty(0, self._facts.dtype)
+        rest = np.empty(0, self._facts.dtype)
         for begin in range(0, count, step):
             part = self._source.read(begin, min(begin + step, count))
             if begin:
-                cut = _find_cut(held["gps_time"][-LONGEST_RUN:], part["gps_time"][:LONGEST_RUN])
+                cut = _find_cut(rest["gps_time"][-LONGEST_RUN:], part["gps_time"][:LONGEST_RUN])
                 start = self._borders[-1]
                 self._borders.append(begin + cut)
-                yield start, np.concatenate([held, part[:cut]]) if cut else held
-                held = part[cut:]
+                yield start, np.concatenate([rest, part[:cut]]) if cut else rest
+                rest = part[cut:]
             else:
-                held = part
+                rest = part
         if count:
             self._borders.append(count)
-            yield self._borders[-2], held
+            yield self._borders[-2], rest
 
     def _keep(self, unit: int, points: np.ndarray) -> None:
         """Keep the points of a compressed strip: to decode them again takes twenty times as long as to read them."""
@@ -168,7 +168,7 @@ class _Scanner:
         width = np.take(self._widths, points["wavepacket_index"][new])
         self._claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
         if len(rows):
-            self._votes.add_points(take_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
+            self._votes.add_points(take_whole_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
             self._vote(groups, parts, own)
         self._window.append(part)
 
@@ -177,7 +177,7 @@ class _Scanner:
         entries["index"], entries["record"] = parts.index[rows], parts.take(rows)
         return entries
 
-    def _vote(self, groups: Groups, parts: _Parts, own: np.ndarray) -> None:
+    def _vote(self, groups: PacketGroups, parts: _Parts, own: np.ndarray) -> None:
         follows = np.ones(len(groups.order), bool)
         follows[groups.starts] = False
         place = np.flatnonzero(follows)
@@ -215,7 +215,7 @@ class _Scanner:
     def _give(self, start: int, stop: int, wants: np.ndarray) -> None:
         points = self._source.read(start, stop)
         entries = np.empty(len(wants), self._context.dtype)
-        entries["index"], entries["record"] = wants["index"], take_records(points, wants["index"] - start)
+        entries["index"], entries["record"] = wants["index"], take_whole_records(points, wants["index"] - start)
         self._context.append(wants["unit"], entries)
 
     def _vote_far(self) -> None:
@@ -229,7 +229,7 @@ class _Scanner:
             judged = self._judge.judge(points, self._form)
             rows = np.flatnonzero(judged.usable)
             rows = rows[np.argsort(index[rows], kind="stable")]
-            parts = _Parts([_Part(judged.keys[rows], np.arange(len(rows)), unit, take_records(points, rows), 0)])
+            parts = _Parts([_Part(judged.keys[rows], np.arange(len(rows)), unit, take_whole_records(points, rows), 0)])
             self._vote(group_keys(parts.keys), parts, np.ones(len(rows), bool))
 
     def _count_overfull(self, overfull: np.ndarray) -> None:
@@ -245,7 +245,7 @@ class _Scanner:
         """most: how many times packets may claim the bytes that are there."""
         tally, facts, points = self._tally, self._facts, self._facts.header.point_count
         usable, missing = int(tally.reasons[Reason.USABLE]), int(tally.reasons[Reason.NO_WAVEFORM])
-        decision = decide(self._votes, facts.direction_option, metres_per_unit(facts.units)[0])
+        decision = decide_direction(self._votes, facts.direction_option, metres_per_unit(facts.units)[0])
         reasons = tally.describe()
         problems = list(decision.problems)
         if not usable and missing < points:
@@ -286,7 +286,7 @@ class _Part:
 
     def take(self, rows: np.ndarray) -> np.ndarray:
         """Returns the records of the usable points `rows`."""
-        return take_records(self._points, self.index[rows] - self._start)
+        return take_whole_records(self._points, self.index[rows] - self._start)
 
     def tail(self, least: int) -> _Part:
         """The part from file index `least` on; a copy if that frees memory."""
@@ -317,7 +317,7 @@ class _Parts:
             places.append(here)
         back = np.empty(len(rows), np.int64)
         back[np.concatenate(places)] = np.arange(len(rows))
-        return take_records(np.concatenate(taken), back)
+        return take_whole_records(np.concatenate(taken), back)
 
 
 def _find_cut(before: np.ndarray, after: np.ndarray) -> int:

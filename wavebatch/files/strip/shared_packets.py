@@ -31,7 +31,7 @@ _WANT = np.dtype([("index", "<i8"), ("unit", "<i8")])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Groups:
+class PacketGroups:
     """Entries sorted by key, then by place: group g is order[starts[g] : starts[g] + counts[g]]."""
 
     order: np.ndarray
@@ -39,14 +39,14 @@ class Groups:
     counts: np.ndarray
 
 
-def group_keys(keys: np.ndarray) -> Groups:
+def group_keys(keys: np.ndarray) -> PacketGroups:
     """Return the groups of equal keys (n,)."""
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
     new = np.ones(len(keys), bool)
     new[1:] = ordered[1:] != ordered[:-1]
     starts = np.flatnonzero(new)
-    return Groups(order, starts, np.diff(np.append(starts, len(keys))))
+    return PacketGroups(order, starts, np.diff(np.append(starts, len(keys))))
 
 
 def expand(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -56,7 +56,7 @@ def expand(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return np.arange(total) + np.repeat(starts - begin, counts)
 
 
-def cross_units(groups: Groups, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cross_units(groups: PacketGroups, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return pairs (unit, entry): the entry shares a key with entries of that unit, but lies in another unit.
 
     unit: unit of each entry (n,), ascending within a group.
@@ -91,7 +91,9 @@ class NearSharing:
         self.reach = 0
         self.overfull: list[np.ndarray] = []
 
-    def add(self, keys: np.ndarray, index: np.ndarray, unit: np.ndarray, own: np.ndarray, records: Callable) -> Groups:
+    def add(
+        self, keys: np.ndarray, index: np.ndarray, unit: np.ndarray, own: np.ndarray, records: Callable
+    ) -> PacketGroups:
         """Take one unit with the window before it and return the groups of its keys.
 
         Parameters
@@ -190,7 +192,7 @@ def find_far(units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders
     return FarSharing(wants.seal(), packets, reach, np.concatenate([np.empty(0, np.uint64), *overfull]))
 
 
-def _append_wants(wants: Spool, groups: Groups, index: np.ndarray, borders: np.ndarray) -> None:
+def _append_wants(wants: Spool, groups: PacketGroups, index: np.ndarray, borders: np.ndarray) -> None:
     unit = np.searchsorted(borders, index, "right") - 1
     target, member = cross_units(groups, unit)
     entries = np.empty(len(target), _WANT)

@@ -82,6 +82,6 @@ def cluster_candidates(
     columns = [np.empty(m, np.int64) for _ in Clusters._fields]
     tail = None if tail is None else np.ascontiguousarray(tail, np.int64)
     grouping = library.Grouping(margin, reach, most, None if tail is None else place(tail, np.int64))
-    groups = library.Groups(*(place(column, np.int64) for column in columns))
+    groups = library.CGroups(*(place(column, np.int64) for column in columns))
     c = call("group_candidates", samples.as_block(), ctypes.c_int64(m), waveform, time, grouping, groups)
     return Clusters(*(column[:c] for column in columns))

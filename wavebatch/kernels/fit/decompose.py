@@ -72,11 +72,11 @@ def _no_echoes() -> tuple[np.ndarray, ...]:
 
 def _as_problem(
     samples: Samples, candidates: Candidates, clusters: Clusters, settings: Settings
-) -> tuple[library.Block, library.Clusters, library.Settings]:
+) -> tuple[library.Block, library.CClusters, library.CSettings]:
     """The structures of one call; each holds the arrays to which it points."""
     samples = samples.checked()
     candidates, clusters = _check(samples, candidates, clusters)
-    windows = library.Clusters(
+    windows = library.CClusters(
         len(clusters.number), *(place(field, np.int64) for field in clusters),
         *(place(field, np.float64) for field in (candidates.amplitude, candidates.time, candidates.width)),
     )  # fmt: skip
@@ -102,7 +102,7 @@ def _check(samples: Samples, candidates: Candidates, clusters: Clusters) -> tupl
     )
 
 
-def _as_structure(settings: Settings) -> library.Settings:
+def _as_structure(settings: Settings) -> library.CSettings:
     """The settings for the library."""
     if not 0 < settings.width_ref < np.inf:
         raise ValueError("the width of the pulse must be above 0")
@@ -113,7 +113,7 @@ def _as_structure(settings: Settings) -> library.Settings:
     if table.shape != (3, 3) or not np.isfinite(table).all():
         raise ValueError("a whitening filter has three finite rows of three")
     values |= {"whitened": settings.whitening is not None, "whitening": (ctypes.c_double * 9)(*table.ravel())}
-    structure = library.Settings(**values)
+    structure = library.CSettings(**values)
     structure.arrays = pulse.arrays
     return structure
 

@@ -158,7 +158,7 @@ def gather_pulse(
     return matrix, right
 
 
-def _as_structure(sums: Sums, noise: SampleNoise, change: float) -> library.Described:
+def _as_structure(sums: Sums, noise: SampleNoise, change: float) -> library.CDescribed:
     """The structure, which holds its arrays; raises ValueError where the library would misuse memory."""
     n, s = sums.left.shape
     first = np.ascontiguousarray(sums.first, np.int64)
@@ -173,7 +173,7 @@ def _as_structure(sums: Sums, noise: SampleNoise, change: float) -> library.Desc
         raise ValueError("echoes must be finite, and widths and noise above 0")
     ahead, left_over = _predict(noise.correlation)
     pulse = as_pulse(sums.shape)
-    structure = library.Described(
+    structure = library.CDescribed(
         n, s, *(place(plane, np.float32) for plane in planes), place(used, np.bool_), place(first, np.int64),
         *(place(column, np.float64) for column in columns), pulse, noise.std**2, noise.gain, change,
         (ctypes.c_double * 2)(*ahead), left_over,

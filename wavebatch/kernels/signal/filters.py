@@ -24,6 +24,16 @@ def curvature_taps(width: float, reach: float = 4.0) -> np.ndarray:
     return taps - bell * total / (bell[0] + 2 * bell[1:].sum())
 
 
+def slope_taps(width: float, reach: float = 4.0) -> np.ndarray:
+    """Half of an antisymmetric filter, the derivative of a Gaussian: taps 0, 1, ... [samples], float64.
+
+    The first one is 0. It gives the slope per sample of a straight line.
+    """
+    x = np.arange(int(np.ceil(reach * width)) + 1)
+    taps = x * exp(-0.5 * (x / width) ** 2)
+    return taps / (2 * np.sum(taps * x))
+
+
 def filter_energy(taps: np.ndarray) -> float:
     """Sum of the squares of a symmetric filter given by its half: the gain of the variance of white noise."""
     return float(taps[0] ** 2 + 2 * np.sum(taps[1:] ** 2))
@@ -56,6 +66,29 @@ def filter_symmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
         part = np.float32(tap) * signal
         total[i:] += part[:-i]
         total[:-i] += part[i:]
+    return total
+
+
+def filter_antisymmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
+    """Signal correlated with an antisymmetric filter.
+
+    Parameters
+    ----------
+    signal : float32 (s, n)
+        Waveforms; zero outside.
+    taps : float (k,)
+        Taps 0, 1, ... towards later samples; earlier samples have the negative ones.
+
+    Returns
+    -------
+    float32 (s, n)
+    """
+    s = len(signal)
+    total = np.zeros_like(signal)
+    for i, tap in enumerate(taps[1:s], start=1):
+        part = np.float32(tap) * signal
+        total[:-i] += part[i:]
+        total[i:] -= part[:-i]
     return total
 
 

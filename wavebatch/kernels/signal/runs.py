@@ -66,6 +66,34 @@ def highest_samples(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) ->
     return sample[at[np.append(True, np.diff(run[at]) > 0)]]
 
 
+def run_moments(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre of gravity and standard deviation of the positive signal in each run.
+
+    Parameters
+    ----------
+    signal : float (s, n)
+        Waveforms.
+    starts, ends : int64 (k,)
+        Runs.
+
+    Returns
+    -------
+    centre, spread : float64 (k,), samples
+        The middle of the run and 0 where no sample is positive.
+    """
+    s, n = signal.shape
+    run, place = list_samples(starts, ends)
+    sample = place % s
+    weight = np.maximum(signal.reshape(-1)[sample * n + place // s], 0).astype(np.float64)
+    middle = 0.5 * (starts + ends - 1) - starts // s * s
+    lag = sample - middle[run]
+    # bincount adds sample after sample, so that sums do not depend on the rest of the block.
+    total, first, second = (np.bincount(run, weight * lag**p, minlength=len(starts)) for p in range(3))
+    total = np.where(total > 0, total, 1.0)
+    mean = first / total
+    return middle + mean, np.sqrt(np.maximum(second / total - mean**2, 0.0))
+
+
 def lobe_edges(x: np.ndarray, curve: np.ndarray, level: float) -> tuple[float, float]:
     """Where the main lobe of one curve crosses a level, on the left and on the right of its peak.
 

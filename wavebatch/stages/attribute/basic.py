@@ -26,7 +26,7 @@ def amplitude(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: E
 
 
 def _need_free_skew(step: Step, chain: Chain, system: SystemPulse | None) -> str:
-    """Refuse a chain in which no echo has a skew of its own."""
+    """Refuse a chain in which no skew is fitted to single echoes."""
     decomposer = chain.steps[2]
     free = decomposer.stage.name == "decompose.skewed" and decomposer.effective()["kappa"] == "free"
     if free or "skew" in decomposer.stage.makes:
@@ -92,11 +92,11 @@ def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: Echo
 
 
 def _need_one_pulse(step: Step, chain: Chain, system: SystemPulse | None) -> str:
-    """Refuse decomposers that give every echo a pulse of its own: none is common to compare with."""
+    """Refuse decomposers that fit another pulse to every echo: none is common to compare with."""
     decomposer = chain.steps[2]
     own = decomposer.effective().get("kappa") == "free" or decomposer.effective().get("model") == "generalized"
     if own or "skew" in decomposer.stage.makes or decomposer.stage.name == "decompose.generalized_gaussian":
-        return f"{decomposer.stage.name} gives every echo a shape of its own; use it after decompose.adaptive"
+        return f"{decomposer.stage.name} fits another shape to every echo; use it after decompose.adaptive"
     return ""
 
 

@@ -88,6 +88,26 @@ def gaussian(
     return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
 
 
+_GAUSS_NEWTON = FitOptions(max_iterations=20, tolerance=0.01)
+
+
+@stage("decompose", fits=fit_gaussian, shares=_GAUSS_NEWTON)
+def gauss_newton(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: float
+) -> EchoTable:
+    """Sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
+
+    A fit that is lost returns its start, flagged as not converged.
+
+    References
+    ----------
+    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
+    """
+    fit = replace(_GAUSS_NEWTON, **options)
+    settings = make_settings(block, system, GAUSSIAN, fit, grow=False, undamped=True)._replace(noise_gain=0.0)
+    return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
+
+
 @stage("decompose", shares=_ADAPTIVE)
 def adaptive(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,

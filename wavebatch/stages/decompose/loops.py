@@ -19,9 +19,10 @@ from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference
 from wavebatch.stages.decompose.rebuild import render_table
-from wavebatch.stages.decompose.skew import fit_skewed, skewed
+from wavebatch.stages.decompose.skew import skew_system, skewed
 from wavebatch.stages.decompose.solve import EchoLimits, fit_gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
+from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.flags import flag_echoes
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, pulse_shape
 
@@ -51,7 +52,7 @@ def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse
     model = loop_model(system, parameters["model"])
     if model == "learned":
         return system
-    return fit_skewed(system, {"kappa": 0.0}) if model == "skewed" else fit_gaussian(system, {})
+    return skew_system(system, {"kappa": 0.0}) if model == "skewed" else fit_gaussian(system, {})
 
 
 @stage("decompose", fits=_fit_loop, shares=EchoLimits())
@@ -236,3 +237,44 @@ def _misfit(residual: np.ndarray, waveform: np.ndarray, sample: np.ndarray, reac
         total += np.where(inside, residual[waveform, np.clip(at, 0, residual.shape[1] - 1)], 0.0) ** 2
         number += inside
     return np.sqrt(total / np.maximum(number, 1)).astype(np.float32)
+
+
+@stage("decompose", fits=fit_gaussian, check=need_asdf)
+def asdf_mixed(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    describe: Literal["samples", "detector"] = "samples",
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+) -> EchoTable:  # fmt: skip
+    """Echoes as `decompose.asdf_only` has them where `detect.maximum` agrees with the detector, else fitted Gaussians.
+
+    It comes after `detect.asdf` or another detector that `decompose.asdf_only` takes. They disagree where their numbers
+    of echoes differ, or a time.
+
+    Parameters
+    ----------
+    describe : {"samples", "detector"}
+        As for `decompose.asdf_only`.
+    tolerance : float
+        Largest distance in time of echoes that agree [widths of the system pulse].
+
+    References
+    ----------
+    Wagner et al. (2007); docs/algorithms.md 1.1.
+    """
+    quick = asdf_only(block, noise, system, echoes, describe=describe)
+    maxima = maximum(block, noise, system)
+    differ = _disagree(len(block), maxima, quick, tolerance * system.sigma_ref)
+    rows = np.flatnonzero(differ)
+    chosen = maxima.take(np.flatnonzero(differ[maxima.waveform]))
+    chosen = replace(chosen, waveform=np.searchsorted(rows, chosen.waveform).astype(np.int32))
+    fitted = gaussian(block.rows(rows), noise.rows(rows), system, chosen)
+    agreed = quick.take(np.flatnonzero(~differ[quick.waveform]))
+    return join_tables(agreed, replace(fitted, waveform=rows[fitted.waveform].astype(np.int32)))
+
+
+def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> np.ndarray:
+    """Find waveforms in which two tables have different numbers of echoes, or one at a different time."""
+    differ = first.count(n) != second.count(n)
+    a, b = (table.take(np.flatnonzero(~differ[table.waveform])) for table in (first, second))
+    differ[a.waveform[np.abs(a.time - b.time) > tolerance]] = True
+    return differ

@@ -63,7 +63,7 @@ def rebuild_waveforms(
 
 
 def render_table(shape: PulseShape, block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
-    """Add up the pulses of the echoes of a block; echoes with a skew or an exponent of their own are drawn with it.
+    """Add up the pulses of the echoes of a block; echoes whose skew or exponent was fitted are drawn with it.
 
     Parameters
     ----------

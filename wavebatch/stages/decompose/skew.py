@@ -13,10 +13,10 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Settings
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import find_clusters
-from wavebatch.stages.decompose.solve import FIT, describe_solution, fit_candidates, make_settings
+from wavebatch.stages.decompose.solve import FIT, FitOptions, describe_solution, fit_candidates, make_settings
 from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.pulse_tables import pulse_shape
 
@@ -52,7 +52,7 @@ def system_skew(system: SystemPulse) -> float:
     return system.skew
 
 
-def fit_skewed(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
+def skew_system(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
     """Return the system with the pulse that `skewed` fits.
 
     Parameters
@@ -71,7 +71,7 @@ def fit_skewed(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPuls
     return replace(system, components=(), kappa=0.0 if kappa == "free" else kappa or system_skew(system))
 
 
-@stage("decompose", fits=fit_skewed, shares=FIT)
+@stage("decompose", fits=skew_system, shares=FIT)
 def skewed(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     kappa: Annotated[float, Range(-0.9, 0.9)] | Literal["free"] = 0.0,
@@ -92,7 +92,7 @@ def skewed(
     ----------
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 0, 1.2.
     """
-    shape = pulse_shape(fit_skewed(system, {"kappa": 0.0 if kappa == "free" else kappa}), block.spacing)
+    shape = pulse_shape(skew_system(system, {"kappa": 0.0 if kappa == "free" else kappa}), block.spacing)
     fit = replace(FIT, **options)
     settings = make_settings(block, system, shape, fit, grow=False)
     if kappa != "free":
@@ -134,3 +134,38 @@ def fit_each(
     # Widths and times are of the skewed pulse, which has no further components to be described.
     plain = settings._replace(shape=GAUSSIAN)
     return describe_solution(block, noise, system, clusters, solution, plain, significance, columns)
+
+
+_LOG_NORMAL = FitOptions(max_iterations=60)
+
+
+def _fit_skews(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
+    """Echoes carry their skews, with which they are drawn."""
+    return replace(system, components=(), kappa=0.0)
+
+
+@stage("decompose", makes=("skew", "skew_err"), fits=_fit_skews, shares=_LOG_NORMAL)
+def log_normal(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    origin: Literal["segment", "waveform"] = "segment",
+    **options: float,
+) -> EchoTable:  # fmt: skip
+    """Sum of log-normals as the paper prints them, a exp(-(ln x - mu)^2 / (2 sigma^2)): three parameters per echo.
+
+    For comparison. The formula needs an origin of x, which the paper does not name, and the origin decides the skew: it
+    is the width over the distance of the peak from the origin. Counted from the start of the waveform there is hardly
+    any skew; counted from the start of the echo's own samples it depends on the amplitude. `decompose.skewed` has the
+    same pulse with a skew that the data choose.
+
+    Parameters
+    ----------
+    origin : {"segment", "waveform"}
+        Sample with x = 1: the first one of the samples that are fitted together, or of the waveform.
+
+    References
+    ----------
+    Wang, Wang and Tseng eq. 2; docs/algorithms.md 1.2.
+    """
+    fit = replace(_LOG_NORMAL, **options)
+    settings = make_settings(block, system, PulseShape(origin=origin), fit, grow=False)
+    return fit_each(block, noise, system, echoes, settings, fit.significance)

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
-from wavebatch.batch.job import StripJob, choose_columns, name_columns
+from wavebatch.batch.job import StripJob, choose_columns, list_column_names
 from wavebatch.batch.options import RunOptions, describe_options
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
@@ -119,7 +119,7 @@ def plan_run(
         Path(),
         widest_chain,
         options,
-        name_columns(options.columns),
+        list_column_names(options.columns),
         request,
         read_sensor(options),
         None if options.calibration is None else load_calibration(Path(options.calibration)),

@@ -13,7 +13,7 @@ from wavebatch.files.las.geo_keys import GeoKeys
 from wavebatch.files.las.geotiff_wkt import build_utm
 from wavebatch.files.las.header import GEOTIFF_ID, Vlr
 from wavebatch.files.pulsewaves.reader import Piece, PulseReader
-from wavebatch.tools.archives.utm import find_zone, project_utm
+from wavebatch.tools.archives.utm import find_utm_zone, project_utm
 
 SCALE = 0.001
 """Largest unit of stored coordinates [m]: coarser ones would shift samples by as much."""
@@ -64,7 +64,7 @@ def find_frame(reader: PulseReader) -> Frame:
     first = next(iter(reader.pieces())).anchor[:1] if header.count else np.zeros((1, 3))
     zero = _ZONES.get(keys.code or 4326)
     if keys.kind == "geographic" and zero is not None:
-        zone, south = find_zone(float(first[0, 0])), bool(first[0, 1] < 0) and zero == 32600
+        zone, south = find_utm_zone(float(first[0, 0])), bool(first[0, 1] < 0) and zero == 32600
         code = zero + zone + (100 if south else 0)
         note = f"coordinates are degrees; they are projected to UTM zone {zone}{'S' if south else 'N'} (EPSG:{code})"
         frame = Frame(zone, south, (SCALE,) * 3, (0.0,) * 3, build_utm(code), (), (note,))

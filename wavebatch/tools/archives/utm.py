@@ -9,7 +9,7 @@ _AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257222101
 _SCALE, _EASTING, _NORTHING = 0.9996, 500_000.0, 10_000_000.0
 
 
-def find_zone(longitude: float) -> int:
+def find_utm_zone(longitude: float) -> int:
     """Return the UTM zone, 1 to 60, of a longitude in degrees (-180 to 360)."""
     return int((longitude + 180) // 6) % 60 + 1
 

@@ -1,6 +1,6 @@
 """How well chains find the simulated echoes: groups of waveforms with their truth, and the figures over all groups.
 
-`command` and `stability` make groups and add what a chain found to a Tally. Each group has its own seed and survey,
+`command` and `stability` make groups and add what a chain found to AccuracyTally. Each group has one seed and survey,
 because the survey of a strip is a source of error too.
 """
 
@@ -16,7 +16,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.score import ISOLATED, QUANTITIES, find_isolated, list_pairs, match_echoes
 from wavebatch.surveying import Survey, survey_block
-from wavebatch.tools.bench.figures import Figure, root_mean_square, share
+from wavebatch.tools.bench.figures import Figure, root_mean_square, share_figure
 from wavebatch.tools.bench.truth import describe_truth, find_bounds
 from wavebatch.tools.simulate import Scene, simulate_blocks
 
@@ -27,7 +27,7 @@ GROSS = 10.0
 """Errors above this many bounds are gross: they are counted, but left out of error/bound."""
 
 GROUPS = 8
-"""Groups of a scene; each has its own survey, like the strips of a project."""
+"""Groups of a scene; each has one survey, like the strips of a project."""
 
 CM_PER_NS = 100 * HALF_C
 
@@ -68,7 +68,7 @@ def derive_seed(*numbers: int) -> int:
 def make_groups(
     scene: Scene, waveforms: int, seed: int, progress: Callable[[str], None] = lambda text: None
 ) -> list[Group]:
-    """`waveforms` waveforms of the scene in GROUPS groups, each with its own seed and survey."""
+    """`waveforms` waveforms of the scene in GROUPS groups, each with another seed and survey."""
     size = max(waveforms // GROUPS, 1)
     groups = []
     for place in range(GROUPS):
@@ -119,7 +119,7 @@ def describe_found(found: EchoTable) -> EchoTable:
 
 
 @dataclass(slots=True)
-class Tally:
+class AccuracyTally:
     """Collects the echoes found in groups; `figures` summarises them."""
 
     _waveforms: list[dict[str, np.ndarray]] = field(default_factory=list)
@@ -169,14 +169,14 @@ class Tally:
         group, true, found = w["group"], w["true"], w["found"]
         one, none = true == 1, true == 0
         return {
-            "completeness": share(w["matched"], true, group),
-            "correctness": share(w["matched"], found * true.any(), group),
-            "exact_count": share(found == true, np.ones(len(true)), group),
-            "false_splits": share(one & (found > 1), one, group),
-            "false_alarms": share(none & (found > 0), none, group),
-            "found_isolated": share(w["isolated_matched"], w["isolated"], group),
-            "found_overlapped": share(w["overlapped_matched"], w["overlapped"], group),
-            "wrong": share(true + found - 2 * w["matched"], (true + found) * true.any(), group),
+            "completeness": share_figure(w["matched"], true, group),
+            "correctness": share_figure(w["matched"], found * true.any(), group),
+            "exact_count": share_figure(found == true, np.ones(len(true)), group),
+            "false_splits": share_figure(one & (found > 1), one, group),
+            "false_alarms": share_figure(none & (found > 0), none, group),
+            "found_isolated": share_figure(w["isolated_matched"], w["isolated"], group),
+            "found_overlapped": share_figure(w["overlapped_matched"], w["overlapped"], group),
+            "wrong": share_figure(true + found - 2 * w["matched"], (true + found) * true.any(), group),
         }
 
     def _errors(self) -> dict[str, Figure]:
@@ -190,13 +190,13 @@ class Tally:
             clear = rows & e["clear"]
             ratios = np.stack([e[f"{name}_ratio"] for name in QUANTITIES])
             gross = np.abs(ratios).max(axis=0) > GROSS
-            figures[f"gross_{kind}"] = share(clear & gross, clear, e["group"])
+            figures[f"gross_{kind}"] = share_figure(clear & gross, clear, e["group"])
             for name in QUANTITIES:
                 figures[f"{name}_ratio_{kind}"] = _spread(e, f"{name}_ratio", clear & ~gross)
                 known = np.isfinite(e[f"{name}_scaled"])
                 figures[f"{name}_calibration_{kind}"] = _spread(e, f"{name}_scaled", clear & ~gross & known)
         known = e["clear"] & np.isfinite(e["time_scaled"])
-        figures["hidden"] = share(known & e["hidden"], known, e["group"])
+        figures["hidden"] = share_figure(known & e["hidden"], known, e["group"])
         for kind in ("flagged", "hidden"):
             for name, rows in ((kind, e[kind]), (f"not_{kind}", ~e[kind])):
                 figures[f"time_calibration_{name}"] = _spread(e, "time_scaled", known & rows)

@@ -50,7 +50,7 @@ def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
     return None
 
 
-DETECTORS = {"decompose.asdf_only": "detect.asdf"}
+DETECTORS = {"decompose.asdf_only": "detect.asdf", "decompose.asdf_mixed": "detect.asdf"}
 """Detectors of decomposers that refuse `detect.maximum`."""
 
 

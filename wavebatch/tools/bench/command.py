@@ -19,7 +19,7 @@ from wavebatch.batch.unit import BLOCK_SAMPLES
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.schema import Range, option
 from wavebatch.stages.chain import Chain
-from wavebatch.tools.bench.accuracy import Group, Tally, derive_seed, describe_found, make_groups
+from wavebatch.tools.bench.accuracy import AccuracyTally, Group, derive_seed, describe_found, make_groups
 from wavebatch.tools.bench.chains import AUTO, choose_chains, find_twin, list_methods, load_chains
 from wavebatch.tools.bench.figures import choose_cheapest, find_front, median_range
 from wavebatch.tools.bench.scenes import shape_scene
@@ -95,7 +95,7 @@ def _measure_scene(
     chosen = [choose_chains(chains, group.survey) for group in groups]
     twin = find_twin(chosen)
     measured = {name: chain for name, chain in chosen[0].items() if name != AUTO or twin is None}
-    tallies = {name: Tally() for name in measured}
+    tallies = {name: AccuracyTally() for name in measured}
     for name, tally in tallies.items():
         progress(f"{scene.name}: error of {name}")
         for group, of_group in zip(groups, chosen, strict=True):
@@ -128,7 +128,7 @@ def _time(
         return time_chains(timed, block, strip, Path(name), options.repeats, progress)
 
 
-def make_row(name: str, kind: str, tally: Tally, laps: Laps) -> dict[str, Any]:
+def make_row(name: str, kind: str, tally: AccuracyTally, laps: Laps) -> dict[str, Any]:
     """The row of a chain or of another program (kind: chain or peer)."""
     figures = {key: figure.to_json() for key, figure in tally.figures().items()}
     times = {key: median_range(value) if isinstance(value, list) else value for key, value in asdict(laps).items()}

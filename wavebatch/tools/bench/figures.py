@@ -44,7 +44,7 @@ class Figure:
         return Figure(self.value * factor, self.error * factor)
 
 
-def share(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Figure:
+def share_figure(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Figure:
     """Sum of `part` over that of `whole`, counts per waveform (n,) in groups (n,), as a figure.
 
     Shares near 0 or 1 keep the error that two counts more or less would make (Agresti and Coull 1998).

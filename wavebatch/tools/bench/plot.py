@@ -15,7 +15,7 @@ import numpy as np
 from wavebatch.core.optional import advise_install
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.bench.figures import find_front
-from wavebatch.tools.plots.labels import place_labels
+from wavebatch.tools.plots.draw_cloud import MARKERS, SERIES
 
 NO_PLOT = f"no plot without matplotlib: {advise_install('matplotlib')}"
 
@@ -30,20 +30,12 @@ def plot_scene(section: Mapping[str, Any], target: Path) -> None:
     with open_picture(target, (11, 4.6), overwrite=True, dpi=120) as figure:
         figure.suptitle(plain_text(f"{section['scene']}: error against run time, one core"))
         panels = figure.subplots(1, len(PANELS))
-        labels = [
+        for axes, (name, factor, label) in zip(panels, PANELS, strict=True):
             _draw_panel(axes, section["rows"], name, factor, label)
-            for axes, (name, factor, label) in zip(panels, PANELS, strict=True)
-        ]
-        # The panels must have their final size before labels can be placed.
-        figure.draw_without_rendering()
-        for axes, names in zip(panels, labels, strict=True):
-            place_labels(axes, names, keep=True)
 
 
-def _draw_panel(
-    axes: Any, rows: list[Mapping[str, Any]], name: str, factor: float, label: str
-) -> list[tuple[str, float, float]]:
-    """Draws one error against time; returns the labels of the points with their positions."""
+def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: float, label: str) -> None:
+    """Draws one error against time."""
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     twins = {row["same_as"]: row["name"] for row in rows if "same_as" in row}
@@ -59,18 +51,15 @@ def _draw_panel(
     axes.set_xlabel("kernels: microseconds per waveform")
     axes.set_ylabel(label)
     if not known:
-        return []
+        return
     chains = np.array([row["kind"] == "chain" for row in known])
     front = find_front(np.where(chains[:, None], np.stack([time, value], axis=1), np.nan))
     order = np.flatnonzero(front)[np.argsort(time[front])]
     axes.plot(time[order], value[order], color="tab:red", zorder=1, label="Pareto front")
-    labels = []
     for i, row in enumerate(known):
-        marker = "o" if row["kind"] == "chain" else "s"
-        color = "tab:red" if front[i] else "tab:gray"
-        axes.errorbar(time[i], value[i], yerr=error[i], fmt=marker, color=color, capsize=2)
-        labels.append((" = ".join([row["name"], *filter(None, [twins.get(row["name"])])]), time[i], value[i]))
+        names = " = ".join([row["name"], *filter(None, [twins.get(row["name"])])])
+        marker, color = MARKERS[i // len(SERIES) % len(MARKERS)], SERIES[i % len(SERIES)]
+        axes.errorbar(time[i], value[i], yerr=error[i], fmt=marker, color=color, capsize=2, label=names)
     axes.margins(x=0.25, y=0.15)
     axes.set_ylim(bottom=0)
-    axes.legend()
-    return labels
+    axes.legend(fontsize=7.0)

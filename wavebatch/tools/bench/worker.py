@@ -22,7 +22,7 @@ from wavebatch.files.disk.closing import Closing
 _START = "from wavebatch.tools.bench.worker import serve; serve()"
 
 
-class WorkerDied(Exception):
+class BenchWorkerDied(Exception):
     """The process ended before it answered."""
 
 
@@ -46,7 +46,7 @@ class Worker(Closing):
             self._process.stdin.flush()
             kind, value = pickle.load(self._process.stdout)
         except (EOFError, OSError, ValueError, pickle.UnpicklingError):
-            raise WorkerDied("the measuring process ended") from None
+            raise BenchWorkerDied("the measuring process ended") from None
         if kind == "raised":
             raise value
         return value

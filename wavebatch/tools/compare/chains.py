@@ -130,7 +130,7 @@ def match_sides(
 def match_chains(
     blocks: Iterator[WaveformBlock], runs: dict[str, ChainRun], names: tuple[str, str], tolerance_ns: float
 ) -> Comparison:
-    """Compares chains a and b, or a and the vendor's returns, waveform by waveform; `runs` collect their own sums."""
+    """Compares chains a and b, or a and the vendor's returns, waveform by waveform; each of `runs` collects sums."""
     between = Pairing(tolerance_ns)
     for block in blocks:
         found = {key: run.find(block) for key, run in runs.items()}

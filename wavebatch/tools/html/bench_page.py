@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,6 @@ def write_bench_page(target: Path, document: Mapping[str, Any], report: str) -> 
     """Write the page of a benchmark; document: as --json prints it, report: the text that is printed."""
     names = ", ".join(section["scene"] for section in document["scenes"])
     write_page(target, f"wavebatch bench: {names}", _parts(document, report))
-
-
-def write_real_page(target: Path, reports: Sequence[tuple[str, str]]) -> None:
-    """Write the page of `bench --real`: name and report of each strip."""
-    parts = (markup.section(name, markup.code(report)) for name, report in reports)
-    write_page(target, f"wavebatch bench --real: {len(reports)} strips" if len(reports) != 1 else
-               f"wavebatch bench --real: {reports[0][0]}", parts)  # fmt: skip
 
 
 def _parts(document: Mapping[str, Any], report: str) -> Iterator[str]:

@@ -16,9 +16,8 @@ from wavebatch.files.figure_file import has_matplotlib, open_svg, plain_text
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
 from wavebatch.surveying.systems.shown import full_width, sample_pulse
 from wavebatch.tools.html.markup import text
-from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, draw_cells
-from wavebatch.tools.plots.draw_sheet import HEAD, LEGEND, draw_waveforms, sheet_size
-from wavebatch.tools.plots.labels import place_labels
+from wavebatch.tools.plots.draw_cloud import MARKERS, SERIES, add_colorbar, draw_cells
+from wavebatch.tools.plots.draw_sheet import HEAD, LEGEND, draw_small_waveforms, sheet_size
 from wavebatch.tools.plots.raster import Raster
 from wavebatch.tools.plots.waveform import WaveformView
 
@@ -96,7 +95,8 @@ def draw_sheet(views: Sequence[WaveformView], title: str, notes: Sequence[str] =
     columns = min(SHEET_COLUMNS, len(views)) or 1
     wide, high = sheet_size(len(views), columns)
     size = (wide, high - HEAD)
-    return picture(title, size, lambda figure: draw_waveforms(figure, views, columns, notes=notes, head=0.0), LEGEND)
+    draw = lambda figure: draw_small_waveforms(figure, views, columns, notes=notes, head=0.0)  # noqa: E731
+    return picture(title, size, draw, LEGEND)
 
 
 def draw_histogram(edges: np.ndarray, counts: np.ndarray, *, title: str, label: str, log: bool = False,
@@ -212,11 +212,11 @@ def draw_scatter(rows: Sequence[tuple[str, float, float]], *, title: str, labels
         axes.set(title=title, xlabel=labels[0], ylabel=labels[1])
         for set_scale, axis in ((axes.set_xscale, axes.xaxis), (axes.set_yscale, axes.yaxis)):
             _scale_log(set_scale, axis)
-        for number, (_, x, y) in enumerate(known):
-            axes.plot(x, y, "o", color=SERIES[number % len(SERIES)])
+        for number, (name, x, y) in enumerate(known):
+            marker = MARKERS[number // len(SERIES) % len(MARKERS)]
+            axes.plot(x, y, marker, color=SERIES[number % len(SERIES)], label=name)
         axes.margins(0.2)
-        figure.draw_without_rendering()
-        place_labels(axes, [tuple(row) for row in known], keep=True)
+        axes.legend(fontsize=7.0)
 
     return picture(title, (5.6, 3.6), draw, note)
 

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from wavebatch import __version__
-from wavebatch.tools.compare.angles import AngleAgreement
 from wavebatch.tools.compare.chains import Matchup
-from wavebatch.tools.compare.overlap import OverlapComparison
 from wavebatch.tools.compare.pairing import Comparison
 from wavebatch.tools.html import markup
-from wavebatch.tools.html.charts import draw_counts, draw_histogram, figures
+from wavebatch.tools.html.charts import draw_counts, figures
 from wavebatch.tools.html.page import write_page
 
 _SPREAD = ("number", "median", "mean", "rms", "nmad")
@@ -25,19 +20,11 @@ _SPREAD = ("number", "median", "mean", "rms", "nmad")
 _spread = attrgetter(*_SPREAD)
 
 
-def write_compare_page(
-    target: Path, result: Comparison | Matchup | AngleAgreement | OverlapComparison, broken: Sequence[str] = ()
-) -> None:
+def write_compare_page(target: Path, result: Comparison | Matchup, broken: Sequence[str] = ()) -> None:
     """Write the page of a comparison; broken: the thresholds that are not met."""
     between = result.between if isinstance(result, Matchup) else result
     names = [Path(side).name for side in (between.a, between.b) if side]
-    if isinstance(result, AngleAgreement):
-        parts = _angle_parts(result)
-    elif isinstance(result, OverlapComparison):
-        parts = _overlap_parts(result)
-    else:
-        parts = _echo_parts(result, between, broken)
-    write_page(target, f"wavebatch compare: {' with '.join(names)}", parts)
+    write_page(target, f"wavebatch compare: {' with '.join(names)}", _echo_parts(result, between, broken))
 
 
 def _echo_parts(result: Comparison | Matchup, one: Any, broken: Sequence[str]) -> Iterator[str]:
@@ -122,29 +109,3 @@ def _strip_parts(result: Matchup) -> Iterator[str]:
     words = "E = |f - y|^2 / |f|^2 of model f and waveform y; E0 is the E that noise alone gives."
     head = ["side", "waveforms with", "number", "mean E", "median E", "mean E0", "median E0"]
     yield markup.section("Goodness of fit", markup.paragraph(words), markup.table(head, rows))
-
-
-def _overlap_parts(result: OverlapComparison) -> Iterator[str]:
-    rows = {"A": result.a, "B": result.b, "cell": f"{result.cell:.1f} m", "angles from": result.angles}
-    yield markup.section("Summary", markup.facts(rows))
-    compared = {"height, A less B [m]": result.height}
-    compared |= {f"{name}, A over B less 1": one for name, one in result.columns.items()}
-    lines = [[name, one.cells, one.median, one.error, one.nmad, one.stated] for name, one in compared.items()]
-    head = ["A against B", "cells", "median", "error", "nmad", "stated"]
-    yield markup.section("Flat cells with single echoes of both", markup.table(head, lines))
-    yield markup.section("Provenance", markup.facts({"wavebatch": __version__}))
-
-
-def _angle_parts(result: AngleAgreement) -> Iterator[str]:
-    hidden = ("edges", "difference_edges", "histogram_widths", "histogram_normals", "histogram_difference")
-    plain = {name: value for name, value in asdict(result).items() if name not in hidden}
-    yield markup.section("Summary", markup.facts({name.replace("_", " "): value for name, value in plain.items()
-                                                  if value is not None}))  # fmt: skip
-    if result.number:
-        charts = [draw_histogram(np.array(edges), np.array(counts), title=title, label="deg")
-                  for title, edges, counts in (("From echo width", result.edges, result.histogram_widths),
-                                               ("From normals", result.edges, result.histogram_normals),
-                                               ("Width less normals", result.difference_edges,
-                                                result.histogram_difference))]  # fmt: skip
-        yield markup.section("Angles", figures(charts))
-    yield markup.section("Provenance", markup.facts({"wavebatch": __version__}))

@@ -25,7 +25,7 @@ FEW = 4
 """So many strips all have a part."""
 
 MOST_PARTS = 8
-"""Strips with a part of their own: a part has about 200 kB, and a browser must still open the page."""
+"""Strips with a part each: a part has about 200 kB, and a browser must still open the page."""
 
 PART_WAVEFORMS = 200_000
 """Waveforms of a larger batch for each part but the first: the run of a tenth of these takes as long as a part."""

@@ -40,7 +40,7 @@ class Views:
     """With the root mean square of their residual in standard deviations of the noise, the largest first."""
 
 
-def read_views(path: Path, chain: Chain, system: SystemPulse, *, seed: int = 0, **reading: Any) -> Views:
+def read_page_views(path: Path, chain: Chain, system: SystemPulse, *, seed: int = 0, **reading: Any) -> Views:
     """Waveforms of a sample that is spread evenly over the strip; reading: direction and headerless.
 
     Raises InputError if the strip cannot be read.
@@ -53,7 +53,7 @@ def read_views(path: Path, chain: Chain, system: SystemPulse, *, seed: int = 0, 
         total = scan.packets
         for block in reader.sample_blocks(scan, min(SEARCHED, sample_size(reader, scan))):
             searched += len(block)
-            residual = measure_residuals(block, chain, system)
+            residual = measure_view_residuals(block, chain, system)
             # The least of random numbers, kept over all blocks, draw each waveform with the same chance.
             order = generator.random(len(block))
             drawn = _keep(drawn, block, chain, system, order, SHOWN_RANDOM)
@@ -75,7 +75,7 @@ def _keep(
     return sorted([*kept, *zip(keys[rows].tolist(), views, strict=True)], key=lambda pair: pair[0])[:most]
 
 
-def measure_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -> np.ndarray:
+def measure_view_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -> np.ndarray:
     """Root mean square of each waveform's residual in standard deviations of the noise, f8 (n,); NaN without a model.
 
     Samples that are missing, or at the digitizer's limit, are left out.
@@ -98,9 +98,9 @@ def measure_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -
 def draw_waveforms(path: Path, chain: Chain, system: SystemPulse, name: str, **reading: Any) -> str:
     """The sheet of random waveforms and the worst fits, as sections of a page; name: of the chain.
 
-    reading, errors: as for `read_views`.
+    reading, errors: as for `read_page_views`.
     """
-    views, level = read_views(path, chain, system, **reading), 3
+    views, level = read_page_views(path, chain, system, **reading), 3
     whole = f"all {views.searched:,} waveforms"
     part = f"{views.searched:,} waveforms that are spread over the strip ({views.total:,} in all)"
     head = (

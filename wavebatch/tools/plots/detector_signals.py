@@ -20,11 +20,19 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
-from wavebatch.kernels.signal.filters import curvature_taps, filter_energy, filter_symmetric, gaussian_taps
+from wavebatch.kernels.signal.filters import (
+    curvature_taps,
+    filter_antisymmetric,
+    filter_energy,
+    filter_symmetric,
+    gaussian_taps,
+    slope_taps,
+)
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121
 from wavebatch.kernels.signal.square_differences import pad_samples, slide_taps, square_differences
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.detect.candidates import signal_above
+from wavebatch.stages.detect.classic import INFLECTED
 from wavebatch.stages.detect.maximum import LEAST_BLUR, choose_smoothing
 from wavebatch.stages.detect.wavelet import BACKGROUND, spike_reach, transform
 from wavebatch.stages.reference_pulse import reference_pulse
@@ -59,28 +67,28 @@ class DetectorSignal:
 
 def choose_step(chain: Chain, show: str) -> Step:
     """The detector whose signal is shown: that of the chain if it searches in this kind, else the kind's first one."""
-    own = chain.steps[1]
+    step = chain.steps[1]
     if show == "detector":
-        if own.stage.name not in _SIGNALS:
-            raise ConfigError(f"--show detector: {own.stage.name} has no known signal; choose {', '.join(KINDS)}")
-        return own
+        if step.stage.name not in _SIGNALS:
+            raise ConfigError(f"--show detector: {step.stage.name} has no known signal; choose {', '.join(KINDS)}")
+        return step
     names = [name for name, (kind, _) in _SIGNALS.items() if kind == show]
     if not show or not names:
         raise ConfigError(f"--show {show!r}: must be one of {', '.join(('detector', *KINDS))}")
-    return own if own.stage.name in names else Step(STAGES[names[0]])
+    return step if step.stage.name in names else Step(STAGES[names[0]])
 
 
 def see_block(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, step: Step, *, own: bool = True
+    block: WaveformBlock, noise: Noise, system: SystemPulse, step: Step, *, in_chain: bool = True
 ) -> list[DetectorSignal]:
     """What the detector of a step sees in each waveform of a block, with the echoes that it finds there.
 
-    own: whether it is the detector of the chain; the title then does not say that it is another one.
+    in_chain: whether it is the detector of the chain; the title then does not say that it is another one.
     """
     scene = _Scene(block, noise, system, SimpleNamespace(**step.effective()))
     whole = _SIGNALS[step.stage.name][1](scene)
     found = step.stage.function(block, noise, system, **step.parameters)
-    name = describe_step(step) + ("" if own else ", which the chain does not use")
+    name = describe_step(step) + ("" if in_chain else ", which the chain does not use")
     time = (whole.first + np.arange(len(whole.values))) * block.spacing
     return [
         replace(whole, values=whole.values[:, row], least=np.float64(whole.least[row]), time=time, stage=name,
@@ -147,6 +155,12 @@ def _see_smoothed(scene: _Scene) -> DetectorSignal:
                           level * SMOOTH_GAIN * scene.std)  # fmt: skip
 
 
+def _see_samples(scene: _Scene) -> DetectorSignal:
+    one = scene.options
+    rule = f"runs above {one.level:g} std for {one.duration:g} pulses"
+    return DetectorSignal("above the baseline [DN]", rule, scene.signal, one.level * scene.std)
+
+
 def _see_matched(scene: _Scene) -> DetectorSignal:
     taps = gaussian_taps(scene.ref)
     energy = filter_energy(taps)
@@ -204,18 +218,35 @@ def _see_curvature(scene: _Scene) -> DetectorSignal:
     return DetectorSignal("- second derivative [DN/sample2]", rule, filter_symmetric(scene.signal, taps), least)
 
 
+def _see_crossings(scene: _Scene) -> DetectorSignal:
+    one = scene.options
+    blur = max(one.scale * scene.ref, LEAST_BLUR)
+    high = f"where the smoothed signal is above {one.level:g} std"
+    if one.derivative == "first":
+        values = filter_antisymmetric(scene.signal, slope_taps(blur))
+        least = np.full(values.shape[1], np.nan)
+        return DetectorSignal("derivative [DN/sample]", f"falls through zero {high}", values, least)
+    taps = curvature_taps(blur)
+    least = INFLECTED * np.sqrt(filter_energy(taps)) * scene.std
+    values = filter_symmetric(scene.signal, taps)
+    return DetectorSignal("- second derivative [DN/sample2]", f"middle of two zeros {high}", values, least)
+
+
 _SIGNALS: Mapping[str, tuple[str, Callable[[_Scene], DetectorSignal]]] = {
     "detect.maximum": ("", _see_maximum),
     "detect.threshold": ("", _see_smoothed),
     "detect.constant_fraction": ("", _see_smoothed),
+    "detect.center_of_gravity": ("", _see_smoothed),
+    "detect.sustained_threshold": ("", _see_samples),
     "detect.asdf": ("asdf", _see_asdf),
     "detect.wavelet": ("wavelet", _see_wavelet),
     "detect.correlation": ("correlation", _see_correlation),
     "detect.matched_filter": ("correlation", _see_matched),
     "detect.richardson_lucy": ("deconvolved", _see_spikes),
     "detect.second_derivative": ("derivative", _see_curvature),
+    "detect.zero_crossing": ("derivative", _see_crossings),
 }
 """Per detector the kind of its signal, as --show names it, and the function that computes it."""
 
 KINDS = tuple(dict.fromkeys(kind for kind, _ in _SIGNALS.values() if kind))
-"""Kinds of signal; --show draws that of the chain's own detector, or of the first one that searches in this kind."""
+"""Kinds of signal; --show draws that of the chain's detector, or of the first one that searches in this kind."""

@@ -26,26 +26,32 @@ if TYPE_CHECKING:
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a8a8a")
 """Colours of Okabe and Ito, which colour-blind readers can distinguish; more than eight series repeat them."""
 
+MARKERS = "os^Dv*"
+"""Marks of points; each serves for a round of SERIES."""
+
 MOST_TOGETHER = 6
 """Most series in one axes: more lines cannot be followed."""
 
+FEWEST_IN_LINE = 5
+"""Series of fewer values are points: two values make a line of two needles."""
+
 _NARROW = 4.0
-"""Maps so many times as high as wide have a place of its own for the scale of colours: it would shrink with them."""
+"""Maps so many times as high as wide have a separate place for the scale of colours: it would shrink with them."""
 
 _LONG = 8.0
 """Longer side of a map [inches]."""
 
 
-def draw_histograms(
-    every: Sequence[Histogram], target: Path, *, log: bool = False, counts: bool = False, overwrite: bool = False
+def draw_cloud_histogram(
+    found: Histogram, target: Path, *, log: bool = False, counts: bool = False, overwrite: bool = False
 ) -> None:
-    """Writes a picture of histograms, one below the other, each with an axis of its own unit.
+    """Writes a picture of a histogram.
 
-    Several series in one histogram are drawn as shares of their values, so that small and large ones can be compared;
-    more than MOST_TOGETHER side by side, each in its own axes.
+    Several series are drawn as shares of their values, so that small and large ones can be compared;
+    more than MOST_TOGETHER side by side, each in axes for it alone.
     counts: as numbers of values all the same. log: logarithmic axis of counts. Raises as figure_file.open_picture does.
     """
-    every = [part for found in every for part in _split_series(found)]
+    every = _split_series(found)
     columns = 1 if len(every) <= MOST_TOGETHER else 2
     rows, lines = -(-len(every) // columns), sum(len(found.names) + (len(found.names) == 1) for found in every)
     size = 8.0 * columns, 3.9 * rows + 0.3 + 0.2 * lines / columns
@@ -61,10 +67,10 @@ def _split_series(found: Histogram) -> list[Histogram]:
     """The histogram, or one for each of its series where these are too many for one picture."""
     if len(found.names) <= MOST_TOGETHER:
         return [found]
-    own = ("counts", "below", "above", "values", "percentiles", "means")
+    by_series = ("counts", "below", "above", "values", "percentiles", "means")
     parts = []
     for row, name in enumerate(found.names):
-        rows = {key: getattr(found, key)[row : row + 1] for key in own}
+        rows = {key: getattr(found, key)[row : row + 1] for key in by_series}
         parts.append(replace(found, names=(name,), clouds=(name,), total=Tally(values=int(rows["values"][0])), **rows))
     return parts
 
@@ -110,7 +116,11 @@ def _draw_series(axes: Axes, found: Histogram, series: int, as_counts: bool) -> 
     low, median, high = (_value_text(value, found.edges) for value in found.percentiles[series])
     label = "" if alone else fit_text(axes.figure, f"{plain_text(found.names[series], 200)}: ", 3.6, size=8.0)
     text = f"{label}{number:,} values, mean {_value_text(found.means[series], found.edges)}, median {median}{unit}"
-    axes.stairs(counts, found.edges, color=color, linewidth=1.2, linestyle=style, label=text)
+    if number < FEWEST_IN_LINE:
+        filled, middles = np.flatnonzero(counts), 0.5 * (found.edges[:-1] + found.edges[1:])
+        axes.plot(middles[filled], counts[filled], "o", color=color, label=text)
+    else:
+        axes.stairs(counts, found.edges, color=color, linewidth=1.2, linestyle=style, label=text)
     if math.isnan(middle):
         return
     axes.axvline(middle, color="#222222" if alone else color, linewidth=1.2, linestyle=(0, (5, 2)))
@@ -154,7 +164,7 @@ def draw_flags(
         axes.set_title(fit_text(figure, title, 6.0, size=10.5))
 
 
-def draw_map(found: Raster, target: Path, *, overwrite: bool = False) -> None:
+def draw_cloud_map(found: Raster, target: Path, *, overwrite: bool = False) -> None:
     """Writes a picture of a map. Raises as figure_file.open_picture does."""
     grid = found.grid
     ratio = grid.rows / grid.columns

@@ -11,7 +11,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.tools.plots.draw_waveform import ECHO, FIT, GREY, draw_samples, find_peaks, fit_height
+from wavebatch.tools.plots.draw_waveform import ECHO, FIT, GREY, draw_samples, find_echo_heights, fit_signal_panel
 from wavebatch.tools.plots.labels import fit_parts, fit_text
 from wavebatch.tools.plots.waveform import WaveformView
 
@@ -40,7 +40,7 @@ QUIET_FLAGS = EchoFlag.OVERLAPPED | EchoFlag.WEAK
 """Flags that are too common to be named."""
 
 
-def draw_sheet(
+def draw_waveform_sheet(
     views: Sequence[WaveformView],
     target: Path,
     *,
@@ -59,7 +59,7 @@ def draw_sheet(
     with open_picture(target, size, overwrite=overwrite) as figure:
         # A layout for 200 axes takes a minute; a grid needs none.
         figure.set_layout_engine("none")
-        draw_waveforms(figure, views, columns, times)
+        draw_small_waveforms(figure, views, columns, times)
         parts = (plain_text(strip), plain_text(chain, 200), f"{len(views)} waveforms")
         title = fit_text(figure, "   ".join(parts), size[0] - 0.2, size=10, weight="bold")
         figure.text(0.1 / size[0], 1 - 0.1 / size[1], title, va="top", fontsize=10, weight="bold")
@@ -72,7 +72,7 @@ def sheet_size(number: int, columns: int) -> tuple[float, float]:
     return CELL[0] * columns, CELL[1] * -(-number // columns) + HEAD + FOOT
 
 
-def draw_waveforms(
+def draw_small_waveforms(
     figure: Figure, views: Sequence[WaveformView], columns: int, times: tuple[float, float] | None = None,
     notes: Sequence[str] = (), head: float = HEAD,
 ) -> None:  # fmt: skip
@@ -95,9 +95,9 @@ def _draw_cell(
     lower = figure.add_axes((left, bottom, width, (SHARE - 0.03) * height), sharex=upper)
     times = times or view.span
     draw_samples(upper, view, times, dot=1.2, thin=0.55)
-    upper.plot(view.echoes.time, find_peaks(view), "D", color=ECHO, markersize=3, markerfacecolor="none",
+    upper.plot(view.echoes.time, find_echo_heights(view), "D", color=ECHO, markersize=3, markerfacecolor="none",
                markeredgewidth=0.7)  # fmt: skip
-    fit_height(upper, view, times)
+    fit_signal_panel(upper, view, times)
     _draw_residual(lower, view)
     upper.set_xlim(times)
     for axes in (upper, lower):
@@ -118,7 +118,7 @@ def _draw_residual(axes: Axes, view: WaveformView) -> None:
     residual = np.clip(view.residual, -RESIDUAL, RESIDUAL)
     large = np.abs(view.residual) > RESIDUAL
     for rows, color in ((~large, FIT), (large, ECHO)):
-        # One broken line: hundreds of lines of their own would be most of a page.
+        # One broken line: hundreds of lines would be most of a page.
         ends = np.stack([np.zeros(rows.sum()), residual[rows], np.full(rows.sum(), np.nan)], axis=1)
         axes.plot(np.repeat(view.time[rows], 3), ends.ravel(), color=color, linewidth=0.7)
 

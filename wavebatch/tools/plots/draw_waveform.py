@@ -1,7 +1,7 @@
 """Pictures of waveforms with their fit, residual and echoes, drawn with matplotlib.
 
-`wavebatch plot waveform` calls `draw_waveforms` with the views of `waveform.read_views`. Style and files are those of
-`files.figure_file`; the same views give the same bytes.
+`wavebatch plot waveform` calls `draw_waveform_panels` with the views of `waveform.read_views`. Style and files are
+those of `files.figure_file`; the same views give the same bytes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.kernels.signal.runs import find_stretches
 from wavebatch.tools.plots.detector_signals import DetectorSignal
 from wavebatch.tools.plots.echo_table import list_echoes
-from wavebatch.tools.plots.labels import fit_parts, fit_text, place_labels, set_head
+from wavebatch.tools.plots.labels import fit_parts, fit_text, set_head
 from wavebatch.tools.plots.waveform import WaveformView
 
 if TYPE_CHECKING:
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 INK, GREY = "#222222", "#8a8a8a"
 FIT, PULSE, ECHO, VENDOR, CLIPPED = "#0072b2", "#56b4e9", "#d55e00", "#009e73", "#e69f00"
 """Colours of Okabe and Ito, which colour-blind readers can distinguish."""
+
+_LONGEST_BAR = 1e6
+"""Longer error bars leave every panel all the same, and could overflow [ns, DN]."""
 
 _MANY = 150
 """Waveforms with more samples get smaller dots."""
@@ -47,7 +50,7 @@ _LETTER = 0.085
 """Width of a letter of a title [inches]."""
 
 
-def draw_waveforms(
+def draw_waveform_panels(
     views: Sequence[WaveformView],
     target: Path,
     *,
@@ -155,7 +158,8 @@ def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, 
     for curve in view.curves:
         axes.fill_between(view.fine, level, level + curve, color=PULSE, alpha=0.15, linewidth=0)
     draw_samples(axes, view, times, dot=(2.4 if small else 3.4) * (1.0 if len(view.time) <= _MANY else 0.6))
-    _draw_errors(axes, view, times, fit_height(axes, view, times))
+    _draw_errors(axes, view, times)
+    fit_signal_panel(axes, view, times)
 
 
 def draw_samples(
@@ -190,38 +194,34 @@ def shade_gaps(axes: Axes, view: WaveformView) -> None:
                      label="not recorded")  # fmt: skip
 
 
-def find_peaks(view: WaveformView) -> np.ndarray:
+def find_echo_heights(view: WaveformView) -> np.ndarray:
     """Heights of the echoes in the signal panel [DN], f8 (k,)."""
     level = np.interp(view.echoes.time, view.time, view.level)
     return level + view.echoes.amplitude.astype(np.float64)
 
 
-def _draw_errors(axes: Axes, view: WaveformView, times: tuple[float, float], heights: tuple[float, float]) -> None:
-    """Draws the echoes with error bars; a bar that would leave the panel ends at its edge with an arrowhead."""
-    time, peak = view.echoes.time.astype(np.float64), find_peaks(view)
-    shown = (time >= times[0]) & (time <= times[1])
-    axes.plot(time[shown], peak[shown], "D", markersize=4, markerfacecolor="none", color=ECHO, zorder=4, label="echoes")
-    errors = [np.nan_to_num(error.astype(np.float64)) for error in (view.echoes.time_err, view.echoes.amplitude_err)]
-    for place, fixed, error, (low, high), heads in (
-        (time, peak, errors[0], times, ("<", ">")), (peak, time, errors[1], heights, ("v", "^")),
-    ):  # fmt: skip
-        for row in np.flatnonzero(shown & (error > 0)):
-            ends = np.clip([place[row] - error[row], place[row] + error[row]], low, high)
-            along, across = ends, np.full(2, fixed[row])
-            flat = heads[0] == "<"
-            axes.plot(*((along, across) if flat else (across, along)), color=ECHO, linewidth=1.2, zorder=4)
-            for end, sign, head in zip(ends, (-1, 1), heads, strict=True):
-                cut = sign * (place[row] + sign * error[row] - end) > 1e-9 * max(abs(end), 1.0)
-                mark = head if cut else "|" if flat else "_"
-                at = (end, fixed[row]) if flat else (fixed[row], end)
-                axes.plot(*at, marker=mark, color=ECHO, markersize=4, zorder=4, clip_on=False)
+def _draw_errors(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
+    """Draws the echoes with error bars."""
+    shown = (view.echoes.time >= times[0]) & (view.echoes.time <= times[1])
+    time, amplitude = (
+        np.minimum(np.nan_to_num(error[shown].astype(np.float64)), _LONGEST_BAR)
+        for error in (view.echoes.time_err, view.echoes.amplitude_err)
+    )
+    axes.errorbar(view.echoes.time[shown].astype(np.float64), find_echo_heights(view)[shown], yerr=amplitude, xerr=time,
+                  fmt="D", markersize=4, markerfacecolor="none", color=ECHO, capsize=2, zorder=4, label="echoes")
 
 
 def _number_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:
-    low, high = axes.get_xlim()
-    peaks = zip(view.echoes.time.tolist(), find_peaks(view).tolist(), strict=True)
-    labels = [(str(row), time, height) for row, (time, height) in enumerate(peaks, 1) if low <= time <= high]
-    place_labels(axes, labels, color=ECHO, fontsize=7.5 if small else 9, weight="bold")
+    """Writes numbers above the echoes; one that would lie on the number before it is left out."""
+    (low, high), size = axes.get_xlim(), 7.5 if small else 9.0
+    room = 1.3 * size / 72 * axes.figure.dpi / axes.get_window_extent().width * (high - low)
+    last = -np.inf
+    peaks = zip(view.echoes.time.tolist(), find_echo_heights(view).tolist(), strict=True)
+    for row, (time, height) in enumerate(peaks, 1):
+        if max(low, last + room * len(str(row))) <= time <= high:
+            axes.annotate(str(row), (time, height), textcoords="offset points", xytext=(0, 5), ha="center",
+                          annotation_clip=False, color=ECHO, fontsize=size, weight="bold").set_in_layout(False)
+            last = time
 
 
 def draw_detector(axes: Axes, seen: DetectorSignal, times: tuple[float, float], *, small: bool) -> None:
@@ -268,14 +268,14 @@ def _draw_residual(axes: Axes, view: WaveformView, times: tuple[float, float]) -
     axes.set_ylim(-height, height)
 
 
-def fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> tuple[float, float]:
-    """Scales the signal panel to what is shown, with error bars up to half of its height; returns its limits."""
+def fit_signal_panel(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
+    """Scales the signal panel to what is shown, with error bars up to half of its height."""
 
     def inside(time: np.ndarray) -> np.ndarray:
         return (time >= times[0]) & (time <= times[1])
 
     echoes = inside(view.echoes.time)
-    peak, error = find_peaks(view)[echoes], np.nan_to_num(view.echoes.amplitude_err[echoes].astype(np.float64))
+    peak, error = find_echo_heights(view)[echoes], np.nan_to_num(view.echoes.amplitude_err[echoes].astype(np.float64))
     values = [view.samples[inside(view.time)], [view.baseline - view.std, view.baseline + view.std], peak]
     if view.fit is not None:
         values.append(view.fit[inside(view.fine)])
@@ -284,9 +284,7 @@ def fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> tu
     room = _ERROR_ROOM * (high - low)
     low = min(low, float((peak - np.minimum(error, room)).min(initial=low)))
     high = max(high, float((peak + np.minimum(error, room)).max(initial=high)), low + 6 * view.std)
-    limits = low - 0.05 * (high - low), high + 0.17 * (high - low)
-    axes.set_ylim(limits)
-    return limits
+    axes.set_ylim(low - 0.05 * (high - low), high + 0.17 * (high - low))
 
 
 def _place_legend(figure: Figure, width: float) -> None:

@@ -77,8 +77,8 @@ def format_echoes(views: Sequence[WaveformView]) -> str:
     extra = list(dict.fromkeys(name for view in views for name in view.echoes.attributes))
     head = ["packet", "point", "gps_time [s]", "echo"]
     head += [f"{name}{end} [{COLUMNS[name].unit}]" for name in _NAMES.values() for end in ("", "_err")]
-    own = (*_NAMES.values(), "point")
-    rest = [name for name in extra if name.removesuffix("_err") not in own and not name.endswith("_reason")]
+    shown = (*_NAMES.values(), "point")
+    rest = [name for name in extra if name.removesuffix("_err") not in shown and not name.endswith("_reason")]
     head += [f"{name} [{COLUMNS[name].unit}]" if name in COLUMNS else name for name in rest]
     table = []
     for view in views:

@@ -1,4 +1,4 @@
-"""Texts of pictures that fit: shortened to the room that they have, and labels that cover nothing.
+"""Texts of pictures that fit: shortened to the room that they have.
 
 All modules that draw use it. Texts are measured with the renderer, not estimated from the number of letters.
 """
@@ -12,20 +12,10 @@ from typing import TYPE_CHECKING, Any
 from wavebatch.files.figure_file import plain_text
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-PLACES = (
-    (6, 5), (6, -5), (-6, 5), (-6, -5), (0, 7), (0, -7), (10, 0), (-10, 0), (6, 15), (-6, 15), (0, 18), (6, -15),
-    (-6, -15), (0, -18), (16, 8), (-16, 8), (6, 26), (-6, 26), (0, 30), (6, 38), (-6, 38), (0, 42), (22, 20), (-22, 20),
-)  # fmt: skip
-"""Offsets of labels from their points [typographic points], the best first."""
 
 _LEAST_LETTERS = 8
 """Texts are not shortened below this."""
-
-_TOUCHING = 1e-6
-"""Area that rounding leaves [pixels]."""
 
 
 def text_width(figure: Figure, text: str, size: float, weight: str = "normal") -> float:
@@ -68,56 +58,6 @@ def set_head(figure: Figure, parts: Sequence[str], *, size: float = 10.0, **look
     """Writes the parts of a title above all panels, to the left, as wide as the figure."""
     text = fit_parts(figure, parts, figure.get_figwidth() - 0.2, size=size, **look)
     figure.suptitle(text, x=0.01, ha="left", fontsize=size, **look)
-
-
-def place_labels(
-    axes: Axes, labels: Sequence[tuple[str, float, float]], *, keep: bool = False, **look: Any
-) -> list[Any]:
-    """Writes each label next to its point, at the first place where it covers no point and no other label.
-
-    A label for which there is no such place in the axes is left out: what lies on another text cannot be read. keep:
-    write it where it covers least. The layout must be final; `Figure.draw_without_rendering` makes it so. look: of the
-    text. Returns the labels.
-    """
-    from matplotlib.transforms import Bbox
-
-    legend = axes.get_legend()
-    taken = [legend.get_window_extent()] if legend else []
-    dot = 4 * axes.figure.dpi / 72
-    for _, x, y in labels:
-        x, y = axes.transData.transform((x, y))
-        taken.append(Bbox.from_extents(x - dot, y - dot, x + dot, y + dot))
-    frame, written = axes.get_window_extent(), []
-    for text, x, y in labels:
-        note = axes.annotate(text, (x, y), textcoords="offset points", xytext=(6, 5), annotation_clip=False, **look)
-        note.set_in_layout(False)
-        covered = [_cover(_move(note, place), taken, frame) for place in PLACES]
-        best = covered.index(min(covered))
-        if covered[best] > _TOUCHING and not keep:
-            note.remove()
-            continue
-        taken.append(_move(note, PLACES[best]))
-        written.append(note)
-    return written
-
-
-def _cover(box: Any, taken: Sequence[Any], frame: Any) -> float:
-    """Area of a label that covers other things or lies outside of the axes [pixels]."""
-    return sum(_overlap(box, other) for other in taken) + box.width * box.height - _overlap(box, frame)
-
-
-def _move(note: Any, place: tuple[float, float]) -> Any:
-    """Puts a label at an offset [points] from its point, on the side to which the offset goes; returns its box."""
-    note.set_position(place)
-    note.set_ha("left" if place[0] > 0 else "right" if place[0] < 0 else "center")
-    note.set_va("bottom" if place[1] > 0 else "top" if place[1] < 0 else "center")
-    return note.get_window_extent()
-
-
-def _overlap(a: Any, b: Any) -> float:
-    """Area that two boxes share [pixels]."""
-    both = a.intersection(a, b)
-    return both.width * both.height if both else 0.0
 
 
 def space_ticks(axis: Any, length: float, each: float) -> None:

@@ -210,8 +210,8 @@ def _is_wanted(table: EchoTable, n: int, wanted: Wanted) -> np.ndarray:
     meets = (table.flags & np.uint16(wanted.flags)) != 0 if wanted.flags else np.ones(len(table), bool)
     if wanted.where is None:
         return meets
-    own = {"echo_time": table.time, "echo_flags": table.flags, "number_of_returns": table.count(n)[table.waveform]}
-    have = {**table.attributes, **own}
+    made = {"echo_time": table.time, "echo_flags": table.flags, "number_of_returns": table.count(n)[table.waveform]}
+    have = {**table.attributes, **made}
     for name in wanted.where.columns:
         if name not in have:
             raise wanted.where.complain(name, f"echoes have no column {name!r}; {nearest(name, have)}")

@@ -28,8 +28,7 @@ from wavebatch.tools.plots.values import (
     round_up,
     sample_points,
 )
-from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, check_cells
-from wavebatch.tools.rasters.tiles import Placed, compute_tiles
+from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, Placed, check_cells, compute_tiles
 
 MOST_CELLS = 4_000_000
 """Most cells of a grid; a picture cannot show more."""

@@ -148,7 +148,7 @@ def add_ranges(
     return Chain((*chain.steps, *step), chain.name), source.fill, source.error
 
 
-def describe_chain(chain: Chain) -> str:
+def name_chain(chain: Chain) -> str:
     """Name, detector and decomposer of a chain, with the parameters that it sets."""
     detector, decomposer = (describe_step(step) for step in chain.steps[1:3])
     return f"{chain.name.removeprefix('profile ') or 'chain'}: {detector}, {decomposer}"
@@ -164,7 +164,7 @@ def build_views(
     seen: Sequence[DetectorSignal | None] = [None] * len(block)
     if show is not None:
         step = choose_step(chain, show)
-        seen = see_block(block, noise, system, step, own=step is chain.steps[1])
+        seen = see_block(block, noise, system, step, in_chain=step is chain.steps[1])
     views = []
     for row, number in enumerate(packets):
         table = echoes.take(np.flatnonzero(echoes.waveform == row))

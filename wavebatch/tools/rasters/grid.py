@@ -1,6 +1,6 @@
 """`wavebatch grid`: columns of clouds of any size as a GeoTIFF, in memory that does not grow with clouds or raster.
 
-Clouds are read twice: here for the extent, then by `tiles` for the cells. Tiles without a point are not written at all.
+Clouds are read twice: here for the extent, then by `cells.compute_tiles`. Tiles without a point are not written at all.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.tools.plots.values import Clouds, Selection, check_statistic
-from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, check_cells
-from wavebatch.tools.rasters.tiles import Placed, compute_tiles, is_inside
+from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, Placed, check_cells, compute_tiles, is_in_bounds
 
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
 """Most cells along a side, and of the raster (300 km x 300 km at 1 m): more is damage of coordinates, clouds of several
@@ -138,7 +137,7 @@ def _find_extent(clouds: Clouds, options: GridOptions) -> tuple[Box, int, np.nda
     low, high, points = np.full(2, np.inf), np.full(2, -np.inf), 0
     largest = np.zeros(1 + len(clouds.other_facts))
     for _, rows, _ in clouds.read_all():
-        rows = rows[is_inside(rows, options.bbox)]
+        rows = rows[is_in_bounds(rows, options.bbox)]
         if len(rows):
             places = np.stack([rows["x"], rows["y"]], axis=1)
             low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))

@@ -64,7 +64,7 @@ class Division(Protocol):
         return ""
 
 
-class Grid(Division):
+class AreaGrid(Division):
     """Square cells whose borders are multiples of `size`, in the unit of the coordinates."""
 
     def __init__(self, size: float) -> None:

@@ -57,15 +57,15 @@ class Distances:
 
     def list_zones(self) -> dict[str, DeadZone]:
         """The dead zone of `all` pairs, and of the classes of RANKS that have pairs."""
-        zones = {"all": find_zone(self.bins.sum(axis=0))}
-        return zones | {name: find_zone(bins) for name, bins in zip(RANKS, self.bins, strict=True) if bins.any()}
+        zones = {"all": find_dead_zone(self.bins.sum(axis=0))}
+        return zones | {name: find_dead_zone(bins) for name, bins in zip(RANKS, self.bins, strict=True) if bins.any()}
 
     def count_hidden(self, size: float) -> int:
         """Pairs that a dead zone would hold if they were as frequent there as up to twice its size."""
         return int(self.bins[:, round(size / BIN) : round(2 * size / BIN)].sum())
 
 
-def find_zone(bins: np.ndarray) -> DeadZone:
+def find_dead_zone(bins: np.ndarray) -> DeadZone:
     """The dead zone of the pairs of a histogram: the 0.1 % quantile of their distances."""
     pairs = int(bins.sum())
     if pairs < LEAST_PAIRS:

@@ -164,7 +164,7 @@ class _Keys:
     def __init__(self, by_time: bool) -> None:
         self._by_time, self._pulse, self._last = by_time, 0, 255
         self.untimed = 0
-        """Points without a time of their own, while others have one."""
+        """Points without a time, while others have one."""
 
     def of(self, rows: np.ndarray) -> np.ndarray:
         """Pulse number of each row, u8 (n,)."""

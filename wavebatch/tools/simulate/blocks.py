@@ -15,7 +15,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.tools.simulate.geometry import Flight, Rays, trace_rays
+from wavebatch.tools.simulate.geometry import FlightLine, SceneRays, trace_rays
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
 from wavebatch.tools.simulate.scenes import Scene, find_scene
 
@@ -41,7 +41,7 @@ class Simulated:
 
     block: WaveformBlock
     truth: EchoTable
-    rays: Rays
+    rays: SceneRays
 
     def cut(self, start: int, stop: int) -> Simulated:
         """Pulses [start, stop)."""
@@ -49,7 +49,7 @@ class Simulated:
             return self
         a, b = np.searchsorted(self.truth.waveform, [start, stop])
         truth = self.truth.take(np.arange(a, b))
-        rays = Rays(**{field.name: getattr(self.rays, field.name)[start:stop] for field in fields(Rays)})
+        rays = SceneRays(**{field.name: getattr(self.rays, field.name)[start:stop] for field in fields(SceneRays)})
         truth = replace(truth, waveform=truth.waveform - np.int32(start))
         return Simulated(self.block.rows(slice(start, stop)), truth, rays)
 
@@ -94,7 +94,7 @@ def seed_block(scene: Scene) -> int:
     return min(SEED_BLOCK, SEED_SAMPLES // scene.recording.n_samples)
 
 
-def simulate_seed_block(scene: Scene, seed: int, number: int, flight: Flight | None = None) -> Simulated:
+def simulate_seed_block(scene: Scene, seed: int, number: int, flight: FlightLine | None = None) -> Simulated:
     """Pulses [k number, k (number + 1)) of the scene with this seed, k from `seed_block`."""
     n = seed_block(scene)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
@@ -102,11 +102,11 @@ def simulate_seed_block(scene: Scene, seed: int, number: int, flight: Flight | N
 
 
 def simulate_pulses(
-    scene: Scene, n: int, rng: np.random.Generator, *, first: int = 0, flight: Flight | None = None
+    scene: Scene, n: int, rng: np.random.Generator, *, first: int = 0, flight: FlightLine | None = None
 ) -> Simulated:
     """Block, truth and rays of pulses [first, first + n)."""
     recording = scene.recording
-    rays = trace_rays(flight or scene.flight or Flight(), scene.terrain, first + np.arange(n))
+    rays = trace_rays(flight or scene.flight or FlightLine(), scene.terrain, first + np.arange(n))
     drawn = scene.draw(rng, n, rays)
     signal = paint_echoes(recording, n, drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
     counts = record_counts(recording, signal, rng, drawn.constant)

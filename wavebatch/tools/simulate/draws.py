@@ -163,7 +163,7 @@ def _find_room(recording: Recording, margin: float) -> tuple[float, float]:
     return keep, recording.duration - keep
 
 
-def draw_counts(rng: np.random.Generator, n: int, probabilities: tuple[float, ...]) -> np.ndarray:
+def draw_numbers(rng: np.random.Generator, n: int, probabilities: tuple[float, ...]) -> np.ndarray:
     """Echoes per waveform, i8 (n,), with the given probabilities of 0, 1, 2 ... echoes."""
     edges = np.cumsum(probabilities)
     return np.searchsorted(edges[:-1] / edges[-1], rng.random(n), side="right")

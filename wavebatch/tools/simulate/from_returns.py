@@ -24,7 +24,7 @@ from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.files.wkt_repair import repair_records
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
-from wavebatch.tools.simulate.return_light import Light, LightCounts, LightModel, SynthesisOptions
+from wavebatch.tools.simulate.return_light import LightCounts, LightModel, ReturnLight, SynthesisOptions
 from wavebatch.tools.simulate.returns import fill_packets
 
 MARGIN = 6.0
@@ -215,7 +215,7 @@ def _model_pulses(
     count = np.diff(np.append(starts, len(rows)))
     pulse = np.repeat(np.arange(len(starts)), count)
     ray = fit_rays(rows["xyz"], starts, rows["scan_angle"], rows["source"])
-    seen: Light = light.measure(rows, records, starts)
+    seen: ReturnLight = light.measure(rows, records, starts)
     sigma = seen.sigma
     delay = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], ray[pulse]) / HALF_C
     margin = MARGIN * np.maximum.reduceat(sigma, starts)

@@ -22,7 +22,7 @@ START_TIME = 300_000_000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Flight:
+class FlightLine:
     """How the aircraft flies and scans."""
 
     height: float = 800.0
@@ -40,7 +40,7 @@ class Flight:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rays:
+class SceneRays:
     """Pulses in space: sensor, point on the ground, direction away from the sensor."""
 
     gps_time: np.ndarray
@@ -57,7 +57,7 @@ class Rays:
     """Degrees off nadir, positive to the left of the flight (north), f8 (n,)."""
 
 
-def trace_rays(flight: Flight, terrain: str, pulse: np.ndarray) -> Rays:
+def trace_rays(flight: FlightLine, terrain: str, pulse: np.ndarray) -> SceneRays:
     """Rays of the pulses with the given numbers (n,) over the terrain."""
     seconds = pulse / flight.pulse_rate
     phase = (seconds * flight.line_rate) % 1.0
@@ -73,7 +73,7 @@ def trace_rays(flight: Flight, terrain: str, pulse: np.ndarray) -> Rays:
     distance = np.sqrt(dx * dx + dy * dy + dz * dz)
     unit = np.stack([dx / distance, dy / distance, dz / distance], axis=1)
     facing = (slope_x * unit[:, 0] + slope_y * unit[:, 1] - unit[:, 2]) / np.sqrt(1 + slope_x**2 + slope_y**2)
-    return Rays(
+    return SceneRays(
         gps_time=START_TIME + seconds,
         ground=np.stack([x, y, z], axis=1),
         direction=unit * AIR_SPEED,

@@ -76,7 +76,7 @@ class SynthesisOptions:
     radar: Radar | None = None
     """Needed for `reflectance`, and only there."""
     width: Annotated[float, Above(0.0, 1000.0)] = option(
-        4.7, "Full width of the pulse at half maximum [ns], and of echoes without a width of their own.", form="NS"
+        4.7, "Full width of the pulse at half maximum [ns], and of echoes without a width.", form="NS"
     )
     widths: str | None = option(
         None, "Column with the full width of each echo at half maximum [ns].", form="COLUMN",
@@ -143,7 +143,7 @@ class LightCounts:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Light:
+class ReturnLight:
     """k returns of whole pulses."""
 
     strength: np.ndarray
@@ -183,7 +183,7 @@ class LightModel:
             self.counts.assumed_unit |= option == "widths" and facts.unit == "-"
             return reader.find_value(column)
 
-    def measure(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> Light:
+    def measure(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> ReturnLight:
         """The light of returns (k,), RETURN_DTYPE, with their raw records; starts: first return of each pulse.
 
         Raises InputError for shares that are none, and for points above the sensor.
@@ -191,13 +191,13 @@ class LightModel:
         sigma = self._measure_sigma(rows["echo_width"] if self._read_width is None else self._read_width(records))
         intensity = rows["intensity"].astype(np.float64)
         if self.options.radar is None:
-            return Light(intensity, sigma)
+            return ReturnLight(intensity, sigma)
         power = _receive(intensity / 65535, rows, self.options.radar, self.path)
         # The power is that of an echo as short as the pulse: a wider one spreads the same energy over a longer time.
         power *= self.options.sigma / sigma
         if self.options.shares is not None:
             power *= self._measure_shares(rows, records, starts)
-        return Light(power, sigma)
+        return ReturnLight(power, sigma)
 
     def check_widths(self) -> None:
         """Raises ConfigError where most widths of the named column had to be limited: they are no widths in ns."""

@@ -23,10 +23,10 @@ from wavebatch.tools.simulate.draws import (
     Mixture,
     WithGaps,
     WithinDepth,
-    draw_counts,
+    draw_numbers,
     widen_on_slope,
 )
-from wavebatch.tools.simulate.geometry import GROUND, Flight, Rays
+from wavebatch.tools.simulate.geometry import GROUND, FlightLine, SceneRays
 from wavebatch.tools.simulate.hazards import HAZARDS, draw_hazards
 from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording
@@ -60,7 +60,7 @@ class Scene:
     light: float = 0.0
     """amplitude sigma range^2 of a white surface that faces the sensor, without attenuation by the air [count ns m2].
     Above 0, amplitudes are those of Lambertian surfaces with GROUND_REFLECTS and ROOFS_REFLECT."""
-    flight: Flight | None = None
+    flight: FlightLine | None = None
     """None: the default Flight."""
     hazards: tuple[str, ...] = ()
     """Names of hazards that replace all of the above."""
@@ -69,13 +69,13 @@ class Scene:
     recording: Recording = field(default_factory=Recording)
     """The receiver."""
 
-    def draw(self, rng: np.random.Generator, n: int, rays: Rays) -> Drawn:
+    def draw(self, rng: np.random.Generator, n: int, rays: SceneRays) -> Drawn:
         """Echoes of n waveforms along n rays."""
         if self.hazards:
             return draw_hazards(rng, n, self.recording, self.hazards)
         if self.canopy:
             return self.canopy.draw(rng, n, self.recording)
-        count = draw_counts(rng, n, self.counts)
+        count = draw_numbers(rng, n, self.counts)
         waveform = np.repeat(np.arange(n), count)
         time = self.times(rng, count, self.recording)
         amplitude = self.amplitude(rng, len(waveform))
@@ -89,7 +89,7 @@ class Scene:
         return Drawn(waveform, time[order], amplitude[order], sigma[order])
 
 
-def _light_surfaces(light: float, rays: Rays) -> np.ndarray:
+def _light_surfaces(light: float, rays: SceneRays) -> np.ndarray:
     """amplitude times sigma of surfaces that face their ray [count ns], (n,)."""
     high = rays.ground[:, 2] > GROUND + LEAST_ROOF
     reflectance = np.where(high, ROOFS_REFLECT, GROUND_REFLECTS)
@@ -132,7 +132,7 @@ _SCENES = (
         terrain="village",
         divergence=1.1,
         light=1.4e8,
-        flight=Flight(height=640.0, half_angle=10.0, look_ahead=0.0),
+        flight=FlightLine(height=640.0, half_angle=10.0, look_ahead=0.0),
         recording=Recording(n_samples=128, spacing=0.5, pulse=PulseModel(sigma=1.5 / FWHM_PER_SIGMA)),
     ),
     Scene(

@@ -2,7 +2,7 @@
 
 `wavebatch simulate` calls `simulate_strip` and `simulate_returns`. Both store the pulses of `blocks`, one seed block at
 a time, so that memory does not grow with the number of pulses. Random numbers of storage (what the points get wrong)
-come from a generator of their own: the waveforms do not depend on StripOptions.
+come from another generator: the waveforms do not depend on StripOptions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated
 from wavebatch.tools.simulate.blocks import Simulated, seed_block, simulate_seed_block
-from wavebatch.tools.simulate.geometry import EAST, NORTH, Flight
+from wavebatch.tools.simulate.geometry import EAST, NORTH, FlightLine
 from wavebatch.tools.simulate.returns import DiscreteReceiver, Returns, fill_packets, list_returns
 from wavebatch.tools.simulate.scenes import Scene, find_scene
 from wavebatch.tools.simulate.truth import TruthWriter
@@ -104,7 +104,7 @@ def simulate_strip(
     seed: int = 0,
     options: StripOptions | None = None,
     truth: Path | None = None,
-    flight: Flight | None = None,
+    flight: FlightLine | None = None,
     overwrite: bool = False,
     progress: Callable[[int], object] | None = None,
 ) -> StripSummary:
@@ -140,7 +140,7 @@ def simulate_returns(
     seed: int = 0,
     receiver: DiscreteReceiver | None = None,
     options: StripOptions | None = None,
-    flight: Flight | None = None,
+    flight: FlightLine | None = None,
     overwrite: bool = False,
     progress: Callable[[int], object] | None = None,
 ) -> ReturnSummary:
@@ -174,7 +174,7 @@ def simulate_returns(
 
 
 def _simulate_parts(
-    scene: Scene, pulses: int, seed: int, flight: Flight | None, progress: Callable[[int], object] | None
+    scene: Scene, pulses: int, seed: int, flight: FlightLine | None, progress: Callable[[int], object] | None
 ) -> Iterator[Simulated]:
     """Pulses 0 to `pulses` of the scene, a seed block at a time; progress is called when the caller has used one."""
     if pulses < 1:

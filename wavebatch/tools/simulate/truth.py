@@ -17,7 +17,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.npz import NpzWriter
-from wavebatch.files.disk.npz_reader import read_header, read_text, reading_npz
+from wavebatch.files.disk.npz_reader import read_array_header, read_array_text, reading_npz
 from wavebatch.files.disk.publish import Draft
 
 ECHO_COLUMNS: dict[str, str] = {
@@ -95,10 +95,10 @@ class TruthReader(Closing):
         return reading_npz(self.path, "truth file of `wavebatch simulate`", "simulate the strip again")
 
     def _read_text(self, member: IO[bytes]) -> str:
-        shape, _, dtype = read_header(member)
+        shape, _, dtype = read_array_header(member)
         if shape or dtype.kind != "U" or dtype.itemsize > _MOST_TEXT:
             raise InputError(f"{self.path}: its description is {dtype}, no text; simulate the strip again")
-        return read_text(member.read(dtype.itemsize), dtype)
+        return read_array_text(member.read(dtype.itemsize), dtype)
 
     def close(self) -> None:
         """Closes the file."""
@@ -124,7 +124,7 @@ class TruthReader(Closing):
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
     def _read_length(self, name: str, member: IO[bytes]) -> int:
-        shape, _, dtype = read_header(member)
+        shape, _, dtype = read_array_header(member)
         if dtype != np.dtype(_DTYPES[name]) or len(shape) != 1:
             raise InputError(f"{self.path}: column {name} is {dtype}, not {_DTYPES[name]}; simulate the strip again")
         return shape[0]

@@ -1,7 +1,7 @@
 """The data cube of scan lines: samples by line, pulse and time on one axis, as an .npz, and slices of it.
 
 `wavebatch slice --cube` writes it, `wavebatch plot cube` draws slices of it. The axis of time is one for all pulses:
-windows open at other heights for every pulse, and counted from their own first samples the relief would be lost. Lines
+windows open at other heights for every pulse, and counted from their first samples the relief would be lost. Lines
 of an oscillating mirror run to and fro, and some begin late: pulses of equal scan angle have the same column.
 """
 
@@ -107,10 +107,10 @@ def align_pulses(lines: Sequence[ScanLine]) -> list[np.ndarray]:
     step = max((model[-1] - model[0]) / max(len(model) - 1, 1), 1e-12)
     shifts = []
     for angle, order in zip(angles, found, strict=True):
-        own = angle[order]
-        inside = (own >= model[0]) & (own <= model[-1])
-        at = np.where(inside, np.interp(own, model, np.arange(len(model))), (own - model[0]) / step)
-        off = (at - np.arange(len(own)))[inside if inside.any() else slice(None)]
+        angles = angle[order]
+        inside = (angles >= model[0]) & (angles <= model[-1])
+        at = np.where(inside, np.interp(angles, model, np.arange(len(model))), (angles - model[0]) / step)
+        off = (at - np.arange(len(angles)))[inside if inside.any() else slice(None)]
         shifts.append(round(float(np.median(off))) if model[-1] > model[0] else 0)
     columns = []
     for order, shift in zip(found, shifts, strict=True):

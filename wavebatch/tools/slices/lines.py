@@ -189,7 +189,7 @@ def _build_line(number: int, pulses: _Pulses) -> ScanLine:
 def align_times(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Find where the windows of pulses begin on one axis of time.
 
-    Windows open when the receiver sees an echo, at another height for every pulse: counted from their own first
+    Windows open when the receiver sees an echo, at another height for every pulse: counted from their first
     samples, the relief is lost. The axis begins at the plane across the mean ray through the sample that is nearest to
     the sensor; every pulse passes it, wherever its window is.
 

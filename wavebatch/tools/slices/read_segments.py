@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.tools.plots.section_data import Profile, place_heights
+from wavebatch.tools.plots.sections import Profile, place_heights
 from wavebatch.tools.plots.values import Tally, check_statistic, name_paths
 from wavebatch.tools.slices.output import SEGMENT_SUFFIXES
 
@@ -81,7 +81,7 @@ def profile_segments(
 ) -> Profile:
     """The number of segments, or the sum or mean of a column, per height.
 
-    Arguments and errors as `section_data.measure_profile`; sums and means weight a segment by the share of its height
+    Arguments and errors as `sections.measure_profile`; sums and means weight a segment by the share of its height
     in a bin.
     """
     check_statistic(column, statistic)
@@ -134,7 +134,7 @@ def check_alone(paths: Sequence[Path], options: dict) -> None:
     """Raises ConfigError where segments come with clouds, or with options that select points."""
     mixed = [path for path in paths if not is_segments(path)]
     if mixed:
-        raise ConfigError(f"{mixed[0]}: segments are drawn without clouds; draw these in a picture of their own")
+        raise ConfigError(f"{mixed[0]}: segments are drawn without clouds; draw these in another picture")
     for name in ("flags", "drop_flags", "where"):
         if options[name]:
             raise ConfigError(f"{paths[0]}: --{name.replace('_', '-')} selects points; segments have none")

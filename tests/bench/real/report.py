@@ -1,4 +1,4 @@
-"""What `wavebatch bench --real` prints and writes: a text, a JSON document and a picture per strip."""
+"""What `make bench-real` prints and writes: a text, a JSON document and a picture per strip."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bench.real.agreement import MOST_DIFFER, MOST_OFFSET, MOST_SCALE, Agreement
+from bench.real.measure import APART, NEAR_SIGMAS, Calibration, Class, RealReport, between
+
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
 from wavebatch.tools.bench.plot import NO_PLOT
-from wavebatch.tools.bench.real.agreement import MOST_DIFFER, MOST_OFFSET, MOST_SCALE, Agreement
-from wavebatch.tools.bench.real.measure import APART, NEAR_SIGMAS, Calibration, Class, RealReport, between
 from wavebatch.tools.bench.report import align, write_texts
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from bench.real.pool import Pool, Solver, find_gaps, find_strongest
 from scipy.interpolate import BSpline, make_lsq_spline
 
 from wavebatch.core.echoes import UNCLEAN, EchoTable
@@ -18,7 +19,6 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, MAD_TO_STD
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.tools.bench.real.pool import Pool, Solver, find_gaps, find_strongest
 
 BEFORE, AFTER = 4.5, 12.5
 """What a template covers before and after its peak, in sigmas of the system pulse: after-pulses are part of it."""

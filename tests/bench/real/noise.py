@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from bench.real.pool import Pool, Solver, each_echo, find_gaps
 from scipy.linalg import solve_toeplitz
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.special import ndtr, ndtri
@@ -13,7 +14,6 @@ from scipy.special import ndtr, ndtri
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.tools.bench.real.pool import Pool, Solver, each_echo, find_gaps
 
 LAGS = 4
 """Lags at which the covariance is measured [samples]; beyond them it counts as none."""

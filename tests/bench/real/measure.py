@@ -1,4 +1,4 @@
-"""`measure_real`: everything that `wavebatch bench --real` reports about one strip.
+"""`measure_real`: everything that `make bench-real` reports about one strip.
 
 The tables of injected echoes are made here: the share that is found, and how right the reported errors are.
 """
@@ -14,10 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from wavebatch.core.errors import InputError
-from wavebatch.surveying.measuring.trial import Trial
-from wavebatch.tools.bench.real.agreement import (
+from bench.real.agreement import (
     LEAST,
     Agreement,
     Pulse,
@@ -26,11 +23,14 @@ from wavebatch.tools.bench.real.agreement import (
     find_sensor,
     survey_limited,
 )
-from wavebatch.tools.bench.real.false_echoes import FalseEchoes, count_false
-from wavebatch.tools.bench.real.inject import Injected, inject_echoes
-from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise
-from wavebatch.tools.bench.real.pool import Pool, Solver, read_pool
-from wavebatch.tools.bench.real.templates import TemplateSummary, learn_templates, summarize
+from bench.real.false_echoes import FalseEchoes, count_false
+from bench.real.inject import Injected, inject_echoes
+from bench.real.noise import QuietNoise, measure_noise
+from bench.real.pool import Pool, Solver, read_pool
+from bench.real.templates import TemplateSummary, learn_templates, summarize
+
+from wavebatch.core.errors import InputError
+from wavebatch.surveying.measuring.trial import Trial
 
 INJECTIONS = 8000
 

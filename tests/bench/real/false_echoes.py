@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from bench.real.inject import TOLERANCE
+from bench.real.noise import QuietNoise, unround
+from bench.real.pool import Pool, Solver, each_echo, find_gaps
+from bench.real.templates import bare_block
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
-from wavebatch.tools.bench.real.inject import TOLERANCE
-from wavebatch.tools.bench.real.noise import QuietNoise, unround
-from wavebatch.tools.bench.real.pool import Pool, Solver, each_echo, find_gaps
-from wavebatch.tools.bench.real.templates import bare_block
 
 STRONG = 8.0
 """Echoes from this many noise standard deviations on are signal; weaker ones in a signal-free stretch are not."""

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from bench.real.noise import QuietNoise, unround
+from bench.real.pool import ROWS, Pool, Solver, each_echo, find_fill, find_gaps, find_strongest
+from bench.real.templates import Template, bare_block, digitizer_kind
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.shared_packets import expand
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
-from wavebatch.tools.bench.real.noise import QuietNoise, unround
-from wavebatch.tools.bench.real.pool import ROWS, Pool, Solver, each_echo, find_fill, find_gaps, find_strongest
-from wavebatch.tools.bench.real.templates import Template, bare_block, digitizer_kind
 
 LEAST = 2.5
 """Least amplitude that is injected [noise standard deviations]."""
