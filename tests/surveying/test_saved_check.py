@@ -111,8 +111,6 @@ def test_a_forced_survey_is_a_warning_and_in_the_report(folder, tmp_path):
     assert result.exit_code == 0
     assert "warning: --force: the survey given by --system is not of this sensor: its noise is" in result.stderr
     assert "--force: the survey" in (tmp_path / "noisy.report.json").read_text()
-    result = run("run", folder / "flat.las", "-o", tmp_path, "--force")
-    assert result.exit_code == 2 and "--force is of no use without --system" in result.stderr
 
 
 @pytest.mark.parametrize("picoseconds", [2, 200_000], ids=["waveform within the pulse", "pulse on one sample"])

@@ -167,6 +167,7 @@ class RunReport:
         totals = [(name, sum(parts.values())) for name, parts in list_sums(counts, points).items()]
         totals.append(("waveforms", int(self.echoes_per_waveform.sum())))
         totals += [("echoes", sum(reasons.values())) for reasons in self.no_data.values()]
+        totals.append(("points_cut", min(counts["points_cut"], counts["points_broken"])))
         for name, total in totals:
             if counts[name] != total:
                 raise StageError(

@@ -32,6 +32,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     FEW,
     FIRST_WIDTH,
     RESIDUAL_LOOK,
+    SMALL,
     find_saturation,
     list_widths,
     measure_again,
@@ -41,7 +42,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening
-from wavebatch.surveying.systems.doubt import share_unexplained
+from wavebatch.surveying.systems.doubt import share_repeated, share_unexplained
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known
 from wavebatch.surveying.systems.shown import Shown
@@ -401,6 +402,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
         figures.echoes_in_doubt = max(choice.doubt, share_unexplained(system, echoes, block.spacing))
+        if len(block) < SMALL:
+            figures.echoes_in_doubt = max(figures.echoes_in_doubt, share_repeated(echoes, system.sigma_ref))
     else:
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)

@@ -40,6 +40,9 @@ COVERED = 3.2
 """Misfit over the change from shot to shot: two directions of change promise more than this squared to one echo in
 200 (chi2 with two degrees of freedom exceeds 10.6 so often)."""
 
+BORNE = 1.0, 2.0, COVERED, 5.0
+"""Misfits of the chosen pulse that are tried, over its change from shot to shot."""
+
 SURE, HOPELESS = 3.0, 8.0
 """Standard errors by which a description must be shorter to be better; and by which it is longer where no change of
 shape is worth trying."""
@@ -76,7 +79,7 @@ class Candidate:
     """Of the description of each waveform [nats], float64 (n,)."""
     echoes: int
     gaussians: int
-    """Of the pulse, as far as they had to be learned: 1 for one from elsewhere."""
+    """Of the pulse, as far as they had to be learned: 2 for one from elsewhere, so that a plain Gaussian goes first."""
     seen: float
     """Change of the shape that the median of the strongest echoes shows."""
 
@@ -168,7 +171,7 @@ def choose_pulse(
     found = [_try_changes(held, one.name, one.system, known=one.name in given) for one in hopeful]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
     found += [_try_changes(held, name, system) for name, system in _learn(learn, begin)]
-    return _decide(found, len(held))
+    return _decide(found, held)
 
 
 def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
@@ -200,7 +203,7 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     written = 0.0 if known else 3 * gaussians * 0.5 * log(max(np.count_nonzero(explained.sums.used), 1)) / len(block)
     length = describe_waveforms(block, borne, explained, change) + written
     return Candidate(
-        name, system, change, length, len(explained.echoes), 1 if known else gaussians, measure_change(borne, explained)
+        name, system, change, length, len(explained.echoes), 2 if known else gaussians, measure_change(borne, explained)
     )
 
 
@@ -215,7 +218,7 @@ def _try_changes(block: WaveformBlock, name: str, system: SystemPulse, *, known:
     return next(one for one in tried if one.exceeds(best) < SURE)
 
 
-def _decide(found: list[Candidate], number: int) -> Choice:
+def _decide(found: list[Candidate], held: WaveformBlock) -> Choice:
     """The candidate with the simplest pulse, then the fewest echoes, that no other one beats surely."""
     ordered = sorted(found, key=lambda one: (one.gaussians, one.echoes, one.name))
     best = ordered[0]
@@ -223,10 +226,21 @@ def _decide(found: list[Candidate], number: int) -> Choice:
         if best.exceeds(one) > SURE:
             best = one
     tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
-    # The mirror says how much more than the change itself is asked for.
-    best = replace(best, system=_bear(best.system, best.change / COVERED))
+    best = replace(best, system=_choose_misfit(held, best))
     doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
+
+
+def _choose_misfit(block: WaveformBlock, best: Candidate) -> SystemPulse:
+    """The system with the least misfit, over its change, that no other one beats surely: it decides what is split."""
+    tried = []
+    for share in BORNE:
+        system = _bear(best.system, share * best.change / COVERED)
+        explained = explain(block, system, least_width=STRICT, width_prior=0.0)
+        length = describe_waveforms(block, system, explained, best.change)
+        tried.append(replace(best, system=system, length=length))
+    least = min(tried, key=lambda one: one.typical)
+    return next(one.system for one in tried if one.exceeds(least) < SURE)
 
 
 def settle(block: WaveformBlock, system: SystemPulse) -> tuple[SystemPulse, Mirror]:

@@ -9,8 +9,9 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import log
+from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
@@ -179,6 +180,22 @@ def _simplest(fits: list[PulseFit], goal: float) -> PulseFit:
     return next(fit for fit in fits if fit.rms <= enough)
 
 
+CORE = 4.0
+"""Widths of the pulse around its peak in which its misfit counts."""
+
+
+def _draw(fit: PulseFit, lag: np.ndarray) -> np.ndarray:
+    """The pulse of a fit at the lags of its stack, with the height of the stack."""
+    weight, delay, sigma = fit.components.T
+    if fit.kappa:
+        at = np.array([fit.datum])
+        drawn = evaluate_pulse(PulseShape(kappa=fit.kappa), lag[:, None], at, sigma[:1])[0][:, 0]
+    else:
+        z = (lag[:, None] - fit.datum - delay) / sigma
+        drawn = np.einsum("lc,c->l", exp(-0.5 * z * z), weight)
+    return drawn / drawn.max()
+
+
 def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float) -> SystemPulse:
     """The system with a learned pulse in ns; its ringing is the largest value beyond 4 widths.
 
@@ -187,9 +204,11 @@ def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float
     width = system.sigma_ref / spacing
     far = np.abs(stack.lag - fit.datum) > 4 * width
     ringing = float(np.abs(stack.value[far]).max(initial=0.0))
-    # What the model misses of the stack beyond chance, in the kernel's terms: its energy over that of a Gaussian.
-    missed = max(fit.rms**2 - float(np.mean(stack.error**2)), 0.0)
-    misfit = float(np.sqrt(missed * (stack.lag[-1] - stack.lag[0]) / (SQRT_PI * width)))
+    # What the model misses of the stack's core beyond chance, in the kernel's terms: its energy over
+    # that of a Gaussian. Further out are neighbours.
+    core = np.abs(stack.lag - fit.datum) < CORE * width
+    missed = max(float(np.mean((_draw(fit, stack.lag) - stack.value)[core] ** 2 - stack.error[core] ** 2)), 0.0)
+    misfit = float(np.sqrt(missed * 2 * CORE / SQRT_PI))
     system = replace(system, ringing=ringing, kappa=fit.kappa, components=(), misfit=misfit)
     if len(fit.components) > 1:
         components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)

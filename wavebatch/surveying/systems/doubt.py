@@ -10,12 +10,19 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import StripWarning
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.stages.flags import find_unexplained
+from wavebatch.kernels.elementary import log
+from wavebatch.stages.flags import find_unexplained, list_neighbours
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.measuring.residuals import hides_noise
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import find_source
+
+WEAKER, REACH = 0.5, 15
+"""Height over that of a stronger echo, and distance from it [system widths], up to which one may be a part of it."""
+
+SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
+"""Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
 
 MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
 """Share of the echoes in doubt, because another pulse, misfit or noise serves as well, from which a survey's pulse is
@@ -57,3 +64,24 @@ def share_unexplained(system: SystemPulse, echoes: EchoTable, spacing: float) ->
     clear = echoes.amplitude > MIN_SNR * system.noise.std
     unexplained = find_unexplained(echoes, system, spacing)[clear] > 1
     return float(np.mean(unexplained)) if len(unexplained) >= FEW else 0.0
+
+
+def share_repeated(echoes: EchoTable, width: float) -> float:
+    """Twice the share of the echoes that, beyond chance, stand beside stronger ones, all at one lag and one ratio.
+
+    A pulse that few echoes show only roughly leaves such parts of it, each at its place.
+    """
+    pairs = []
+    for row, other, lag in list_neighbours(echoes):
+        ratio = echoes.amplitude[row] / echoes.amplitude[other]
+        near = (ratio < WEAKER) & (np.abs(lag) < REACH * width)
+        pairs.append(np.stack([lag[near] / width, log(ratio[near])]))
+    lags, ratios = np.concatenate(pairs, axis=1) if pairs else np.empty((2, 0))
+    most = 0.0
+    for centre in np.arange(-REACH, REACH, 0.5):
+        here = np.abs(lags - centre) <= 1
+        if np.count_nonzero(here) >= FEW:
+            alike = np.abs(ratios - np.median(ratios[here])) < SAME_RATIO
+            chance = max(np.mean(alike[~here]), 0.1) if np.count_nonzero(~here) >= FEW else CHANCE_RATIO
+            most = max(most, np.count_nonzero(alike & here) - chance * np.count_nonzero(here))
+    return 2 * most / max(len(echoes), 1)
