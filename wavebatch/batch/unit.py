@@ -22,15 +22,15 @@ from wavebatch.batch.selection import RowSelector
 from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
-from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
+from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
-from wavebatch.surveying.calibrating.setting import check_energies
 from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import Choice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius, measure_slope
+from wavebatch.surveying.matching.strip_energies import take_energies
 from wavebatch.surveying.prepare import prepare
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, judge_scale, refuse_units
 
@@ -134,9 +134,11 @@ def prepare_strip(job: StripJob) -> Prepared:
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += StripWarning.of("beam", more)
             job = replace(job, chain=_set_parameters(reader, scan, job.chain))
-            energy = find_pulse_energy(reader, scan, job.energy) if needs_sensor(job.chain) else None
-            if job.energy is not None and energy is not None:
-                check_energies(reader, scan, energy)
+            energy = None
+            if needs_sensor(job.chain):
+                found = take_energies(reader, scan, job.energy, job.calibration)
+                energy, job = found.energy, replace(job, calibration=found.widen(job.calibration))
+                doubts += StripWarning.of("energy", found.notes if job.calibration else ())
             layout = plan_layout(job, facts)
             RowSelector.plan(job.selection, job.chain, layout)
             units = reader.unit_count()

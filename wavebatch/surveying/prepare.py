@@ -14,10 +14,10 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import Calibration, needs_sensor
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
 from wavebatch.surveying.flight import hold_strip
+from wavebatch.surveying.matching.strip_match import match_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.saved_check import check_saved
 

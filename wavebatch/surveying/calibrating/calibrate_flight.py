@@ -70,7 +70,11 @@ def calibrate_flight(
     options = options or CalibrationOptions()
     check_attenuation(options.air)
     boxes = [find_box(path) for path in paths]
-    strips = [read_strip(path, i, boxes, targets, options) for i, path in enumerate(paths)]
+    strips: list[FlightStrip] = []
+    for i, path in enumerate(paths):
+        # All energies count relative to those of the first strip: the mean of each would hide what lasers lose.
+        before = Calibration(1.0, 0.0, **strips[0].sent.describe()) if strips else None
+        strips.append(read_strip(path, i, boxes, targets, replace(options, before=before)))
     good = [strip for strip in strips if strip.found is not None]
     if not good:
         raise InputError(strips[0].refused if len(strips) == 1 else "; ".join(strip.refused for strip in strips))
@@ -120,13 +124,7 @@ def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) 
     stated = max(row.relative_error for row in calibration.strips)
     reason = _UNEXPLAINED if trend is None else trend.doubt
     note = f"{reason}; the error of the constants grows from {100 * stated:.1f} by {100 * spread:.1f} %"
-    channels, strips = (
-        tuple(replace(row, relative_error=math.hypot(row.relative_error, spread)) for row in rows)
-        for rows in (calibration.channels, calibration.strips)
-    )
-    whole = math.hypot(calibration.relative_error, spread)
-    notes = [note] if spread > stated else []
-    return replace(calibration, relative_error=whole, channels=channels, strips=strips), notes
+    return calibration.widened(spread), [note] if spread > stated else []
 
 
 def _tie(sources: Sequence[Source]) -> Ties:

@@ -37,6 +37,10 @@ _NUMBERS: dict[str, Key] = {
         "distance", 0.0, 1e7, "from the sensor to the targets, median: others are less certain", optional=True
     ),
     "pulse_rate_hz": Key("rate", 1e-3, 1e12, "by GPS times: a laser has another energy at another rate", optional=True),
+    "energy_mean": Key(
+        "energy_mean", 1e-30, 1e30, "mean energy of the pulses: light was divided by the energy over it", optional=True
+    ),
+    "energy_spread": Key("energy_spread", 0.0, 1e6, "of the energies from shot to shot, relative", optional=True),
     "section_constant": Key(
         "section_constant", 0.0, 1e30, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission", optional=True
     ),
@@ -74,7 +78,8 @@ _STRIP: dict[str, Key] = _CONSTANT | {
 
 _DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
-_TEXTS = ("strip", "date", "conditions", "sensor", "software", "flight", "chain", "decomposer")
+_TEXTS = ("strip", "date", "conditions", "sensor", "software", "flight", "chain", "decomposer", "energy_source",
+          "energy_unit")  # fmt: skip
 _SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0)}
 """Keys of [scan_angle] with their limits: the constant grows by exp(square u^2 + fourth u^4), u = angle / most_deg."""
 _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."

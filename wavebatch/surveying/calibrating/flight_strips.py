@@ -17,7 +17,6 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.system import angle_to_vertical
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.calibrating.setting import SCANNERS, see_channels
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, EchoSource, open_source
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.targets import (
@@ -28,6 +27,8 @@ from wavebatch.surveying.calibrating.targets import (
 )
 from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, hash_squares
 from wavebatch.surveying.calibration import Calibration, ChannelConstant
+from wavebatch.surveying.matching.setting import SCANNERS, see_channels
+from wavebatch.surveying.matching.strip_energies import StripEnergies
 
 MOST_TIES = 200_000
 """Most waveforms of a strip that are decomposed for ties; they come from whole squares of 10 m, spread by chance."""
@@ -51,7 +52,8 @@ class FlightStrip:
     channels: tuple[ChannelConstant, ...]
     """How each of its channels records."""
     ranging: float
-    """Relative error of a constant from the error of the sensor's position."""
+    """Relative error of a constant from the errors of the sensor's position and of the level of the energies."""
+    sent: StripEnergies
     ties: np.ndarray
     """Array of TIE, with channels as sources."""
     seen: Mapping[int, np.void]
@@ -121,7 +123,8 @@ def read_strip(
             found=found,
             refused=refused,
             channels=tuple(describe_channel(row, source) for row in channels),
-            ranging=measure_ranging(source.sensor, distance, options.air),
+            ranging=math.hypot(measure_ranging(source.sensor, distance, options.air), source.sent.growth),
+            sent=source.sent,
             ties=ties,
             seen=_see_targets(on_targets),
         )

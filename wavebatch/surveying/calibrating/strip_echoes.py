@@ -18,14 +18,16 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.pulse_energy import PulseEnergy, find_column, find_pulse_energy, name_columns, take_records
+from wavebatch.files.pulse_energy import PulseEnergy, find_column, name_columns, take_records
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.kernels.physics.radiometry import usual_attenuation
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
-from wavebatch.surveying.calibrating.setting import SCANNERS, Setting, check_energies, measure_setting
+from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Choice, Request
+from wavebatch.surveying.matching.setting import SCANNERS, Setting, measure_setting
+from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 
@@ -76,6 +78,8 @@ class CalibrationOptions:
     """Where packet vectors point: auto, toward or away."""
     energy: str | None = None
     """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
+    before: Calibration | None = None
+    """Of the strips of the flight that were read before, by whose energies those of the next ones count."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -98,7 +102,7 @@ class EchoSource:
     system: SystemPulse
     sensor: SensorSource
     setting: Setting
-    energy: PulseEnergy | None = None
+    sent: StripEnergies
     column: PulseEnergy | None = None
     """The extra byte whose values go with the echoes, if one was asked for."""
 
@@ -119,7 +123,7 @@ class EchoSource:
                     part = block.rows(near)
                     records = take_records(part, unit)
                     given = None if self.column is None else self.column.record.read(records[self.column.field])
-                    part = self.sensor.fill(part if self.energy is None else self.energy.fill(part, unit))
+                    part = self.sensor.fill(part if self.sent.energy is None else self.sent.energy.fill(part, unit))
                     yield take_clean(part, self.chain.run(part, self.system), given)
 
 
@@ -147,9 +151,7 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = setup.system.with_radiometry(attenuation=options.air, sensor_error=0.0)
         setting = measure_setting(reader, scan, setup.sensor, options.air)
-        sent = find_pulse_energy(reader, scan, options.energy)
-        if options.energy is not None and sent is not None:
-            check_energies(reader, scan, sent)
+        sent = take_energies(reader, scan, options.energy, options.before)
         column = options.column
         given = find_column(reader, column) if column else None
         if column and given is None:

@@ -14,9 +14,9 @@ import numpy as np
 from wavebatch.core.order import group_medians, robust_std
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.geometry.facets import fit_facet
-from wavebatch.surveying.calibrating.setting import SCANNERS
 from wavebatch.surveying.calibrating.target_file import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibration import ChannelConstant, TargetResult
+from wavebatch.surveying.matching.setting import SCANNERS
 
 LEAST_ECHOES = 10
 """A target with fewer echoes is left out: a median of fewer is no better than one echo."""

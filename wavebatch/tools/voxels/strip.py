@@ -24,13 +24,14 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.column_reader import find_keep
 from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
-from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
+from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
 from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Request
+from wavebatch.surveying.matching.strip_energies import take_energies
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
@@ -167,7 +168,10 @@ def voxelize_strip(
         positions = Positions.IF_KNOWN if calibration is None else Positions.REQUIRED
         setup = prepare(reader, scan, widest_chain(), Request(auto=True, system=system, force=force), sensor=sensor,
                         positions=positions, calibration=calibration)  # fmt: skip
-        source, pulse, doubts = setup.sensor, setup.system.with_radiometry(sensor_error=0.0), setup.doubts
+        sent = take_energies(reader, scan, options.energy, setup.calibration)
+        setup, energy = replace(setup, calibration=sent.widen(setup.calibration)), sent.energy
+        source, pulse = setup.sensor, setup.system.with_radiometry(sensor_error=0.0)
+        doubts = (*setup.doubts, *(sent.notes if calibration else ()))
         if calibration is not None:
             doubts += tuple(filter(None, [source.doubt()]))
             if pulse.radiometry.divergence is None:
@@ -190,7 +194,6 @@ def voxelize_strip(
             ) as writer,
         ):
             counts: Counter[str] = Counter(waveforms=0, with_signal=0, anchored=0, clipped=0)
-            energy = find_pulse_energy(reader, scan, options.energy)
             for block, chosen in _read_blocks(reader, scan, block_size, keep, energy):
                 used = block if chosen is None else block.rows(chosen)
                 counts["left_out"] += len(block) - len(used)

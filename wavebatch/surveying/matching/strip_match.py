@@ -21,15 +21,15 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import sample_reference
-from wavebatch.surveying.calibrating.setting import see_channels
-from wavebatch.surveying.calibrating.strip_conditions import (
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
+from wavebatch.surveying.matching.setting import see_channels
+from wavebatch.surveying.matching.strip_conditions import (
     compare_air,
     compare_divergence,
     compare_setting,
     doubt_calibration,
     find_growth,
 )
-from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.sensor import SensorSource
 
 OTHER_PULSE, NEAR_PULSE = 1.25, 1.03
@@ -121,9 +121,8 @@ def match_strip(
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
     air = compare_air(calibration, reader, sensor, attenuation, warnings)
-    rows = [replace(row, relative_error=math.hypot(row.relative_error, air)) for row in rows]
     fitted = replace(calibration, constant=math.nan, channels=tuple(rows), strips=())
-    return fitted, tuple(dict.fromkeys(warnings))
+    return fitted.widened(air), tuple(dict.fromkeys(warnings))
 
 
 def _find_pulses(

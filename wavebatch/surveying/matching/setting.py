@@ -11,14 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.header import decode_text
-from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.kernels.physics.pulse_energies import judge_energies
 from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.surveying.sensor import SensorSource
 
@@ -27,9 +24,6 @@ SAMPLE = 2048
 
 BRIGHT = 0.95
 """Quantile of the light of waveforms: above it lie few metal roofs and signs."""
-
-ENERGIES = 4096
-"""Neighbouring pulses whose light is compared with their energies."""
 
 SLICES, SLICE_POINTS = 8, 2048
 """Places of the strip at which GPS times are read, and points at each."""
@@ -78,23 +72,9 @@ def measure_setting(reader: StripReader, scan: StripScan, sensor: SensorSource, 
     return Setting(_measure_rate(reader), brightest)
 
 
-def check_energies(reader: StripReader, scan: StripScan, energy: PulseEnergy) -> None:
-    """Raise InputError where the light of neighbouring pulses in the middle of a strip contradicts their energies."""
-    if not reader.unit_count():
-        return
-    unit = reader.read_unit(reader.unit_count() // 2, scan)
-    rows = np.flatnonzero(unit.packets.owned)[:ENERGIES]
-    blocks = [energy.fill(block, unit) for block, _ in reader.read_rows(unit, rows, ENERGIES)]
-    if not blocks:
-        return
-    light = np.concatenate([np.nansum(_take_off_level(block), axis=1) for block in blocks])
-    order = np.argsort(np.concatenate([block.gps_time for block in blocks]), kind="stable")
-    doubt = judge_energies(light[order], np.concatenate([block.pulse_energy for block in blocks])[order])
-    if doubt:
-        raise InputError(
-            f"{reader.facts.path}: --energy {energy.source} contradicts the strip: {doubt}; check its times, or "
-            "leave it out"
-        )
+def sum_light(block: WaveformBlock) -> np.ndarray:
+    """Sum of the samples of each waveform above its median, f4 (n,) [DN]: the light of whole pulses, not fitted."""
+    return np.nansum(_take_off_level(block), axis=1)
 
 
 def _take_off_level(block: WaveformBlock) -> np.ndarray:

@@ -15,8 +15,8 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.attribute.light import AIR_DOUBT
-from wavebatch.surveying.calibrating.setting import measure_setting, read_day, read_sensor_name
 from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.matching.setting import measure_setting, read_day, read_sensor_name
 from wavebatch.surveying.sensor import SensorSource
 
 SAME_DIVERGENCE = 0.03
