@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 import wavebatch as wb
-from tests import footprints
+from tests import facet_strips, footprints
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, path_of, write_strip, write_trajectory
 from tests.footprints import Flight, Plane
 from wavebatch.cli import main
@@ -164,9 +164,9 @@ def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibra
 @pytest.mark.parametrize(
     ("change", "said", "growth"),
     [
-        ({"rate": 20_000.0, "line_rate": 50.0, "light": 0.5 * LIGHT}, "so another energy: 2e+04", 0.69),
-        ({"light": 0.5 * LIGHT, "noise": 0.3}, "noise of digitizer 1 is [DN] 0.", 0.5),
-        ({"light": 0.5 * LIGHT}, "another gain, or other surfaces: light of digitizer 1", 0.45),
+        ({"rate": 20_000.0, "line_rate": 50.0, "light": 0.5 * LIGHT}, "so another energy: 2e+04", 1.0),
+        ({"light": 0.5 * LIGHT, "noise": 0.3}, "noise of digitizer 1 is [DN] 0.", 1.0),
+        ({"light": 0.5 * LIGHT}, "another gain, or other surfaces: light of digitizer 1", 1.0),
     ],
 )
 def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_path, calibrated, change, said, growth):
@@ -176,6 +176,34 @@ def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_pat
     cloud = wb.read_cloud(tmp_path / "out" / "b.laz")
     stated = cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"]
     assert np.nanmedian(stated) == pytest.approx(growth, abs=0.1)
+
+
+@pytest.mark.parametrize("gain", [0.8, 1.25])
+def test_another_gain_over_a_like_scene_is_named_and_in_the_error(tmp_path, calibrated, gain):
+    write_strip(tmp_path / "b.las", GROUND, replace(SENSOR, light=gain * LIGHT, time=START + 600), 10_000, seed=3)
+    line = run(calibrated, tmp_path / "out", tmp_path / "b.las")
+    assert f"all echoes of digitizer 1 are brighter by a factor of {gain:.1f}" in line and "scenes are alike" in line
+    cloud = wb.read_cloud(tmp_path / "out" / "b.laz")
+    stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
+    assert stated == pytest.approx(0.25, abs=0.05)
+
+
+def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, calibrated, monkeypatch):
+    even = [Facet(lambda x, y: 0.1 + 0.5 * np.abs(np.sin(y)))]
+    render = facet_strips._render
+
+    def fade(time, strength, sensor):
+        return render(time, strength * np.linspace(1.0, 0.7, len(time))[:, None], sensor)
+
+    write_strip(tmp_path / "even.las", even, replace(SENSOR, time=START + 600), 6000, seed=4)
+    monkeypatch.setattr(facet_strips, "_render", fade)
+    write_strip(tmp_path / "fades.las", even, replace(SENSOR, time=START + 600), 6000, seed=4)
+    monkeypatch.undo()
+    assert "second half" not in run(calibrated, tmp_path / "out", tmp_path / "even.las")
+    assert "the second half of the strip is -16 % brighter" in run(calibrated, tmp_path / "out", tmp_path / "fades.las")
+    cloud = wb.read_cloud(tmp_path / "out" / "fades.laz")
+    stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
+    assert 0.17 < stated < 0.4
 
 
 def test_reflectances_above_one_are_one_line_whatever_the_reason(tmp_path, calibrated):

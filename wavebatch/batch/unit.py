@@ -27,10 +27,8 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
-from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import Choice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius, measure_slope
-from wavebatch.surveying.matching.strip_energies import take_energies
 from wavebatch.surveying.prepare import prepare
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, judge_scale, refuse_units
 
@@ -118,7 +116,8 @@ def prepare_strip(job: StripJob) -> Prepared:
         try:
             scanned = time.perf_counter()
             setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, calibration=job.calibration,
-                            air=job.attenuation and job.attenuation[0], extend=job.extend)  # fmt: skip
+                            air=job.attenuation and job.attenuation[0], energy=job.energy,
+                            extend=job.extend)  # fmt: skip
             sensor, doubts = setup.sensor, StripWarning.of("calibration", setup.doubts)
             if setup.stranger:
                 job = replace(job, request=replace(job.request, system=None))
@@ -134,11 +133,8 @@ def prepare_strip(job: StripJob) -> Prepared:
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += StripWarning.of("beam", more)
             job = replace(job, chain=_set_parameters(reader, scan, job.chain))
-            energy = None
-            if needs_sensor(job.chain):
-                found = take_energies(reader, scan, job.energy, job.calibration)
-                energy, job = found.energy, replace(job, calibration=found.widen(job.calibration))
-                doubts += StripWarning.of("energy", found.notes if job.calibration else ())
+            if job.calibration is not None:
+                doubts += StripWarning.of("energy", setup.sent.notes)
             layout = plan_layout(job, facts)
             RowSelector.plan(job.selection, job.chain, layout)
             units = reader.unit_count()
@@ -146,7 +142,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    found = choice, layout, RunReport(timing=timing), sensor, setup.stranger, energy, doubts, setup.forced
+    found = choice, layout, RunReport(timing=timing), sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
     return Prepared(job, facts, scan, units, *found)
 
 

@@ -75,6 +75,11 @@ class PulseEnergy:
     fills: bool = False
     """A pulse of unknown energy counts as one of mean energy, as it would without energies; else it has no data."""
 
+    @property
+    def level(self) -> float:
+        """The mean over the reference."""
+        return self.mean / (self.reference or self.mean)
+
     def read(self, points: np.ndarray) -> np.ndarray:
         """Return the energies of the pulses of point records (n,), f8, NaN where unknown, in the unit of the source."""
         if self.field is not None:
@@ -94,9 +99,8 @@ class PulseEnergy:
             error = np.where((error >= 0) & (error < LARGEST), error, 0.0)
         if self.fills and np.isnan(energy).any():
             unknown = np.isnan(energy)
-            usual = self.mean / whole
-            error = np.where(unknown, self.spread * usual, 0.0 if error is None else error)
-            energy = np.where(unknown, usual, energy)
+            error = np.where(unknown, self.spread * self.level, 0.0 if error is None else error)
+            energy = np.where(unknown, self.level, energy)
         if self.missed:
             error = np.hypot(0.0 if error is None else error, self.missed * energy)
         return replace(block, pulse_energy=energy, pulse_energy_err=error)

@@ -99,6 +99,8 @@ class ChannelConstant:
     """Standard deviation of the noise of a sample [DN]."""
     brightest: float | None = None
     """Light of its strongest waveforms [DN m2]: see `setting.Setting`."""
+    scene: tuple[float, ...] = ()
+    """Quantiles of the light of its waveforms, logarithms: see `setting.Setting`."""
 
     @property
     def is_described(self) -> bool:

@@ -18,7 +18,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml, shorten
-from wavebatch.files.toml_schema import Key, describe_keys, read_keys
+from wavebatch.files.toml_schema import Key, Rows, describe_keys, read_keys
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
@@ -55,7 +55,7 @@ _CONSTANT: dict[str, Key] = {
 }
 """Keys of any constant of a channel."""
 
-_CHANNEL: dict[str, Key] = _CONSTANT | {
+_CHANNEL: dict[str, Key | Rows] = _CONSTANT | {
     "spread": Key("spread", 0.0, 1e6, optional=True),
     "echoes": Key("echoes", 0, 10**12, optional=True, kind=int),
     "shot_energy": Key("shot_energy", 0.0, 1e6, optional=True),
@@ -66,6 +66,7 @@ _CHANNEL: dict[str, Key] = _CONSTANT | {
     "pulse_ns": Key("pulse_ns", 1e-6, 1e9, optional=True),
     "noise_dn": Key("noise_dn", 0.0, 1e12, optional=True),
     "brightest": Key("brightest", 0.0, 1e30, optional=True),
+    "scene": Rows("scene", ((-100.0, 100.0),), "numbers", "", optional=True),
 }
 """Keys of a [[channel]]."""
 

@@ -150,8 +150,8 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
         setup = prepare(reader, scan, chain, options.request, sensor=options.sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = setup.system.with_radiometry(attenuation=options.air, sensor_error=0.0)
-        setting = measure_setting(reader, scan, setup.sensor, options.air)
         sent = take_energies(reader, scan, options.energy, options.before)
+        setting = measure_setting(reader, scan, setup.sensor, options.air, sent.energy.level if sent.energy else 1.0)
         column = options.column
         given = find_column(reader, column) if column else None
         if column and given is None:

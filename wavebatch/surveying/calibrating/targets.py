@@ -149,6 +149,7 @@ def describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstan
         row,
         noise_dn=system.noise.std,
         brightest=source.setting.brightest.get(row.digitizer),
+        scene=source.setting.scenes.get(row.digitizer, ()),
         bits=digitizer.bits,
         samples=digitizer.n_samples,
         spacing_ns=digitizer.spacing,

@@ -13,10 +13,10 @@ import numpy as np
 
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.las.header import decode_text
-from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.light import AIR_DOUBT
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.matching.setting import measure_setting, read_day, read_sensor_name
+from wavebatch.surveying.matching.setting import Setting, compare_scenes, read_day, read_sensor_name
 from wavebatch.surveying.sensor import SensorSource
 
 SAME_DIVERGENCE = 0.03
@@ -35,7 +35,7 @@ FAR = 1.3
 SAME_RATE = 1.02
 """Ratio up to which pulse rates are equal."""
 
-OTHER_NOISE, OTHER_LIGHT = 1.3, 1.7
+OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
 one, other surfaces the other."""
 
@@ -94,11 +94,9 @@ def find_growth(
     return float(np.sqrt(np.sum(np.square(parts)))), lines
 
 
-def compare_setting(
-    calibration: Calibration, reader: StripReader, scan: StripScan, system: SystemPulse, sensor: SensorSource
-) -> tuple[float, list[str]]:
+def compare_setting(calibration: Calibration, found: Setting, system: SystemPulse) -> tuple[float, list[str]]:
     """Error that another pulse rate or gain adds to the constant, relative, and the warnings."""
-    found, growth, lines = measure_setting(reader, scan, sensor, calibration.attenuation), 0.0, []
+    growth, lines = 0.0, []
 
     def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
         nonlocal growth
@@ -114,6 +112,14 @@ def compare_setting(
         # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
         light = found.brightest.get(row.digitizer)
         compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or other surfaces: light {which} is")
+        scene = found.scenes.get(row.digitizer)
+        off = compare_scenes(scene, row.scene) if scene and len(row.scene) == len(scene) else 0.0
+        if off:
+            growth = max(growth, math.expm1(abs(off)))
+            lines.append(
+                f"calibration: another gain or energy under the same header: all echoes {which} are brighter by a "
+                f"factor of {math.exp(off):.2f}, though scenes are alike"
+            )
     return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines]
 
 

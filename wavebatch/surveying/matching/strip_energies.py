@@ -57,10 +57,8 @@ class StripEnergies:
     """Error of the strip's level, relative."""
     notes: tuple[str, ...] = ()
 
-    def widen(self, calibration: Calibration | None) -> Calibration | None:
+    def widen(self, calibration: Calibration) -> Calibration:
         """Return a calibration with these errors."""
-        if calibration is None:
-            return None
         rows = (replace(row, shot_energy=math.hypot(row.shot_energy, self.shot_error)) for row in calibration.channels)
         return replace(calibration, channels=tuple(rows)).widened(self.growth)
 

@@ -31,7 +31,6 @@ from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
 from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Request
-from wavebatch.surveying.matching.strip_energies import take_energies
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
@@ -167,11 +166,9 @@ def voxelize_strip(
             raise InputError(f"{strip}: holds no waveform to put into voxels; see `wavebatch check`")
         positions = Positions.IF_KNOWN if calibration is None else Positions.REQUIRED
         setup = prepare(reader, scan, widest_chain(), Request(auto=True, system=system, force=force), sensor=sensor,
-                        positions=positions, calibration=calibration)  # fmt: skip
-        sent = take_energies(reader, scan, options.energy, setup.calibration)
-        setup, energy = replace(setup, calibration=sent.widen(setup.calibration)), sent.energy
-        source, pulse = setup.sensor, setup.system.with_radiometry(sensor_error=0.0)
-        doubts = (*setup.doubts, *(sent.notes if calibration else ()))
+                        positions=positions, calibration=calibration, energy=options.energy)  # fmt: skip
+        source, pulse, energy = setup.sensor, setup.system.with_radiometry(sensor_error=0.0), setup.sent.energy
+        doubts = (*setup.doubts, *(setup.sent.notes if calibration else ()))
         if calibration is not None:
             doubts += tuple(filter(None, [source.doubt()]))
             if pulse.radiometry.divergence is None:
