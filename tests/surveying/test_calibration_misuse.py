@@ -206,6 +206,24 @@ def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, ca
     assert 0.17 < stated < 0.4
 
 
+@pytest.mark.parametrize(("off", "said"), [(1, "m too short, 1 x the 600 m"), (-1, "too long"), (0, "")])
+def test_a_wrong_pulse_zone_is_refused(tmp_path, monkeypatch, off, said):
+    fast = Sensor(light=LIGHT, rate=250_000.0, line_rate=800.0, half_angle=20.0, height=911.0)
+    write, zone = facet_strips._write, 1e9 * facet_strips.C_AIR / fast.rate
+
+    def write_off(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy, facing):
+        first, hit = first - off * zone / facet_strips.C_AIR, hit - off * zone
+        write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy, facing)
+
+    monkeypatch.setattr(facet_strips, "_write", write_off)
+    ground = [replace(facet, slope=(0.1, -0.05)) for facet in GROUND]
+    write_strip(tmp_path / "s.las", ground, fast, 8000)
+    done = call("calibrate", tmp_path / "s.las", "--targets", write_targets(tmp_path / "t.csv"),
+                "-o", tmp_path / "cal.toml")  # fmt: skip
+    assert done.exit_code == (1 if off else 0) and said in done.stderr
+    assert ("its ground is bent across the flight" in done.stderr) == bool(off)
+
+
 def test_reflectances_above_one_are_one_line_whatever_the_reason(tmp_path, calibrated):
     wrong = write_targets(tmp_path / "t.csv")
     wrong.write_text(wrong.read_text().replace("field,0.3", "field,0.9"))

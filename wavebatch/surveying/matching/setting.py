@@ -12,6 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.errors import InputError
+from wavebatch.core.order import robust_std
+from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.header import decode_text
@@ -29,6 +32,14 @@ QUANTILES = np.linspace(0.05, 0.95, 10)
 UNLIKE = 4.0
 """Scenes of one setting differ in brightness by up to so many times the scatter of the ratios of their quantiles:
 quarters of strips over villages, fields and forest by up to 3.8 times."""
+
+ZONE_PARTS = 8
+"""Parts of a strip whose bend is measured: their scatter tells ground from a wrong pulse zone."""
+
+LEAST_BEND, MOST_BEND = 0.002, 0.1
+"""Least standard deviation of the cosine of the rays' angles that bends level ground by a metre or more; and by how
+much of a zone the ranges may seem to be off a whole number of them, and uncertain: terrain that follows the flight line
+for the whole strip seldom does so."""
 
 LEAST_SCENE = 200
 """Waveforms of a scene."""
@@ -85,8 +96,7 @@ def measure_setting(
     reader: StripReader, scan: StripScan, sensor: SensorSource, attenuation: float, energy: float = 1.0
 ) -> Setting:
     """Measure the setting of a strip; attenuation: of the air, one way [dB/km], energy: by which light is divided."""
-    light: dict[int, list[np.ndarray]] = {}
-    times: dict[int, list[np.ndarray]] = {}
+    parts: dict[int, list[np.ndarray]] = {}
     for block in reader.sample_blocks(scan, SAMPLE):
         block = sensor.fill(block)
         if block.sensor is None:
@@ -96,14 +106,39 @@ def measure_setting(
         away = block.origin + block.direction * time[:, None] - block.sensor
         distance = np.sqrt((away * away).sum(axis=1))
         whole = np.nansum(above, axis=1) * distance**2 / transmit(distance, attenuation) / energy
-        good = whole > 0
-        light.setdefault(block.digitizer.index, []).append(whole[good])
-        times.setdefault(block.digitizer.index, []).append(block.gps_time[good])
-    known = {index: np.concatenate(parts) for index, parts in light.items() if sum(map(len, parts))}
-    brightest = {index: float(np.quantile(rows, BRIGHT)) for index, rows in known.items()}
-    scenes = {index: _describe_scene(rows) for index, rows in known.items()}
-    fades = [_find_fading(np.concatenate(times[index]), rows) for index, rows in known.items()]
-    return Setting(_measure_rate(reader), brightest, scenes, max(fades, key=abs, default=0.0))
+        rows = np.stack([block.gps_time, whole, *(away + block.sensor).T, -away[:, 2] / distance])
+        parts.setdefault(block.digitizer.index, []).append(rows[:, whole > 0])
+    joined = {index: np.concatenate(some, axis=1) for index, some in parts.items()}
+    known = {index: rows for index, rows in joined.items() if rows.size}
+    rate = _measure_rate(reader)
+    if known and rate:
+        _refuse_zone(reader, np.concatenate([*known.values()], axis=1), 1e9 * HALF_C / rate)
+    brightest = {index: float(np.quantile(rows[1], BRIGHT)) for index, rows in known.items()}
+    scenes = {index: _describe_scene(rows[1]) for index, rows in known.items()}
+    fades = [_find_fading(*rows[:2]) for rows in known.values()]
+    return Setting(rate, brightest, scenes, max(fades, key=abs, default=0.0))
+
+
+def _refuse_zone(reader: StripReader, rows: np.ndarray, zone: float) -> None:
+    """Raise InputError where the ground is bent across the flight as by ranges that are off by whole pulse intervals.
+
+    rows: f8 (6, n), of which the last four are x, y, z and the cosine of the ray's angle to the vertical; zone: way of
+    light between two pulses, one way [m]. Ranges that are too short by s lift the ground by s times that cosine.
+    """
+    found = []
+    for part in np.array_split(rows[2:, np.argsort(rows[0], kind="stable")], ZONE_PARTS, axis=1):
+        x, y, z, down = part - part.mean(axis=1, keepdims=True)
+        if part.shape[1] < LEAST_SCENE // 2 or np.std(down) < LEAST_BEND:
+            return
+        found.append(np.linalg.lstsq(np.stack([x, y, down], axis=1), z, rcond=None)[0][2])
+    off, error = float(np.median(found)), robust_std(np.array(found)) / ZONE_PARTS**0.5
+    number = round(off / zone)
+    if number and abs(off - number * zone) < MOST_BEND * zone > error:
+        raise InputError(
+            f"{reader.facts.path}: its ground is bent across the flight as if all ranges were {abs(off):.0f} m too "
+            f"{'short' if off > 0 else 'long'}, {abs(number)} x the {zone:.0f} m between two pulses: echoes were taken "
+            "for those of another pulse; resolve the pulse zones again with the sensor's software"
+        )
 
 
 def _describe_scene(light: np.ndarray) -> tuple[float, ...]:
