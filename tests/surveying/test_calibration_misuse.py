@@ -224,6 +224,31 @@ def test_a_wrong_pulse_zone_is_refused(tmp_path, monkeypatch, off, said):
     assert ("its ground is bent across the flight" in done.stderr) == bool(off)
 
 
+def disc(radius):
+    return lambda x, y: (x - 50) ** 2 + (y - 10) ** 2 < radius**2
+
+
+SLOW = Sensor(speed=3.0, line_rate=20.0, half_angle=4.0, light=LIGHT, divergence=0.25e-3, start=(14.0, 0.0))
+
+
+@pytest.mark.parametrize(("radius", "off"), [(1.2, 0.53), (3.2, 0.03)])
+def test_a_target_that_is_declared_too_large_has_an_error_that_holds(tmp_path, radius, off):
+    write_strip(tmp_path / "a.las", [Facet(0.6, inside=disc(radius)), Facet(0.28)], SLOW, 8000, seed=3)
+    (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n0.6,{EAST + 50},{NORTH + 10},3\n")
+    found, said = calibrate(tmp_path, "--divergence", 0.25, strips=["a.las"])
+    assert ("darker or brighter than the target by far" in said) == (radius < 3)
+    assert found.relative_error == pytest.approx(off, abs=0.01)
+    assert abs(4 / (2 * LIGHT) / found.constant - 1) < 1.1 * off
+
+
+def test_a_target_that_is_clipped_is_refused(tmp_path):
+    bright = replace(SLOW, bits=8, energy_spread=0.03, light=235 / 0.5 * 700**2 * 10 ** (2e-4 * 0.22 * 700))
+    write_strip(tmp_path / "a.las", [Facet(0.5, inside=disc(4.0)), Facet(0.28)], bright, 8000, seed=3)
+    (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n0.5,{EAST + 50},{NORTH + 10},3\n")
+    done = call("calibrate", tmp_path / "a.las", "--targets", tmp_path / "t.csv", "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 1 and "of its echoes are clipped, the others are its dim ones" in done.stderr
+
+
 def test_reflectances_above_one_are_one_line_whatever_the_reason(tmp_path, calibrated):
     wrong = write_targets(tmp_path / "t.csv")
     wrong.write_text(wrong.read_text().replace("field,0.3", "field,0.9"))

@@ -181,7 +181,7 @@ def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> t
         for contains, some in zip(inside, on_targets, strict=True):
             if sum(map(len, some)) < MOST_ECHOES:
                 some.append(rows[contains(rows["xyz"])])
-        parts.append(_shorten(rows[area.contains(rows["xyz"])], area.origin))
+        parts.append(_shorten(rows[area.contains(rows["xyz"]) & np.isfinite(rows["light_err"])], area.origin))
     return [np.concatenate(some)[:MOST_ECHOES] for some in on_targets], np.concatenate(parts)
 
 

@@ -173,21 +173,25 @@ def with_energy(chain: Chain) -> Chain:
 def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None = None) -> np.ndarray:
     """Take the echoes of a block that are alone in their waveform and whose place and energy are sure, as ECHO.
 
+    Clipped echoes are there too, with an infinite error of their light: a target may be too bright.
+
     given: values of a column for each waveform, f8 (n,).
     """
     alone = echoes.alone(len(block))
-    echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.UNANCHORED)) == 0)))
+    unclean = UNCLEAN & ~EchoFlag.SATURATED | EchoFlag.UNANCHORED
+    echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(unclean)) == 0)))
+    clipped = (echoes.flags & np.uint16(EchoFlag.SATURATED)) != 0
     rows = np.zeros(len(echoes), ECHO)
     rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
     away = rows["xyz"] - block.sensor[echoes.waveform]
     rows["distance"] = np.sqrt((away * away).sum(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
         rows["ray"] = away / rows["distance"][:, None]
-    rows["light"] = echoes.attributes[_LIGHT]
-    rows["light_err"] = echoes.attributes[f"{_LIGHT}_err"]
+    rows["light"] = np.where(clipped, 1.0, echoes.attributes[_LIGHT])
+    rows["light_err"] = np.where(clipped, np.inf, echoes.attributes[f"{_LIGHT}_err"])
     scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(np.int32)
     rows["time"] = block.gps_time[echoes.waveform]
     rows["given"] = np.nan if given is None else given[echoes.waveform]
     rows["channel"] = SCANNERS * block.digitizer.index + scanner
-    known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & np.isfinite(rows["light_err"])
+    known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & ~np.isnan(rows["light_err"])
     return rows[known]

@@ -175,7 +175,7 @@ def _list_doubts(
         if result.strange > MOST_STRANGE:
             yield (
                 f"{result.name}: {100 * result.strange:.0f} % of its echoes are darker or brighter than the target by "
-                "far: check its outline and the coordinates"
+                "far: check its outline and the coordinates; the error holds it"
             )
     good = [result for result in results if result.constant is not None]
     limits = [abs(np.log(a.constant / b.constant)) / (3 * np.hypot(a.relative_error, b.relative_error))
