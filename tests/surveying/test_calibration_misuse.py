@@ -103,13 +103,53 @@ def test_the_term_over_the_scan_angle_is_fitted_kept_drawn_and_applied(tmp_path,
     page = tmp_path / "page.html"
     found, said = calibrate(dim_edges, "--scan-angle", "--html", page)
     assert "scan angle: -2" in said and "brightness changes" not in said
-    assert "Light from 0 to 12" in page.read_text()
-    assert np.degrees(found.swath[0]) == pytest.approx(12.3, abs=0.2)
+    assert "Light from -12.0 (left of the flight) to 12.0 deg" in page.read_text()
+    assert np.degrees(found.swath[0]) == pytest.approx(12.0, abs=0.1) and abs(found.swath[3]) < 0.01
     assert np.exp(-sum(found.swath[1:])) == pytest.approx(0.75, abs=0.03)
     assert parse_calibration(format_calibration(found), "again").swath == pytest.approx(found.swath)
-    assert found.channels[0].relative_error < 0.04
+    # Light that falls from side to side would look the same in two strips of opposite headings.
+    assert "these strips do not show whether light falls from one side" in said
+    assert 0.1 < found.channels[0].relative_error < 0.2
     off, _ = offsets(dim_edges, tmp_path)
     assert abs(np.median(off)) < 0.01 and np.quantile(np.abs(off), 0.9) < 0.03
+
+
+@pytest.fixture(scope="module")
+def one_side(tmp_path_factory):
+    """Light that falls from 1 at the left edge of the swath to .8 at the right one, in strips of three headings."""
+    folder, render = tmp_path_factory.mktemp("side"), facet_strips._render
+
+    def fall(time, strength, sensor):
+        left = 1 - 2 * ((np.arange(len(time)) / sensor.rate * sensor.line_rate) % 1)
+        return render(time, strength * (0.9 + 0.1 * left)[:, None], sensor)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(facet_strips, "_render", fall)
+        flights = {"a": {}, "b": {"start": (116, 100), "heading": 270.0}, "c": {"start": (0, 100)}}
+        for number, (name, flight) in enumerate(flights.items()):
+            sensor = Sensor(**BASE, light=LIGHT, time=START + 600 * number, **flight)
+            write_strip(folder / f"{name}.las", GROUND, sensor, 14_000, seed=11 + number)
+    write_targets(folder / "t.csv")
+    return folder
+
+
+def test_light_that_falls_from_side_to_side_is_fitted_by_three_strips(tmp_path, one_side):
+    found, said = calibrate(one_side, "--scan-angle", "--divergence", 0.4, strips=["a.las", "b.las", "c.las"])
+    assert "falls from one side" not in said and "light to the left and -11" in said
+    off, stated = offsets(one_side, tmp_path)
+    assert abs(np.median(off)) < 0.005 and np.quantile(np.abs(off), 0.9) < 0.03 and np.median(stated) < 0.035
+    assert parse_calibration(format_calibration(found), "again").swath == pytest.approx(found.swath)
+    older = "\n".join(line for line in format_calibration(found).splitlines() if not line.startswith("odd"))
+    assert parse_calibration(older, "older").swath == pytest.approx((*found.swath[:3], 0.0))
+
+
+@pytest.mark.parametrize("strips", ["ab", "ac"])
+def test_light_that_falls_from_side_to_side_is_an_error_where_strips_leave_it_open(tmp_path, one_side, strips):
+    found, said = calibrate(one_side, "--scan-angle", strips=[f"{name}.las" for name in strips])
+    assert "these strips do not show whether light falls from one side" in said
+    assert found.swath[3] == 0.0 and all(0.05 < row.relative_error < 0.13 for row in found.strips)
+    off, stated = offsets(one_side, tmp_path)
+    assert np.mean(np.abs(off) < stated) > 0.55
 
 
 @pytest.mark.slow

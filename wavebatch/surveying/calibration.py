@@ -174,6 +174,8 @@ class Calibration:
     energy_unit: str = ""
     swath: tuple[float, ...] = ()
     """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
+    right: tuple[float, float] = (0.0, 0.0)
+    """Of the strip's flight, as `Radiometry.right`; not kept in the file."""
     notes: tuple[str, ...] = ()
     """What is doubtful about it, one line each; not kept in the file."""
 
@@ -192,6 +194,7 @@ class Calibration:
             channels={(row.digitizer, row.scanner): (row.constant, row.relative_error) for row in self.channels},
             shot_error=max((row.shot_energy for row in self.channels), default=0.0),
             swath=self.swath,
+            right=self.right,
             attenuation=self.attenuation,
             divergence=self.divergence if system.radiometry.divergence is None else system.radiometry.divergence,
         )

@@ -81,8 +81,9 @@ _DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
 _TEXTS = ("strip", "date", "conditions", "sensor", "software", "flight", "chain", "decomposer", "energy_source",
           "energy_unit")  # fmt: skip
-_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0)}
-"""Keys of [scan_angle] with their limits: the constant grows by exp(square u^2 + fourth u^4), u = angle / most_deg."""
+_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0), "odd": (-10.0, 10.0, 0.0)}
+"""Keys of [scan_angle] with their limits: the constant grows by exp(square u^2 + fourth u^4 + odd u), u = angle to the
+right of the flight / most_deg."""
 _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.system import angle_to_vertical
+from wavebatch.core.system import angle_across, angle_to_vertical
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, EchoSource, open_source
@@ -58,6 +58,8 @@ class FlightStrip:
     """Array of TIE, with channels as sources."""
     seen: Mapping[int, np.void]
     """How the targets were seen by each channel, as VIEW."""
+    right: tuple[float, float]
+    """Unit vector to the right of its flight."""
 
 
 class Source(NamedTuple):
@@ -126,16 +128,18 @@ def read_strip(
             ranging=math.hypot(measure_ranging(source.sensor, distance, options.air), source.sent.growth),
             sent=source.sent,
             ties=ties,
-            seen=_see_targets(on_targets),
+            seen=_see_targets(on_targets, source.setting.right),
+            right=source.setting.right,
         )
 
 
-def _see_targets(on_targets: Sequence[np.ndarray]) -> dict[int, np.void]:
+def _see_targets(on_targets: Sequence[np.ndarray], right: tuple[float, float]) -> dict[int, np.void]:
     """How each channel saw the targets in the middle, as VIEW; good targets are level."""
     rows, seen = np.concatenate(on_targets), {}
     for channel in np.unique(rows["channel"]).tolist():
         mine, view = rows[rows["channel"] == channel], np.zeros(1, VIEW)[0]
-        view["angle"] = view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
+        view["angle"] = np.median(angle_across(mine["ray"], right))
+        view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
         view["distance"], view["time"] = np.median(mine["distance"]), np.median(mine["time"])
         seen[channel] = view
     return seen

@@ -6,7 +6,7 @@ makes another sensor of it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
@@ -78,6 +78,8 @@ class Setting(NamedTuple):
     it."""
     scenes: dict[int, tuple[float, ...]]
     """Logarithms of the QUANTILES of that light, for each digitizer."""
+    right: tuple[float, float]
+    """Unit vector to the right of the flight."""
     fades: float
     """By how much this light falls from the first half of the strip to the second, as of one scene (logarithm)."""
 
@@ -106,7 +108,7 @@ def measure_setting(
         away = block.origin + block.direction * time[:, None] - block.sensor
         distance = np.sqrt((away * away).sum(axis=1))
         whole = np.nansum(above, axis=1) * distance**2 / transmit(distance, attenuation) / energy
-        rows = np.stack([block.gps_time, whole, *(away + block.sensor).T, -away[:, 2] / distance])
+        rows = np.stack([block.gps_time, whole, *(away + block.sensor).T, -away[:, 2] / distance, *block.sensor.T[:2]])
         parts.setdefault(block.digitizer.index, []).append(rows[:, whole > 0])
     joined = {index: np.concatenate(some, axis=1) for index, some in parts.items()}
     known = {index: rows for index, rows in joined.items() if rows.size}
@@ -116,17 +118,25 @@ def measure_setting(
     brightest = {index: float(np.quantile(rows[1], BRIGHT)) for index, rows in known.items()}
     scenes = {index: _describe_scene(rows[1]) for index, rows in known.items()}
     fades = [_find_fading(*rows[:2]) for rows in known.values()]
-    return Setting(rate, brightest, scenes, max(fades, key=abs, default=0.0))
+    return Setting(rate, brightest, scenes, _find_right(known), max(fades, key=abs, default=0.0))
+
+
+def _find_right(known: Mapping[int, np.ndarray]) -> tuple[float, float]:
+    """Unit vector to the right of the mean motion of the sensor; 0 where it does not move."""
+    rows = np.concatenate([np.empty((8, 0)), *known.values()], axis=1)
+    time, *place = rows[[0, 6, 7]] - rows[[0, 6, 7]].mean(axis=1, keepdims=True)
+    ahead = np.nan_to_num(np.stack(place) @ time)
+    return tuple((np.array([ahead[1], -ahead[0]]) / max(float(np.hypot(*ahead)), 1e-30)).tolist())
 
 
 def _refuse_zone(reader: StripReader, rows: np.ndarray, zone: float) -> None:
     """Raise InputError where the ground is bent across the flight as by ranges that are off by whole pulse intervals.
 
-    rows: f8 (6, n), of which the last four are x, y, z and the cosine of the ray's angle to the vertical; zone: way of
-    light between two pulses, one way [m]. Ranges that are too short by s lift the ground by s times that cosine.
+    rows: f8 (8, n), of which 2 to 5 are x, y, z and the cosine of the ray's angle to the vertical; zone: way of light
+    between two pulses, one way [m]. Ranges that are too short by s lift the ground by s times that cosine.
     """
     found = []
-    for part in np.array_split(rows[2:, np.argsort(rows[0], kind="stable")], ZONE_PARTS, axis=1):
+    for part in np.array_split(rows[2:6, np.argsort(rows[0], kind="stable")], ZONE_PARTS, axis=1):
         x, y, z, down = part - part.mean(axis=1, keepdims=True)
         if part.shape[1] < LEAST_SCENE // 2 or np.std(down) < LEAST_BEND:
             return

@@ -132,7 +132,7 @@ def match_strip(
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
     air = compare_air(calibration, reader, sensor, attenuation, warnings)
-    fitted = replace(calibration, constant=math.nan, channels=tuple(rows), strips=())
+    fitted = replace(calibration, right=setting.right, constant=math.nan, channels=tuple(rows), strips=())
     return fitted.widened(air), tuple(dict.fromkeys(warnings))
 
 
