@@ -7,20 +7,18 @@ into the errors: the scatter of energies that are not logged, a log that drifts 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.order import even_places
-from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
-from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.pulse_energies import judge_energies
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.matching.setting import sum_light
+from wavebatch.surveying.matching.setting import SCANNERS, sum_light
 
 OTHER_UNIT = 3.0
 """Ratio of mean energies from which a log is in another unit: lasers lose a half of their energy at most."""
@@ -71,16 +69,6 @@ class StripEnergies:
         return {"energy_mean": mean, "energy_spread": sent.shots, **names}
 
 
-class _Pulses(NamedTuple):
-    """Waveforms in the order of time; arrays (n,)."""
-
-    time: np.ndarray
-    light: np.ndarray
-    energy: np.ndarray
-    """Over its mean; 1 where nothing is known."""
-    channel: np.ndarray
-
-
 def take_energies(
     reader: StripReader, scan: StripScan, request: str | None, calibration: Calibration | None = None
 ) -> StripEnergies:
@@ -113,7 +101,7 @@ def take_energies(
     pulses = _read_neighbours(reader, scan, energy)
     growth = 0.0
     if energy is not None and request is not None:
-        doubt = judge_energies(pulses.light, pulses.energy)
+        doubt = judge_energies(pulses[1], pulses[2])
         if doubt:
             raise InputError(
                 f"{reader.facts.path}: --energy {energy.source} contradicts the strip: {doubt}; check its times, or "
@@ -132,14 +120,14 @@ def take_energies(
             f"gains without a mark: the error of the constant grows by {100 * apart * 0.5**0.5:.0f} %; give --energy"
         )
         growth = math.hypot(growth, apart * 0.5**0.5)
-    if calibration is None:
-        return StripEnergies(energy, 0.0, growth, tuple(notes))
-    energy = energy and _refer(reader, energy, calibration)
-    lacks = _find_lack(energy, calibration)
-    notes += _name_lack(energy, calibration, lacks)
-    if energy is not None:
-        return StripEnergies(replace(energy, missed=lacks), 0.0, growth, tuple(notes))
-    return StripEnergies(None, lacks, growth, tuple(notes))
+    lacks = 0.0
+    if calibration is not None:
+        energy = energy and _refer(reader, energy, calibration)
+        lacks, note = _compare(energy, calibration)
+        notes += [note] if note else []
+    if energy is None:
+        return StripEnergies(None, lacks, growth, tuple(notes))
+    return StripEnergies(replace(energy, missed=lacks), 0.0, growth, tuple(notes))
 
 
 def _refer(reader: StripReader, energy: PulseEnergy, calibration: Calibration) -> PulseEnergy:
@@ -157,84 +145,75 @@ def _refer(reader: StripReader, energy: PulseEnergy, calibration: Calibration) -
     return replace(energy, reference=known)
 
 
-def _find_lack(energy: PulseEnergy | None, calibration: Calibration) -> float:
+def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[float, str]:
     """Scatter of the energy from shot to shot that nothing of the strip tells, relative: what the calibration had
-    beyond that of the strip's own log, so that a log that stands still proves nothing."""
-    if calibration.energy_mean is not None:
-        scatter = calibration.energy_spread
-    else:
-        scatter = max((row.shot_energy for row in calibration.channels), default=0.0) if energy is not None else 0.0
-    known = 0.0 if energy is None else energy.shots
-    return math.sqrt(max(scatter**2 - known**2, 0.0))
-
-
-def _name_lack(energy: PulseEnergy | None, calibration: Calibration, lacks: float) -> Iterator[str]:
-    if energy is None and calibration.energy_mean is not None:
-        yield (
-            f"calibration: measured with the energy of each pulse ({calibration.energy_source}), this strip has none: "
-            f"its pulses scatter by {100 * lacks:.1f} % from shot to shot, which is in the error"
-        )
-    elif energy is not None and calibration.energy_mean is None:
-        yield (
+    beyond that of the strip's own log, so that a log that stands still proves nothing; and the line about it."""
+    own, scatter, source = energy.shots if energy else 0.0, calibration.energy_spread, calibration.energy_source
+    if calibration.energy_mean is None:
+        if energy is None:
+            return 0.0, ""
+        scatter = max((row.shot_energy for row in calibration.channels), default=0.0)
+        return math.sqrt(max(scatter**2 - own**2, 0.0)), (
             f"calibration: measured without the energies of the pulses, this strip has them ({energy.source}): they "
             "count relative to their mean, which may be another than that of the calibration's strip"
         )
-    elif energy is not None and lacks > LEAST_SAID:
-        yield (
-            f"--energy {energy.source}: its values scatter by {100 * energy.shots:.1f} % from shot to shot, those of "
-            f"the calibration by {100 * calibration.energy_spread:.1f} %: is the log stuck? The rest is in the error"
+    lacks = math.sqrt(max(scatter**2 - own**2, 0.0))
+    if energy is None:
+        return lacks, (
+            f"calibration: measured with the energy of each pulse ({source}), this strip has none: its pulses scatter "
+            f"by {100 * lacks:.1f} % from shot to shot, which is in the error"
         )
+    line = (
+        f"--energy {energy.source}: its values scatter by {100 * own:.1f} % from shot to shot, those of the "
+        f"calibration by {100 * scatter:.1f} %: is the log stuck? The rest is in the error"
+    )
+    return lacks, line if lacks > LEAST_SAID else ""
 
 
-def _read_neighbours(reader: StripReader, scan: StripScan, energy: PulseEnergy | None) -> _Pulses:
-    """Neighbouring waveforms in the middle of the strip."""
+def _read_neighbours(reader: StripReader, scan: StripScan, energy: PulseEnergy | None) -> np.ndarray:
+    """Neighbouring waveforms in the middle of the strip, as `_join`."""
     if not reader.unit_count():
-        return _join([])
+        return np.empty((4, 0))
     unit = reader.read_unit(reader.unit_count() // 2, scan)
-    rows = np.flatnonzero(unit.packets.owned)[:NEIGHBOURS]
-    blocks = [block for block, _ in reader.read_rows(unit, rows, NEIGHBOURS)]
-    return _join([block if energy is None else energy.fill(block, unit) for block in blocks])
+    return _join(reader, unit, np.flatnonzero(unit.packets.owned)[:NEIGHBOURS], energy)
 
 
-def _join(blocks: list[WaveformBlock]) -> _Pulses:
+def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy | None) -> np.ndarray:
+    """Time, light, energy (1 where nothing is known) and channel of waveforms in the order of time, f8 (4, n)."""
     parts = [np.empty((4, 0))]
-    for block in blocks:
-        sent = np.ones(len(block)) if block.pulse_energy is None else block.pulse_energy
-        scanner = 0 if block.scanner is None else block.scanner
-        channel = np.full(len(block), 4 * block.digitizer.index) + scanner
+    for block, _ in reader.read_rows(unit, rows, NEIGHBOURS):
+        sent = np.ones(len(block)) if energy is None else energy.fill(block, unit).pulse_energy
+        channel = np.full(len(block), SCANNERS * block.digitizer.index)
+        channel += 0 if block.scanner is None else block.scanner
         parts.append(np.stack([block.gps_time, sum_light(block), sent, channel]))
-    rows = np.concatenate(parts, axis=1)
-    return _Pulses(*rows[:, np.argsort(rows[0], kind="stable")])
+    joined = np.concatenate(parts, axis=1)
+    return joined[:, np.argsort(joined[0], kind="stable")]
 
 
-def _find_alternation(pulses: _Pulses) -> float:
+def _find_alternation(pulses: np.ndarray) -> float:
     """By how much the logarithm of the light of neighbouring pulses of one channel differs in turns; 0 where not."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        light = np.log(pulses.light / pulses.energy)
-    apart = []
-    for channel in np.unique(pulses.channel):
-        own = light[pulses.channel == channel]
+        light = np.log(pulses[1] / pulses[2])
+    most = 0.0
+    for channel in np.unique(pulses[3]):
+        own = light[pulses[3] == channel]
         if len(own) > LEAST_COMPARED:
             near, *far = (float(np.nanmedian(np.abs(own[k:] - own[:-k]))) for k in (1, *PERIODS))
-            apart.append(near if near > LEAST_APART and min(far) < LIKE * near else 0.0)
-    return max(apart, default=0.0)
+            most = max(most, near) if near > LEAST_APART and min(far) < LIKE * near else most
+    return most
 
 
 def _compare_drift(reader: StripReader, scan: StripScan, energy: PulseEnergy) -> float:
     """Error by slow changes of the log that the strip's brightness does not follow, relative."""
-    sent, light = [], []
+    found = []
     numbers = even_places(reader.unit_count(), PLACES).tolist()
     for number in numbers:
         unit = reader.read_unit(number, scan)
-        rows = np.flatnonzero(unit.packets.owned)
-        for part in np.array_split(rows, -(-PLACES // len(numbers))):
-            chosen = part[even_places(len(part), OF_PLACE)]
-            pulses = _join([energy.fill(block, unit) for block, _ in reader.read_rows(unit, chosen, OF_PLACE)])
+        for part in np.array_split(np.flatnonzero(unit.packets.owned), -(-PLACES // len(numbers))):
             with np.errstate(invalid="ignore", divide="ignore"):
-                sent.append(np.median(np.log(pulses.energy)))
-                light.append(np.nanmedian(np.log(pulses.light)))
-    known = np.isfinite(sent) & np.isfinite(light)
-    sent, light = np.array(sent)[known], np.array(light)[known]
+                pulses = _join(reader, unit, part[even_places(len(part), OF_PLACE)], energy)
+                found.append(np.nanmedian(np.log(pulses[1:3]), axis=1))
+    light, sent = np.array(found)[np.isfinite(found).all(axis=1)].T if found else np.empty((2, 0))
     if len(sent) < LEAST_PLACES:
         return 0.0
     sent, light = sent - sent.mean(), light - light.mean()
