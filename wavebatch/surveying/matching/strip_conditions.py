@@ -26,6 +26,9 @@ OTHER_DAY, OTHER_MONTH = 0.02, 0.05
 """Errors for strips of another day than the calibration, and for more than 30 days: lasers and receivers drift. These
 are assumptions; `wavebatch calibrate` of several strips measures the drift of a flight."""
 
+UNSTATED = 0.03
+"""Error of a constant whose file states none: that of the reflectances of targets."""
+
 LEAST_AIR = 0.005
 """Relative change of the light from which other air on the same day is named."""
 
@@ -49,8 +52,8 @@ def doubt_calibration(calibration: Calibration) -> Iterator[str]:
         )
     if not min(row.relative_error for row in (calibration, *calibration.channels)):
         yield (
-            "calibration: its relative_error is 0, but no constant is known exactly: put the error of the targets into "
-            "the file"
+            f"calibration: its relative_error is 0, but no constant is known exactly: {UNSTATED:.0%} is taken; put the "
+            "error of the targets into the file"
         )
 
 
@@ -62,7 +65,8 @@ def find_growth(
     attenuation: of the strip's air [dB/km], where it is given. Air that is not given is known to AIR_DOUBT: over the
     whole way on another day than that of the calibration, over what the ways differ on the same.
     """
-    parts, lines = [], []
+    rows = (calibration, *calibration.channels)
+    parts, lines = [UNSTATED if not min(row.relative_error for row in rows) else 0.0], []
     day = read_day(reader)
     slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
     if day and calibration.flight and day != calibration.flight:
