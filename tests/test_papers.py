@@ -282,7 +282,30 @@ def test_tables_say_where_their_inputs_come_from(load):
     misses = scripts["s4_ussyshkin"].table_of_separations(4000, 0)
     assert sum("miss" in row[0] for row in misses.rows) == 4
     tall = scripts["s4_ussyshkin"].table_of_tall_stands(4000, 0)
-    assert [row[1] for row in tall.rows if "miss" not in row[0]] == ["3.44", "3.50", "3.69", "3.64", "3.92", "4.26"]
+    printed = {row[0]: row[1] for row in tall.rows}
+    means = [printed[f"orion-{stand} m, mean of {pair}"] for stand in (6, 20, 22) for pair in ("1-2", "2-3", "3-4")]
+    assert means == ["2.54", "2.10", "1.91", "3.44", "3.50", "3.69", "3.64", "3.92", "4.26"]
+    least = [printed[f"orion-{stand} m, least of {pair}"] for stand in (6, 20, 22) for pair in ("1-2", "2-3", "3-4")]
+    assert least == ["0.68", "0.71", "0.73", "0.65", "0.61", "0.68", "0.70", "0.70", "0.64"]
+
+
+def test_the_paper_column_has_what_is_printed(load):
+    numbers = load("s4_ussyshkin").table_of_numbers(2000, 0)
+    printed = {row[0]: row[1] for row in numbers.rows}
+    assert [printed[f"orion-20 m, number {k}"] for k in (1, 2, 3, 4)] == ["44.8", "31.91", "16.79", "6.51"]
+    assert [printed[f"orion-6 m, number {k}"] for k in (1, 2)] == ["55.88", "33.03"]
+    assert [printed[f"orion-22 m, number {k}"] for k in (3, 4)] == ["17.71", "7.47"]
+    assert printed["gemini-24 m, number 1"] == "43.5, 39.8, 42.1" and printed["orion-6 m, returns per pulse"] == "-"
+    wagner = load("s0_wagner")
+    strip = wagner.simulate(300, 0)
+    counts = {row[0]: row[1] for row in wagner.table_of_counts({"no ringing": strip, "ringing of 5 %": strip}).rows}
+    assert counts["maxima: 1"] == "58.08, 51.54" and counts["ASDF, mean pulse: 5 or more"] == "0.24, 0.27"
+    models = {row[0]: row[1] for row in load("s1_wang").table_of_models(20, 0).rows}
+    assert models["table 3: Leica, mean of both classes, log-normal"] == "0.0083"
+
+
+def test_the_profile_of_the_third_paper_has_its_table(load):
+    scripts = {"s2_jutzi": load("s2_jutzi")}
     profile = str(scripts["s2_jutzi"].table_of_profile(1000, 0))
     assert all(f" {value} " in profile for value in (20.4, 12.0, 30.6, 21.4, 0.216, 0.207, 0.236, 0.232))
 

@@ -64,10 +64,17 @@ RETURN_TABLES: dict[str, tuple[float, tuple[float, ...]]] = {
 }
 """Ussyshkin and Theriault (2011): dead zone [m] and shares of pulses with exactly 1, 2, 3, 4 returns [%], by stand.
 
-The second follow from the shares of the returns that the paper prints; PRINTED_SHARES has those that rounding moves."""
+The second follow from the shares of the returns that the paper prints: see PRINTED_SHARES."""
 
-PRINTED_SHARES = {("orion-6", 3): 9.38, ("orion-6", 4): 1.71}
-"""Share of the returns with a number [%] as printed, where the one from RETURN_TABLES differs (9.39 and 1.73)."""
+PRINTED_SHARES: dict[str, tuple[str, ...]] = {
+    "orion-6": ("55.88", "33.03", "9.38", "1.71"),
+    "orion-20": ("44.8", "31.91", "16.79", "6.51"),
+    "orion-22": ("43.22", "31.6", "17.71", "7.47"),
+    "gemini-6": ("84.5, 85.7, 83.6", "15.3, 14.1, 15.8", "0.2, 0.2, 0.6", "0.0, 0.0, 0.0"),
+    "gemini-24": ("43.5, 39.8, 42.1", "35.3, 31.9, 34.0", "16.9, 21.4, 18.7", "4.3, 6.9, 5.2"),
+}
+"""Share of the returns with a number [%] in tables 3 and 5, as printed, by stand; of Gemini three samples each. Ours
+are fitted to the first."""
 
 
 def paint_slice(

@@ -119,7 +119,7 @@ def test_every_number_of_the_system_has_a_key():
     keys = {entry.field for entry in (NUMBERS | ROWS).values()} | {"noise.by_kind", "digitizers"}
     # Of a calibration and of the sensor's position, which come with files of their own.
     elsewhere = {"constant", "constant_error", "channels", "attenuation", "sensor_error", "shot_error"}
-    elsewhere |= {"attenuation_error", "swath"}
+    elsewhere |= {"attenuation_error", "swath", "right"}
     parts = {"noise": ReceiverNoise, "defects": Defects, "widths": LevelWidths, "radiometry": Radiometry}
     fields = set(SystemPulse.__dataclass_fields__) - set(parts)
     fields |= {f"{name}.{field}" for name, part in parts.items() for field in part.__dataclass_fields__}

@@ -22,13 +22,11 @@ from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.process import Seconds
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
-from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
+from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
-from wavebatch.surveying.calibrating.setting import check_energies
-from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import Choice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius, measure_slope
 from wavebatch.surveying.prepare import prepare
@@ -118,7 +116,8 @@ def prepare_strip(job: StripJob) -> Prepared:
         try:
             scanned = Seconds.now()
             setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, calibration=job.calibration,
-                            air=job.attenuation and job.attenuation[0], extend=job.extend)  # fmt: skip
+                            air=job.attenuation and job.attenuation[0], energy=job.energy,
+                            extend=job.extend)  # fmt: skip
             sensor, doubts = setup.sensor, StripWarning.of("calibration", setup.doubts)
             if setup.stranger:
                 job = replace(job, request=replace(job.request, system=None))
@@ -134,9 +133,8 @@ def prepare_strip(job: StripJob) -> Prepared:
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += StripWarning.of("beam", more)
             job = replace(job, chain=_set_parameters(reader, scan, job.chain))
-            energy = find_pulse_energy(reader, scan, job.energy) if needs_sensor(job.chain) else None
-            if job.energy is not None and energy is not None:
-                check_energies(reader, scan, energy)
+            if job.calibration is not None:
+                doubts += StripWarning.of("energy", setup.sent.notes)
             layout = plan_layout(job, facts)
             RowSelector.plan(job.selection, job.chain, layout)
             units = reader.unit_count()
@@ -145,7 +143,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": Seconds.now() - surveyed}
     report = RunReport(counts={"points_cut": scan.cut}, timing=timing)
-    found = choice, layout, report, sensor, setup.stranger, energy, doubts, setup.forced
+    found = choice, layout, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
     return Prepared(job, facts, scan, units, *found)
 
 

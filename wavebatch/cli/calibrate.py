@@ -103,8 +103,10 @@ def calibrate(
     for line in [*map(_describe_strip, found.strips), *map(_describe_pair, flight.pairs)]:
         tell(line)
     if found.swath:
-        edge = math.expm1(-sum(found.swath[1:]))
-        tell(f"scan angle: {100 * edge:+.1f} % light at {math.degrees(found.swath[0]):.1f} deg against straight down")
+        most, square, fourth, odd = found.swath
+        left, right = (100 * math.expm1(-square - fourth - side * odd) for side in (-1, 1))
+        sides = f"{left:+.1f} % light to the left and {right:+.1f} % to the right"
+        tell(f"scan angle: {sides}, at {math.degrees(most):.1f} deg against straight down")
     numbers = f"constant {format_relative(found.constant, found.relative_error)} +- {100 * found.relative_error:.1f} %"
     if len(found.channels) > 1:
         numbers = f"constants of {len(found.channels)} channels"

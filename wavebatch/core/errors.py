@@ -35,6 +35,7 @@ WARNINGS = {
     "false-echoes": "the chain that was asked for does not fit the pulse: many of its echoes are false",
     "failed-fits": "far more fits than usual did not converge, or ended at a bound",
     "calibration": "the calibration does not quite fit the strip, or its constant is less certain",
+    "energy": "the energies of the pulses are not known as those of the calibration are",
     "reflectance": "more reflectances above 1 than surfaces explain",
     "beam": "the divergence contradicts the widths of the echoes",
     "units": "coordinates may be in other units than the vectors of the packets",

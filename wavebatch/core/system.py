@@ -91,9 +91,11 @@ class Radiometry:
     channels: Mapping[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
     """Constant and its relative error of single channels, by (index of the digitizer, scanner channel)."""
     swath: tuple[float, ...] = ()
-    """How the constant grows with the angle t of the ray to the vertical: largest angle T [rad], a and b of
-    exp(a u^2 + b u^4), u = min(t / T, 1); empty where it does not.
+    """How the constant grows with the angle t of the ray across the flight: largest angle T [rad], a, b and c of
+    exp(a u^2 + b u^4 + c u), u = t / T from -1 to 1; empty where it does not.
     """
+    right: tuple[float, float] = (0.0, 0.0)
+    """Unit vector to the right of the strip's flight."""
     attenuation: float = AIR_ATTENUATION
     """Attenuation of the light in the air, one way [dB/km]."""
     attenuation_error: float = 0.0
@@ -110,7 +112,13 @@ def angle_to_vertical(direction: np.ndarray) -> np.ndarray:
     return np.arccos(np.clip(down, -1.0, 1.0))
 
 
+def angle_across(direction: np.ndarray, right: np.ndarray | tuple[float, float]) -> np.ndarray:
+    """Angle of rays f8 (n, 3) across the flight, from the vertical to its right, f8 (n,) [rad]; right: unit vector
+    (2,), or one for each ray (n, 2)."""
+    return np.arctan2((direction[:, :2] * right).sum(axis=1), -direction[:, 2])
+
+
 def swath_columns(angle: np.ndarray, most: float) -> np.ndarray:
-    """u^2 and u^4 of angles (n,) [rad], f8 (n, 2), u = min(angle / most, 1): see `Radiometry.swath`."""
-    square = np.minimum(angle / most, 1.0) ** 2
-    return np.stack([square, square**2], axis=1)
+    """u^2, u^4 and u of angles (n,) [rad], f8 (n, 3), u = angle / most from -1 to 1: see `Radiometry.swath`."""
+    share = np.clip(angle / most, -1.0, 1.0)
+    return np.stack([share**2, share**4, share], axis=1)

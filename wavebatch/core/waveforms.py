@@ -18,7 +18,7 @@ from wavebatch.core.system import (
     LevelWidths,
     Radiometry,
     ReceiverNoise,
-    angle_to_vertical,
+    angle_across,
     swath_columns,
 )
 from wavebatch.core.units import HALF_C
@@ -317,5 +317,6 @@ class SystemPulse:
                 same = np.full(n, scanner == 0) if block.scanner is None else block.scanner == scanner
                 constant[same], error[same] = value, value_err
         if given.swath:
-            constant *= np.exp(swath_columns(angle_to_vertical(block.direction), given.swath[0]) @ given.swath[1:])
+            angle = angle_across(block.direction, given.right)
+            constant *= np.exp(swath_columns(angle, given.swath[0]) @ given.swath[1:])
         return constant, error

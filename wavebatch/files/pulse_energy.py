@@ -1,7 +1,7 @@
 """The energy of each emitted pulse, as sensors log it: an extra byte of the points, or a text file by GPS time.
 
-Runs, calibrations and voxels find it once per strip and fill it into each block. Energies count relative to their mean
-over the strip, so their unit does not matter.
+Runs, calibrations and voxels find it once per strip and fill it into each block. Energies count relative to the mean of
+the calibration, or of the strip where there is none: see `matching.strip_energies`.
 """
 
 from __future__ import annotations
@@ -59,13 +59,26 @@ class PulseEnergy:
     mean: float = 1.0
     """Of the strip, in the unit of the source."""
     spread: float = 0.0
-    """Standard deviation from shot to shot, relative."""
+    """Standard deviation over the strip, relative."""
+    shots: float = 0.0
+    """Standard deviation from shot to shot, relative: without what changes slowly, or stands still."""
+    reference: float | None = None
+    """The energy that counts as 1; None: the mean."""
+    missed: float = 0.0
+    """Scatter of the true energies that these do not tell, relative."""
+    unit: str = ""
+    """What the description of the extra byte says."""
     known: float = 1.0
     """Share of the sampled points whose energy is known."""
     error_field: str | None = None
     """Field of the standard deviations, in the unit of the source; None where they are not known."""
     fills: bool = False
     """A pulse of unknown energy counts as one of mean energy, as it would without energies; else it has no data."""
+
+    @property
+    def level(self) -> float:
+        """The mean over the reference."""
+        return self.mean / (self.reference or self.mean)
 
     def read(self, points: np.ndarray) -> np.ndarray:
         """Return the energies of the pulses of point records (n,), f8, NaN where unknown, in the unit of the source."""
@@ -78,16 +91,18 @@ class PulseEnergy:
         return np.where(np.abs(self.time[place] - time) <= self.reach, self.energy[place], np.nan)
 
     def fill(self, block: WaveformBlock, unit: Unit) -> WaveformBlock:
-        """Return a block of the unit with the energies of its pulses over their mean."""
-        records = take_records(block, unit)
-        energy, error = self.read(records) / self.mean, None
+        """Return a block of the unit with the energies of its pulses over the reference."""
+        records, whole = take_records(block, unit), self.reference or self.mean
+        energy, error = self.read(records) / whole, None
         if self.error_field is not None:
-            error = records[self.error_field].astype(np.float64) / self.mean
+            error = records[self.error_field].astype(np.float64) / whole
             error = np.where((error >= 0) & (error < LARGEST), error, 0.0)
         if self.fills and np.isnan(energy).any():
             unknown = np.isnan(energy)
-            error = np.where(unknown, self.spread, 0.0 if error is None else error)
-            energy = np.where(unknown, 1.0, energy)
+            error = np.where(unknown, self.spread * self.level, 0.0 if error is None else error)
+            energy = np.where(unknown, self.level, energy)
+        if self.missed:
+            error = np.hypot(0.0 if error is None else error, self.missed * energy)
         return replace(block, pulse_energy=energy, pulse_energy_err=error)
 
     def describe(self) -> dict[str, Any]:
@@ -95,6 +110,7 @@ class PulseEnergy:
         return {
             "source": self.source,
             "mean": float(f"{self.mean:.6g}"),
+            "reference": float(f"{self.reference or self.mean:.6g}"),
             "spread": round(self.spread, 6),
             "share_known": round(self.known, 6),
         }
@@ -152,7 +168,8 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
     mean = float(there.mean()) if len(there) else 1.0
     spread = float(there.std() / mean) if len(there) else 0.0
     known = len(there) / max(len(values), 1)
-    return replace(found, mean=mean, spread=spread, known=known, fills=request is None)
+    shots = float(np.sqrt(0.5 * np.mean(np.diff(there) ** 2)) / mean) if len(there) > 1 else 0.0
+    return replace(found, mean=mean, spread=spread, shots=shots, known=known, fills=request is None)
 
 
 def _once(found: PulseEnergy, unit: Unit) -> np.ndarray:
@@ -170,7 +187,7 @@ def find_column(reader: StripReader, request: str) -> PulseEnergy | None:
         return None
     error, described = known.get(f"{request}_err", (None, None))
     plain = described is not None and 1 <= described.code <= 10 and described.scaling is None
-    return PulseEnergy(request, field, record, error_field=error if plain else None)
+    return PulseEnergy(request, field, record, error_field=error if plain else None, unit=record.description)
 
 
 def name_columns(reader: StripReader, request: str) -> str:

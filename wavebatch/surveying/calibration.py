@@ -1,7 +1,7 @@
 """The calibration of a sensor: its constants, what they were measured with, and the stages that it adds to a chain.
 
 `calibrating.targets` measures a calibration, `calibrating.calibration_file` keeps it as CAL.toml, and `wavebatch run`
-fits it to each strip with `calibrating.strip_match`. Before you change it: give new fields a default, since older files
+fits it to each strip with `matching.strip_match`. Before you change it: give new fields a default, since older files
 lack them.
 """
 
@@ -99,6 +99,8 @@ class ChannelConstant:
     """Standard deviation of the noise of a sample [DN]."""
     brightest: float | None = None
     """Light of its strongest waveforms [DN m2]: see `setting.Setting`."""
+    scene: tuple[float, ...] = ()
+    """Quantiles of the light of its waveforms, logarithms: see `setting.Setting`."""
 
     @property
     def is_described(self) -> bool:
@@ -164,8 +166,16 @@ class Calibration:
     """Channels that have a constant of their own."""
     strips: tuple[StripConstant, ...] = ()
     """Constants of single strips, where several were calibrated together."""
+    energy_mean: float | None = None
+    """Mean energy of the pulses by which the light was divided, in the unit of its source; None where it was not."""
+    energy_spread: float = 0.0
+    """Standard deviation of these energies from shot to shot, relative."""
+    energy_source: str = ""
+    energy_unit: str = ""
     swath: tuple[float, ...] = ()
     """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
+    right: tuple[float, float] = (0.0, 0.0)
+    """Of the strip's flight, as `Radiometry.right`; not kept in the file."""
     notes: tuple[str, ...] = ()
     """What is doubtful about it, one line each; not kept in the file."""
 
@@ -184,9 +194,19 @@ class Calibration:
             channels={(row.digitizer, row.scanner): (row.constant, row.relative_error) for row in self.channels},
             shot_error=max((row.shot_energy for row in self.channels), default=0.0),
             swath=self.swath,
+            right=self.right,
             attenuation=self.attenuation,
             divergence=self.divergence if system.radiometry.divergence is None else system.radiometry.divergence,
         )
+
+    def widened(self, growth: float) -> Calibration:
+        """Return the calibration with a further relative error of all its constants."""
+        channels, strips = (
+            tuple(replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows)
+            for rows in (self.channels, self.strips)
+        )
+        whole = math.hypot(self.relative_error, growth)
+        return replace(self, relative_error=whole, channels=channels, strips=strips)
 
     def describe(self) -> dict[str, Any]:
         """Return the calibration as plain values for reports."""

@@ -12,12 +12,14 @@ from enum import Enum
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.pulse_energy import NONE
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import Calibration, needs_sensor
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
 from wavebatch.surveying.flight import hold_strip
+from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
+from wavebatch.surveying.matching.strip_match import match_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.saved_check import check_saved
 
@@ -40,6 +42,8 @@ class Setup:
     sensor: SensorSource = UNKNOWN
     calibration: Calibration | None = None
     """As it holds for this strip."""
+    sent: StripEnergies = StripEnergies(None)
+    """Of its pulses, where the chain or a calibration needs them."""
     doubts: tuple[str, ...] = ()
     """Why the calibration may not fit."""
     stranger: str = ""
@@ -69,6 +73,7 @@ def prepare(
     positions: Positions = Positions.IF_NEEDED,
     calibration: Calibration | None = None,
     air: float | None = None,
+    energy: str | None = NONE,
     extend: Callable[[Chain], Chain] | None = None,
 ) -> Setup:
     """Choose pulse and chain of a strip, find its sensor, and see whether its calibration fits.
@@ -86,6 +91,8 @@ def prepare(
     calibration : Calibration, optional
     air : float, optional
         Attenuation during the flight [dB/km]; None: that of the calibration.
+    energy : str, optional
+        Energies of the pulses, as `find_pulse_energy`.
     extend : callable, optional
         Adds stages to a chain that the request chose.
 
@@ -108,10 +115,14 @@ def prepare(
     source = UNKNOWN
     if positions is not Positions.IF_NEEDED or needs_sensor(choice.chain):
         source = _find_sensor(reader, scan, sensor or SensorRequest(), positions)
+    sent = StripEnergies(None)
+    if calibration is not None or positions is not Positions.IF_NEEDED or needs_sensor(choice.chain):
+        sent = take_energies(reader, scan, energy, calibration)
     if calibration is None:
-        return Setup(choice, source, stranger=stranger, forced=forced)
-    fitted, doubts = match_strip(calibration, reader, scan, choice.survey.system, source, choice.chain, air)
-    return Setup(choice, source, fitted, doubts, stranger, forced)
+        return Setup(choice, source, None, sent, (), stranger, forced)
+    system, level = choice.survey.system, sent.energy and sent.energy.level
+    fitted, doubts = match_strip(calibration, reader, scan, system, source, choice.chain, air, level)
+    return Setup(choice, source, sent.widen(fitted), sent, doubts, stranger, forced)
 
 
 def _hold(reader: StripReader, scan: StripScan, request: Request) -> tuple[str, str]:

@@ -1,6 +1,6 @@
 """Whether the light of a strip follows the energies that are said to be those of its pulses.
 
-`calibrating.setting` asks it for the energies of `--energy`.
+`matching.setting` asks it for the energies of `--energy`.
 """
 
 from __future__ import annotations

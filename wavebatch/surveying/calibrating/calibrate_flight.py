@@ -70,18 +70,24 @@ def calibrate_flight(
     options = options or CalibrationOptions()
     check_attenuation(options.air)
     boxes = [find_box(path) for path in paths]
-    strips = [read_strip(path, i, boxes, targets, options) for i, path in enumerate(paths)]
+    strips: list[FlightStrip] = []
+    for i, path in enumerate(paths):
+        # All energies count relative to those of the first strip: the mean of each would hide what lasers lose.
+        before = Calibration(1.0, 0.0, **strips[0].sent.describe()) if strips else None
+        strips.append(read_strip(path, i, boxes, targets, replace(options, before=before)))
     good = [strip for strip in strips if strip.found is not None]
     if not good:
         raise InputError(strips[0].refused if len(strips) == 1 else "; ".join(strip.refused for strip in strips))
     sources = [Source(strip, row) for strip in strips for row in strip.channels]
     if len(sources) == 1 and not options.scan_angle:
         return FlightCalibration(good[0].found)
-    ties = _tie(sources)
+    rights = np.array([source.strip.right for source in sources])
+    ties = _tie(sources, rights)
     anchors, seen = _list_given(sources, options)
     swath: tuple[float, ...] = ()
+    open_error = None
     if options.scan_angle:
-        adjusted, swath = fit_swath(ties, anchors, seen)
+        adjusted, swath, open_error = fit_swath(ties, anchors, seen)
         ties = replace(ties, value=ties.value + swath_columns(ties.view["angle"], swath[0]) @ swath[1:])
         anchors = replace(anchors, value=anchors.value - swath_columns(seen["angle"], swath[0]) @ swath[1:])
     else:
@@ -96,6 +102,12 @@ def calibrate_flight(
     ]
     notes = [*calibration.notes, *find_doubts(lost, calibration.strips, pairs)]
     calibration, more = _widen(calibration, adjusted, find_trend(ties, anchors, seen, adjusted))
+    if open_error is not None and open_error > LEAST_SPREAD:
+        calibration = calibration.widened(open_error)
+        more.append(
+            "--scan-angle: these strips do not show whether light falls from one side of the swath to the other: the "
+            f"error of the constants grows by {100 * open_error:.1f} %; give three strips, one of another heading"
+        )
     return FlightCalibration(replace(calibration, notes=(*notes, *more)), pairs, ties.size)
 
 
@@ -120,16 +132,10 @@ def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) 
     stated = max(row.relative_error for row in calibration.strips)
     reason = _UNEXPLAINED if trend is None else trend.doubt
     note = f"{reason}; the error of the constants grows from {100 * stated:.1f} by {100 * spread:.1f} %"
-    channels, strips = (
-        tuple(replace(row, relative_error=math.hypot(row.relative_error, spread)) for row in rows)
-        for rows in (calibration.channels, calibration.strips)
-    )
-    whole = math.hypot(calibration.relative_error, spread)
-    notes = [note] if spread > stated else []
-    return replace(calibration, relative_error=whole, channels=channels, strips=strips), notes
+    return calibration.widened(spread), [note] if spread > stated else []
 
 
-def _tie(sources: Sequence[Source]) -> Ties:
+def _tie(sources: Sequence[Source], rights: np.ndarray) -> Ties:
     """The tie cells of all sources."""
     parts = [np.empty(0, TIE)]
     for number, source in enumerate(sources):
@@ -137,7 +143,7 @@ def _tie(sources: Sequence[Source]) -> Ties:
         rows["source"] = number
         parts.append(rows)
     rows = np.concatenate(parts)
-    return measure_ties(rows, choose_size(rows))
+    return measure_ties(rows, choose_size(rows), rights=rights)
 
 
 def _list_given(sources: Sequence[Source], options: CalibrationOptions) -> tuple[Anchors, np.ndarray]:

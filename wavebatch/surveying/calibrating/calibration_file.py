@@ -18,7 +18,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml, shorten
-from wavebatch.files.toml_schema import Key, describe_keys, read_keys
+from wavebatch.files.toml_schema import Key, Rows, describe_keys, read_keys
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
@@ -37,6 +37,10 @@ _NUMBERS: dict[str, Key] = {
         "distance", 0.0, 1e7, "from the sensor to the targets, median: others are less certain", optional=True
     ),
     "pulse_rate_hz": Key("rate", 1e-3, 1e12, "by GPS times: a laser has another energy at another rate", optional=True),
+    "energy_mean": Key(
+        "energy_mean", 1e-30, 1e30, "mean energy of the pulses: light was divided by the energy over it", optional=True
+    ),
+    "energy_spread": Key("energy_spread", 0.0, 1e6, "of the energies from shot to shot, relative", optional=True),
     "section_constant": Key(
         "section_constant", 0.0, 1e30, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission", optional=True
     ),
@@ -51,7 +55,7 @@ _CONSTANT: dict[str, Key] = {
 }
 """Keys of any constant of a channel."""
 
-_CHANNEL: dict[str, Key] = _CONSTANT | {
+_CHANNEL: dict[str, Key | Rows] = _CONSTANT | {
     "spread": Key("spread", 0.0, 1e6, optional=True),
     "echoes": Key("echoes", 0, 10**12, optional=True, kind=int),
     "shot_energy": Key("shot_energy", 0.0, 1e6, optional=True),
@@ -62,6 +66,7 @@ _CHANNEL: dict[str, Key] = _CONSTANT | {
     "pulse_ns": Key("pulse_ns", 1e-6, 1e9, optional=True),
     "noise_dn": Key("noise_dn", 0.0, 1e12, optional=True),
     "brightest": Key("brightest", 0.0, 1e30, optional=True),
+    "scene": Rows("scene", ((-100.0, 100.0),), "numbers", "", optional=True),
 }
 """Keys of a [[channel]]."""
 
@@ -74,9 +79,11 @@ _STRIP: dict[str, Key] = _CONSTANT | {
 
 _DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
-_TEXTS = ("strip", "date", "conditions", "sensor", "software", "flight", "chain", "decomposer")
-_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0)}
-"""Keys of [scan_angle] with their limits: the constant grows by exp(square u^2 + fourth u^4), u = angle / most_deg."""
+_TEXTS = ("strip", "date", "conditions", "sensor", "software", "flight", "chain", "decomposer", "energy_source",
+          "energy_unit")  # fmt: skip
+_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0), "odd": (-10.0, 10.0, 0.0)}
+"""Keys of [scan_angle] with their limits: the constant grows by exp(square u^2 + fourth u^4 + odd u), u = angle to the
+right of the flight / most_deg."""
 _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
 
 

@@ -14,10 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.system import angle_to_vertical
+from wavebatch.core.system import angle_across, angle_to_vertical
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.calibrating.setting import SCANNERS, see_channels
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, EchoSource, open_source
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.targets import (
@@ -28,6 +27,8 @@ from wavebatch.surveying.calibrating.targets import (
 )
 from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, hash_squares
 from wavebatch.surveying.calibration import Calibration, ChannelConstant
+from wavebatch.surveying.matching.setting import SCANNERS, see_channels
+from wavebatch.surveying.matching.strip_energies import StripEnergies
 
 MOST_TIES = 200_000
 """Most waveforms of a strip that are decomposed for ties; they come from whole squares of 10 m, spread by chance."""
@@ -51,11 +52,14 @@ class FlightStrip:
     channels: tuple[ChannelConstant, ...]
     """How each of its channels records."""
     ranging: float
-    """Relative error of a constant from the error of the sensor's position."""
+    """Relative error of a constant from the errors of the sensor's position and of the level of the energies."""
+    sent: StripEnergies
     ties: np.ndarray
     """Array of TIE, with channels as sources."""
     seen: Mapping[int, np.void]
     """How the targets were seen by each channel, as VIEW."""
+    right: tuple[float, float]
+    """Unit vector to the right of its flight."""
 
 
 class Source(NamedTuple):
@@ -121,18 +125,21 @@ def read_strip(
             found=found,
             refused=refused,
             channels=tuple(describe_channel(row, source) for row in channels),
-            ranging=measure_ranging(source.sensor, distance, options.air),
+            ranging=math.hypot(measure_ranging(source.sensor, distance, options.air), source.sent.growth),
+            sent=source.sent,
             ties=ties,
-            seen=_see_targets(on_targets),
+            seen=_see_targets(on_targets, source.setting.right),
+            right=source.setting.right,
         )
 
 
-def _see_targets(on_targets: Sequence[np.ndarray]) -> dict[int, np.void]:
+def _see_targets(on_targets: Sequence[np.ndarray], right: tuple[float, float]) -> dict[int, np.void]:
     """How each channel saw the targets in the middle, as VIEW; good targets are level."""
     rows, seen = np.concatenate(on_targets), {}
     for channel in np.unique(rows["channel"]).tolist():
         mine, view = rows[rows["channel"] == channel], np.zeros(1, VIEW)[0]
-        view["angle"] = view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
+        view["angle"] = np.median(angle_across(mine["ray"], right))
+        view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
         view["distance"], view["time"] = np.median(mine["distance"]), np.median(mine["time"])
         seen[channel] = view
     return seen
@@ -178,7 +185,7 @@ def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> t
         for contains, some in zip(inside, on_targets, strict=True):
             if sum(map(len, some)) < MOST_ECHOES:
                 some.append(rows[contains(rows["xyz"])])
-        parts.append(_shorten(rows[area.contains(rows["xyz"])], area.origin))
+        parts.append(_shorten(rows[area.contains(rows["xyz"]) & np.isfinite(rows["light_err"])], area.origin))
     return [np.concatenate(some)[:MOST_ECHOES] for some in on_targets], np.concatenate(parts)
 
 

@@ -18,14 +18,16 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.pulse_energy import PulseEnergy, find_column, find_pulse_energy, name_columns, take_records
+from wavebatch.files.pulse_energy import PulseEnergy, find_column, name_columns, take_records
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.kernels.physics.radiometry import usual_attenuation
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
-from wavebatch.surveying.calibrating.setting import SCANNERS, Setting, check_energies, measure_setting
+from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Choice, Request
+from wavebatch.surveying.matching.setting import SCANNERS, Setting, measure_setting
+from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 
@@ -76,6 +78,8 @@ class CalibrationOptions:
     """Where packet vectors point: auto, toward or away."""
     energy: str | None = None
     """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
+    before: Calibration | None = None
+    """Of the strips of the flight that were read before, by whose energies those of the next ones count."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -98,7 +102,7 @@ class EchoSource:
     system: SystemPulse
     sensor: SensorSource
     setting: Setting
-    energy: PulseEnergy | None = None
+    sent: StripEnergies
     column: PulseEnergy | None = None
     """The extra byte whose values go with the echoes, if one was asked for."""
 
@@ -119,7 +123,7 @@ class EchoSource:
                     part = block.rows(near)
                     records = take_records(part, unit)
                     given = None if self.column is None else self.column.record.read(records[self.column.field])
-                    part = self.sensor.fill(part if self.energy is None else self.energy.fill(part, unit))
+                    part = self.sensor.fill(part if self.sent.energy is None else self.sent.energy.fill(part, unit))
                     yield take_clean(part, self.chain.run(part, self.system), given)
 
 
@@ -146,10 +150,8 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
         setup = prepare(reader, scan, chain, options.request, sensor=options.sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = setup.system.with_radiometry(attenuation=options.air, sensor_error=0.0)
-        setting = measure_setting(reader, scan, setup.sensor, options.air)
-        sent = find_pulse_energy(reader, scan, options.energy)
-        if options.energy is not None and sent is not None:
-            check_energies(reader, scan, sent)
+        sent = take_energies(reader, scan, options.energy, options.before)
+        setting = measure_setting(reader, scan, setup.sensor, options.air, sent.energy.level if sent.energy else 1.0)
         column = options.column
         given = find_column(reader, column) if column else None
         if column and given is None:
@@ -171,21 +173,25 @@ def with_energy(chain: Chain) -> Chain:
 def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None = None) -> np.ndarray:
     """Take the echoes of a block that are alone in their waveform and whose place and energy are sure, as ECHO.
 
+    Clipped echoes are there too, with an infinite error of their light: a target may be too bright.
+
     given: values of a column for each waveform, f8 (n,).
     """
     alone = echoes.alone(len(block))
-    echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.UNANCHORED)) == 0)))
+    unclean = UNCLEAN & ~EchoFlag.SATURATED | EchoFlag.UNANCHORED
+    echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(unclean)) == 0)))
+    clipped = (echoes.flags & np.uint16(EchoFlag.SATURATED)) != 0
     rows = np.zeros(len(echoes), ECHO)
     rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
     away = rows["xyz"] - block.sensor[echoes.waveform]
     rows["distance"] = np.sqrt((away * away).sum(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
         rows["ray"] = away / rows["distance"][:, None]
-    rows["light"] = echoes.attributes[_LIGHT]
-    rows["light_err"] = echoes.attributes[f"{_LIGHT}_err"]
+    rows["light"] = np.where(clipped, 1.0, echoes.attributes[_LIGHT])
+    rows["light_err"] = np.where(clipped, np.inf, echoes.attributes[f"{_LIGHT}_err"])
     scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(np.int32)
     rows["time"] = block.gps_time[echoes.waveform]
     rows["given"] = np.nan if given is None else given[echoes.waveform]
     rows["channel"] = SCANNERS * block.digitizer.index + scanner
-    known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & np.isfinite(rows["light_err"])
+    known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & ~np.isnan(rows["light_err"])
     return rows[known]

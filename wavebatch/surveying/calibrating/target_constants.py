@@ -14,9 +14,9 @@ import numpy as np
 from wavebatch.core.order import group_medians, robust_std
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.geometry.facets import fit_facet
-from wavebatch.surveying.calibrating.setting import SCANNERS
 from wavebatch.surveying.calibrating.target_file import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibration import ChannelConstant, TargetResult
+from wavebatch.surveying.matching.setting import SCANNERS
 
 LEAST_ECHOES = 10
 """A target with fewer echoes is left out: a median of fewer is no better than one echo."""
@@ -36,8 +36,12 @@ INSET = 1.5
 ASSUMED_DIVERGENCE = 1.0
 """Full angle of the beam [mrad] for the inset where none is given: as wide as topographic lasers have."""
 
-STRANGE_SIGMA, MOST_STRANGE = 6.0, 0.1
-"""Echoes this many robust standard deviations off the median are of another surface; more than this share is named."""
+STRANGE_SIGMA, MOST_STRANGE = 6.0, 0.02
+"""Echoes this many robust standard deviations off the median are of another surface; more than this share may be the
+target itself, inside of an outline that is too large: it is named, and by how much they are off is in the error."""
+
+MOST_CLIPPED = 0.2
+"""Share of clipped echoes from which a target is refused: the others are the dim ones, by a third of their scatter."""
 
 EDGE_SIGMA, LEAST_EDGE = 4.0, 0.01
 """Echoes of the outer half differ from the others where their medians do by so many errors and by this share."""
@@ -77,8 +81,12 @@ def measure_target(
     -----
     docs/algorithms.md 5.
     """
-    blank = TargetResult(target.name, target.reflectance, len(rows))
-    nothing = rows[:0], np.empty(0)
+    clipped = np.isinf(rows["light_err"])
+    blank, nothing = TargetResult(target.name, target.reflectance, int(np.sum(~clipped))), (rows[:0], np.empty(0))
+    if clipped.sum() > MOST_CLIPPED * len(rows):
+        reason = f"{np.mean(clipped):.0%} of its echoes are clipped, the others are its dim ones: take a darker target"
+        return replace(blank, refused=reason), *nothing
+    rows = rows[~clipped]
     if len(rows) < LEAST_ECHOES:
         return replace(blank, refused=f"{len(rows)} clean single echoes, {LEAST_ECHOES} are needed"), *nothing
     facet = fit_facet(rows["xyz"], rows["ray"])
@@ -115,18 +123,18 @@ def measure_target(
     bright = target.reflectance * (1.0 + target.hot_spot)
     constant = 4.0 * bright * np.cos(angle[used]) / rows["light"][used]
     relative = _by_channel(constant, rows["channel"][used])
-    edge, edge_err = _compare_edge(relative, depth[used])
+    (edge, edge_err), (strange, strange_err) = _compare_edge(relative, depth[used]), _share_strange(relative)
     result = replace(
         summarise(blank, constant),
         incidence_deg=float(np.degrees(np.median(angle[used]))),
         incidence_error_deg=float(np.degrees(angle_err)),
         inset_m=round(inset, 3),
         edge=edge,
-        strange=_share_strange(relative),
+        strange=strange,
     )
     inner = MEDIAN_ERROR * result.spread / np.sqrt(result.echoes - 1)
     hot_err = 0.5 * target.hot_spot / (1.0 + target.hot_spot)
-    error = float(np.sqrt(reflectance_error**2 + hot_err**2 + facing_err**2 + inner**2 + edge_err**2))
+    error = float(np.sqrt(reflectance_error**2 + hot_err**2 + facing_err**2 + inner**2 + edge_err**2 + strange_err**2))
     return replace(result, relative_error=error), rows[used], constant
 
 
@@ -153,7 +161,7 @@ def measure_column(
     constant : float64 (k,)
         As `measure_target`.
     """
-    rows = rows[np.isfinite(rows["given"])]
+    rows = rows[np.isfinite(rows["given"] + rows["light_err"])]
     facing = 10.0 ** (0.1 * rows["given"]) if np.mean(rows["given"] < 0) > LEAST_NEGATIVE else rows["given"]
     rows, facing = rows[facing > LEAST_REFLECTANCE], facing[facing > LEAST_REFLECTANCE]
     blank = TargetResult(f"column {name}", float(np.median(facing)) if len(facing) else 0.0, len(rows))
@@ -184,10 +192,12 @@ def _by_channel(constant: np.ndarray, channel: np.ndarray) -> np.ndarray:
     return constant / group_medians(constant, group)[0][group]
 
 
-def _share_strange(constant: np.ndarray) -> float:
-    """Share of echoes whose constant is that of another surface."""
+def _share_strange(constant: np.ndarray) -> tuple[float, float]:
+    """Share of echoes whose constant is that of another surface, and the error that follows."""
     off = np.abs(constant / np.median(constant) - 1.0)
-    return float(np.mean(off > max(STRANGE_SIGMA * MAD_TO_STD * float(np.median(off)), LEAST_EDGE)))
+    strange = off > max(STRANGE_SIGMA * MAD_TO_STD * float(np.median(off)), LEAST_EDGE)
+    share = float(np.mean(strange))
+    return share, float(np.median(off[strange])) if share > MOST_STRANGE else 0.0
 
 
 def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None, float]:

@@ -7,6 +7,7 @@ chain and energy must be those of `wavebatch run`, or the constant would not fit
 from __future__ import annotations
 
 import datetime
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,7 +19,6 @@ from wavebatch.files.area_crs import describe_miss
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.las.header import decode_text
 from wavebatch.kernels.physics.radiometry import backscatter_error
-from wavebatch.surveying.calibrating.setting import read_day, read_sensor_name
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
 from wavebatch.surveying.calibrating.target_constants import (
     LEAST_ECHOES,
@@ -30,6 +30,7 @@ from wavebatch.surveying.calibrating.target_constants import (
 )
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
+from wavebatch.surveying.matching.setting import read_day, read_sensor_name
 from wavebatch.surveying.sensor import SensorSource
 
 MOST_ECHOES = 200_000
@@ -80,7 +81,7 @@ def build_calibration(
         reasons = miss or "; ".join(f"{result.name}: {result.refused}" for result in results)
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])
-    ranging = measure_ranging(source.sensor, used["distance"], options.air)
+    ranging = math.hypot(measure_ranging(source.sensor, used["distance"], options.air), source.sent.growth)
     channels = tuple(
         describe_channel(replace(row, relative_error=float(np.hypot(row.relative_error, ranging))), source)
         for row in _measure_channels(measured)
@@ -108,6 +109,7 @@ def build_calibration(
         fingerprint=take_fingerprint(source.path, facts.packets.file),
         targets=tuple(results),
         channels=channels,
+        **source.sent.describe(),
         notes=tuple(_list_doubts(source, results, channels, options)),
     )
 
@@ -147,6 +149,7 @@ def describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstan
         row,
         noise_dn=system.noise.std,
         brightest=source.setting.brightest.get(row.digitizer),
+        scene=source.setting.scenes.get(row.digitizer, ()),
         bits=digitizer.bits,
         samples=digitizer.n_samples,
         spacing_ns=digitizer.spacing,
@@ -162,9 +165,7 @@ def _list_doubts(
     options: CalibrationOptions,
 ):
     """What a person should look at before the calibration is used."""
-    doubt = source.sensor.doubt()
-    if doubt:
-        yield doubt
+    yield from filter(None, (source.sensor.doubt(), *source.sent.notes))
     for result in results:
         if result.edge is not None:
             yield (
@@ -174,7 +175,7 @@ def _list_doubts(
         if result.strange > MOST_STRANGE:
             yield (
                 f"{result.name}: {100 * result.strange:.0f} % of its echoes are darker or brighter than the target by "
-                "far: check its outline and the coordinates"
+                "far: check its outline and the coordinates; the error holds it"
             )
     good = [result for result in results if result.constant is not None]
     limits = [abs(np.log(a.constant / b.constant)) / (3 * np.hypot(a.relative_error, b.relative_error))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.core.order import group_medians
-from wavebatch.core.system import angle_to_vertical
+from wavebatch.core.system import angle_across
 from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.kernels.geometry.planes import fit_planes
 
@@ -22,7 +22,7 @@ TIE = np.dtype([
 range [m], GPS time [s]."""
 
 VIEW = np.dtype([("angle", "<f8"), ("incidence", "<f8"), ("distance", "<f8"), ("time", "<f8")])
-"""How a source saw a cell: angle of the ray to the vertical and to the normal [rad], range [m], GPS time [s]."""
+"""How a source saw a cell: angle of the ray across the flight and to the normal [rad], range [m], GPS time [s]."""
 
 LEAST_ECHOES = 5
 """Echoes that a source needs in a cell."""
@@ -85,7 +85,9 @@ def hash_squares(xyz: np.ndarray) -> np.ndarray:
     return (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53
 
 
-def measure_ties(rows: np.ndarray, size: float, slope: float | None = None) -> Ties:
+def measure_ties(
+    rows: np.ndarray, size: float, slope: float | None = None, rights: np.ndarray | None = None
+) -> Ties:
     """Measure what each source saw in each flat cell.
 
     Parameters
@@ -96,6 +98,8 @@ def measure_ties(rows: np.ndarray, size: float, slope: float | None = None) -> T
         Edge of a cell [m].
     slope : float, optional
         Largest slope of a cell [rad]; by default any that rays do not strike too steeply.
+    rights : float64 (sources, 2), optional
+        Unit vectors to the right of the flight of each source, for the angles of the views.
 
     Returns
     -------
@@ -120,21 +124,21 @@ def measure_ties(rows: np.ndarray, size: float, slope: float | None = None) -> T
         rows[good], cell[good], value[good], off[good], tilt[good], facing[good]
     )
     if not len(rows):
-        return measure_ties(rows, size)
+        return measure_ties(rows, size, None, rights)
     _, at, group, number = np.unique(pair, return_index=True, return_inverse=True, return_counts=True)
     middle, spread = group_medians(value, group)
     _, cells = np.unique(kept_cell[at], return_inverse=True)
     centre = (np.floor(rows["xyz"][at, :2] / size) + 0.5) * size
     height, _ = group_medians(off, group)
     error = MEDIAN_ERROR * np.maximum(spread, 1e-3) / np.sqrt(number)
-    view = _describe_view(rows, facing, at + number // 2)
+    view = _describe_view(rows, facing, at + number // 2, rights)
     return Ties(cells, rows["source"][at], middle, error, height, tilt[at], centre.astype(np.float64), size, view)
 
 
-def _describe_view(rows: np.ndarray, facing: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _describe_view(rows: np.ndarray, facing: np.ndarray, at: np.ndarray, rights: np.ndarray | None) -> np.ndarray:
     """How the rows `at` were seen, array of VIEW."""
     view = np.empty(len(at), VIEW)
-    view["angle"] = angle_to_vertical(rows["ray"][at])
+    view["angle"] = np.nan if rights is None else angle_across(rows["ray"][at], rights[rows["source"][at]])
     view["incidence"] = np.arccos(np.clip(facing[at], 0.0, 1.0))
     view["distance"], view["time"] = rows["distance"][at], rows["time"][at]
     return view

@@ -26,6 +26,12 @@ EXPLAINED = 0.8
 MOST_EDGE_ERROR = 0.05
 """The term over the scan angle is refused where it is less certain than this at the edge of the swath, relative."""
 
+LEAST_LEFT = 0.05
+"""What constants and even terms must leave of u (root mean square) for a term that falls from side to side."""
+
+_EDGES = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, -1.0]])
+"""The columns of `swath_columns` at both edges of the swath."""
+
 _REMEDY = {
     "scan angle": "fit it with --scan-angle",
     "incidence": "surfaces are not matt, or a term over the scan angle is missing (--scan-angle)",
@@ -43,7 +49,9 @@ class Trend(NamedTuple):
     """Root mean square of what it changes against the places of the targets, relative."""
 
 
-def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustment, tuple[float, float, float]]:
+def fit_swath(
+    ties: Ties, anchors: Anchors, seen: np.ndarray
+) -> tuple[Adjustment, tuple[float, ...], float | None]:
     """Adjust the constants with a term over the scan angle.
 
     Parameters
@@ -57,25 +65,57 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
     -------
     adjusted : Adjustment
         With the constants straight below the sensor.
-    swath : (float, float, float)
+    swath : (float, float, float, float)
         As `Radiometry.swath`.
+    open_error : float or None
+        Error of the constants, relative, where the strips leave open whether light falls from side to side: as if that
+        made their constants differ, or stood for what falls to both edges. None where they tell it.
 
     Raises
     ------
     InputError
         If the overlaps do not determine the term.
     """
-    most = float(ties.view["angle"].max(initial=0.0))
-    columns = swath_columns(ties.view["angle"], most or 1.0)
-    anchors = replace(anchors, columns=np.nan_to_num(swath_columns(seen["angle"], most or 1.0)))
-    adjusted = adjust_constants(ties, anchors, columns)
-    edge = float(np.std(adjusted.term_trials.sum(axis=1), ddof=1)) if len(ties.cell) else np.inf
+    most = float(np.abs(ties.view["angle"]).max(initial=0.0))
+    columns, edge = swath_columns(ties.view["angle"], most or 1.0), np.inf
+    at_targets = np.nan_to_num(swath_columns(seen["angle"], most or 1.0))
+    odd = _tells_sides(ties, anchors, columns)
+    used = 3 if odd else 2
+    adjusted = adjust_constants(ties, replace(anchors, columns=at_targets[:, :used]), columns[:, :used])
+    if len(ties.cell):
+        edge = max(float(np.std(adjusted.term_trials @ side[:used], ddof=1)) for side in _EDGES)
     if not 0 < edge <= MOST_EDGE_ERROR:
         raise InputError(
             f"--scan-angle: the overlaps do not show the light at the edge of the swath to {100 * MOST_EDGE_ERROR:.0f} "
             "%; give strips that overlap by a third or more, or leave --scan-angle out"
         )
-    return adjusted, (most, *map(float, adjusted.terms))
+    if odd:
+        return adjusted, (most, *map(float, adjusted.terms)), None
+    other = adjust_constants(ties, replace(anchors, columns=at_targets[:, 2:]), columns[:, 2:], 0)
+    return adjusted, (most, *map(float, adjusted.terms), 0.0), _leave_open(ties, adjusted, other, columns[:, 2])
+
+
+def _tells_sides(ties: Ties, anchors: Anchors, columns: np.ndarray) -> bool:
+    """Whether constants and a term that is alike on both sides cannot stand for one that falls from side to side: they
+    can where headings are alike, and where two strips of opposite headings overlap."""
+    side = replace(ties, value=columns[:, 2], error=np.full(len(columns), 1e-3))
+    free = Anchors(0.0 * anchors.value, 1e3 * np.ones(len(anchors.value)), np.zeros((len(anchors.value), 2)))
+    rest = adjust_constants(side, free, columns[:, :2], 0).residual
+    return bool(len(rest) and np.nanstd(rest) > LEAST_LEFT)
+
+
+def _leave_open(ties: Ties, adjusted: Adjustment, other: Adjustment, side: np.ndarray) -> float:
+    """Error of the constants if they differ because each strip was seen from another side, or if the light falls from
+    side to side and not to both edges, where that explains the overlaps nearly as well."""
+    n, grid = len(adjusted.value), np.linspace(-1.0, 1.0, 21)
+    place = np.bincount(ties.source, side, n) / np.maximum(adjusted.ties, 1)
+    known = np.isfinite(adjusted.value) & (adjusted.ties > 0)
+    off, value = place[known] - place[known].mean(), adjusted.value[known] - adjusted.value[known].mean()
+    drift = float(abs(off @ value) / max(off @ off, 1e-3) * np.sqrt(np.mean(side**2)))
+    apart = float(np.mean(adjusted.value[known] - other.value[known]))
+    apart = apart + swath_columns(grid, 1.0) @ [*adjusted.terms, -other.terms[0]]
+    alike = other.scatter < max(LEAST_SPREAD, adjusted.scatter / EXPLAINED)
+    return max(drift, float(np.sqrt(np.mean(apart**2))) if alike else 0.0)
 
 
 def find_trend(ties: Ties, anchors: Anchors, seen: np.ndarray, adjusted: Adjustment) -> Trend | None:
@@ -109,7 +149,7 @@ def find_trend(ties: Ties, anchors: Anchors, seen: np.ndarray, adjusted: Adjustm
 def _list_columns(ties: Ties, seen: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Name, columns (k, m) at the ties and (n, m) at the targets, of each quantity."""
     view = ties.view
-    most = float(view["angle"].max())
+    most = float(np.abs(view["angle"]).max())
     yield "scan angle", swath_columns(view["angle"], most or 1.0), swath_columns(seen["angle"], most or 1.0)
     yield "incidence", 1.0 - np.cos(view["incidence"])[:, None], 1.0 - np.cos(seen["incidence"])[:, None]
     middle = float(np.median(view["distance"])) or 1.0

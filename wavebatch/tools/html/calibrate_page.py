@@ -67,10 +67,11 @@ def _parts(flight: FlightCalibration, found: Calibration) -> Iterator[str]:
 
 def _draw_swath(swath: tuple[float, ...]) -> str:
     """How the light falls with the scan angle, which the calibration takes off."""
-    angles = np.linspace(0.0, swath[0], 7)
+    angles = np.linspace(-swath[0], swath[0], 13)
     light = 100 * np.exp(-swath_columns(angles, swath[0]) @ swath[1:])
     names = [f"{angle:.1f}" for angle in np.degrees(angles)]
-    return draw_values(names, light, np.zeros(7), title=f"Light from 0 to {names[-1]} deg", label="% of straight down")
+    title = f"Light from {names[0]} (left of the flight) to {names[-1]} deg"
+    return draw_values(names, light, np.zeros(13), title=title, label="% of straight down")
 
 
 def _list_targets(found: Calibration) -> str:

@@ -25,7 +25,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.column_reader import find_keep
 from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
-from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
+from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
@@ -180,8 +180,9 @@ def voxelize_strip(
             raise InputError(f"{strip}: holds no waveform to put into voxels; see `wavebatch check`")
         positions = Positions.IF_KNOWN if calibration is None else Positions.REQUIRED
         setup = prepare(reader, scan, widest_chain(), Request(auto=True, system=system, force=force), sensor=sensor,
-                        positions=positions, calibration=calibration)  # fmt: skip
-        source, pulse, doubts = setup.sensor, setup.system.with_radiometry(sensor_error=0.0), setup.doubts
+                        positions=positions, calibration=calibration, energy=options.energy)  # fmt: skip
+        source, pulse, energy = setup.sensor, setup.system.with_radiometry(sensor_error=0.0), setup.sent.energy
+        doubts = (*setup.doubts, *(setup.sent.notes if calibration else ()))
         if calibration is not None:
             doubts += tuple(filter(None, [source.doubt()]))
             if pulse.radiometry.divergence is None:
@@ -192,7 +193,6 @@ def voxelize_strip(
         middle = _find_middle(reader, scan, options)
         floor = Floor(middle)
         ceiling = find_ceiling(reader, scan, middle, options.size, floor)
-        energy = find_pulse_energy(reader, scan, options.energy)
         tracer = _Tracer(reader, source, pulse, options, floor.finish(), ceiling, energy, calibration is not None)
         rule = find_rule(map(tracer.trace, _sample_batches(reader, scan)), options.reflectance_ratio)
         with (

@@ -21,15 +21,15 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import sample_reference
-from wavebatch.surveying.calibrating.setting import see_channels
-from wavebatch.surveying.calibrating.strip_conditions import (
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
+from wavebatch.surveying.matching.setting import measure_setting, see_channels
+from wavebatch.surveying.matching.strip_conditions import (
     compare_air,
     compare_divergence,
     compare_setting,
     doubt_calibration,
     find_growth,
 )
-from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.sensor import SensorSource
 
 OTHER_PULSE, NEAR_PULSE = 1.25, 1.03
@@ -54,6 +54,7 @@ def match_strip(
     sensor: SensorSource,
     chain: Chain | None = None,
     attenuation: float | None = None,
+    energy: float | None = None,
 ) -> tuple[Calibration, tuple[str, ...]]:
     """Fit a calibration to a strip.
 
@@ -69,6 +70,8 @@ def match_strip(
         That the strip runs with.
     attenuation : float, optional
         Of the air [dB/km], where it is not that of the calibration.
+    energy : float, optional
+        Mean of its pulses over that of the calibration, where it is known.
 
     Returns
     -------
@@ -91,9 +94,17 @@ def match_strip(
         return calibration, tuple(warnings)
     growth, reasons = find_growth(calibration, reader, sensor, attenuation)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
+    setting = measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0)
     if all(row.sha256 != own_strip for row in calibration.strips):
-        more, lines = compare_setting(calibration, reader, scan, system, sensor)
+        more, lines = compare_setting(calibration, setting, system)
         growth, reasons = math.hypot(growth, more), [*reasons, *lines]
+    if setting.fades and energy is None:
+        growth = math.hypot(growth, math.expm1(abs(setting.fades)))
+        reasons.append(
+            f"calibration: the second half of the strip is {100 * math.expm1(-setting.fades):+.0f} % brighter, though "
+            "both are like one scene: a laser that fades, or haze? The error of the constant grows by "
+            f"{100 * math.expm1(abs(setting.fades)):.0f} %; calibrate shorter strips"
+        )
     warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows, reasons = [], {}
@@ -121,9 +132,8 @@ def match_strip(
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
     air = compare_air(calibration, reader, sensor, attenuation, warnings)
-    rows = [replace(row, relative_error=math.hypot(row.relative_error, air)) for row in rows]
-    fitted = replace(calibration, constant=math.nan, channels=tuple(rows), strips=())
-    return fitted, tuple(dict.fromkeys(warnings))
+    fitted = replace(calibration, right=setting.right, constant=math.nan, channels=tuple(rows), strips=())
+    return fitted.widened(air), tuple(dict.fromkeys(warnings))
 
 
 def _find_pulses(

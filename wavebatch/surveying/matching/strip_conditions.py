@@ -13,10 +13,10 @@ import numpy as np
 
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.las.header import decode_text
-from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.light import AIR_DOUBT
-from wavebatch.surveying.calibrating.setting import measure_setting, read_day, read_sensor_name
 from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.matching.setting import Setting, compare_scenes, read_day, read_sensor_name
 from wavebatch.surveying.sensor import SensorSource
 
 SAME_DIVERGENCE = 0.03
@@ -25,6 +25,9 @@ SAME_DIVERGENCE = 0.03
 OTHER_DAY, OTHER_MONTH = 0.02, 0.05
 """Errors for strips of another day than the calibration, and for more than 30 days: lasers and receivers drift. These
 are assumptions; `wavebatch calibrate` of several strips measures the drift of a flight."""
+
+UNSTATED = 0.03
+"""Error of a constant whose file states none: that of the reflectances of targets."""
 
 LEAST_AIR = 0.005
 """Relative change of the light from which other air on the same day is named."""
@@ -35,7 +38,7 @@ FAR = 1.3
 SAME_RATE = 1.02
 """Ratio up to which pulse rates are equal."""
 
-OTHER_NOISE, OTHER_LIGHT = 1.3, 1.7
+OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
 one, other surfaces the other."""
 
@@ -49,8 +52,8 @@ def doubt_calibration(calibration: Calibration) -> Iterator[str]:
         )
     if not min(row.relative_error for row in (calibration, *calibration.channels)):
         yield (
-            "calibration: its relative_error is 0, but no constant is known exactly: put the error of the targets into "
-            "the file"
+            f"calibration: its relative_error is 0, but no constant is known exactly: {UNSTATED:.0%} is taken; put the "
+            "error of the targets into the file"
         )
 
 
@@ -62,7 +65,8 @@ def find_growth(
     attenuation: of the strip's air [dB/km], where it is given. Air that is not given is known to AIR_DOUBT: over the
     whole way on another day than that of the calibration, over what the ways differ on the same.
     """
-    parts, lines = [], []
+    rows = (calibration, *calibration.channels)
+    parts, lines = [UNSTATED if not min(row.relative_error for row in rows) else 0.0], []
     day = read_day(reader)
     slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
     if day and calibration.flight and day != calibration.flight:
@@ -94,11 +98,9 @@ def find_growth(
     return float(np.sqrt(np.sum(np.square(parts)))), lines
 
 
-def compare_setting(
-    calibration: Calibration, reader: StripReader, scan: StripScan, system: SystemPulse, sensor: SensorSource
-) -> tuple[float, list[str]]:
+def compare_setting(calibration: Calibration, found: Setting, system: SystemPulse) -> tuple[float, list[str]]:
     """Error that another pulse rate or gain adds to the constant, relative, and the warnings."""
-    found, growth, lines = measure_setting(reader, scan, sensor, calibration.attenuation), 0.0, []
+    growth, lines = 0.0, []
 
     def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
         nonlocal growth
@@ -114,6 +116,14 @@ def compare_setting(
         # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
         light = found.brightest.get(row.digitizer)
         compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or other surfaces: light {which} is")
+        scene = found.scenes.get(row.digitizer)
+        off = compare_scenes(scene, row.scene) if scene and len(row.scene) == len(scene) else 0.0
+        if off:
+            growth = max(growth, math.expm1(abs(off)))
+            lines.append(
+                f"calibration: another gain or energy under the same header: all echoes {which} are brighter by a "
+                f"factor of {math.exp(off):.2f}, though scenes are alike"
+            )
     return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines]
 
 

@@ -1,0 +1,139 @@
+"""Energies of pulses in a calibration and in the strips that run with it: their mean counts, what lacks is an error."""
+
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pytest
+
+import wavebatch as wb
+from tests import facet_strips
+from tests.facet_strips import EAST, NORTH, START, Sensor, write_strip
+from tests.surveying.test_calibration_misuse import BASE, GROUND, LIGHT, call, fields, write_targets
+from wavebatch.surveying.calibrating.calibration_file import load_calibration
+
+pytestmark = pytest.mark.kept_surveys
+
+FLICKERS = Sensor(**BASE, light=LIGHT, energy_spread=0.06, store_energy=True)
+COLUMNS = "level_reflectance,backscatter_coefficient,backscatter_coefficient_err"
+
+
+@pytest.fixture(scope="module")
+def flickering(tmp_path_factory):
+    """A strip whose shots scatter by 6 %, and its calibration with and without their energies."""
+    folder = tmp_path_factory.mktemp("energies")
+    write_strip(folder / "a.las", GROUND, FLICKERS, 8000, seed=1)
+    write_targets(folder / "t.csv")
+    for name, more in (("with", ()), ("without", ("--energy", "none"))):
+        done = call("calibrate", folder / "a.las", "--targets", folder / "t.csv", "-o", folder / f"{name}.toml",
+                    "--divergence", 0.4, *more)  # fmt: skip
+        assert done.exit_code == 0, done.output
+    return folder
+
+
+def judge(out, strip, calibration, *options):
+    """Reflectances of level ground over the truth, less 1, the relative errors that they state, and what was said."""
+    done = call("run", strip, "-o", out, "--calibration", calibration, "--columns", COLUMNS, *options)
+    assert done.exit_code == 0, done.output
+    cloud = wb.read_cloud(out / f"{strip.stem}.laz")
+    x, y = cloud["x"] - EAST, cloud["y"] - NORTH
+    inside = (np.abs(x % 20 - 10) < 9) & (np.abs(y % 20 - 10) < 9)
+    target = (x >= 40) & (x < 60) & (y >= 0) & (y < 20)
+    inside &= np.isfinite(cloud["level_reflectance"])
+    off = (cloud["level_reflectance"] / np.where(target, 0.3, fields(x, y)) - 1)[inside]
+    stated = (cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])[inside]
+    return off, stated, done.stderr
+
+
+def write_log(path, strip, change):
+    cloud = laspy.read(strip)
+    energy = change(np.asarray(cloud["pulse_energy"], np.float64))
+    rows = zip(np.asarray(cloud.gps_time), energy, strict=True)
+    path.write_text("time,energy\n" + "\n".join(f"{time:.9f},{value:.6f}" for time, value in rows))
+    return path
+
+
+def test_a_weaker_laser_that_its_log_knows_is_right(tmp_path, flickering):
+    found = load_calibration(flickering / "with.toml")
+    assert found.energy_mean == pytest.approx(1.0, abs=0.005) and found.energy_source == "pulse_energy"
+    assert found.energy_spread == pytest.approx(0.06, rel=0.05)
+    write_strip(tmp_path / "weak.las", GROUND, replace(FLICKERS, gains={1: 0.8}, time=START + 600), 5000, seed=2)
+    off, stated, said = judge(tmp_path / "out", tmp_path / "weak.las", flickering / "with.toml")
+    assert abs(np.median(off)) < 0.01 and np.median(stated) < 0.035 and "energ" not in said
+
+
+def test_a_log_in_another_unit_is_refused_unless_the_calibration_says_its_mean(tmp_path, flickering):
+    log = write_log(tmp_path / "log.csv", flickering / "a.las", lambda energy: 1000 * energy)
+    options = ("--columns", COLUMNS, "--energy", log, "--calibration")
+    done = call("run", flickering / "a.las", "-o", tmp_path / "out", *options, flickering / "with.toml")
+    assert done.exit_code == 4 and "another unit?" in done.stderr and "energy_mean in CAL.toml" in done.stderr
+    text = (flickering / "with.toml").read_text().replace("energy_mean = 0.99", "energy_mean = 999.")
+    (tmp_path / "cal.toml").write_text(text)
+    off, _, _ = judge(tmp_path / "out", flickering / "a.las", tmp_path / "cal.toml", "--energy", log)
+    assert abs(np.median(off)) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("calibration", "options", "said", "error"),
+    [
+        ("with", ("--energy", "none"), "this strip has none: its pulses scatter by 6.0 %", 0.067),
+        ("without", (), "measured without the energies of the pulses, this strip has them", 0.031),
+        ("without", ("--energy", "none"), "", 0.063),
+    ],
+)
+def test_energies_that_only_one_of_both_has_are_named_and_in_the_error(
+    tmp_path, flickering, calibration, options, said, error
+):
+    off, stated, line = judge(tmp_path, flickering / "a.las", flickering / f"{calibration}.toml", *options)
+    assert said in line and (said or "energies of" not in line and "each pulse" not in line)
+    assert np.median(stated) == pytest.approx(error, abs=0.005)
+    assert np.mean(np.abs(off) < stated) > 0.62
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda energy: np.ones(len(energy)), "scatter by 0.0 % from shot to shot, those of the calibration by 6.0 %"),
+        (lambda energy: energy[np.arange(len(energy)) // 50 * 50], "is the log stuck?"),
+        (lambda energy: np.where(np.arange(len(energy)) < 4000, energy, energy[4000]), "is the log stuck?"),
+        (lambda energy: energy * np.linspace(0.9, 1.1, len(energy)), "not proved by the strip's brightness"),
+        (lambda energy: energy, ""),
+    ],
+    ids=["constant", "held", "stuck", "drifts", "right"],
+)
+def test_logs_that_stand_still_or_drift_alone_are_named_and_in_the_error(tmp_path, flickering, change, said):
+    log = write_log(tmp_path / "log.csv", flickering / "a.las", change)
+    off, stated, line = judge(tmp_path, flickering / "a.las", flickering / "with.toml", "--energy", log)
+    assert said in line and (said or "--energy log.csv" not in line)
+    assert np.mean(np.abs(off) < stated) > 0.6
+
+
+def test_two_lasers_that_take_turns_without_a_mark_are_named_and_in_the_error(tmp_path, flickering, monkeypatch):
+    render = facet_strips._render
+
+    def take_turns(time, strength, sensor):
+        return render(time, strength * np.where(np.arange(len(time)) % 2, 0.7, 1.0)[:, None], sensor)
+
+    monkeypatch.setattr(facet_strips, "_render", take_turns)
+    plain = replace(FLICKERS, store_energy=False)
+    write_strip(tmp_path / "two.las", GROUND, replace(plain, energy_spread=0.02), 8000, seed=4)
+    monkeypatch.undo()
+    off, stated, line = judge(tmp_path, tmp_path / "two.las", flickering / "without.toml")
+    assert "alternates by a factor of 0.70, as of two lasers" in line
+    assert abs(np.mean(off)) < np.median(stated) and np.median(stated) > 0.24
+    two = Sensor(**BASE, light=LIGHT, gains={1: 1.0, 2: 0.45})
+    write_strip(tmp_path / "channels.las", GROUND, two, 4000, seed=5)
+    calibrate = ("calibrate", tmp_path / "channels.las", "--targets", flickering / "t.csv", "-o", tmp_path / "c.toml")
+    done = call(*calibrate)
+    assert done.exit_code == 0 and "alternates" not in done.stderr
+
+
+@pytest.mark.slow
+def test_strips_of_a_flight_are_calibrated_with_one_unit_of_energy(tmp_path, flickering):
+    b = replace(FLICKERS, gains={1: 0.8}, start=(98, 100), heading=270.0, time=START + 600)
+    write_strip(tmp_path / "b.las", GROUND, b, 8000, seed=12)
+    done = call("calibrate", flickering / "a.las", tmp_path / "b.las", "--targets", flickering / "t.csv",
+                "-o", tmp_path / "cal.toml")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    found = load_calibration(tmp_path / "cal.toml")
+    assert len(found.strips) == 2 and max(abs(row.drift) for row in found.strips) < 0.01

@@ -1,0 +1,226 @@
+"""The energies of a strip's pulses beside those of its calibration, and what the strip's own light says of both.
+
+`run`, `calibrate` and `voxelize` call `take_energies` once per strip. What a strip lacks against its calibration goes
+into the errors: the scatter of energies that are not logged, a log that drifts alone, two lasers without a mark.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from wavebatch.core.errors import InputError
+from wavebatch.core.order import even_places
+from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
+from wavebatch.files.strip.reader import StripReader, StripScan, Unit
+from wavebatch.kernels.physics.pulse_energies import judge_energies
+from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.matching.setting import SCANNERS, sum_light
+
+OTHER_UNIT = 3.0
+"""Ratio of mean energies from which a log is in another unit: lasers lose a half of their energy at most."""
+
+NEIGHBOURS = 4096
+"""Neighbouring pulses whose light is compared."""
+
+PERIODS = (2, 3, 4)
+"""Lasers, or heads, that may take turns."""
+
+LEAST_APART, LIKE = 0.04, 0.5
+"""Light alternates where that of neighbours differs by more than the first (median of the logarithm), and that of
+pulses one period apart by this share of it at most: surfaces make pulses that lie further apart differ more."""
+
+LEAST_COMPARED = 200
+"""Pairs of pulses that show it."""
+
+PLACES, OF_PLACE, LEAST_PLACES = 32, 128, 8
+"""Places along the strip at which slow changes of the log are compared with light, pulses at each, and the fewest."""
+
+LEAST_SAID = 0.01
+"""Smaller errors are not named."""
+
+
+@dataclass(frozen=True, slots=True)
+class StripEnergies:
+    """What is known of the energies of a strip's pulses."""
+
+    energy: PulseEnergy | None
+    """None where nothing is."""
+    shot_error: float = 0.0
+    """Scatter from shot to shot that the calibration's energies held and the strip's do not, relative."""
+    growth: float = 0.0
+    """Error of the strip's level, relative."""
+    notes: tuple[str, ...] = ()
+
+    def widen(self, calibration: Calibration) -> Calibration:
+        """Return a calibration with these errors."""
+        rows = (replace(row, shot_energy=math.hypot(row.shot_energy, self.shot_error)) for row in calibration.channels)
+        return replace(calibration, channels=tuple(rows)).widened(self.growth)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the fields of a Calibration that say what it was measured with."""
+        sent = self.energy
+        if sent is None:
+            return {}
+        mean, names = sent.reference or sent.mean, {"energy_source": sent.source, "energy_unit": sent.unit}
+        return {"energy_mean": mean, "energy_spread": sent.shots, **names}
+
+
+def take_energies(
+    reader: StripReader, scan: StripScan, request: str | None, calibration: Calibration | None = None
+) -> StripEnergies:
+    """Find the energies of a strip's pulses, and compare them with its light and its calibration.
+
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    request : str or None
+        As `find_pulse_energy`.
+    calibration : Calibration, optional
+        That the strip runs with, or of the strip that was calibrated before it in one flight.
+
+    Returns
+    -------
+    StripEnergies
+        Energies count relative to the mean of the calibration, or of the strip where the calibration has none.
+
+    Raises
+    ------
+    InputError
+        Where the energies cannot be read, contradict the strip's light, or are in another unit than the calibration's.
+
+    Notes
+    -----
+    docs/algorithms.md 5.2.
+    """
+    energy, notes = find_pulse_energy(reader, scan, request), []
+    pulses = _read_neighbours(reader, scan, energy)
+    growth = 0.0
+    if energy is not None and request is not None:
+        doubt = judge_energies(pulses[1], pulses[2])
+        if doubt:
+            raise InputError(
+                f"{reader.facts.path}: --energy {energy.source} contradicts the strip: {doubt}; check its times, or "
+                "leave it out"
+            )
+        growth = _compare_drift(reader, scan, energy)
+        if growth > LEAST_SAID:
+            notes.append(
+                f"--energy {energy.source}: its slow changes along the strip are not proved by the strip's brightness: "
+                f"the error of the constant grows by {100 * growth:.1f} %"
+            )
+    apart = _find_alternation(pulses)
+    if apart:
+        notes.append(
+            f"the light of neighbouring pulses alternates by a factor of {math.exp(-apart):.2f}, as of two lasers or "
+            f"gains without a mark: the error of the constant grows by {100 * apart * 0.5**0.5:.0f} %; give --energy"
+        )
+        growth = math.hypot(growth, apart * 0.5**0.5)
+    lacks = 0.0
+    if calibration is not None:
+        energy = energy and _refer(reader, energy, calibration)
+        lacks, note = _compare(energy, calibration)
+        notes += [note] if note else []
+    if energy is None:
+        return StripEnergies(None, lacks, growth, tuple(notes))
+    return StripEnergies(replace(energy, missed=lacks), 0.0, growth, tuple(notes))
+
+
+def _refer(reader: StripReader, energy: PulseEnergy, calibration: Calibration) -> PulseEnergy:
+    """The energies relative to the mean of the calibration's; InputError for another unit."""
+    known = calibration.energy_mean
+    if known is None:
+        return energy
+    ratio = energy.mean / known
+    if max(ratio, 1 / ratio) > OTHER_UNIT:
+        raise InputError(
+            f"{reader.facts.path}: the mean energy of its pulses is {energy.mean:.4g} ({energy.source}), that of the "
+            f"calibration {known:.4g} {calibration.energy_unit} ({calibration.energy_source}): another unit? Then give "
+            "the calibration's mean in this unit as energy_mean in CAL.toml, or leave energies out with --energy none"
+        )
+    return replace(energy, reference=known)
+
+
+def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[float, str]:
+    """Scatter of the energy from shot to shot that nothing of the strip tells, relative: what the calibration had
+    beyond that of the strip's own log, so that a log that stands still proves nothing; and the line about it."""
+    own, scatter, source = energy.shots if energy else 0.0, calibration.energy_spread, calibration.energy_source
+    if calibration.energy_mean is None:
+        if energy is None:
+            return 0.0, ""
+        scatter = max((row.shot_energy for row in calibration.channels), default=0.0)
+        return math.sqrt(max(scatter**2 - own**2, 0.0)), (
+            f"calibration: measured without the energies of the pulses, this strip has them ({energy.source}): they "
+            "count relative to their mean, which may be another than that of the calibration's strip"
+        )
+    lacks = math.sqrt(max(scatter**2 - own**2, 0.0))
+    if energy is None:
+        return lacks, (
+            f"calibration: measured with the energy of each pulse ({source}), this strip has none: its pulses scatter "
+            f"by {100 * lacks:.1f} % from shot to shot, which is in the error"
+        )
+    line = (
+        f"--energy {energy.source}: its values scatter by {100 * own:.1f} % from shot to shot, those of the "
+        f"calibration by {100 * scatter:.1f} %: is the log stuck? The rest is in the error"
+    )
+    return lacks, line if lacks > LEAST_SAID else ""
+
+
+def _read_neighbours(reader: StripReader, scan: StripScan, energy: PulseEnergy | None) -> np.ndarray:
+    """Neighbouring waveforms in the middle of the strip, as `_join`."""
+    if not reader.unit_count():
+        return np.empty((4, 0))
+    unit = reader.read_unit(reader.unit_count() // 2, scan)
+    return _join(reader, unit, np.flatnonzero(unit.packets.owned)[:NEIGHBOURS], energy)
+
+
+def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy | None) -> np.ndarray:
+    """Time, light, energy (1 where nothing is known) and channel of waveforms in the order of time, f8 (4, n)."""
+    parts = [np.empty((4, 0))]
+    for block, _ in reader.read_rows(unit, rows, NEIGHBOURS):
+        sent = np.ones(len(block)) if energy is None else energy.fill(block, unit).pulse_energy
+        channel = np.full(len(block), SCANNERS * block.digitizer.index)
+        channel += 0 if block.scanner is None else block.scanner
+        parts.append(np.stack([block.gps_time, sum_light(block), sent, channel]))
+    joined = np.concatenate(parts, axis=1)
+    return joined[:, np.argsort(joined[0], kind="stable")]
+
+
+def _find_alternation(pulses: np.ndarray) -> float:
+    """By how much the logarithm of the light of neighbouring pulses of one channel differs in turns; 0 where not."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        light = np.log(pulses[1] / pulses[2])
+    most = 0.0
+    for channel in np.unique(pulses[3]):
+        own = light[pulses[3] == channel]
+        if len(own) > LEAST_COMPARED:
+            near, *far = (float(np.nanmedian(np.abs(own[k:] - own[:-k]))) for k in (1, *PERIODS))
+            most = max(most, near) if near > LEAST_APART and min(far) < LIKE * near else most
+    return most
+
+
+def _compare_drift(reader: StripReader, scan: StripScan, energy: PulseEnergy) -> float:
+    """Error by slow changes of the log that the strip's brightness does not follow, relative."""
+    found = []
+    numbers = even_places(reader.unit_count(), PLACES).tolist()
+    for number in numbers:
+        unit = reader.read_unit(number, scan)
+        for part in np.array_split(np.flatnonzero(unit.packets.owned), -(-PLACES // len(numbers))):
+            with np.errstate(invalid="ignore", divide="ignore"):
+                pulses = _join(reader, unit, part[even_places(len(part), OF_PLACE)], energy)
+                found.append(np.nanmedian(np.log(pulses[1:3]), axis=1))
+    light, sent = np.array(found)[np.isfinite(found).all(axis=1)].T if found else np.empty((2, 0))
+    if len(sent) < LEAST_PLACES:
+        return 0.0
+    sent, light = sent - sent.mean(), light - light.mean()
+    # Medians of OF_PLACE pulses scatter by themselves: only what is beyond that is slow.
+    slow = math.sqrt(max(float(np.mean(sent**2)) - 1.57 * energy.shots**2 / OF_PLACE, 0.0))
+    if not slow:
+        return 0.0
+    slope = float(sent @ light / (sent @ sent))
+    error = math.sqrt(float(np.sum((light - slope * sent) ** 2)) / (len(sent) - 2) / float(sent @ sent))
+    return slow * min(math.hypot(1.0 - slope, error), 1.0)
