@@ -98,7 +98,7 @@ def draw_sensor(number: int) -> tuple[Sensor, np.random.Generator]:
     base = 5 * noise + rng.uniform(0, 10)
     room = (2**bits - 1 - base) / noise
     saturated = bool(rng.random() < 0.12)
-    top = 1.6 * room if saturated else _spread(rng, 20, max(min(0.9 * room, 5000), 25))
+    top = 1.6 * room if saturated else _spread(rng, 45, max(min(0.9 * room, 5000), 50))
     colour = rng.choice(["white", "one", "two"], p=[0.5, 0.3, 0.2])
     radius, angle = rng.uniform(0.5, 0.8), rng.uniform(0.3, 0.9)
     filters = {"white": (), "one": (rng.uniform(0.3, 0.9),), "two": (2 * radius * np.cos(angle), -(radius**2))}

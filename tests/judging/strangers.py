@@ -30,7 +30,7 @@ SURE = 3.0
 FOUND = 0.5
 """Distance [widths] up to which a found echo is a true one."""
 ONE = 0.7
-"""True echoes closer than this [widths] may be found as one."""
+"""True echoes closer than this [widths] may be found as one, so that far from them."""
 MOST_MISSED, MOST_EXTRA = 0.03, 0.03
 GROUP = 25
 """Strips of one process."""
@@ -69,7 +69,7 @@ def match(truth: dict[str, np.ndarray], found: dict[str, np.ndarray], fwhm: floa
     far = np.abs(found_at[nearest] - true_at) > FOUND * truth["fwhm"]
     group = np.r_[0, np.cumsum(np.diff(true_at) > ONE * fwhm)]
     own = _find_nearest(found_at, true_at)
-    stray = np.abs(found_at - true_at[own]) > FOUND * truth["fwhm"][own]
+    stray = np.abs(found_at - true_at[own]) > ONE * truth["fwhm"][own]
     member = group[own]
     allowed, seen = np.bincount(group), np.bincount(member[~stray], minlength=group[-1] + 1)
     # Of too many, which one is extra does not matter: those farthest from a true echo.
@@ -103,9 +103,11 @@ def score(sensor: Any, truth: dict[str, np.ndarray], found: dict[str, np.ndarray
     found = found | {"time": found["time"] - shift}
     nearest, extra = match(truth, found, sensor.fwhm)
     # Beside clipped echoes nothing is extra: their shape is not known.
-    for row in np.flatnonzero(truth["clipped"]):
-        here = (found["packet"] == truth["packet"][row]) & (np.abs(found["time"] - truth["time"][row]) < 2 * sensor.fwhm)
-        extra &= ~here
+    clipped, far = np.flatnonzero(truth["clipped"]), 1e9
+    if len(clipped):
+        places = truth["packet"][clipped] * far + truth["time"][clipped]
+        at = found["packet"] * far + found["time"]
+        extra &= np.abs(at - places[_find_nearest(at, places)]) > 2 * sensor.fwhm
     hit = clear & (nearest >= 0)
     missed, number = int((clear & (nearest < 0)).sum()), int(clear.sum())
     over, total = int(extra.sum()), len(found["time"])
@@ -182,7 +184,8 @@ def tabulate(results: list[dict[str, Any]], older: list[dict[str, Any]]) -> str:
         if verdict(one) != "right" or old not in ("-", "right"):
             listed.append([
                 one["strip"], verdict(one), old, 100 * one.get("missed", np.nan), 100 * one.get("extra", np.nan),
-                one.get("width_ratio"), one.get("clear"), one.get("found"), one.get("error") or ", ".join(one["causes"]),
+                *(one.get(name) for name in ("width_ratio", "clear", "found")),
+                one.get("error") or ", ".join(one["causes"]),
             ])  # fmt: skip
     return f"{text}\n\n{format_table(listed)}" if len(listed) > 1 else text
 
