@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -37,13 +38,17 @@ def timed(call: Callable, *arguments: Any, **options: Any) -> tuple[Any, float]:
 
 
 def find_echoes(strip: Any, chain: Any, system: Any) -> dict[str, np.ndarray]:
-    """Echoes of all packets of an open strip, sorted by packet, then time [ns]; packets by the row of their point."""
+    """Echoes of all packets of an open strip, sorted by packet, then time [ns]."""
+    blocks = list(strip.blocks())
+    return flatten(blocks, [chain.run(block, system) for block in blocks])
+
+
+def flatten(blocks: list[Any], tables: list[Any]) -> dict[str, np.ndarray]:
+    """Echoes of blocks as columns, sorted by packet, then time [ns]; packets by the row of their first point."""
     names = ("time", "amplitude", "sigma", "time_err", "amplitude_err", "flags")
-    parts = []
-    for block in strip.blocks():
-        echoes = chain.run(block, system)
-        parts.append([block.point[echoes.waveform], *(getattr(echoes, name) for name in names)])
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)] if parts else [np.empty(0)] * 7
+    parts = [[block.point[echoes.waveform], *(getattr(echoes, name) for name in names)]
+             for block, echoes in zip(blocks, tables, strict=True)]  # fmt: skip
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     order = np.lexsort((columns[1], columns[0]))
     return {name: column[order] for name, column in zip(("packet", *names), columns, strict=True)}
 
@@ -60,6 +65,15 @@ def find_doubts(path: Path, survey: Any, folder: Path) -> tuple[list[str], float
     _, seconds = timed(wb.run, [path], folder, on_event=events.append, **options)
     said = [str(line) for event in events for line in event.get("warnings", ())]
     return [line for line in said if "--system " not in line.split(":")[0] and "returns" not in line], seconds
+
+
+def find_function(name: str) -> Callable:
+    """A function of wavebatch, wherever it is."""
+    import wavebatch
+
+    folder = Path(wavebatch.__file__).parent
+    home = next(path for path in sorted(folder.rglob("*.py")) if f"\ndef {name}(" in path.read_text())
+    return getattr(importlib.import_module(".".join(home.relative_to(folder.parent).with_suffix("").parts)), name)
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
