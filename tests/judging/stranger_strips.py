@@ -251,14 +251,15 @@ def _see(sensor: Sensor, lag: np.ndarray, height: np.ndarray, amplitude: np.ndar
 def make_strip(number: int, folder: Path) -> Path:
     """The strip NNNN.las in a folder, with NNNN.npz and NNNN.json of its truth; made where they are not there."""
     path = folder / f"{number:04d}.las"
-    if path.exists():
+    sensor, rng = draw_sensor(number)
+    note, described = path.with_suffix(".json"), json.dumps({**asdict(sensor), "causes": sensor.causes()})
+    if path.exists() and note.read_text() == described:
         return path
     folder.mkdir(parents=True, exist_ok=True)
-    sensor, rng = draw_sensor(number)
     echoes = draw_scene(sensor, rng)
     counts = render(sensor, echoes, rng)
     np.savez_compressed(path.with_suffix(".npz"), **echoes)
-    path.with_suffix(".json").write_text(json.dumps({**asdict(sensor), "causes": sensor.causes()}))
+    note.write_text(described)
     strongest = np.full(sensor.packets, np.nan)
     order = np.argsort(echoes["amplitude"])
     strongest[echoes["packet"][order]] = echoes["time"][order]
