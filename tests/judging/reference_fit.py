@@ -23,6 +23,9 @@ FINE = 20
 """Steps of the pulse's table per sample."""
 LAGS = 16
 """Of the noise's covariance that are measured."""
+CUT, SMOOTH = 0.35, 0.8
+"""Share of quiet samples up to which a strip is cut to its signal: what fits leave there is echoes that were not found,
+so the first samples of all packets give the noise, and its correlation is a guess."""
 WIDEST = 6.0
 """Largest variance of a target, in those of the pulse."""
 STEP = 0.125
@@ -50,8 +53,10 @@ class Pulse:
     @classmethod
     def widen(cls, lag: np.ndarray, plain: np.ndarray) -> Pulse:
         """With all widenings of a plain pulse."""
-        above = lag[plain >= 0.5 * plain.max()]
-        fwhm = float(above[-1] - above[0])
+        top = int(np.argmax(plain))
+        before = np.interp(0.5 * plain[top], np.maximum.accumulate(plain[: top + 1]), lag[: top + 1])
+        after = np.interp(-0.5 * plain[top], np.maximum.accumulate(-plain[top:]), lag[top:])
+        fwhm = float(after - before)
         sigma = fwhm / 2.3548 * FINE
         levels = np.arange(0, WIDEST + STEP, STEP)
         table = [gaussian_filter1d(plain, sigma * np.sqrt(v), mode="nearest") if v else plain for v in levels]
@@ -74,8 +79,8 @@ class Pulse:
 def read_known(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """A pulse of a file: a recording (.csv, a count per line), or Gaussians of a shipped system (.toml)."""
     if path.suffix == ".csv":
-        counts = np.loadtxt(path)
-        counts = np.maximum(counts - np.quantile(counts, 0.1), 0)
+        counts = np.trim_zeros(np.loadtxt(path))
+        counts = counts - np.median(counts[:8])
         x = np.arange(len(counts)) - float(np.argmax(counts))
         lag = np.arange(-60, 90, 1 / FINE)
         return lag, np.interp(lag, x, counts / counts.max(), 0, 0)
@@ -88,7 +93,7 @@ def read_known(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stack_pulse(waveforms: list[Waveform]) -> tuple[np.ndarray, np.ndarray]:
-    """The pulse of lone echoes: of the narrower half of them, so that slopes do not widen it."""
+    """The pulse of lone echoes of the most frequent width, so that slopes do not widen it."""
     level = np.median(np.concatenate([one.samples[:8] for one in waveforms]))
     noise = max(measure_white(waveforms), 0.3)
     rows = []
@@ -109,7 +114,10 @@ def stack_pulse(waveforms: list[Waveform]) -> tuple[np.ndarray, np.ndarray]:
         far = np.abs(np.arange(len(y)) - centre) > 1.4 * usual
         if y[far].max(initial=0) < 0.08 * y.max() and 2.5 * usual < centre < len(y) - 3.5 * usual:
             lone.append((width, centre, y))
-    limits = np.quantile([row[0] for row in lone], [0.03, 0.5])
+    # The shortest interval with half of the widths: level ground has the most frequent width, not the least.
+    widths, half = np.sort([row[0] for row in lone]), (len(lone) + 1) // 2
+    begin = int(np.argmin(widths[half - 1 :] - widths[: len(widths) - half + 1]))
+    limits = widths[begin], widths[begin + half - 1]
     lone = [row for row in lone if limits[0] <= row[0] <= limits[1]]
     lag = np.arange(-4 * usual, 8 * usual, 1 / FINE)
     height, centre = np.array([row[2].max() for row in lone]), np.array([row[1] for row in lone])
@@ -154,6 +162,13 @@ class Fitter:
         self.spread = float(1.4826 * np.median(np.abs(lows - self.level)) + 0.5)
         self.covariance = np.r_[measure_white(waveforms) ** 2 + 1 / 12, np.zeros(LAGS - 1)]
         self.misfit = 0.005
+        starts = np.array([one.samples[5] - one.samples[0] for one in waveforms])
+        scale = max(1.4826 * np.median(np.abs(starts - np.median(starts))) / np.sqrt(2), 0.5)
+        quiet = np.mean([np.mean(np.abs(one.samples - self.level) < 4 * scale) for one in waveforms])
+        if quiet < CUT:
+            self.covariance = scale**2 * SMOOTH ** np.arange(LAGS) * (1 - np.arange(LAGS) / LAGS)
+            self.misfit = 0.01
+            return
         for _ in range(2):
             self._measure(waveforms[:: max(len(waveforms) // 50, 1)])
 

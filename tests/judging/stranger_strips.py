@@ -256,6 +256,7 @@ def make_strip(number: int, folder: Path) -> Path:
     if path.exists() and note.read_text() == described:
         return path
     folder.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
     echoes = draw_scene(sensor, rng)
     counts = render(sensor, echoes, rng)
     np.savez_compressed(path.with_suffix(".npz"), **echoes)
