@@ -112,7 +112,7 @@ def stack_pulse(waveforms: list[Waveform]) -> tuple[np.ndarray, np.ndarray]:
     lone = []
     for width, centre, y in rows:
         far = np.abs(np.arange(len(y)) - centre) > 1.4 * usual
-        if y[far].max(initial=0) < 0.08 * y.max() and 2.5 * usual < centre < len(y) - 3.5 * usual:
+        if y[far].max(initial=0) < 0.08 * y.max() and 1.5 * usual < centre < len(y) - 2 * usual:
             lone.append((width, centre, y))
     # The shortest interval with half of the widths: level ground has the most frequent width, not the least.
     widths, half = np.sort([row[0] for row in lone]), (len(lone) + 1) // 2
