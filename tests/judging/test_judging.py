@@ -1,0 +1,91 @@
+"""The judges say what is true of answers that are known; the fast tests run one small stranger."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reference_fit import Fitter, Waveform
+from stranger_strips import draw_sensor, make_strip
+from strangers import judge_strip, score, tabulate, verdict
+from strip_parts import list_packets, write_part
+
+import wavebatch as wb
+
+SMALL = 7
+"""A stranger with few packets of open ground: any survey should be right."""
+LONE = 0
+"""A stranger with enough lone echoes to stack its pulse."""
+
+
+@pytest.fixture(scope="module")
+def strip(tmp_path_factory) -> Path:
+    return make_strip(SMALL, tmp_path_factory.mktemp("strangers"))
+
+
+@pytest.fixture(scope="module")
+def answer(strip) -> dict[str, np.ndarray]:
+    """The truth as an answer that a decomposition could give."""
+    with np.load(strip.with_suffix(".npz")) as truth:
+        found = {name: truth[name] for name in ("packet", "time", "amplitude")}
+    order = np.lexsort((found["time"], found["packet"]))
+    found = {name: column[order] for name, column in found.items()}
+    ones = np.ones(len(order))
+    return found | {"time_err": 0.01 * ones, "amplitude_err": 0.1 * ones}
+
+
+def judge(strip: Path, found: dict[str, np.ndarray]) -> dict:
+    with np.load(strip.with_suffix(".npz")) as truth:
+        return score(draw_sensor(SMALL)[0], dict(truth), found)
+
+
+def test_the_truth_is_right_also_where_all_of_it_is_late(strip, answer):
+    for late in (0.0, 1.5):
+        result = judge(strip, answer | {"time": answer["time"] + late})
+        assert result["right"] and result["missed"] == result["extra"] == 0
+        assert result["clear"] > 0.9 * result["true"] and result["time_scatter"] < 1e-6
+
+
+def test_missing_echoes_are_missed(strip, answer):
+    result = judge(strip, {name: column[::2] for name, column in answer.items()})
+    assert not result["right"] and 0.4 < result["missed"] < 0.6 and result["extra"] == 0
+
+
+def test_one_half_of_a_split_echo_is_extra(strip, answer):
+    both = {name: np.repeat(column, 2) for name, column in answer.items()}
+    both["time"] = both["time"] + np.tile([-0.2, 0.2], len(answer["time"])) * draw_sensor(SMALL)[0].fwhm
+    result = judge(strip, both)
+    assert not result["right"] and result["missed"] == 0 and result["extra"] == pytest.approx(0.5)
+
+
+def test_a_small_stranger_is_judged(strip):
+    result = judge_strip(SMALL, strip.parent)
+    assert "error" not in result and result["survey_s"] > 0
+    assert result["missed"] < 0.05 and result["extra"] < 0.05 and abs(result["width_ratio"] - 1) < 0.1
+    head, every, *_ = tabulate([result], [result | {"right": False}]).splitlines()
+    assert "wrong before" in head and every.split()[:2] == ["all", "1"]
+    assert verdict({"right": False, "doubts": []}) == "silent"
+
+
+def test_a_part_of_a_strip_holds_its_packets_only(strip, tmp_path):
+    keep = list_packets(strip) % 3 == 1
+    with wb.open_strip(strip) as whole, wb.open_strip(write_part(strip, keep, tmp_path / "part.las")) as part:
+        one, other = next(whole.blocks()), next(part.blocks())
+    np.testing.assert_array_equal(one.samples[keep], other.samples)
+    np.testing.assert_allclose(one.origin[keep], other.origin)
+
+
+@pytest.mark.slow
+def test_the_reference_fit_finds_clear_echoes(tmp_path):
+    sensor, path = draw_sensor(LONE)[0], make_strip(LONE, tmp_path)
+    with wb.open_strip(path) as opened:
+        block = next(opened.blocks(200))
+    every = np.ones(sensor.samples, bool)
+    waveforms = [Waveform(row, samples.astype(float), every) for row, samples in enumerate(block.samples)]
+    fitter = Fitter(waveforms, None)
+    assert fitter.pulse.fwhm == pytest.approx(sensor.fwhm, rel=0.06)
+    with np.load(path.with_suffix(".npz")) as truth:
+        packet, time = truth["packet"], truth["time"]
+    for row in range(0, 40, 4):
+        true, times = np.sort(time[packet == row]), fitter.fit(waveforms[row])[0][:, 0]
+        assert len(times) == len(true)
+        assert np.abs(times - true).max(initial=0) < 0.2 * sensor.fwhm
