@@ -112,7 +112,7 @@ dist: $(VENV)/.test
 	$(BIN)/python tests/wheels.py dist
 
 figures: $(VENV)/.test
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/figures.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/printed_figures.py
 
 man: $(VENV)/.test
 	$(BIN)/wavebatch --man-pages build/man

@@ -1,7 +1,7 @@
 """Every command that README, docs and examples show is run on an empty disk; what they print is compared.
 
-Below a `$ wavebatch` command stand lines of its output, which it must print (tests/figures.py). All others must end
-with exit code 0.
+Below a `$ wavebatch` command stand lines of its output, which it must print (tests/printed_figures.py). All others
+must end with exit code 0.
 """
 
 import glob
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from figures import PAGES, renew, renew_page, split, strips_of
+from printed_figures import PAGES, renew, renew_page, split, strips_of
 
 from wavebatch.cli import COMMANDS, main
 

@@ -1,6 +1,6 @@
 """Figures that README and docs print: runs the commands of their blocks, and writes what they print into the blocks.
 
-    python tests/figures.py [PAGE ...]        (`make figures`; needs the strip of a RIEGL LMS-Q680i, see strips_of)
+    python tests/printed_figures.py [PAGE ...]   (`make figures`; needs a RIEGL LMS-Q680i strip, see strips_of)
 
 A block is indented by four blanks; below `$ wavebatch ...` stand lines of what the command prints. A page may leave
 lines out, cut one with `...`, and set blanks as it likes; its words and numbers must stand side by side in the output.
