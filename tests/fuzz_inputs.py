@@ -147,9 +147,9 @@ info {resumed}/strip.laz
 """,
     "settings.toml": """
 run {base}/strip.las -o {out} -q
-stats {base}/strip.las
-slice {base}/strip.las -o {out}/a.csv
-voxelize {base}/strip.las -o {out}/a.npz --size 1
+stats --config {input} {base}/strip.las
+slice --config {input} {base}/strip.las -o {out}/a.csv
+voxelize --config {input} {base}/strip.las -o {out}/a.npz --size 1
 """,
 }
 _ARRAYS = {
@@ -282,7 +282,7 @@ def _write_texts(base: Path) -> None:
         'divergence_mrad = 0.5\nstrip = "a.las"\n'
     )
     (base / "settings.toml").write_text(
-        '[run]\nprofile = "fast"\nclasses = [0, 1, 2]\nformat = "las"\nno-data = "nan"\n'
+        '[run]\nprofile = "fast"\nclasses = [0, 1, 2]\nno-data = "nan"\n'
         'where = "amplitude > 3"\n\n[slice]\nsigma = 2.5\nlines = "0:2"\n\n[voxelize]\nmethod = "gold"\n'
         "iterations = 3\n"
         '\n[stats]\narea = "5"\n'

@@ -137,4 +137,4 @@ def test_quiet_samples_are_looked_for_again_with_a_narrower_pulse():
     middle = np.median(np.concatenate([block.point for block in blocks]))
     parts = [block.rows(np.flatnonzero(block.point > middle)) for block in blocks]
     noise = survey_blocks([part for part in parts if len(part)]).system.noise
-    assert 2.5 < noise.by_kind["quiet"] < 3.8 and 5 < noise.std < 8
+    assert 2.5 < noise.by_kind["quiet"] < 3.8 and 5 < noise.std < 9.5

@@ -196,7 +196,8 @@ def _find_alternation(pulses: np.ndarray) -> float:
         light = np.log(pulses[1] / pulses[2])
     most = 0.0
     for channel in np.unique(pulses[3]):
-        own = light[pulses[3] == channel]
+        # Packets without signal, and pulses of unknown energy, have no light to compare.
+        own = light[(pulses[3] == channel) & np.isfinite(light)]
         if len(own) > LEAST_COMPARED:
             near, *far = (float(np.nanmedian(np.abs(own[k:] - own[:-k]))) for k in (1, *PERIODS))
             most = max(most, near) if near > LEAST_APART and min(far) < LIKE * near else most
@@ -212,8 +213,11 @@ def _compare_drift(reader: StripReader, scan: StripScan, energy: PulseEnergy) ->
         for part in np.array_split(np.flatnonzero(unit.packets.owned), -(-PLACES // len(numbers))):
             with np.errstate(invalid="ignore", divide="ignore"):
                 pulses = _join(reader, unit, part[even_places(len(part), OF_PLACE)], energy)
-                found.append(np.nanmedian(np.log(pulses[1:3]), axis=1))
-    light, sent = np.array(found)[np.isfinite(found).all(axis=1)].T if found else np.empty((2, 0))
+                both = np.log(pulses[1:3])
+            both = both[:, np.isfinite(both).all(axis=0)]
+            if both.size:
+                found.append(np.median(both, axis=1))
+    light, sent = np.array(found).T if found else np.empty((2, 0))
     if len(sent) < LEAST_PLACES:
         return 0.0
     sent, light = sent - sent.mean(), light - light.mean()
