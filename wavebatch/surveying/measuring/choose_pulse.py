@@ -18,7 +18,14 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
 from wavebatch.stages.pulse_tables import shape_limits
 from wavebatch.surveying.measuring.joint_pulse import learn_jointly
-from wavebatch.surveying.measuring.judge import describe_waveforms, explain, find_own_width, measure_change
+from wavebatch.surveying.measuring.judge import (
+    SURE,
+    count_errors,
+    describe_waveforms,
+    explain,
+    find_own_width,
+    measure_change,
+)
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
 
@@ -43,9 +50,8 @@ COVERED = 3.2
 BORNE = 1.0, 2.0, COVERED, 5.0
 """Misfits of the chosen pulse that are tried, over its change from shot to shot."""
 
-SURE, HOPELESS = 3.0, 8.0
-"""Standard errors by which a description must be shorter to be better; and by which it is longer where no change of
-shape is worth trying."""
+HOPELESS = 8.0
+"""Standard errors by which a description is longer where no change of shape is worth trying."""
 
 FEWEST = 48
 """Waveforms on which each candidate is judged first."""
@@ -56,9 +62,6 @@ a higher threshold than these add: echoes of 4 to 6 noises are some 2 % of a sce
 
 STEP, LARGEST = 1.6, 0.1
 """Factor by which the misfit grows at a time, and its largest value: what exceeds it is no pulse of this strip."""
-
-WORTH = 0.2
-"""Echoes in the mirror per echo that is false: misfit that leaves an echo of one sign has no twin there."""
 
 LEAST_MISFIT = 0.0005
 """Misfit to begin with where there is none: half a noise at 1,000 noises."""
@@ -91,8 +94,7 @@ class Candidate:
     def exceeds(self, other: Candidate) -> float:
         """Standard errors by which descriptions are longer than with another candidate."""
         more = self.length - other.length
-        more = np.clip(more, *np.quantile(more, (0.02, 0.98)))
-        return float(more.mean() / max(more.std() / np.sqrt(len(more)), 1e-9))
+        return count_errors(np.clip(more, *np.quantile(more, (0.02, 0.98))))
 
 
 class Tried(NamedTuple):
@@ -232,15 +234,17 @@ def _decide(found: list[Candidate], held: WaveformBlock) -> Choice:
 
 
 def _choose_misfit(block: WaveformBlock, best: Candidate) -> SystemPulse:
-    """The system with the least misfit, over its change, that no other one beats surely: it decides what is split."""
+    """The system with the least misfit, over its change, that no other one beats surely: it decides what is split.
+
+    All waveforms count in full: a misfit loses or saves the echoes of a few, which are then the outliers.
+    """
     tried = []
     for share in BORNE:
         system = _bear(best.system, share * best.change / COVERED)
         explained = explain(block, system, least_width=STRICT, width_prior=0.0)
-        length = describe_waveforms(block, system, explained, best.change)
-        tried.append(replace(best, system=system, length=length))
-    least = min(tried, key=lambda one: one.typical)
-    return next(one.system for one in tried if one.exceeds(least) < SURE)
+        tried.append((system, describe_waveforms(block, system, explained, best.change)))
+    least = min((length for _, length in tried), key=np.mean)
+    return next(system for system, length in tried if count_errors(length - least) < SURE)
 
 
 def settle(block: WaveformBlock, system: SystemPulse) -> tuple[SystemPulse, Mirror]:
@@ -271,20 +275,14 @@ def settle(block: WaveformBlock, system: SystemPulse) -> tuple[SystemPulse, Mirr
     while tried[-1][1].beside > bound(FALSE_BESIDE, tried[-1][1].mains) and tried[-1][0].misfit < LARGEST:
         harder = replace(system, misfit=min(max(STEP * tried[-1][0].misfit, LEAST_MISFIT), LARGEST))
         tried.append((harder, look_in_mirror(part, harder)))
-    system, mirror = max(tried, key=_worth)
+    system, mirror = max(tried, key=lambda one: one[1].worth)
     tried = [(system, mirror)]
     for significance in np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER):
         if tried[-1][1].quiet <= bound(FALSE_QUIET, tried[-1][1].echoes):
             break
         harder = replace(system, significance=float(significance))
         tried.append((harder, look_in_mirror(part, harder)))
-    return max(tried, key=_worth)
-
-
-def _worth(tried: tuple[SystemPulse, Mirror]) -> float:
-    """Echoes that are found, less those that are false by the mirror."""
-    _, mirror = tried
-    return mirror.echoes - (mirror.beside + mirror.quiet) / WORTH
+    return max(tried, key=lambda one: one[1].worth)
 
 
 def bound(share: float, number: int) -> float:

@@ -41,6 +41,9 @@ SCATTERS = 0.01, 0.02, 0.04, 0.06
 """Scatter of the widths of level ground beyond their errors that is tried [widths]: no pulse model is exact, and pulses
 change from shot to shot."""
 
+SURE = 3.0
+"""Standard errors by which a description must be shorter to be better."""
+
 KNOWN, LEAST_KNOWN = 0.15, 10
 """Largest error of a width that tells of the density of widths, as a share of it; and fewest widths that do."""
 
@@ -144,6 +147,11 @@ def describe_waveforms(
     orders = np.r_[0.0, np.cumsum(log(np.arange(1.0, max(int(number.max(initial=0)), 1) + 1)))]
     count = log(1 + mean) - number * log(mean / (1 + mean)) - orders[number]
     return length + volume + count + np.bincount(echoes.waveform, cost, minlength=n)
+
+
+def count_errors(values: np.ndarray) -> float:
+    """Return the mean of values (n,) over its standard error."""
+    return float(values.mean() / max(values.std() / np.sqrt(len(values)), 1e-9))
 
 
 def find_own_width(explained: Explained, ref: float) -> float:

@@ -23,6 +23,9 @@ ZONE, SAME = 2.0, 1.0
 """Distance from a main echo up to which what is false is its misfit, and distance up to which an echo of the mirror is
 that of the waveform [full widths at half maximum]."""
 
+WORTH = 0.2
+"""Echoes in the mirror per echo that is false: misfit that leaves an echo of one sign has no twin there."""
+
 
 @dataclass(frozen=True, slots=True)
 class Mirror:
@@ -35,6 +38,11 @@ class Mirror:
     echoes: int
     quiet: int
     """Unmatched ones further than ZONE from any echo."""
+
+    @property
+    def worth(self) -> float:
+        """Echoes that are found, less those that are false by the mirror."""
+        return self.echoes - (self.beside + self.quiet) / WORTH
 
 
 def look_in_mirror(block: WaveformBlock, system: SystemPulse) -> Mirror:
