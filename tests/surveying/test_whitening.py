@@ -97,6 +97,16 @@ def test_what_decides(given, is_whitened):
     assert bool(choose_whitening(block, system_of(**noise)).noise.whitening) is is_whitened
 
 
+@pytest.mark.parametrize(("change", "is_whitened"), [(0.005, True), (0.02, False)])
+def test_a_pulse_that_changes_is_not_whitened(change, is_whitened):
+    """Its lone echoes leave white noise, but fits that are whitened take 5 % of its changes for echoes."""
+    block, _ = record(1000, (200.0,), distort=change * np.random.default_rng(9).standard_normal((1000, 1)))
+    system = replace(system_of(), misfit=change)
+    assert len(find(block, system)) == 1000
+    assert (len(find(block, whiten(system))) > 1020) is not is_whitened
+    assert bool(choose_whitening(block, system, change).noise.whitening) is is_whitened
+
+
 def test_a_survey_decides():
     block, _ = record(1000, (120.0,))
     near, far = survey_block(block).system.noise.whitening

@@ -18,7 +18,7 @@ from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_sa
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.hidden_neighbours import measure_hidden
-from wavebatch.surveying.measuring.choose_pulse import COVERED, Tried, choose_pulse, settle
+from wavebatch.surveying.measuring.choose_pulse import Tried, choose_pulse, settle
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
     find_isolated,
@@ -394,9 +394,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = measure_tail(block, system, find_strong(clear))
         if not (system.components or system.kappa):
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
-        system = choose_whitening(part, system)
-        if system.noise.whitening:  # such fits see a change of the pulse's shape as sharply as the judge does
-            system = replace(system, misfit=max(COVERED * choice.best.change, system.misfit))
+        system = choose_whitening(part, system, choice.best.change)
         system, mirror = settle(block, system)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)

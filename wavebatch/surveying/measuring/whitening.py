@@ -9,6 +9,7 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
+from wavebatch.surveying.measuring.judge import SURE, count_errors, describe_waveforms, explain
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.measuring.residuals import decompose_sample
 
@@ -27,8 +28,8 @@ MOST_LEFT = 1.3
 filter for noise makes more of that."""
 
 
-def choose_whitening(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
-    """Let fits whiten the noise where it is coloured, and where lone echoes then leave white noise.
+def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 0.0) -> SystemPulse:
+    """Let fits whiten coloured noise where lone echoes then leave white noise, and the judge does not object.
 
     Parameters
     ----------
@@ -36,6 +37,8 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
         A sample of the strip.
     system : SystemPulse
         Its pulse and noise.
+    change : float
+        Of the pulse from shot to shot, as a share of its amplitude.
 
     Returns
     -------
@@ -50,7 +53,11 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     echoes = decompose_sample(block, whitened)
     strong = echoes.alone(len(block)) & (echoes.amplitude > STRONG * system.noise.std)
     left = echoes.residual[strong & ((echoes.flags & np.uint16(UNCLEAN)) == 0)].astype(np.float64) ** 2
-    return whitened if len(left) >= FEW and np.median(left) <= MOST_LEFT else plain
+    if len(left) < FEW or np.median(left) > MOST_LEFT:
+        return plain
+    # Whitened fits take small changes of the pulse for echoes: the description, which knows both, is then longer.
+    lengths = [describe_waveforms(block, way, explain(block, way), change) for way in (whitened, plain)]
+    return whitened if count_errors(lengths[0] - lengths[1]) <= SURE else plain
 
 
 def _predicted(whitening: tuple[float, float]) -> float:
