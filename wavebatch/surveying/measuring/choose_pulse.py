@@ -47,24 +47,19 @@ COVERED = 3.2
 """Misfit over the change from shot to shot: two directions of change promise more than this squared to one echo in
 200 (chi2 with two degrees of freedom exceeds 10.6 so often)."""
 
-BORNE = 1.0, 2.0, COVERED, 5.0
-"""Misfits of the chosen pulse that are tried, over its change from shot to shot."""
-
 HOPELESS = 8.0
 """Standard errors by which a description is longer where no change of shape is worth trying."""
 
 FEWEST = 48
 """Waveforms on which each candidate is judged first."""
 
-FALSE_BESIDE, FALSE_QUIET = 0.005, 0.0075
-"""Mirrored echoes that are borne: per main echo beside it, and per echo elsewhere. A survey's user loses more points to
-a higher threshold than these add: echoes of 4 to 6 noises are some 2 % of a scene's."""
+MISFITS = 0.0005 * 2.0 ** np.arange(9)
+"""Misfits of the chosen pulse that are tried: half a noise at 1,000 noises up to an eighth of the pulse, beyond which it
+is no pulse of this strip."""
 
-STEP, LARGEST = 1.6, 0.1
-"""Factor by which the misfit grows at a time, and its largest value: what exceeds it is no pulse of this strip."""
-
-LEAST_MISFIT = 0.0005
-"""Misfit to begin with where there is none: half a noise at 1,000 noises."""
+FALSE_QUIET = 0.0075
+"""Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
+threshold than these add: echoes of 4 to 6 noises are some 2 % of a scene's."""
 
 SIGNIFICANCE, FINER, MOST_SIGNIFICANT = 4.5, 0.5, 6.5
 """Least energy of an echo to begin with, step by which it grows, and where it ends [standard deviations]."""
@@ -173,7 +168,7 @@ def choose_pulse(
     found = [_try_changes(held, one.name, one.system, known=one.name in given) for one in hopeful]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
     found += [_try_changes(held, name, system) for name, system in _learn(learn, begin)]
-    return _decide(found, held)
+    return _decide(found)
 
 
 def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
@@ -220,7 +215,7 @@ def _try_changes(block: WaveformBlock, name: str, system: SystemPulse, *, known:
     return next(one for one in tried if one.exceeds(best) < SURE)
 
 
-def _decide(found: list[Candidate], held: WaveformBlock) -> Choice:
+def _decide(found: list[Candidate]) -> Choice:
     """The candidate with the simplest pulse, then the fewest echoes, that no other one beats surely."""
     ordered = sorted(found, key=lambda one: (one.gaussians, one.echoes, one.name))
     best = ordered[0]
@@ -228,63 +223,60 @@ def _decide(found: list[Candidate], held: WaveformBlock) -> Choice:
         if best.exceeds(one) > SURE:
             best = one
     tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
-    best = replace(best, system=_choose_misfit(held, best))
     doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
 
 
-def _choose_misfit(block: WaveformBlock, best: Candidate) -> SystemPulse:
-    """The system with the least misfit, over its change, that no other one beats surely: it decides what is split.
-
-    All waveforms count in full: a misfit loses or saves the echoes of a few, which are then the outliers.
-    """
-    tried = []
-    for share in BORNE:
-        system = _bear(best.system, share * best.change / COVERED)
-        explained = explain(block, system, least_width=STRICT, width_prior=0.0)
-        tried.append((system, describe_waveforms(block, system, explained, best.change)))
-    least = min((length for _, length in tried), key=np.mean)
-    return next(system for system, length in tried if count_errors(length - least) < SURE)
-
-
-def settle(block: WaveformBlock, system: SystemPulse) -> tuple[SystemPulse, Mirror]:
-    """Raise misfit and significance until mirrored residuals hold no more echoes than may be false.
+def settle(block: WaveformBlock, system: SystemPulse, change: float) -> tuple[SystemPulse, Mirror]:
+    """Choose the misfit that describes waveforms shortest, then raise the significance until noise adds no echoes.
 
     Parameters
     ----------
     block : WaveformBlock
         Cleaned waveforms.
     system : SystemPulse
-        With the misfit that the judge chose.
+        With the pulse that the judge chose.
+    change : float
+        Of the pulse from shot to shot, as a share of its amplitude.
 
     Returns
     -------
     system : SystemPulse
         With `misfit` and `significance`.
     mirror : Mirror
-        What is left.
-
-    Notes
-    -----
-    Near strong echoes the pulse's misfit, which echoes absorb, shows in the mirror; in quiet stretches noise does. Each
-    is raised while the mirror shows more than it may, and stays where the echoes that are found less those that are
-    false are most: where mirrored echoes do not follow, what they show is not cured so.
+        Echoes of mirrored residuals that are left.
     """
     part = thin_block(block, int(np.clip(4 * SAMPLES // block.samples.shape[1], 2 * LEAST, 2048)))
+    system = replace(system, misfit=_choose_misfit(part, system, change))
     tried = [(system, look_in_mirror(part, system))]
-    while tried[-1][1].beside > bound(FALSE_BESIDE, tried[-1][1].mains) and tried[-1][0].misfit < LARGEST:
-        harder = replace(system, misfit=min(max(STEP * tried[-1][0].misfit, LEAST_MISFIT), LARGEST))
-        tried.append((harder, look_in_mirror(part, harder)))
-    system, mirror = max(tried, key=lambda one: one[1].worth)
-    tried = [(system, mirror)]
     for significance in np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER):
-        if tried[-1][1].quiet <= bound(FALSE_QUIET, tried[-1][1].echoes):
+        if tried[-1][1].quiet <= _bound(FALSE_QUIET, tried[-1][1].echoes):
             break
         harder = replace(system, significance=float(significance))
         tried.append((harder, look_in_mirror(part, harder)))
     return max(tried, key=lambda one: one[1].worth)
 
 
-def bound(share: float, number: int) -> float:
+def _choose_misfit(block: WaveformBlock, system: SystemPulse, change: float) -> float:
+    """Return the least misfit whose description is longer than the shortest by at most one standard error.
+
+    It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
+    much of it neighbours are not found, and both lengthen the description. Between two misfits that are tried it is
+    found by their standard errors: halves of a strip then agree.
+    """
+    lengths = []
+    for misfit in MISFITS:
+        explained = explain(block, replace(system, misfit=float(misfit)))
+        lengths.append(describe_waveforms(block, system, explained, change))
+    least = min(lengths, key=np.mean)
+    longer = [count_errors(length - least) for length in lengths]
+    first = next(place for place, errors in enumerate(longer) if errors <= 1)
+    if first == 0:
+        return 0.0
+    share = (longer[first - 1] - 1) / (longer[first - 1] - longer[first])
+    return float(MISFITS[first - 1] * (MISFITS[first] / MISFITS[first - 1]) ** share)
+
+
+def _bound(share: float, number: int) -> float:
     """Events of this probability that `number` tries show without being more than chance: one standard deviation."""
     return share * number + np.sqrt(share * number)

@@ -150,8 +150,8 @@ def describe_waveforms(
 
 
 def count_errors(values: np.ndarray) -> float:
-    """Return the mean of values (n,) over its standard error."""
-    return float(values.mean() / max(values.std() / np.sqrt(len(values)), 1e-9))
+    """Return the mean of values (n,) [nats] over its standard error; a sum below one nat says nothing."""
+    return float(values.sum() / max(values.std() * np.sqrt(len(values)), 1.0))
 
 
 def find_own_width(explained: Explained, ref: float) -> float:

@@ -11,12 +11,15 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
+from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.stages.score import match_echoes
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, find_strongest
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW
-from wavebatch.surveying.measuring.residuals import subtract_echoes
+from wavebatch.surveying.measuring.residuals import decompose_sample, render_own, subtract_echoes
 
 CLIPPED = 0.1
 """Share of clipped waveforms from which the bound is what a Gaussian leaves in common, and no learned pulse can exceed:
@@ -31,9 +34,11 @@ TAIL_BEFORE, TAIL_AFTER = 15, 40
 BESIDE, NOT_ABSORBED = 10, 3
 """Widths of the pulse beside an echo up to which what is left is measured, and from which."""
 
-MOSTLY_FREE = 0.25
-"""Share of the samples at a distance that must be free of other echoes: the few that are beside many hold echoes that
-were not found."""
+ADDED, MOST_TURNS = 1024, 8
+"""Echoes that are added, some 60 for each width of lag, and how often to the same waveforms at most."""
+
+HEIGHTS = 10.0, 40.0
+"""Amplitudes over noise of echoes that are added: found beside strong ones too, and small enough to be moved by them."""
 
 ONE_SIGMA = 0.6827
 """Share of normal values within one standard deviation."""
@@ -59,7 +64,7 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -
 
 
 def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
-    """The system with what fits leave beside strong echoes: of their pulse, and of targets too weak to be found.
+    """Measure how much further than noise an echo is off beside strong ones, by echoes that are added to waveforms.
 
     Parameters
     ----------
@@ -71,36 +76,64 @@ def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     Returns
     -------
     SystemPulse
-        `beside`: by lag, the variance of a pulse's amplitude there beyond that of noise, over that of noise.
+        `beside`: by lag, the variance of an amplitude there beyond that of noise, over that of noise.
 
     Notes
     -----
-    Around the strongest echo of each waveform, where no other echo was found (docs/algorithms.md R3). Nearer than
-    NOT_ABSORBED its own fit takes what is left.
+    Beside the strongest echo of each waveform, where no other echo is near (docs/algorithms.md R3). What a pulse leaves
+    there is not all error: echoes and levels of a fit absorb some of it. Echoes that are added and found show the rest.
+    Nearer than NOT_ABSORBED the strong echo's own fit takes what is left.
     """
     strongest, _ = find_strongest(echoes, len(block))
     strong = echoes.take(strongest[echoes.amplitude[strongest] > MIN_SNR * system.noise.std])
+    strong = strong.take(np.arange(0, len(strong), max(len(strong) // ADDED, 1)))
     if len(strong) < FEW:
         return system
-    ref = system.sigma_ref / block.spacing
-    taps = gaussian_taps(ref)
-    left = np.nan_to_num(subtract_echoes(block, system, echoes))[strong.waveform]
-    seen = filter_symmetric(left.T, taps).T / (np.sqrt(filter_energy(taps)) * system.noise.std)
-    lag = (np.arange(left.shape[1]) - (strong.time / block.spacing)[:, None]) / ref
-    free = np.ones(lag.shape, bool)
-    owner = np.full(len(block), -1)
-    owner[strong.waveform] = np.arange(len(strong))
-    others = echoes.take(np.flatnonzero((owner[echoes.waveform] >= 0) & ~np.isin(np.arange(len(echoes)), strongest)))
-    for row, time in zip(owner[others.waveform], others.time / block.spacing, strict=True):
-        free[row, max(int(time - NOT_ABSORBED * ref), 0) : int(time + NOT_ABSORBED * ref) + 2] = False
+    turns = range(min(-(-ADDED // len(strong)), MOST_TURNS))
+    lag, off = zip(*(_add_beside(block, system, echoes, strong, turn) for turn in turns), strict=True)
+    lag, off = np.concatenate(lag), np.concatenate(off)
     profile = []
     for place in range(-BESIDE, BESIDE + 1):
-        near = (lag >= place - 0.5) & (lag < place + 0.5)
-        here = np.abs(seen[free & near])
-        if abs(place) >= NOT_ABSORBED and len(here) >= max(ENOUGH_TO_LEARN, MOSTLY_FREE * np.count_nonzero(near)):
+        here = np.abs(off[np.abs(lag - place) <= 1])
+        if abs(place) >= NOT_ABSORBED and len(here) >= ENOUGH_TO_LEARN:
             variance = float(np.quantile(here, ONE_SIGMA)) ** 2 - 1
             profile.append((float(place * system.sigma_ref), max(variance, 0.0)))
     return replace(system, beside=tuple(profile))
+
+
+def _add_beside(
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, strong: EchoTable, turn: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lags of echoes that were added and found [widths], and how far their times and amplitudes are off [errors]."""
+    rng = np.random.default_rng(turn)
+    block, ref = block.rows(strong.waveform), system.sigma_ref
+    n, s = block.samples.shape
+    lag = rng.choice([-1, 1], n) * rng.uniform(NOT_ABSORBED - 1, BESIDE + 1, n)
+    height = system.noise.std * exp(rng.uniform(*log(np.array(HEIGHTS)), n))
+    added = EchoTable.build(np.arange(n), strong.time + lag * ref, height, np.full(n, ref))
+    owner = np.full(int(max(echoes.waveform.max(), strong.waveform.max())) + 1, -1)
+    owner[strong.waveform] = np.arange(n)
+    here = echoes.take(np.flatnonzero(owner[echoes.waveform] >= 0))
+    here = replace(here, waveform=owner[here.waveform].astype(here.waveform.dtype))
+    # The strong one itself is so near at most; any other is nearer than a fit takes apart from the one that is added.
+    crowded = match_echoes(here, added, (NOT_ABSORBED - 1) * ref).truth
+    place = np.rint(added.time / block.spacing).astype(np.int64)
+    drawn = render_own(block, system, added, np.arange(n), n)
+    inside = (place >= 0) & (place < s)
+    inside[crowded] = False
+    summed = block.samples + drawn
+    inside &= (summed < clip_level(block, system)).all(axis=1)
+    if block.missing is not None:
+        inside &= ~(block.missing & (drawn > 0.01 * height[:, None])).any(axis=1)
+    rows = np.flatnonzero(inside)
+    found = decompose_sample(replace(block, samples=summed.astype(np.float32)).rows(rows), replace(system, beside=()))
+    added = replace(added.take(rows), waveform=np.arange(len(rows), dtype=added.waveform.dtype))
+    pair = match_echoes(found, added, ref)
+    off = [
+        (getattr(found, name)[pair.found] - getattr(added, name)[pair.truth]) / getattr(found, f"{name}_err")[pair.found]
+        for name in ("time", "amplitude")
+    ]
+    return np.tile(lag[rows][pair.truth], len(off)), np.concatenate(off)
 
 
 def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[tuple[float, float], ...]:
