@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from bench.real.pool import read_pool
 
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.defects import find_spikes
@@ -255,11 +256,11 @@ def test_wandering_levels_that_echoes_hide_make_no_echoes(s, seed):
     assert found > 0.995 and true > 0.975
 
 
-def two_recordings(seed, n=600):
-    """Packets of two recordings that meet at sample 60, which is interpolated: .3 to .7 samples are lost there."""
+def two_recordings(seed, lost, n=600):
+    """Packets of two recordings that meet at sample 60, which is interpolated; lost: samples between them."""
     rng = np.random.default_rng(seed)
     time = rng.uniform(50, 72, n)
-    at = np.arange(120.0) - (np.arange(120) > 60) * rng.uniform(0.3, 0.7, (n, 1))
+    at = np.arange(120.0) - (np.arange(120) > 60) * rng.uniform(*lost, (n, 1))
     exact = BASE + rng.uniform(60, 200, (n, 1)) * bell((at - time[:, None]) / 1.7) + rng.normal(0, 0.7, (n, 120))
     counts = np.rint(exact)
     counts[:, 60] = np.rint(0.5 * (counts[:, 59] + counts[:, 61]))
@@ -267,8 +268,8 @@ def two_recordings(seed, n=600):
 
 
 def test_an_interpolated_seam_between_two_recordings_is_no_signal():
-    """An echo across it was fitted as two, or at a bound (GeoLas: 21 % of the echoes near the seam)."""
-    block, time = two_recordings(14)
+    """Echoes across it were 2 ns off (a hole of eight samples), or two: by the interpolated sample."""
+    block, time = two_recordings(14, (0.0, 0.0))
     survey = survey_blocks([block])
     assert survey.system.seams == {120: 60}
     assert any("two recordings" in decision.reason for decision in survey.decisions)
@@ -277,9 +278,22 @@ def test_an_interpolated_seam_between_two_recordings_is_no_signal():
     for system in (survey.system, replace(survey.system, seams={})):
         echoes = load_profile("accurate").run(block, system)
         numbers.append(echoes.count(len(block))[across].mean())
-    assert numbers[0] < 1.05 < numbers[1]
+        if system.seams:
+            alone = echoes.take(np.flatnonzero(across[echoes.waveform] & echoes.alone(len(block))))
+            off = alone.time - time[alone.waveform]
+            assert np.quantile(np.abs(off), 0.9) < 0.1
+            assert 0.85 < np.std(off / alone.time_err) < 1.15
+    assert numbers[0] < 1.01 < 1.1 < numbers[1]
     kept = parse_survey(format_survey(SavedSurvey(survey, "x", {})), "x")
     assert kept.survey.system.seams == {120: 60}
+
+
+def test_echoes_across_recordings_that_lose_time_are_flagged():
+    block, time = two_recordings(14, (0.3, 0.7))
+    survey = survey_blocks([block])
+    echoes = load_profile("accurate").run(block, survey.system)
+    near = np.abs(echoes.time - 60) < 1.5
+    assert near.any() and (echoes.flags[near] & int(EchoFlag.NEAR_EDGE)).all()
 
 
 def test_strips_without_defects_keep_their_counts():

@@ -23,7 +23,7 @@ from wavebatch.kernels.signal.defects import (
     fit_slopes,
 )
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
-from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_fill, transpose_samples
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, transpose_samples
 from wavebatch.stages.pulse_tables import clip_level
 
 GUARD = 3.0
@@ -44,9 +44,6 @@ SLOPES, STEEP = 0.02, 5.0
 
 LEAST_RISE = 0.5
 """... and standard deviation of the baseline's rise over half of a waveform [noise of a sample]."""
-
-FLANK = 4
-"""Samples beside a seam that hold the flank of an echo of the other recording."""
 
 LEAST_WAVEFORMS, MOST_WAVEFORMS = 50, 2048
 """Waveforms from which defects are looked for, and how many are looked at."""
@@ -105,10 +102,10 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
 
 
 def mark_seam(block: WaveformBlock, seams: Mapping[int, int]) -> WaveformBlock:
-    """Mark the samples of a block's seam as missing.
+    """Mark the interpolated sample of a block's seam as missing; it keeps its count, by which echoes are looked for.
 
-    These are the interpolated sample, its neighbours, and FLANK more in the recording with less signal there: the time
-    between both recordings is not known to a sample, so no pulse fits an echo across the seam.
+    All others were recorded. Where time is lost between both recordings a fit across them misses its samples, and its
+    errors say so; echoes this near to a gap are flagged.
 
     Parameters
     ----------
@@ -121,12 +118,8 @@ def mark_seam(block: WaveformBlock, seams: Mapping[int, int]) -> WaveformBlock:
     if not 0 < at < block.samples.shape[1] - 1:
         return block
     missing = np.zeros(block.samples.shape, bool) if block.missing is None else block.missing.copy()
-    missing[:, at - 1 : at + 2] = True
-    before, after = block.samples[:, max(at - 1 - FLANK, 0) : at - 1], block.samples[:, at + 2 : at + 2 + FLANK]
-    later = after.max(axis=1, initial=0) > before.max(axis=1, initial=0)
-    missing[:, max(at - 1 - FLANK, 0) : at - 1] |= later[:, None]
-    missing[:, at + 2 : at + 2 + FLANK] |= ~later[:, None]
-    return replace(block, samples=quiet_fill(block.samples, missing), missing=missing)
+    missing[:, at] = True
+    return replace(block, missing=missing)
 
 
 def find_seams(blocks: Iterable[WaveformBlock]) -> dict[int, int]:

@@ -137,6 +137,11 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
     ----------
     docs/algorithms.md R3.
     """
+    return scale_errors(table, misfit_factor(table, system, spacing))
+
+
+def misfit_factor(table: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:
+    """Return by how much errors (m,) are larger than those of noise alone; arguments as for `cover_misfit`."""
     variance = np.zeros(len(table))
     lags, beside = np.array(system.beside or ((0.0, 0.0),)).T
     energy = SQRT_PI * system.sigma_ref / spacing / system.noise.std**2
@@ -145,8 +150,7 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
         strong = (table.amplitude[other] > CLEAR * system.noise.std) & (np.abs(lag) < BESIDE * system.sigma_ref)
         more = energy * core**2 + np.where(strong, np.interp(lag, lags, beside), 0.0)
         variance[row] = np.maximum(variance[row], more)
-    factor = np.sqrt(find_unexplained(table, system, spacing) * (1 + variance))
-    return scale_errors(table, factor)
+    return np.sqrt(find_unexplained(table, system, spacing) * (1 + variance))
 
 
 def use_noise_errors(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:

@@ -38,7 +38,8 @@ static void filter_symmetric(int64_t s, const float *x, const float *taps, int64
     }
 }
 
-/* A waveform above its level, with 0 where no sample was recorded; returns whether its counts differ. */
+/* A waveform above its level, with 0 where no sample was recorded, and the mean of its neighbours for a single one: an
+   echo across it is one. Returns whether its counts differ. */
 static int read_signal(const Block *b, int64_t waveform, float *signal) {
     const int64_t s = b->length, first = waveform * s;
     int varies = 0;
@@ -47,6 +48,10 @@ static int read_signal(const Block *b, int64_t waveform, float *signal) {
     take_level(b, waveform, first, s, signal);
     for (int64_t i = 0; i < s && b->missing; i++)
         if (b->missing[first + i]) signal[i] = 0;
+    for (int64_t i = 1; i < s - 1 && b->missing; i++) {
+        const uint8_t *gap = b->missing + first + i;
+        if (gap[0] && !gap[-1] && !gap[1]) signal[i] = 0.5f * (signal[i - 1] + signal[i + 1]);
+    }
     return varies;
 }
 

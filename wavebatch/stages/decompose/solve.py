@@ -315,7 +315,8 @@ def describe_solution(
     keep = (energy >= (significance * noise.std[waveform]) ** 2) & (time >= -0.5 * width) & (time <= last + 0.5 * width)
     keep &= np.isfinite(errors).all(axis=1)
     if block.missing is not None:
-        keep &= gap_distance(block.missing, waveform, time) >= -0.5 * width
+        # An echo between two recorded samples is known, however narrow it is.
+        keep &= gap_distance(block.missing, waveform, time) >= -np.maximum(0.5 * width, 1.0)
     amplitude, time, width = parameters[keep].T
     amplitude_err, time_err, width_err = errors[keep].T
     spacing = block.spacing

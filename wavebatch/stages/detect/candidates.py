@@ -29,7 +29,11 @@ def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
     signal = transpose_samples(block.samples)
     signal -= noise.level.T
     if block.missing is not None:
-        signal[block.missing.T] = 0
+        missing = block.missing.T
+        signal[missing] = 0
+        # An echo across a single sample is one.
+        single = missing[1:-1] & ~missing[:-2] & ~missing[2:]
+        signal[1:-1] = np.where(single, 0.5 * (signal[:-2] + signal[2:]), signal[1:-1])
     return signal
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
-from wavebatch.stages.pulse_tables import shape_limits
+from wavebatch.stages.pulse_tables import clip_level, shape_limits
 from wavebatch.surveying.measuring.joint_pulse import learn_jointly
 from wavebatch.surveying.measuring.judge import (
     SURE,
@@ -227,7 +227,7 @@ def _decide(found: list[Candidate]) -> Choice:
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
 
 
-def settle(block: WaveformBlock, system: SystemPulse, change: float) -> tuple[SystemPulse, Mirror]:
+def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0) -> tuple[SystemPulse, Mirror]:
     """Choose the misfit that describes waveforms shortest, then raise the significance until noise adds no echoes.
 
     Parameters
@@ -236,8 +236,8 @@ def settle(block: WaveformBlock, system: SystemPulse, change: float) -> tuple[Sy
         Cleaned waveforms.
     system : SystemPulse
         With the pulse that the judge chose.
-    change : float
-        Of the pulse from shot to shot, as a share of its amplitude.
+    seen : float
+        Change of the pulse from shot to shot that its strongest echoes show, as a share of the amplitude.
 
     Returns
     -------
@@ -247,7 +247,7 @@ def settle(block: WaveformBlock, system: SystemPulse, change: float) -> tuple[Sy
         Echoes of mirrored residuals that are left.
     """
     part = thin_block(block, int(np.clip(4 * SAMPLES // block.samples.shape[1], 2 * LEAST, 2048)))
-    system = replace(system, misfit=_choose_misfit(part, system, change))
+    system = replace(system, misfit=_choose_misfit(part, system, seen))
     tried = [(system, look_in_mirror(part, system))]
     for significance in np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER):
         if tried[-1][1].quiet <= _bound(FALSE_QUIET, tried[-1][1].echoes):
@@ -257,17 +257,22 @@ def settle(block: WaveformBlock, system: SystemPulse, change: float) -> tuple[Sy
     return max(tried, key=lambda one: one[1].worth)
 
 
-def _choose_misfit(block: WaveformBlock, system: SystemPulse, change: float) -> float:
+def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> float:
     """Return the least misfit whose description is longer than the shortest by at most one standard error.
 
     It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
     much of it neighbours are not found, and both lengthen the description. Between two misfits that are tried it is
     found by their standard errors: halves of a strip then agree.
     """
-    lengths = []
-    for misfit in MISFITS:
-        explained = explain(block, replace(system, misfit=float(misfit)))
-        lengths.append(describe_waveforms(block, system, explained, change))
+    # What clipped echoes hide is no misfit.
+    whole = np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1))
+    block = block.rows(whole) if len(whole) >= FEWEST else block
+    tried = [explain(block, replace(system, misfit=float(misfit))) for misfit in MISFITS]
+    changes = [change for change in CHANGES if change <= STEP_OF_CHANGES * seen]
+    lengths = min(
+        ([describe_waveforms(block, system, explained, change) for explained in tried] for change in changes),
+        key=lambda lengths: min(map(np.mean, lengths)),
+    )
     least = min(lengths, key=np.mean)
     longer = [count_errors(length - least) for length in lengths]
     first = next(place for place, errors in enumerate(longer) if errors <= 1)

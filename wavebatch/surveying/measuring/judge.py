@@ -25,7 +25,7 @@ from wavebatch.kernels.fit.describe import (
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.maximum import matched_filter
-from wavebatch.stages.flags import use_noise_errors
+from wavebatch.stages.flags import misfit_factor, scale_errors
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.noise_and_width import find_edge
@@ -61,12 +61,12 @@ class Explained:
 def explain(block: WaveformBlock, system: SystemPulse, **options: float) -> Explained:
     """Decompose cleaned waveforms, with options of `decompose.adaptive`.
 
-    Errors are those of noise alone: while a pulse is looked for, what a fit misses says nothing about an echo.
+    Errors are those of noise alone: else a larger misfit would make every description shorter.
     """
     block = clean_block(block, system)
     noise = pooled_noise(block, system)
     echoes = adaptive(block, noise, system, matched_filter(block, noise, system), **options)
-    echoes = use_noise_errors(echoes, system, block.spacing)
+    echoes = scale_errors(echoes, 1 / misfit_factor(echoes, system, block.spacing))
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
     whole = np.stack([echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1)
     main = model_parameters(shape, limits, whole.astype(np.float64))
