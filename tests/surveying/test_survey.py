@@ -109,7 +109,7 @@ def test_noise_that_grows_most_where_the_fit_takes_most_is_put_back(rng, width, 
 
 def test_any_waveforms_can_be_surveyed(rng):
     noise = rng.integers(0, 256, (50, 30)).astype(np.uint8)
-    for samples in (noise, noise[:1], noise[:, :3], np.full((FIRST_LOOK + 9, 12), 255, np.uint8)):
+    for samples in (noise, noise[:1], noise[:, :3], np.full((FIRST_LOOK // 12 + 9, 12), 255, np.uint8)):
         survey = survey_block(WaveformBlock.from_samples(samples))
         assert np.isfinite([survey.system.sigma_ref, survey.system.noise.std]).all()
         assert choose_chain(survey).steps

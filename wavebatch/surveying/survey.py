@@ -38,7 +38,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     measure_again,
     measure_gaussian,
     measure_quiet,
-    thin_block,
+    thin_samples,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening
@@ -383,7 +383,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change
         gaussians = (one.typical for one in choice.tried if one.name.startswith("gaussian"))
         figures.gaussian_nats = min(gaussians, default=None)
-        part = thin_block(block, RESIDUAL_LOOK)
+        part = thin_samples(block, RESIDUAL_LOOK)
         if not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref:
             noise = measure_quiet(block, system.sigma_ref / block.spacing).noise
             system = replace(system, noise=replace(noise, gain=first.noise.gain))
@@ -403,7 +403,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if len(block) < SMALL:
             figures.echoes_in_doubt = max(figures.echoes_in_doubt, share_repeated(echoes, system.sigma_ref))
     else:
-        part = thin_block(block, RESIDUAL_LOOK)
+        part = thin_samples(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
     widths = LevelWidths(scatter=_measure_scatter(part, system, echoes))
     system = replace(measure_hidden(part, measure_beside(part, system, echoes), echoes), widths=widths)

@@ -7,8 +7,9 @@ that it was not learned from are shorter to describe with it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -209,7 +210,11 @@ def _try_changes(block: WaveformBlock, name: str, system: SystemPulse, *, known:
 
     Neighbours too close to be found change the shape of some echoes, which is no change from shot to shot.
     """
-    tried = [_judge(block, name, system, change, known=known) for change in CHANGES]
+    tried: list[Candidate] = []
+    for change in CHANGES:
+        if len(tried) > 2 and tried[-1].exceeds(tried[-2]) > SURE:
+            break  # more of it loses more echoes
+        tried.append(_judge(block, name, system, change, known=known))
     tried = [one for one in tried if one.change <= STEP_OF_CHANGES * one.seen]
     best = min(tried, key=lambda one: one.typical)
     return next(one for one in tried if one.exceeds(best) < SURE)
@@ -267,19 +272,34 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> fl
     # What clipped echoes hide is no misfit.
     whole = np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1))
     block = block.rows(whole) if len(whole) >= FEWEST else block
-    tried = [explain(block, replace(system, misfit=float(misfit))) for misfit in MISFITS]
     changes = [change for change in CHANGES if change <= STEP_OF_CHANGES * seen]
-    lengths = min(
-        ([describe_waveforms(block, system, explained, change) for explained in tried] for change in changes),
-        key=lambda lengths: min(map(np.mean, lengths)),
-    )
-    least = min(lengths, key=np.mean)
-    longer = [count_errors(length - least) for length in lengths]
-    first = next(place for place, errors in enumerate(longer) if errors <= 1)
-    if first == 0:
+    lengths: dict[int, list[np.ndarray]] = {}
+
+    def look(places: Iterable[int]) -> tuple[int, list[float]]:
+        """The best place of those tried, and the standard errors by which each of them is longer, by the best change."""
+        for place in places:
+            if place not in lengths:
+                explained = explain(block, replace(system, misfit=float(MISFITS[place])))
+                lengths[place] = [describe_waveforms(block, system, explained, change) for change in changes]
+        best, change = min(product(sorted(lengths), range(len(changes))), key=lambda one: lengths[one[0]][one[1]].mean())
+        least = lengths[best][change]
+        return best, [count_errors(lengths[place][change] - least) for place in sorted(lengths)]
+
+    best, longer = look(range(0, 4, 2))
+    # From coarse to fine, and no further up than echoes are lost for sure.
+    while longer[-1] < HOPELESS and max(lengths) + 2 < len(MISFITS):
+        best, longer = look([max(lengths) + 2])
+    if longer[0] > 1:
+        best, longer = look(place for place in (best - 1, best + 1) if place < len(MISFITS))
+        first = next(place for place, errors in zip(sorted(lengths), longer, strict=True) if errors <= 1)
+        best, longer = look([first - 1])
+    if longer[0] <= 1:
         return 0.0
+    places = sorted(lengths)
+    first = next(place for place, errors in enumerate(longer) if errors <= 1)
+    before, after = MISFITS[places[first - 1]], MISFITS[places[first]]
     share = (longer[first - 1] - 1) / (longer[first - 1] - longer[first])
-    return float(MISFITS[first - 1] * (MISFITS[first] / MISFITS[first - 1]) ** share)
+    return float(before * (after / before) ** share)
 
 
 def _bound(share: float, number: int) -> float:

@@ -44,8 +44,8 @@ change from shot to shot."""
 SURE = 3.0
 """Standard errors by which a description must be shorter to be better."""
 
-KNOWN, LEAST_KNOWN = 0.15, 10
-"""Largest error of a width that tells of the density of widths, as a share of it; and fewest widths that do."""
+KNOWN, LEAST_KNOWN, TELLING = 0.15, 10, 256
+"""Largest error of a width that tells of the density of widths, as a share of it; fewest and most widths that do."""
 
 _DOUBTFUL = np.uint16(EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED | EchoFlag.MERGED)
 
@@ -187,11 +187,13 @@ def _describe_widths(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) ->
 
 def _describe_scattered(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) -> np.ndarray:
     laws = _laws(ratio, error)
+    rows = np.flatnonzero(known)
+    seen = laws[rows[:: max(len(rows) // TELLING, 1)]]
     share = np.full(laws.shape[1], 1.0 / laws.shape[1])
     for _ in range(15):
-        weight = laws[known] * share
+        weight = seen * share
         weight /= np.maximum(np.einsum("mk->m", weight), 1e-300)[:, None]
-        share = (np.einsum("mk->k", weight) + 0.5) / (np.count_nonzero(known) + 0.5 * len(share))
+        share = (np.einsum("mk->k", weight) + 0.5) / (len(seen) + 0.5 * len(share))
     density = (1 - ANYWHERE) * np.einsum("mk,k->m", laws, share) + ANYWHERE / WIDER[-1]
     return -log(density)
 

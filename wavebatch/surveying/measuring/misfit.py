@@ -35,13 +35,15 @@ BESIDE, NOT_ABSORBED = 10, 3
 """Widths of the pulse beside an echo up to which what is left is measured, and from which."""
 
 ADDED, MOST_TURNS = 1024, 8
-"""Echoes that are added, some 60 for each width of lag, and how often to the same waveforms at most."""
+"""Echoes that are added and found, some 200 within two widths of each lag, and how often they are tried: in a canopy
+hardly a place is free."""
 
 HEIGHTS = 10.0, 40.0
 """Amplitudes over noise of echoes that are added: found beside strong ones too, and small enough to be moved by them."""
 
-ONE_SIGMA = 0.6827
-"""Share of normal values within one standard deviation."""
+MEAN_OFF, MOST_OFF = 0.7979, 4.0
+"""Mean size of a normal value, and size at which one counts: an echo that is off by more is another one. A mean varies
+less from part to part of a strip than a quantile: most echoes are hardly off, some by much."""
 
 CONSTANT = 2.0
 """What comes before or after a pulse belongs to it where its mean share is so many times its scatter: else it is
@@ -89,14 +91,18 @@ def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     strong = strong.take(np.arange(0, len(strong), max(len(strong) // ADDED, 1)))
     if len(strong) < FEW:
         return system
-    turns = range(min(-(-ADDED // len(strong)), MOST_TURNS))
-    lag, off = zip(*(_add_beside(block, system, echoes, strong, turn) for turn in turns), strict=True)
-    lag, off = np.concatenate(lag), np.concatenate(off)
+    lags, offs = [np.empty(0)], [np.empty(0)]
+    for turn in range(MOST_TURNS):
+        found = _add_beside(block, system, echoes, strong, turn)
+        lags, offs = [*lags, found[0]], [*offs, found[1]]
+        if sum(map(len, lags)) >= 2 * ADDED:
+            break
+    lag, off = np.concatenate(lags), np.concatenate(offs)
     profile = []
     for place in range(-BESIDE, BESIDE + 1):
-        here = np.abs(off[np.abs(lag - place) <= 1])
+        here = np.abs(off[np.abs(lag - place) <= 2])
         if abs(place) >= NOT_ABSORBED and len(here) >= ENOUGH_TO_LEARN:
-            variance = float(np.quantile(here, ONE_SIGMA)) ** 2 - 1
+            variance = (float(np.mean(np.minimum(here, MOST_OFF))) / MEAN_OFF) ** 2 - 1
             profile.append((float(place * system.sigma_ref), max(variance, 0.0)))
     return replace(system, beside=tuple(profile))
 

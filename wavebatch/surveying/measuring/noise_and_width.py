@@ -31,11 +31,9 @@ FAR_OFF = 0.1
 SETTLED = 0.01
 """Change of the width, as a share of it, below which it stays."""
 
-FIRST_LOOK = 2048
-"""Waveforms from which the noise and the width to begin with are found."""
-
-RESIDUAL_LOOK = 4096
-"""Waveforms whose residuals are looked at."""
+FIRST_LOOK, NOISE_LOOK, RESIDUAL_LOOK, LEAST_LOOK = 80_000, 240_000, 480_000, 256
+"""Samples from which noise and width to begin with are found, from which noise is found then (to 1 %), and whose
+residuals are looked at; and waveforms that each has at least."""
 
 FEW = 20
 """Isolated echoes below which the width of the system pulse is a guess."""
@@ -71,14 +69,14 @@ def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known:
     first: width to begin with [samples], and to end with where too few echoes are isolated; known: it is nearly right.
     """
     saturation = find_saturation(block.samples, block.digitizer.max_count)
-    few = thin_block(block, FIRST_LOOK)
+    few = thin_samples(block, FIRST_LOOK)
     width, last = first, first if known else 0.0
     for _ in range(MOST_ROUNDS):
         if abs(width - last) <= SETTLED * width:
             break
         system, last = _gaussian_system(few, width, saturation), width
         width = _isolated_width(few, system)
-    system = _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
+    system = _gaussian_system(thin_samples(block, NOISE_LOOK), width, saturation)
     last, width = width, _isolated_width(block, system)
     if known and abs(width / last - 1) > FAR_OFF:
         return measure_gaussian(block, width)
@@ -97,7 +95,7 @@ def list_widths(block: WaveformBlock) -> list[float]:
 def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
     """A Gaussian of a width that is known [samples], and the noise outside of the echoes."""
     saturation = find_saturation(block.samples, block.digitizer.max_count)
-    return _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
+    return _gaussian_system(thin_samples(block, NOISE_LOOK), width, saturation)
 
 
 def measure_again(block: WaveformBlock, system: SystemPulse, gain: float) -> SystemPulse:
@@ -112,6 +110,12 @@ def measure_again(block: WaveformBlock, system: SystemPulse, gain: float) -> Sys
 def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
     """About `number` waveforms spread over the block, at least as many where it has them."""
     return block.rows(slice(None, None, max(len(block) // number, 1)))
+
+
+def thin_samples(block: WaveformBlock, number: int) -> WaveformBlock:
+    """Waveforms spread over the block, of `number` samples at most, or LEAST_LOOK of them."""
+    most = max(number // block.samples.shape[1], LEAST_LOOK)
+    return block.rows(slice(None, None, -(-len(block) // most)))
 
 
 def _gaussian_system(block: WaveformBlock, width: float, saturation: float | None) -> SystemPulse:
