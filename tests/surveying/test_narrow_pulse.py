@@ -67,7 +67,7 @@ def test_a_pulse_is_no_wider_than_the_narrowest_echoes(seed, sigma, tail, share)
     [
         ("lvis/lvis1.las", "nasa-lvis", 6.68),
         pytest.param("neon/neon_harv_a.las", "neon-gemini", 15.1, marks=pytest.mark.xfail(
-            strict=True, reason="the judge takes another sensor's pulse of half the width; what is in doubt is .0495, the limit .05")),
+            strict=True, reason="the judge takes another sensor's pulse of half the width")),
     ],
 )
 def test_strangers_have_the_width_of_their_measured_pulses(strip, name, width):

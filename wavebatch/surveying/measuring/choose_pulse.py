@@ -55,8 +55,8 @@ FEWEST = 48
 """Waveforms on which each candidate is judged first."""
 
 MISFITS = 0.0005 * 2.0 ** np.arange(9)
-"""Misfits of the chosen pulse that are tried: half a noise at 1,000 noises up to an eighth of the pulse, beyond which it
-is no pulse of this strip."""
+"""Misfits of the chosen pulse that are tried: half a noise at 1,000 noises up to an eighth of the pulse, beyond which
+it is no pulse of this strip."""
 
 FALSE_QUIET = 0.0075
 """Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
@@ -276,12 +276,13 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> fl
     lengths: dict[int, list[np.ndarray]] = {}
 
     def look(places: Iterable[int]) -> tuple[int, list[float]]:
-        """The best place of those tried, and the standard errors by which each of them is longer, by the best change."""
+        """The best place of those tried, and by how many standard errors each of them is longer, by the best change."""
         for place in places:
             if place not in lengths:
                 explained = explain(block, replace(system, misfit=float(MISFITS[place])))
                 lengths[place] = [describe_waveforms(block, system, explained, change) for change in changes]
-        best, change = min(product(sorted(lengths), range(len(changes))), key=lambda one: lengths[one[0]][one[1]].mean())
+        tried = product(sorted(lengths), range(len(changes)))
+        best, change = min(tried, key=lambda one: lengths[one[0]][one[1]].mean())
         least = lengths[best][change]
         return best, [count_errors(lengths[place][change] - least) for place in sorted(lengths)]
 

@@ -42,8 +42,8 @@ HEIGHTS = 10.0, 40.0
 """Amplitudes over noise of echoes that are added: found beside strong ones too, and small enough to be moved by them."""
 
 MEAN_OFF, MOST_OFF = 0.7979, 4.0
-"""Mean size of a normal value, and size at which one counts: an echo that is off by more is another one. A mean varies
-less from part to part of a strip than a quantile: most echoes are hardly off, some by much."""
+"""Mean size of a normal value, and most that one counts: an echo that is off by more is another one. A mean varies
+less from part to part than a quantile: most echoes are hardly off, some by much."""
 
 CONSTANT = 2.0
 """What comes before or after a pulse belongs to it where its mean share is so many times its scatter: else it is
@@ -135,11 +135,9 @@ def _add_beside(
     found = decompose_sample(replace(block, samples=summed.astype(np.float32)).rows(rows), replace(system, beside=()))
     added = replace(added.take(rows), waveform=np.arange(len(rows), dtype=added.waveform.dtype))
     pair = match_echoes(found, added, ref)
-    off = [
-        (getattr(found, name)[pair.found] - getattr(added, name)[pair.truth]) / getattr(found, f"{name}_err")[pair.found]
-        for name in ("time", "amplitude")
-    ]
-    return np.tile(lag[rows][pair.truth], len(off)), np.concatenate(off)
+    found, truth = found.take(pair.found), added.take(pair.truth)
+    late, high = (found.time - truth.time) / found.time_err, (found.amplitude - truth.amplitude) / found.amplitude_err
+    return np.tile(lag[rows][pair.truth], 2), np.concatenate([late, high])
 
 
 def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[tuple[float, float], ...]:
