@@ -39,7 +39,7 @@ ADDED, MOST_TURNS = 1024, 8
 hardly a place is free."""
 
 HEIGHTS = 10.0, 40.0
-"""Amplitudes over noise of echoes that are added: found beside strong ones too, and small enough to be moved by them."""
+"""Amplitudes over noise of echoes that are added: found beside strong ones too, small enough to be moved by them."""
 
 MEAN_OFF, MOST_OFF = 0.7979, 4.0
 """Mean size of a normal value, and most that one counts: an echo that is off by more is another one. A mean varies
