@@ -41,32 +41,40 @@ def is_alike(one: str, other: str) -> bool:
     return one == other or bool(re.match(r"[-+]?\d|#", one) and re.match(r"[-+]?\d|#", other))
 
 
-def find_tokens(printed: list[str], wanted: list[str]) -> list[str] | None:
-    """The tokens of the output with the words of `wanted`, side by side: those with most numbers in common."""
+def find_tokens(printed: list[str], wanted: list[str], begin: int) -> tuple[int, list[str]] | None:
+    """Place and tokens of the output with the words of `wanted`, side by side: with most numbers in common, then first.
+
+    Those from `begin` on go first: an output may say the same words of two tables.
+    """
     size = len(wanted)
-    starts = (printed[start : start + size] for start in range(len(printed) - size + 1))
-    alike = [part for part in starts if all(map(is_alike, part, wanted))]
-    return max(alike, key=lambda part: sum(map(str.__eq__, part, wanted)), default=None)
+    for places in (range(begin, len(printed) - size + 1), range(min(begin, len(printed) - size + 1))):
+        parts = ((place, printed[place : place + size]) for place in places)
+        alike = [found for found in parts if all(map(is_alike, found[1], wanted))]
+        if alike:
+            return max(alike, key=lambda found: sum(map(str.__eq__, found[1], wanted)))
+    return None
 
 
-def renew(line: str, printed: list[str]) -> str | None:
-    """A line of a page with the figures of the output, columns kept; None where the output has no such words."""
+def renew(line: str, printed: list[str], begin: int = 0) -> tuple[str, int] | None:
+    """A line of a page with the figures of the output, columns kept, and where it ends; None without its words."""
     parts = line.split("...")
     for number, part in enumerate(parts):
-        found = find_tokens(printed, split(part))
+        wanted = split(part)
+        found = find_tokens(printed, wanted, begin)
         if found is None:
             return None
-        for place, token in reversed(list(zip(TOKEN.finditer(part), found, strict=True))):
-            begin, end = place.span()
-            grown = len(token) - (end - begin)
-            room = len(part[:begin]) - len(part[:begin].rstrip(" ")) - 2
+        begin = found[0] + len(wanted)
+        for place, token in reversed(list(zip(TOKEN.finditer(part), found[1], strict=True))):
+            start, end = place.span()
+            grown = len(token) - (end - start)
+            room = len(part[:start]) - len(part[:start].rstrip(" ")) - 2
             if grown > 0:
-                begin -= max(0, min(grown, room))
+                start -= max(0, min(grown, room))
             elif room >= 0:
                 token = " " * -grown + token
-            part = part[:begin] + token + part[end:]
+            part = part[:start] + token + part[end:]
         parts[number] = part
-    return "...".join(parts)
+    return "...".join(parts), begin
 
 
 def list_blocks(text: str) -> Iterator[tuple[str, range]]:
@@ -92,11 +100,13 @@ def renew_page(text: str) -> tuple[str, list[str]]:
             printed = split(f"{done.stdout} {done.stderr}")
             if done.exit_code and words[0] != "check":
                 wrong.append(f"{command}: exit code {done.exit_code}: {done.stderr}")
+            begin = 0
             for place in places:
-                found = renew(lines[place], printed)
+                found = renew(lines[place], printed, begin)
                 if found is None:
                     wrong.append(f"{command}: does not print: {lines[place].strip()}")
-                lines[place] = found or lines[place]
+                else:
+                    lines[place], begin = found
     return "\n".join(lines) + "\n", wrong
 
 

@@ -32,11 +32,18 @@ def place(riegl, tmp_path, monkeypatch):
 def test_figures_are_made_anew_and_columns_kept():
     printed = split("strip.las: 2535 points, 2,672 echoes, ... all      12.5 % ####")
     new = "    strip.las: 2535 points, 2,672 echoes, ..."
-    assert renew("    strip.las: 2530 points, 999 echoes, ...", printed) == new
-    assert renew("    all       9.81 % ##", printed) == "    all       12.5 % ####"
-    assert renew("    all     1009.81 %", printed) == "    all        12.5 %"
+    assert renew("    strip.las: 2530 points, 999 echoes, ...", printed)[0] == new
+    assert renew("    all       9.81 % ##", printed)[0] == "    all       12.5 % ####"
+    assert renew("    all     1009.81 %", printed)[0] == "    all        12.5 %"
     assert renew("    none      9.81 %", printed) is None
-    assert renew("    2 echoes", split("1 points 1 echoes 2 echoes")) == "    2 echoes"
+    assert renew("    2 echoes", split("1 points 1 echoes 2 echoes"))[0] == "    2 echoes"
+
+
+def test_figures_of_a_second_table_come_from_it():
+    printed = split("missed 4 a 1 b 2 extra 5 a 7 b 8")
+    line, begin = renew("    extra 9", printed)
+    assert (line, renew("    b 2", printed, begin)[0]) == ("    extra 5", "    b 8")
+    assert renew("    missed 3", printed, begin)[0] == "    missed 4"
 
 
 @pytest.mark.slow
