@@ -10,7 +10,8 @@ from writer_tools import data_file
 
 from wavebatch.cli import main
 from wavebatch.core.errors import InputError
-from wavebatch.surveying.inspect_strip import check_file, describe_strip
+from wavebatch.files.strip.describe import describe_strip
+from wavebatch.surveying.inspect_strip import check_file
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 

@@ -1,6 +1,6 @@
 """`wavebatch info` shows what a strip holds, `wavebatch check` what is wrong with strips and chain files.
 
-Only prints; the facts come from `wavebatch.surveying.inspect_strip`.
+Only prints; the facts come from `tools.inspect` and `surveying.inspect_strip`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, count, print_text, printable, talk
 from wavebatch.cli.program.completion import complete_files
-from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.inspect.file_facts import describe_file
 
 _SHOWN = 20
@@ -99,6 +98,8 @@ def check(
 
     Exit code: 0 no problems, 1 problems found, 2 wrong usage.
     """
+    from wavebatch.surveying.inspect_strip import check_file  # imports all stages
+
     clean, results = True, []
     for path in shared.find_inputs(files, recursive=recursive):
         found = check_file(path, direction=direction, headerless=headerless)

@@ -11,7 +11,7 @@ How a strip is surveyed:
 4. `sensor` finds where the sensor was. With that and the beam's divergence, `flat_ground` measures how wide the echoes
    of level ground are, and `angle_limits` predicts how well widths measure angles.
 
-`calibration` and the folder `calibrating` use and make calibrations; `inspect_strip` serves `wavebatch info` and
+`calibration` and the folder `calibrating` use and make calibrations; `inspect_strip` serves
 `wavebatch check`.
 """
 

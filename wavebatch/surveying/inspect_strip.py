@@ -1,7 +1,6 @@
-"""The contents of a strip for `wavebatch info`, and the problems of a strip or a chain file for `wavebatch check`.
+"""The problems of a strip or a chain file, for `wavebatch check`.
 
-Before you change it: an error in a file is a finding here, never an exception; only `info` raises for a file that
-cannot be opened.
+Before you change it: an error in a file is a finding here, never an exception.
 """
 
 from __future__ import annotations
@@ -15,13 +14,11 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError, StripWarning
 from wavebatch.core.no_data import without_nan
+from wavebatch.files.strip.describe import describe_samples
 from wavebatch.files.strip.header_check import audit_header
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
 from wavebatch.stages.chain_file import load_chain, load_profile
 from wavebatch.surveying.survey import survey_blocks
-
-_SAMPLED = 4096
-"""Waveforms that are read."""
 
 _MATCHED = 1024
 """Waveforms whose echoes are compared with the returns."""
@@ -51,46 +48,6 @@ class Findings:
     def to_json(self) -> dict[str, Any]:
         """Return the findings as plain values."""
         return {"clean": self.is_clean, **without_nan(asdict(self))}
-
-
-def describe_strip(path: Path | str, *, direction: str = "auto", headerless: bool = False) -> dict[str, Any]:
-    """Collect everything that `wavebatch info` shows of a strip.
-
-    Parameters
-    ----------
-    path : path
-    direction : str
-        Where packet vectors point: auto, toward or away.
-    headerless : bool
-        Accept a .wdp file without its 60-byte header.
-
-    Returns
-    -------
-    dict
-        Plain values for JSON; None for floats that are not finite. `problems` lists why a strip cannot be processed.
-
-    Raises
-    ------
-    InputError
-        Where the strip cannot be read.
-    """
-    with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan(tolerant=True) as scan:
-        facts = reader.facts
-        return {
-            **_describe_file(facts),
-            **_describe_points(scan),
-            "packets": _describe_packets(facts, scan),
-            "samples": _describe_samples(reader, scan),
-            "vectors": {
-                "direction": scan.vectors.direction,
-                "evidence": scan.vectors.evidence,
-                "length_over_half_c": without_nan(scan.vectors.ratio),
-                "form": scan.vectors.form,
-            },
-            "notes": list(scan.notes),
-            "warnings": [*facts.warnings, *scan.warnings],
-            "problems": list(scan.problems),
-        }
 
 
 def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = False) -> Findings:
@@ -135,7 +92,7 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
     facts = reader.facts
     problems = [*scan.problems, *scan.warnings, *facts.warnings]
     try:
-        _describe_samples(reader, scan)
+        describe_samples(reader, scan)
     except InputError as error:
         problems.append(_without_name(path, error))
     else:
@@ -159,25 +116,6 @@ def _note_descriptors(facts: StripFacts, scan: StripScan) -> Iterator[str]:
 def _without_name(path: Path, error: Exception) -> str:
     """The error's line without the file's name in front, which the caller shows."""
     return " ".join(str(error).split()).removeprefix(f"{path}: ")
-
-
-def _describe_samples(reader: StripReader, scan: StripScan) -> dict[str, Any]:
-    """Extremes of waveforms spread over the strip; of none where no packet can be used."""
-    rows = []
-    for block in reader.sample_blocks(scan, _SAMPLED) if scan.with_waveform else ():
-        at_limit = (block.samples == block.digitizer.max_count).any(axis=1)
-        extremes = int(block.samples.min()), int(block.samples.max())
-        gaps = 0 if block.missing is None else int(block.missing.any(axis=1).sum())
-        rows.append((len(block), *extremes, int(np.count_nonzero(at_limit)), gaps, block.samples.shape[1]))
-    numbers, least, largest, limited, gaps, lengths = zip(*rows, strict=True) if rows else ((),) * 6
-    return {
-        "waveforms_read": sum(numbers),
-        "least": min(least, default=None),
-        "largest": max(largest, default=None),
-        "waveforms_at_limit": sum(limited),
-        "waveforms_with_gaps": sum(gaps),
-        "lengths": sorted(set(lengths)),
-    }
 
 
 def doubt_files(facts: StripFacts, scan: StripScan) -> Iterator[StripWarning]:
@@ -211,56 +149,3 @@ def _match_returns(reader: StripReader, scan: StripScan) -> tuple[int, int]:
             matched += np.count_nonzero(echoes.attributes["point"] >= 0)
             returns += np.count_nonzero(np.isin(block.returns.waveform, echoes.waveform))
     return matched, returns
-
-
-def _describe_file(facts: StripFacts) -> dict[str, Any]:
-    return {
-        "file": str(facts.path),
-        "bytes": facts.size,
-        "las_version": facts.version,
-        "point_format": facts.header.point_format,
-        "compressed": facts.header.compressed,
-        "crs": facts.crs,
-        "scales": list(facts.header.scales),
-        "offsets": list(facts.header.offsets),
-        "extra_dimensions": [record.name for record in facts.records],
-    }
-
-
-def _describe_points(scan: StripScan) -> dict[str, Any]:
-    return {
-        "points": scan.points,
-        "points_with_waveform": scan.with_waveform,
-        "points_without_waveform": scan.without_waveform,
-        "points_broken": scan.broken,
-        "share_with_waveform": scan.with_waveform / scan.points if scan.points else None,
-    }
-
-
-def _describe_packets(facts: StripFacts, scan: StripScan) -> dict[str, Any]:
-    used = {index: count for index, count in scan.by_descriptor.items() if index in facts.digitizers}
-    return {
-        "count": scan.packets,
-        "where": None if facts.packets.file is None else "internal" if facts.packets.internal else "external",
-        "file": None if facts.packets.file is None else str(facts.packets.file),
-        "bytes": facts.packets.end - facts.packets.start,
-        "shorter_than_descriptor": scan.short,
-        "farthest_shared": scan.reach,
-        "descriptors": [_describe_descriptor(facts, scan, index, count) for index, count in used.items()],
-        "descriptors_unused": len(facts.digitizers) - len(used),
-    }
-
-
-def _describe_descriptor(facts: StripFacts, scan: StripScan, index: int, points: int) -> dict[str, Any]:
-    digitizer = facts.digitizers[index]
-    form = scan.forms.get(index)
-    return {
-        "index": index,
-        "points": points,
-        "bits": digitizer.bits,
-        "samples": digitizer.n_samples,
-        "spacing_ns": digitizer.spacing,
-        "gain": without_nan(digitizer.gain),
-        "offset": without_nan(digitizer.offset),
-        "inverted": form is not None and form.inverted,
-    }

@@ -1,6 +1,6 @@
 """Header, records and points of any LAS or LAZ file, and how wavebatch made it.
 
-`wavebatch info` prints it; strips with waveforms add what `surveying.inspect_strip` finds of their packets. All points
+`wavebatch info` prints it; strips with waveforms add what `files.strip.describe` finds of their packets. All points
 are read once, in bounded memory, because headers are often wrong.
 """
 
@@ -24,7 +24,7 @@ from wavebatch.files.las.crs import name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
 from wavebatch.files.las.point_formats import WITHOUT_WAVES, locate, read_angles, read_classes, split_numbers
-from wavebatch.surveying.inspect_strip import describe_strip
+from wavebatch.files.strip.describe import describe_strip
 
 _GPS_EPOCH = datetime(1980, 1, 6)
 _ADJUSTED = 1e9
