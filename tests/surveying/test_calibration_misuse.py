@@ -399,6 +399,57 @@ def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, ca
             sensor.refuse_units(SimpleNamespace(facts=facts), scan)
 
 
+def test_feet_without_pairs_of_returns_are_said(tmp_path, calibrated):
+    """Light 10.8 times too bright was put down to another gain or other surfaces."""
+    write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 600), 8000, seed=81)
+    content = bytearray((tmp_path / "s.las").read_bytes())
+    for at, number in ((131, 3), (155, 3), (179, 6)):  # scales, offsets, extent
+        values = np.array(struct.unpack_from(f"<{number}d", content, at)) / 0.3048
+        struct.pack_into(f"<{number}d", content, at, *values)
+    (tmp_path / "s.las").write_bytes(content)
+    columns = "backscatter_coefficient,backscatter_coefficient_err"
+    line = run(calibrated, tmp_path / "out", tmp_path / "s.las", "--columns", columns)
+    assert "or coordinates in feet (which make it 10.8 times as bright)" in line
+    cloud = wb.read_cloud(tmp_path / "out" / "s.laz")
+    gamma, error = cloud["backscatter_coefficient"], cloud["backscatter_coefficient_err"]
+    assert np.nanmedian(error / gamma * (gamma > 4.0)) > 0.9
+
+
+def name_crs(path, code):
+    """The strip again with the GeoTIFF key of a projected CRS."""
+    content = bytearray(path.read_bytes())
+    keys = struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, code)
+    record = struct.pack("<H16sHH32s", 0, b"LASF_Projection", 34735, len(keys), b"") + keys
+    begin, number = struct.unpack_from("<2I", content, 96)
+    struct.pack_into("<2I", content, 96, begin + len(record), number + 1)
+    (packets,) = struct.unpack_from("<Q", content, 227)
+    struct.pack_into("<Q", content, 227, packets + len(record))
+    path.write_bytes(content[:begin] + record + content[begin:])
+
+
+def test_strips_of_two_zones_are_not_tied(tmp_path, dim_edges):
+    for name, code in (("a", 32632), ("b", 32633), ("c", 32632)):
+        (tmp_path / f"{name}.las").write_bytes((dim_edges / ("a.las" if name == "a" else "b.las")).read_bytes())
+        name_crs(tmp_path / f"{name}.las", code)
+    options = ("--targets", dim_edges / "t.csv", "-o", tmp_path / "cal.toml")
+    done = call("calibrate", tmp_path / "a.las", tmp_path / "b.las", *options)
+    assert done.exit_code == 1 and "b.las: its coordinates are in EPSG:32633, those of a.las in" in done.stderr
+    assert call("calibrate", tmp_path / "a.las", tmp_path / "c.las", *options).exit_code == 0
+
+
+@pytest.mark.parametrize("scanners", [False, True])
+def test_lines_of_targets_have_the_constant_of_one_channel(tmp_path, scanners):
+    two = replace(SENSOR, gains={1: 1.0, 2: 0.5}, scanners=scanners)
+    write_strip(tmp_path / "a.las", GROUND, two, 10_000, seed=83)
+    write_targets(tmp_path / "t.csv")
+    done = call("calibrate", tmp_path / "a.las", "--targets", tmp_path / "t.csv", "-o", tmp_path / "c.toml")
+    lines = [line for line in done.stderr.splitlines() if line.startswith("field, digitizer")]
+    constants = [float(line.split("constant ")[1].split(",")[0]) for line in lines]
+    assert len(lines) == 2 and constants[1] / constants[0] == pytest.approx(2.0, rel=0.02), done.output
+    spreads = [float(line.split("spread ")[1].split(" %")[0]) for line in lines]
+    assert max(spreads) < 3.0
+
+
 def test_reflectances_that_were_measured_from_aside_get_the_hot_spot(tmp_path, calibrated):
     plain = load_calibration(calibrated / "cal.toml").channels[0]
     found = {}

@@ -65,6 +65,13 @@ class TargetResult:
     """Standard deviation of the constant from this target alone, relative."""
     refused: str = ""
     """Why the target gave no constant."""
+    channel: str = ""
+    """Digitizer and scanner channel whose echoes these are; empty where the strip has one channel."""
+
+    @property
+    def label(self) -> str:
+        """Return the name, with the channel where there are several."""
+        return ", ".join(filter(None, (self.name, self.channel)))
 
 
 @dataclass(frozen=True, slots=True)

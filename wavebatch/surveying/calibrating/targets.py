@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +30,7 @@ from wavebatch.surveying.calibrating.target_constants import (
 )
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
-from wavebatch.surveying.matching.setting import read_day, read_sensor_name
+from wavebatch.surveying.matching.setting import SCANNERS, read_day, read_sensor_name
 from wavebatch.surveying.sensor import SensorSource
 
 MOST_ECHOES = 200_000
@@ -107,7 +107,7 @@ def build_calibration(
         height=float(np.median(-used["ray"][:, 2] * used["distance"])),
         distance=float(np.median(used["distance"])),
         fingerprint=take_fingerprint(source.path, facts.packets.file),
-        targets=tuple(results),
+        targets=tuple(_split_targets(measured) if len(channels) > 1 else results),
         channels=channels,
         **source.sent.describe(),
         notes=tuple(_list_doubts(source, results, channels, options)),
@@ -139,6 +139,16 @@ def _measure_channels(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndar
         if results:
             found.append(combine_targets(results, _fit_errors(parts), channel))
     return found
+
+
+def _split_targets(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndarray]]) -> Iterator[TargetResult]:
+    """What each channel has of each target: channels differ in gain, so that no median is common to them."""
+    for result, rows, constant in measured:
+        if result.constant is None:
+            yield result
+        for channel in np.unique(rows["channel"]).tolist():
+            name = f"digitizer {channel // SCANNERS}, scanner channel {channel % SCANNERS}"
+            yield replace(summarise(result, constant[rows["channel"] == channel]), channel=name)
 
 
 def describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstant:

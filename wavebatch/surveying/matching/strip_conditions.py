@@ -17,7 +17,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.light import AIR_DOUBT
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.matching.setting import Setting, compare_scenes, read_day, read_sensor_name
-from wavebatch.surveying.sensor import SensorSource
+from wavebatch.surveying.sensor import FOOT, SensorSource
 
 SAME_DIVERGENCE = 0.03
 """Relative difference up to which divergences are equal."""
@@ -37,6 +37,9 @@ FAR = 1.3
 
 SAME_RATE = 1.02
 """Ratio up to which pulse rates are equal."""
+
+LIKE_FEET = 0.35
+"""Logarithm by which light may differ from what feet taken for metres make of it: other surfaces, and more air."""
 
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
@@ -115,7 +118,10 @@ def compare_setting(calibration: Calibration, found: Setting, system: SystemPuls
         compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
         # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
         light = found.brightest.get(row.digitizer)
-        compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or other surfaces: light {which} is")
+        surfaces = "other surfaces"
+        if light and row.brightest and abs(math.log(light / row.brightest * FOOT**2)) < LIKE_FEET:
+            surfaces += ", or coordinates in feet (which make it 10.8 times as bright)"
+        compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or {surfaces}: light {which} is")
         scene = found.scenes.get(row.digitizer)
         off = compare_scenes(scene, row.scene) if scene and len(row.scene) == len(scene) else 0.0
         if off:
