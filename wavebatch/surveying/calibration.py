@@ -181,6 +181,8 @@ class Calibration:
     energy_unit: str = ""
     swath: tuple[float, ...] = ()
     """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
+    haze: float | None = None
+    """As `SensorSource.haze`, where the attenuation was not given: that at other heights follows."""
     right: tuple[float, float] = (0.0, 0.0)
     """Of the strip's flight, as `Radiometry.right`; not kept in the file."""
     notes: tuple[str, ...] = ()

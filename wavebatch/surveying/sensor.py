@@ -14,12 +14,14 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import Trajectory, solve_offset
-from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.core.units import AIR_ATTENUATION
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.ray_sample import RaySample, measure_scale, sample_rays
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
+from wavebatch.kernels.physics.radiometry import mean_haze
 
 NODE_SECONDS = 0.5
 """Time between two positions that are estimated from rays [s]."""
@@ -101,6 +103,18 @@ class SensorSource:
     """Error of the ranges by the packet vectors [m]."""
     facts: tuple[tuple[str, Any], ...] = ()
     """More values for reports, by name."""
+
+    @property
+    def haze(self) -> float:
+        """Haze on the way to the ground over that of a usual flight above a coast; 1 where nothing is known."""
+        if not self.distance:
+            return 1.0
+        top = self.distance if self.trajectory is None else float(np.nanmedian(self.trajectory.xyz[:, 2]))
+        return mean_haze(top - self.distance, top)
+
+    def place(self, system: SystemPulse) -> SystemPulse:
+        """Return the system with the error of the distance, and with the usual air at the heights of the flight."""
+        return system.with_radiometry(sensor_error=self.error, attenuation=AIR_ATTENUATION * self.haze)
 
     def fill(self, block: WaveformBlock) -> WaveformBlock:
         """Return the block with the sensor's positions; the block itself where they are unknown.

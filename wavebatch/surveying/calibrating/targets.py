@@ -81,7 +81,7 @@ def build_calibration(
         reasons = miss or "; ".join(f"{result.name}: {result.refused}" for result in results)
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])
-    ranging = math.hypot(measure_ranging(source.sensor, used["distance"], options.air), source.sent.growth)
+    ranging = math.hypot(measure_ranging(source.sensor, used["distance"], source.air), source.sent.growth)
     channels = tuple(
         describe_channel(replace(row, relative_error=float(np.hypot(row.relative_error, ranging))), source)
         for row in _measure_channels(measured)
@@ -93,7 +93,8 @@ def build_calibration(
     return Calibration(
         constant=whole.constant,
         relative_error=float(np.hypot(np.hypot(whole.relative_error, apart), ranging)),
-        attenuation=options.air,
+        attenuation=source.air,
+        haze=source.haze,
         divergence=divergence,
         strip=source.path.name,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),

@@ -72,9 +72,10 @@ def find_growth(
     parts, lines = [UNSTATED if not min(row.relative_error for row in rows) else 0.0], []
     day = read_day(reader)
     slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
+    haze = sensor.haze / calibration.haze if calibration.haze and attenuation is None else 1.0
     if day and calibration.flight and day != calibration.flight:
         apart = abs((date.fromisoformat(day) - date.fromisoformat(calibration.flight)).days)
-        own = sensor.distance or 0.0 if attenuation is None else 0.0
+        own = haze * (sensor.distance or 0.0) if attenuation is None else 0.0
         air = slope * math.hypot(own, calibration.distance or 0.0)
         parts.append(math.hypot(OTHER_MONTH if apart > 30 else OTHER_DAY, air))
         lines.append(
@@ -82,7 +83,11 @@ def find_growth(
             f"grows by {100 * parts[-1]:.0f} %, {100 * air:.0f} % of it for the air"
         )
     elif calibration.distance and sensor.distance:
-        parts.append(slope * abs(sensor.distance - calibration.distance))
+        more, less = haze * sensor.distance - calibration.distance, 0.0
+        if haze != 1.0:
+            # What heights above sea take off the air is known to a half as well.
+            less = (sensor.distance - calibration.distance) / calibration.haze - more
+        parts.append(slope * math.hypot(more, less))
         ratio = sensor.distance / calibration.distance
         if max(ratio, 1 / ratio) > FAR:
             lines.append(
@@ -144,7 +149,7 @@ def compare_air(
     if abs(off) < LEAST_AIR:
         return 0.0
     warnings.append(
-        f"calibration: --attenuation {attenuation:g} dB/km contradicts the {calibration.attenuation:g} dB/km with "
+        f"calibration: --attenuation {attenuation:g} dB/km contradicts the {calibration.attenuation:.2g} dB/km with "
         f"which the constant was measured on the same day: light changes by {100 * math.expm1(off):+.0f} %, which is "
         "in the error; give `wavebatch calibrate` the same --attenuation"
     )
