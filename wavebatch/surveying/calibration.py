@@ -63,6 +63,8 @@ class TargetResult:
     """Share of its echoes that are far darker or brighter than the others."""
     relative_error: float | None = None
     """Standard deviation of the constant from this target alone, relative."""
+    air: float | None = None
+    """Share of the air that a column of reflectances held, which was taken off; None where it is not known."""
     refused: str = ""
     """Why the target gave no constant."""
     channel: str = ""

@@ -73,7 +73,7 @@ def build_calibration(
         for target, rows in zip(targets, found, strict=not options.column)
     ]
     if options.column:
-        measured = [measure_column(options.column, found[0], options.reflectance_error)]
+        measured = [measure_column(options.column, found[0], options.reflectance_error, source.air)]
     results = [result for result, _, _ in measured]
     whole = combine_targets(results, _fit_errors([used for _, used, _ in measured]))
     if whole is None:
@@ -178,6 +178,13 @@ def _list_doubts(
     """What a person should look at before the calibration is used."""
     yield from filter(None, (source.sensor.doubt(), *source.sent.notes))
     for result in results:
+        if options.column and result.air is None and source.air:
+            yield (
+                f"{result.name}: its ranges are too alike to show whether it still holds the air: the error of the "
+                f"constant, {100 * result.relative_error:.1f} %, holds all of that; ask the vendor, or take targets"
+            )
+        elif options.column and result.air > 0.5:
+            yield f"{result.name}: it falls with the range as if it still held {result.air:.0%} of the air: taken off"
         if result.edge is not None:
             yield (
                 f"{result.name}: echoes near its outline give a constant {100 * result.edge:+.1f} % off that of its "
