@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.order import group_medians, robust_std
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET, MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.geometry.facets import fit_facet
 from wavebatch.surveying.calibrating.target_file import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibration import ChannelConstant, TargetResult
@@ -29,12 +29,6 @@ GIVEN_ANGLE_ERROR = np.radians(1.0)
 
 MOST_OFF = 4.0
 """A given incidence contradicts the plane of the echoes by so many standard errors."""
-
-INSET = 1.5
-"""Echoes count this many 1/e2 radii inside the outline: 0.13 % of a footprint's light lies beyond a straight edge."""
-
-ASSUMED_DIVERGENCE = 1.0
-"""Full angle of the beam [mrad] for the inset where none is given: as wide as topographic lasers have."""
 
 STRANGE_SIGMA, MOST_STRANGE = 6.0, 0.02
 """Echoes this many robust standard deviations off the median are of another surface; more than this share may be the
