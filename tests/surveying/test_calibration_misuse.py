@@ -324,6 +324,35 @@ def test_a_trajectory_that_is_late_is_named_and_in_the_error(tmp_path, calibrate
     assert np.mean(off < cloud["range_error"]) > 0.5 and np.nanmedian(cloud["range_error"]) < (1.0 if late else 0.1)
 
 
+@pytest.mark.quick_cases("0.2")
+@pytest.mark.parametrize("turn", [0.2, -0.4])
+def test_vectors_that_are_turned_against_a_trajectory_are_in_the_errors_of_angles(tmp_path, monkeypatch, turn):
+    """Packet vectors 0.2 deg off the points: one angle of eight was within its error."""
+    write, angle = facet_strips._write, np.radians(turn)
+    about = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+
+    def write_turned(path, sensor, origin, ray, seconds, channel, samples, first, hit, *more):
+        turned = ray @ about.T
+        moved = origin + hit[:, None] * (ray - turned)
+        write(path, sensor, moved, turned, seconds, channel, samples, first, hit, *more)
+
+    monkeypatch.setattr(facet_strips, "_write", write_turned)
+    roof = [Facet(0.3, slope=(0.7, 0.0), z0=-30.0, centre=(20.0, 0.0))]
+    write_strip(tmp_path / "s.las", roof, SENSOR, 8000, seed=61)
+    path = write_trajectory(tmp_path / "path.csv", SENSOR, 1.0)
+    columns = "+incidence_angle_normals,+incidence_angle_normals_err,+range"
+    done = call("run", tmp_path / "s.las", "-o", tmp_path / "out", "--trajectory", path, "--columns", columns)
+    assert done.exit_code == 0, done.output
+    cloud = wb.read_cloud(tmp_path / "out" / "s.laz")
+    ahead = np.stack([cloud[axis] for axis in "xyz"], axis=1) - sensor_of(cloud["gps_time"])
+    normal = np.array([-0.7, 0.0, 1.0]) / np.hypot(0.7, 1.0)
+    true = np.degrees(np.arccos(-(ahead @ normal) / np.linalg.norm(ahead, axis=1)))
+    off = cloud["incidence_angle_normals"] - true
+    known = np.isfinite(off)
+    assert known.mean() > 0.8 and abs(np.median(off[known])) > 0.8 * abs(turn)
+    assert np.mean(np.abs(off[known]) <= cloud["incidence_angle_normals_err"][known]) > 0.6
+
+
 def sensor_of(time):
     return path_of(SENSOR, time - SENSOR.time) + [EAST, NORTH, 0.0]
 

@@ -249,6 +249,9 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndar
     first, *_ = names = found.dtype.names[:-1]
     known = by_echo["gap"] == Gap.KNOWN
     values = {name: np.where(known, by_echo[name], np.float32(np.nan)) for name in names}
+    if f"{first}_err" in values:
+        # A ray that is off turns the angle by as much: no plane of points shows it.
+        values[f"{first}_err"] = np.hypot(values[f"{first}_err"], np.float32(prepared.sensor.turned))
     values[f"{first}{SUFFIX}"] = _REASONS[by_echo["gap"]]
     values |= _solve_again(prepared.job.chain, solved, values, timing)
     columns = {name: spread(name, column, made.echo) for name, column in values.items() if name in COLUMNS}

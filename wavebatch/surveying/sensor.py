@@ -112,6 +112,11 @@ class SensorSource:
         top = self.distance if self.trajectory is None else float(np.nanmedian(self.trajectory.xyz[:, 2]))
         return mean_haze(top - self.distance, top)
 
+    @property
+    def turned(self) -> float:
+        """Angle between packet vectors and the rays from a trajectory, of which either may be right [deg]."""
+        return dict(self.facts).get("angle_to_packet_vectors_deg") or 0.0
+
     def place(self, system: SystemPulse) -> SystemPulse:
         """Return the system with the error of the distance, and with the usual air at the heights of the flight."""
         return system.with_radiometry(sensor_error=self.error, attenuation=AIR_ATTENUATION * self.haze)
