@@ -214,7 +214,11 @@ def _mark_edges(prepared: Prepared, solved: SolvedBlocks) -> SolvedBlocks:
         rest = block.digitizer.n_samples * block.spacing - echoes.time - 2.0 * system.sigma_ref
         parts.append((place, ray, block.gps_time[echoes.waveform], echoes.time * speed, rest * speed))
     beam = 0.5e-3 * (prepared.system.radiometry.divergence or ASSUMED_DIVERGENCE)
-    edge = find_edges(*map(np.concatenate, zip(*parts, strict=True)), INSET * beam * distance)
+    # In the order of packets: blocks of several digitizers come in another one with blocks of another size.
+    order = np.argsort(np.concatenate([index[block.echoes.waveform] for index, block in solved]), kind="stable")
+    edge = np.empty(len(order), bool)
+    given = (np.concatenate(values)[order] for values in zip(*parts, strict=True))
+    edge[order] = find_edges(*given, INSET * beam * distance)
     ends = np.cumsum([len(block.echoes) for _, block in solved])
     return [
         (index, block._replace(echoes=block.echoes.with_attributes(edge=part)))

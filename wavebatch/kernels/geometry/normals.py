@@ -269,11 +269,11 @@ def find_edges(
     Neighbours are those of the rays, by where they meet one level: behind a roof the ground begins metres away in plan.
     """
     edge = np.zeros(len(points), bool)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        level = points[:, :2] - (points[:, 2:] - np.nanmedian(points[:, 2:])) * ray[:, :2] / ray[:, 2:]
-    able = np.flatnonzero(np.isfinite(level).all(axis=1)) if len(points) else np.empty(0, np.int64)
+    able = np.flatnonzero(np.isfinite(points).all(axis=1) & np.isfinite(ray).all(axis=1) & (ray[:, 2] != 0))
     if len(able) < 2:
         return edge
+    with np.errstate(invalid="ignore", divide="ignore"):
+        level = points[:, :2] - (points[:, 2:] - np.median(points[able, 2])) * (ray[:, :2] / ray[:, 2:])
     tree = scipy.spatial.cKDTree(level[able])
     few = level[able[:: max(len(able) // SPACED, 1)]]
     spacing = float(np.median(tree.query(few, k=[min(RING, len(able))])[0]))
@@ -281,16 +281,16 @@ def find_edges(
     most = 2.0 * reach + spacing
     given = (values[able] for values in (level, points[:, 2], ray, time, before, after))
     rows = able[_may_lie_apart(*given, most)]
-    if not len(rows):
-        return edge
     number = int(np.clip(np.ceil(1.5 * np.pi * (most / max(spacing, 1e-6)) ** 2), RING, MOST_NEIGHBOURS))
-    apart, near = tree.query(level[rows], k=min(number + 1, len(able)), distance_upper_bound=most)
-    other = able[np.minimum(near, len(able) - 1)]
-    deeper = np.einsum("mki,mi->mk", points[other] - points[rows][:, None], ray[rows])
-    mine = (apart < SAME_RAY * reach) & (time[other] == time[rows, None])
-    deep = (deeper > after[rows, None]) & np.isfinite(apart)
-    # One echo alone, as noise makes them, is no surface.
-    edge[rows] = (deep.sum(axis=1) > 1) | ((deep | (deeper < -before[rows, None])) & mine).any(axis=1)
+    for start in range(0, len(rows), _LARGEST_CHUNK):
+        own = rows[start : start + _LARGEST_CHUNK]
+        apart, near = tree.query(level[own], k=min(number + 1, len(able)), distance_upper_bound=most)
+        other = able[np.minimum(near, len(able) - 1)]
+        deeper = np.einsum("mki,mi->mk", points[other] - points[own][:, None], ray[own])
+        mine = (apart < SAME_RAY * reach) & (time[other] == time[own, None])
+        deep = (deeper > after[own, None]) & np.isfinite(apart)
+        # One echo alone, as noise makes them, is no surface.
+        edge[own] = (deep.sum(axis=1) > 1) | ((deep | (deeper < -before[own, None])) & mine).any(axis=1)
     return edge
 
 
