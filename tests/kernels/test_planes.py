@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.kernels.geometry import normals
-from wavebatch.kernels.geometry.normals import MOST_PER_CELL, Gap, Surroundings, measure_normals, thin_out
+from wavebatch.kernels.geometry.normals import MOST_PER_CELL, Gap, Surroundings, find_edges, measure_normals, thin_out
 from wavebatch.kernels.geometry.plane_halves import DOUBTFUL, SURE, compare_halves, misfit_of_angles
 from wavebatch.kernels.geometry.planes import (
     LEAST_SPREAD,
@@ -298,3 +298,30 @@ def test_points_that_cannot_be_cut_apart_are_one_tile():
     assert len(cut_tiles(np.zeros((1000, 3)), 10, 0.0)) == 1
     assert len(cut_tiles(np.empty((0, 3)), 10, 1.0)) == 1
     assert len(cut_tiles(np.repeat([[0, 0, 0], [0, 0, 9.0]], [1000, 1], axis=0), 10, 0.0)) == 2
+
+
+def test_edges_are_found_by_the_pulses_around():
+    """Roofs 25 m above ground, in packets that reach 5 m: by brute force, and one lone echo is no surface."""
+    rng = np.random.default_rng(8)
+    x, y = rng.uniform(0, 20, (2, 900))
+    level = np.stack([x, y, np.where(x < 9, 25.0, 0.0)], axis=1)
+    ray = np.array([0.2, -0.1, -1.0]) / np.sqrt(1.05)
+    points = level + (level[:, 2:] - 20.0) / ray[2] * ray * [1, 1, 0]
+    points[0] = [points[0, 0], points[0, 1], -60.0]
+    before, after = np.full(900, 2.0), np.full(900, 5.0)
+    found = find_edges(points, np.tile(ray, (900, 1)), np.arange(900.0), before, after, 0.5)
+    flat = points[:, :2] - (points[:, 2:] - np.median(points[:, 2])) * ray[:2] / ray[2]
+    apart = np.linalg.norm(flat[:, None] - flat, axis=2)
+    most = 1.0 + np.median(np.sort(apart, axis=1)[:, 4])
+    deeper = (points @ ray)[None] - (points @ ray)[:, None] > 5.0
+    assert (found == ((deeper & (apart <= most)).sum(axis=1) > 1)).all() and 20 < found.sum() < 200
+    assert not found[points[:, 2] < 1].any()
+
+
+def test_echoes_of_one_pulse_in_two_packets_share_its_light():
+    x, y = np.meshgrid(np.arange(10.0), np.arange(10.0))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(100)], axis=1)
+    points = np.concatenate([points, points[[44]] + [0, 0, 30]])
+    time = np.append(np.arange(100.0), 44.0)
+    found = find_edges(points, np.tile([0.0, 0, -1], (101, 1)), time, np.full(101, 2.0), np.full(101, 5.0), 0.2)
+    assert np.flatnonzero(found).tolist() == [44, 100]

@@ -11,6 +11,7 @@ from wavebatch.kernels.physics.radiometry import (
     cross_section,
     diffuse_reflectance,
     energy_error,
+    mean_haze,
     reflectance_error,
     transmit,
 )
@@ -124,3 +125,10 @@ def test_light_that_is_shared_alike_tells_no_ratio(rng):
     assert estimate_canopy_ratio(np.zeros(0), np.zeros(0)) is None
     assert estimate_canopy_ratio(np.full(500, np.nan), ground) is None
     assert estimate_canopy_ratio(np.zeros(500), ground) is None
+
+
+def test_haze_is_the_mean_of_its_layers():
+    z = np.linspace(1200.0, 4400.0, 20_001)
+    usual = np.exp(-np.linspace(0.0, 700.0, 20_001) / 2000.0).mean()
+    assert mean_haze(1200.0, 4400.0) == pytest.approx(np.exp(-z / 2000.0).mean() / usual, rel=1e-4)
+    assert mean_haze(0.0, 700.0) == pytest.approx(1.0) and mean_haze(-300.0, 0.0) == mean_haze(0.0, 0.0) > 1.0

@@ -110,6 +110,8 @@ NO_TWIN = {
     "along_ray": "a projection; find_rays, which has a twin, is made of it",
     "on_ray": "a distance; find_rays, which has a twin, is made of it",
     "measure_angles": "tests of known planes, and of the scatter that its error states",
+    "find_edges": "tests/surveying/test_signed_physics.py: traced roofs whose ground lies outside of the packets",
+    "mean_haze": "an integral of an exponential; numbers in its test",
     "measure_normals": "planes, neighbours and halves have twins; tests of known roofs",
     "attenuation_of_visibility": "published numbers",
     "usual_attenuation": "the power law in its test",

@@ -62,7 +62,7 @@ def test_the_order_of_the_strips_does_not_matter(strips, flight):
     [
         ("level", "its level is 13."),
         ("noise", "its noise is 1."),
-        ("wide", "ns wide (Gaussian sigma), those of the flight"),
+        ("wide", "steep slopes widen echoes as well"),
         ("narrow", "ns wide (Gaussian sigma), those of the flight"),
         ("gaussian", "the flight's pulse misses its strong echoes by"),
         ("spacing", "samples 0.5 ns apart; that of the flight has samples 1 ns apart"),

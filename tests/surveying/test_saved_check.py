@@ -25,7 +25,12 @@ SCENES = {
     "wide": make_scene("flat", pulse=find_pulse("leica"), n_samples=100),
     "narrow": make_scene("flat", pulse=replace(find_pulse("gaussian"), sigma=1.2)),
 }
-CONTRADICTED = {"noisy": "its noise is", "bits": "samples have 16 bits", "wide": "ns wide", "narrow": "ns wide"}
+CONTRADICTED = {
+    "noisy": "its noise is",
+    "bits": "samples have 16 bits",
+    "wide": "slopes widen echoes",
+    "narrow": "ns wide",
+}
 
 
 @pytest.fixture(scope="module")

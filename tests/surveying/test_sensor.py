@@ -14,7 +14,15 @@ from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
 from wavebatch.files.strip.ray_sample import MOST_SLICES, RAYS_PER_SLICE, RaySample, sample_rays
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.sensor import SCANNER, UNKNOWN, SensorRequest, SensorSource, estimate_path, find_sensor
+from wavebatch.surveying.sensor import (
+    SCANNER,
+    UNKNOWN,
+    SensorRequest,
+    SensorSource,
+    estimate_path,
+    find_sensor,
+    find_turn,
+)
 from wavebatch.tools.simulate.geometry import START_TIME, FlightLine, trace_rays
 
 
@@ -154,6 +162,25 @@ def test_pairs_of_returns():
     off = np.linalg.norm(found.trajectory.at(time) - true_sensor(time), axis=1)
     assert np.sqrt(np.mean(off**2)) < 1.0
     assert 0.02 < found.error < 1.0
+
+
+@pytest.mark.parametrize("degrees", [0.0, 0.2, -0.1])
+def test_vectors_that_are_turned_against_pairs_of_returns_are_found(degrees):
+    rng = np.random.default_rng(9)
+    time = START_TIME + np.sort(rng.uniform(0.0, 3.0, 8000))
+    rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * 1e5)
+    unit = rays.direction / HALF_C
+    angle = np.radians(degrees)
+    about = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    path = estimate_path(RaySample(time, rays.ground, unit @ about.T, np.ones(8000)), "direction vectors")
+    some = rng.choice(8000, 400, replace=False)
+    some.sort()
+    apart = 9.0 * unit[some] + 0.01 * rng.standard_normal((400, 3))
+    middle = rays.ground[some] - 4.5 * unit[some]
+    found = find_turn(RaySample(time[some], middle, apart, (apart**2).sum(axis=1)), path.trajectory)
+    assert found is None if not degrees else found == pytest.approx(abs(degrees), abs=0.02)
+    few = RaySample(*(values[some[:15]] for values in (time, rays.ground, rays.direction, np.full(8000, 99.0))))
+    assert find_turn(few, path.trajectory) is None
 
 
 def test_flights_with_a_break_have_no_positions_in_it():

@@ -156,3 +156,19 @@ def test_a_survey_depends_on_the_samples_only():
     block = make_block("urban", 3000, seed=7)[0]
     moved = replace(block, origin=block.origin + 5, first=9, point=block.point[::-1])
     assert survey_block(block) == survey_block(moved)
+
+
+@pytest.mark.quick_cases("22-3")
+@pytest.mark.parametrize(("times", "number"), [(22, 3), (60, 1), (28, 15)])
+def test_a_few_retro_reflectors_do_not_hide_the_ground(times, number):
+    """Ground below 8 % of the largest count was no clear echo: no pulse was learned, and its tail became echoes."""
+    rng = np.random.default_rng(41)
+    height = 60.0 * rng.uniform(0.8, 1.2, 4000)
+    height[rng.choice(4000, number, replace=False)] *= times
+    lag = np.arange(80) - 25 - rng.uniform(0, 1, (4000, 1))
+    pulse = np.exp(-0.5 * (lag / 2) ** 2) + 0.25 * np.exp(-0.5 * ((lag - 9) / 3) ** 2)
+    samples = np.rint(20 + height[:, None] * pulse + rng.normal(0, 0.6, lag.shape)).astype(np.uint16)
+    survey = survey_block(WaveformBlock.from_samples(samples, spacing=1.0, bits=16))
+    assert survey.figures.echoes_per_waveform < 1.01 and survey.figures.isolated_echoes > 1000
+    delays = [(weight, delay) for weight, delay, _ in survey.system.components]
+    assert min(abs(weight - 0.25) + abs(delay - 9) for weight, delay in delays) < 0.1

@@ -73,7 +73,7 @@ class Prepared:
     @property
     def system(self) -> SystemPulse:
         """The pulse that the strip is run with, its calibration, and the error of the sensor's position."""
-        return self.job.calibrate(self.choice.survey.system.with_radiometry(sensor_error=self.sensor.error))
+        return self.job.calibrate(self.sensor.place(self.choice.survey.system))
 
     @property
     def second_step(self) -> Step | None:

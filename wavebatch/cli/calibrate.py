@@ -156,7 +156,7 @@ def _describe_target(target: TargetResult) -> str:
     if target.constant is None:
         return f"{target.name}: reflectance {target.reflectance:g}, refused: {target.refused}"
     line = (
-        f"{target.name}: reflectance {target.reflectance:.4g}, {count(target.echoes, 'echo')}, constant "
+        f"{target.label}: reflectance {target.reflectance:.4g}, {count(target.echoes, 'echo')}, constant "
         f"{target.constant:.4g}, spread {100 * target.spread:.1f} %"
     )
     if target.incidence_deg is None:

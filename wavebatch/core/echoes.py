@@ -99,7 +99,7 @@ _COLUMNS = (
     Column("relative_reflectance", "f4", "DN ns m2", "not calibrated: reflectance in units of its own strip"),
     Column("incidence_angle", "f4", "deg", "angle between ray and surface normal"),
     Column("incidence_angle_normals", "f4", "deg", "angle between ray and normal of the plane of the points around"),
-    Column("range_err", "f4", "m", "one standard deviation of the echo along the ray, from the fit and the returns"),
+    Column("range_err", "f4", "m", "one standard deviation along the ray, against the returns of its pulse"),
     Column("range_error", "f4", "m", "error of range with sensor and returns: one standard deviation"),
     Column("amplitude_err", "f4", "DN", "one standard deviation of amplitude, from the fit"),
     Column("amplitude_normalized_err", "f4", "DN", "one standard deviation of amplitude_normalized"),

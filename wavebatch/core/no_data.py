@@ -78,6 +78,11 @@ class NoData(IntEnum):
         "the width of an echo that no slope widens is not known: too few points of the strip lie on planes",
         "give --system with the SYSTEM.toml of a strip of the same sensor that has them (`survey --divergence`)",
     )
+    EDGE = (
+        20,
+        "its footprint may reach over an edge, to a surface after the end of its packet",
+        "record longer waveforms; backscatter_coefficient holds what comes from its surface",
+    )
 
 
 REASONS: dict[NoData, tuple[str, str]] = {code: (code.meaning, code.remedy) for code in NoData if code.meaning}

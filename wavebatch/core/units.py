@@ -37,6 +37,12 @@ AIR_ATTENUATION = 0.22
 The default that others use; no source for it was found (docs/algorithms.md 5, 9).
 """
 
+INSET = 1.5
+"""1/e2 radii from a straight edge at which all of a footprint counts as inside: 0.13 % of its light lies beyond."""
+
+ASSUMED_DIVERGENCE = 1.0
+"""Full angle of the beam [mrad] for such distances where none is given: as wide as topographic lasers have."""
+
 MEDIAN_ERROR = math.sqrt(math.pi / 2.0)
 """Standard deviation of the median of many normal numbers, in that of their mean."""
 

@@ -63,8 +63,17 @@ class TargetResult:
     """Share of its echoes that are far darker or brighter than the others."""
     relative_error: float | None = None
     """Standard deviation of the constant from this target alone, relative."""
+    air: float | None = None
+    """Share of the air that a column of reflectances held, which was taken off; None where it is not known."""
     refused: str = ""
     """Why the target gave no constant."""
+    channel: str = ""
+    """Digitizer and scanner channel whose echoes these are; empty where the strip has one channel."""
+
+    @property
+    def label(self) -> str:
+        """Return the name, with the channel where there are several."""
+        return ", ".join(filter(None, (self.name, self.channel)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +183,8 @@ class Calibration:
     energy_unit: str = ""
     swath: tuple[float, ...] = ()
     """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
+    haze: float | None = None
+    """As `SensorSource.haze`, where the attenuation was not given: that at other heights follows."""
     right: tuple[float, float] = (0.0, 0.0)
     """Of the strip's flight, as `Radiometry.right`; not kept in the file."""
     notes: tuple[str, ...] = ()

@@ -348,7 +348,9 @@ def _compare_pulses(own: Look, whole: Look, system: SystemPulse, wider: float = 
     if own.width and whole.width:
         ratio = own.width / whole.width
         if ratio < 1 - NARROWER or (ratio > 1 + wider and own.steady > STEADY):
-            return f"its echoes are {own.width:.2f} ns wide (Gaussian sigma), those of the flight {whole.width:.2f} ns"
+            slope = "; steep slopes widen echoes as well" if ratio > 1 else ""
+            widths = f"{own.width:.2f} ns wide (Gaussian sigma), those of the flight {whole.width:.2f} ns{slope}"
+            return f"its echoes are {widths}"
         if own.misfit > whole.misfit + SHAPE:
             misfits = f"by {100 * own.misfit:.1f} % of the amplitude, those of the flight by {100 * whole.misfit:.1f} %"
             return f"the flight's pulse misses its strong echoes {misfits}"

@@ -59,7 +59,7 @@ class Setup:
     @property
     def system(self) -> SystemPulse:
         """The pulse with its calibration and the error of the sensor's position."""
-        system = self.choice.survey.system.with_radiometry(sensor_error=self.sensor.error)
+        system = self.sensor.place(self.choice.survey.system)
         return system if self.calibration is None else self.calibration.apply(system)
 
 

@@ -14,12 +14,14 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import Trajectory, solve_offset
-from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.core.units import AIR_ATTENUATION, MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.crs import read_crs_definition
-from wavebatch.files.strip.ray_sample import RaySample, measure_scale, sample_rays
+from wavebatch.files.strip.ray_sample import LEAST_PAIRS, RaySample, measure_scale, sample_rays
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
+from wavebatch.kernels.physics.radiometry import mean_haze
 
 NODE_SECONDS = 0.5
 """Time between two positions that are estimated from rays [s]."""
@@ -64,6 +66,10 @@ MOST_LAG = 5e-3
 """Least distance along the flight, as a share of the range, between a trajectory and the packet vectors for a remark: a
 mounting is known better than to 5 mrad."""
 
+LEAST_PAIR, SURE_TURN = 5.0, 4.0
+"""Distance of returns of a pair [m] from which they show a direction to a tenth of a degree; and errors from which
+their median shows that packet vectors are turned."""
+
 HEIGHT_ERROR = 0.05
 """Error of the range, relative, where only the height of the flight is known."""
 
@@ -101,6 +107,24 @@ class SensorSource:
     """Error of the ranges by the packet vectors [m]."""
     facts: tuple[tuple[str, Any], ...] = ()
     """More values for reports, by name."""
+
+    @property
+    def haze(self) -> float:
+        """Haze on the way to the ground over that of a usual flight above a coast; 1 where nothing is known."""
+        if not self.distance:
+            return 1.0
+        top = self.distance if self.trajectory is None else float(np.nanmedian(self.trajectory.xyz[:, 2]))
+        return mean_haze(top - self.distance, top)
+
+    @property
+    def turned(self) -> float:
+        """Angle between packet vectors and rays from a trajectory, or pairs of returns, where these show it [deg]."""
+        facts = dict(self.facts)
+        return facts.get("angle_to_packet_vectors_deg") or facts.get("angle_to_pairs_deg") or 0.0
+
+    def place(self, system: SystemPulse) -> SystemPulse:
+        """Return the system with the error of the distance, and with the usual air at the heights of the flight."""
+        return system.with_radiometry(sensor_error=self.error, attenuation=AIR_ATTENUATION * self.haze)
 
     def fill(self, block: WaveformBlock) -> WaveformBlock:
         """Return the block with the sensor's positions; the block itself where they are unknown.
@@ -185,7 +209,8 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     for kind, rays in (("direction vectors", vectors), ("pairs of returns", pairs)):
         found = estimate_path(rays, kind)
         if found is not None:
-            return found
+            turn = find_turn(pairs, found.trajectory) if rays is vectors else None
+            return found if turn is None else replace(found, facts=(*found.facts, ("angle_to_pairs_deg", turn)))
     if request.height is not None:
         error = HEIGHT_ERROR * request.height
         return SensorSource("flight height", height=request.height, distance=request.height, error=error)
@@ -335,6 +360,37 @@ def _compare_ranges(
     # A contradiction is known no better than the vectors are.
     error = float(np.hypot(error, path.error)) if error > path.error else error
     return round(float(np.median(longer)), 3), error, round(path.error, 6)
+
+
+def find_turn(pairs: RaySample, path: Trajectory) -> float | None:
+    """Find the angle by which rays from a path are turned against pairs of returns.
+
+    Parameters
+    ----------
+    pairs : RaySample
+    path : Trajectory
+        By packet vectors: where these are turned, so are the rays from it.
+
+    Returns
+    -------
+    float or None
+        [deg]; None where too few pairs show it, or where chance explains it.
+    """
+    rows = np.flatnonzero(pairs.weight > LEAST_PAIR**2)
+    ahead = pairs.point[rows] - path.at(pairs.time[rows])
+    off = []
+    for vectors in (ahead, pairs.direction[rows]):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            off.append(vectors / np.sqrt((vectors * vectors).sum(axis=1))[:, None])
+    turn = off[1] * np.sign(np.einsum("ni,ni->n", *off))[:, None] - off[0]
+    turn = turn[np.isfinite(turn).all(axis=1)]
+    if len(turn) < LEAST_PAIRS:
+        return None
+    middle = np.median(turn, axis=0)
+    errors = MEDIAN_ERROR * MAD_TO_STD * np.median(np.abs(turn - middle), axis=0) / len(turn) ** 0.5
+    if (np.abs(middle) < SURE_TURN * errors).all():
+        return None
+    return round(float(np.degrees(np.sqrt(middle @ middle))), 4)
 
 
 def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> float:

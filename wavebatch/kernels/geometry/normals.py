@@ -28,6 +28,15 @@ MOST_PER_CELL = 4
 LEAST_KEPT = 0.6
 """Smallest share of the neighbours that must lie in the plane."""
 
+RING, MOST_NEIGHBOURS = 5, 128
+"""Echoes within one distance of pulses of another, with itself; and the most that are looked at."""
+
+SPACED = 2000
+"""Echoes from which the distance of pulses is measured."""
+
+SAME_RAY = 0.1
+"""Distance over the reach of a footprint below which two echoes are of one pulse."""
+
 _LARGEST_CHUNK = 4096
 """Points that are handled at a time at most."""
 
@@ -231,3 +240,77 @@ def _take(
     place[rows] = np.arange(len(rows))
     local = place[point]
     return offset[local >= 0], local[local >= 0], Planes(*(part[rows] for part in planes))
+
+
+def find_edges(
+    points: np.ndarray, ray: np.ndarray, time: np.ndarray, before: np.ndarray, after: np.ndarray, reach: float
+) -> np.ndarray:
+    """Find echoes beside which the next pulse, or the same one, met a surface outside of the packet.
+
+    Parameters
+    ----------
+    points : float64 (m, 3), m
+        Positions.
+    ray : float64 (m, 3)
+        Unit vectors away from the sensor; those of neighbours are nearly parallel.
+    time : float64 (m,), s
+        Of the pulse.
+    before, after : float64 (m,), m
+        How far the packet of each echo reaches towards the sensor and away from it.
+    reach : float, m
+        How far the footprint reaches from its centre.
+
+    Returns
+    -------
+    bool (m,)
+
+    Notes
+    -----
+    Neighbours are those of the rays, by where they meet one level: behind a roof the ground begins metres away in plan.
+    """
+    edge = np.zeros(len(points), bool)
+    able = np.flatnonzero(np.isfinite(points).all(axis=1) & np.isfinite(ray).all(axis=1) & (ray[:, 2] != 0))
+    if len(able) < 2:
+        return edge
+    with np.errstate(invalid="ignore", divide="ignore"):
+        level = points[:, :2] - (points[:, 2:] - np.median(points[able, 2])) * (ray[:, :2] / ray[:, 2:])
+    tree = scipy.spatial.cKDTree(level[able])
+    few = level[able[:: max(len(able) // SPACED, 1)]]
+    spacing = float(np.median(tree.query(few, k=[min(RING, len(able))])[0]))
+    # The footprint reaches over the edge, and so does that of the pulses behind it that still see this surface.
+    most = 2.0 * reach + spacing
+    given = (values[able] for values in (level, points[:, 2], ray, time, before, after))
+    rows = able[_may_lie_apart(*given, most)]
+    number = int(np.clip(np.ceil(1.5 * np.pi * (most / max(spacing, 1e-6)) ** 2), RING, MOST_NEIGHBOURS))
+    for start in range(0, len(rows), _LARGEST_CHUNK):
+        own = rows[start : start + _LARGEST_CHUNK]
+        apart, near = tree.query(level[own], k=min(number + 1, len(able)), distance_upper_bound=most)
+        other = able[np.minimum(near, len(able) - 1)]
+        deeper = np.einsum("mki,mi->mk", points[other] - points[own][:, None], ray[own])
+        mine = (apart < SAME_RAY * reach) & (time[other] == time[own, None])
+        deep = (deeper > after[own, None]) & np.isfinite(apart)
+        # One echo alone, as noise makes them, is no surface.
+        edge[own] = (deep.sum(axis=1) > 1) | ((deep | (deeper < -before[own, None])) & mine).any(axis=1)
+    return edge
+
+
+def _may_lie_apart(
+    level: np.ndarray, z: np.ndarray, ray: np.ndarray, time: np.ndarray, before: np.ndarray, after: np.ndarray,
+    most: float,
+) -> np.ndarray:
+    """Whether the cell of an echo, or one of those around it, has heights that lie outside of its packet, bool (m,)."""
+    cell = np.floor((level - level.min(axis=0)) / most)
+    width = cell[:, 1].max() + 3.0
+    cells, own = np.unique(cell[:, 0] * width + cell[:, 1], return_inverse=True)
+    ends = np.full((2, len(cells)), -np.inf)
+    np.maximum.at(ends[0], own, -z)
+    np.maximum.at(ends[1], own, z)
+    reach = ends.copy()
+    for step in (a * width + b for a in (-1, 0, 1) for b in (-1, 0, 1)):
+        at = np.minimum(np.searchsorted(cells, cells + step), len(cells) - 1)
+        there = cells[at] == cells + step
+        reach[:, there] = np.maximum(reach[:, there], ends[:, at[there]])
+    tilt, down = most * np.hypot(*ray[:, :2].T), np.abs(ray[:, 2])
+    lower, higher = (reach[0][own] + z) / down + tilt, (reach[1][own] - z) / down + tilt
+    _, pulse, number = np.unique(time, return_inverse=True, return_counts=True)
+    return (lower > after) | ((higher > before) & (number[pulse] > 1))

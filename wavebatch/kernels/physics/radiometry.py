@@ -79,6 +79,30 @@ def usual_attenuation(wavelength: float) -> float:
     return AIR_ATTENUATION * ratio
 
 
+HAZE_HEIGHT, USUAL_HEIGHT = 2000.0, 700.0
+"""Height over which haze falls to 1/e [m], 1000 to 3000 m by weather and season; and that of usual flights, up to which
+AIR_ATTENUATION is the mean."""
+
+
+def mean_haze(low: float, high: float) -> float:
+    """Mean of the haze between two heights, over that of a usual flight above a coast.
+
+    Parameters
+    ----------
+    low, high : float, m
+        Of the ground and of the sensor above sea level; below it counts as sea level.
+
+    Returns
+    -------
+    float
+        1 up to 700 m, 0.93 up to 1000 m, 0.59 up to 3200 m.
+    """
+    ends, usual = -np.maximum([low, high], 0.0) / HAZE_HEIGHT, USUAL_HEIGHT / HAZE_HEIGHT
+    layer = ends[0] - ends[1]
+    mean = -math.expm1(-layer) / layer if layer > 0 else 1.0
+    return float(math.exp(ends[0]) * mean * usual / -math.expm1(-usual))
+
+
 def backscatter(
     constant: np.ndarray | float, distance: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray, attenuation: float
 ) -> np.ndarray:

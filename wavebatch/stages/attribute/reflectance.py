@@ -109,18 +109,20 @@ def _reflectance(block: WaveformBlock, echoes: EchoTable, name: str, light: Ligh
     known = (echoes.attributes.get(key, unknown) for key in (_ANGLE[surface], f"{_ANGLE[surface]}_err"))
     angle, angle_err = (np.radians(values.astype(np.float64)) for values in known)
     relative = radiometry.reflectance_error(light.relative_error, angle, angle_err)
-    return _divide(block, echoes, name, light, angle, relative)
+    edge = echoes.attributes.get("edge", np.zeros(len(echoes), bool))
+    return _divide(block, echoes, name, light, angle, relative, edge)
 
 
 def _divide(
-    block: WaveformBlock, echoes: EchoTable, name: str, light: Light, angle: np.ndarray, relative: np.ndarray
-) -> EchoTable:
-    """The column gamma / (4 cos(angle)) of echoes that are alone, with relative errors (m,)."""
+    block: WaveformBlock, echoes: EchoTable, name: str, light: Light, angle: np.ndarray, relative: np.ndarray,
+    edge: np.ndarray | bool = False,
+) -> EchoTable:  # fmt: skip
+    """The column gamma / (4 cos(angle)) of echoes that are alone, with relative errors (m,); edge: they may not be."""
     alone = echoes.alone(len(block))
-    rho = np.where(alone & ~light.bound, radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
+    rho = np.where(alone & ~light.bound & ~np.asarray(edge), radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
     steep = angle >= radiometry.STEEPEST
     more = (
         (NoData.UNSETTLED, light.bound), (NoData.SHARED_PULSE, ~alone), (NoData.NO_ANGLE, np.isnan(angle)),
-        (NoData.TOO_STEEP, steep),
+        (NoData.TOO_STEEP, steep), (NoData.EDGE, edge),
     )  # fmt: skip
     return add_column(echoes, name, rho, relative, *light.cases, *more)

@@ -15,6 +15,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.system import swath_columns
+from wavebatch.files.las.crs import describe_crs
 from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
 from wavebatch.surveying.calibrating.flight_strips import FlightStrip, Source, find_box, read_strip
@@ -69,6 +70,7 @@ def calibrate_flight(
     """
     options = options or CalibrationOptions()
     check_attenuation(options.air)
+    _refuse_zones(paths)
     boxes = [find_box(path) for path in paths]
     strips: list[FlightStrip] = []
     for i, path in enumerate(paths):
@@ -109,6 +111,20 @@ def calibrate_flight(
             f"error of the constants grows by {100 * open_error:.1f} %; give three strips, one of another heading"
         )
     return FlightCalibration(replace(calibration, notes=(*notes, *more)), pairs, ties.size)
+
+
+def _refuse_zones(paths: Sequence[Path]) -> None:
+    """Raise InputError where strips name different CRSs: places with equal coordinates would be tied."""
+    named = [(path, describe_crs(path).name) for path in paths]
+    for coded in (True, False):
+        # By codes where files have them: names of one CRS differ from program to program.
+        some = {
+            name.rpartition("EPSG:")[2]: (path, name) for path, name in named if name and coded == ("EPSG:" in name)
+        }
+        if len(some) > 1:
+            (path, one), (second, other) = list(some.values())[:2]
+            problem = f"its coordinates are in {other}, those of {path.name} in {one}"
+            raise InputError(f"{second}: {problem}: project the strips to one CRS, or calibrate them separately")
 
 
 def _is_covered(row: ChannelConstant, channels: Sequence[ChannelConstant]) -> bool:

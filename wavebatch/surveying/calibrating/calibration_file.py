@@ -29,6 +29,9 @@ _NUMBERS: dict[str, Key] = {
     ),
     "relative_error": Key("relative_error", 0.0, 10.0, "standard deviation of the constant, relative"),
     "attenuation_db_km": Key("attenuation", 0.0, 100.0, "of the air, one way, as it was used for the constant", True),
+    "haze": Key(
+        "haze", 1e-6, 10.0, "of the flight over usual ones: other heights have other air", optional=True
+    ),
     "divergence_mrad": Key(
         "divergence", 1e-3, 100.0, "full angle of the beam between the 1/e^2 points; needed for m2", optional=True
     ),

@@ -125,7 +125,7 @@ def read_strip(
             found=found,
             refused=refused,
             channels=tuple(describe_channel(row, source) for row in channels),
-            ranging=math.hypot(measure_ranging(source.sensor, distance, options.air), source.sent.growth),
+            ranging=math.hypot(measure_ranging(source.sensor, distance, source.air), source.sent.growth),
             sent=source.sent,
             ties=ties,
             seen=_see_targets(on_targets, source.setting.right),

@@ -86,7 +86,7 @@ class CalibrationOptions:
 
     @property
     def air(self) -> float:
-        """Attenuation of the air [dB/km]: the given one, or that of clear air at the wavelength."""
+        """Attenuation of the air [dB/km]: the given one, or that of clear air at the wavelength and sea level."""
         return usual_attenuation(self.wavelength) if self.attenuation is None else self.attenuation
 
 
@@ -103,6 +103,10 @@ class EchoSource:
     sensor: SensorSource
     setting: Setting
     sent: StripEnergies
+    air: float
+    """Attenuation [dB/km]."""
+    haze: float | None
+    """As `Calibration.haze`."""
     column: PulseEnergy | None = None
     """The extra byte whose values go with the echoes, if one was asked for."""
 
@@ -149,16 +153,18 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
         chain = options.chain or widest_chain()
         setup = prepare(reader, scan, chain, options.request, sensor=options.sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
-        system = setup.system.with_radiometry(attenuation=options.air, sensor_error=0.0)
+        haze = setup.sensor.haze if options.attenuation is None else None
+        air = options.air * (haze or 1.0)
+        system = setup.system.with_radiometry(attenuation=air, sensor_error=0.0)
         sent = take_energies(reader, scan, options.energy, options.before)
-        setting = measure_setting(reader, scan, setup.sensor, options.air, sent.energy.level if sent.energy else 1.0)
+        setting = measure_setting(reader, scan, setup.sensor, air, sent.energy.level if sent.energy else 1.0)
         column = options.column
         given = find_column(reader, column) if column else None
         if column and given is None:
             hint = name_columns(reader, column)
             raise InputError(f"{path}: --from-column: no extra byte is called {column!r}; {hint}")
         chain = with_energy(setup.chain)
-        yield EchoSource(reader, scan, setup.choice, chain, system, setup.sensor, setting, sent, given)
+        yield EchoSource(reader, scan, setup.choice, chain, system, setup.sensor, setting, sent, air, haze, given)
 
 
 def with_energy(chain: Chain) -> Chain:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.order import group_medians, robust_std
-from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET, MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.geometry.facets import fit_facet
 from wavebatch.surveying.calibrating.target_file import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibration import ChannelConstant, TargetResult
@@ -30,12 +30,6 @@ GIVEN_ANGLE_ERROR = np.radians(1.0)
 MOST_OFF = 4.0
 """A given incidence contradicts the plane of the echoes by so many standard errors."""
 
-INSET = 1.5
-"""Echoes count this many 1/e2 radii inside the outline: 0.13 % of a footprint's light lies beyond a straight edge."""
-
-ASSUMED_DIVERGENCE = 1.0
-"""Full angle of the beam [mrad] for the inset where none is given: as wide as topographic lasers have."""
-
 STRANGE_SIGMA, MOST_STRANGE = 6.0, 0.02
 """Echoes this many robust standard deviations off the median are of another surface; more than this share may be the
 target itself, inside of an outline that is too large: it is named, and by how much they are off is in the error."""
@@ -49,6 +43,10 @@ EDGE_SIGMA, LEAST_EDGE = 4.0, 0.01
 
 LEAST_NEGATIVE, MOST_REFLECTANCE = 0.01, 2.0
 """Share of negative values from which a column of reflectances is in dB, and the most that its median may be."""
+
+MOST_HELD_ERROR = 0.3
+"""Error of the share of the air that a column holds from which the share is not known: it is 0 or 1. Beyond -0.5 and
+1.5 something else changes with the range."""
 
 CLASSES = 5
 """Classes of reflectance whose constants are compared."""
@@ -139,7 +137,7 @@ def measure_target(
 
 
 def measure_column(
-    name: str, rows: np.ndarray, reflectance_error: float
+    name: str, rows: np.ndarray, reflectance_error: float, attenuation: float
 ) -> tuple[TargetResult, np.ndarray, np.ndarray]:
     """Measure the constant by a column of reflectances that the sensor's vendor computed.
 
@@ -152,11 +150,14 @@ def measure_column(
         dB or as a share.
     reflectance_error : float
         Standard deviation of the vendor's constant, relative.
+    attenuation : float
+        Of the air, one way [dB/km].
 
     Returns
     -------
     result : TargetResult
-        Its error holds by how much dark and bright echoes differ.
+        Its error holds by how much dark and bright echoes differ, and the air where ranges do not show whether the
+        vendor has taken it off. Where they show that he has not, it is taken off.
     used : array of ECHO (k,)
     constant : float64 (k,)
         As `measure_target`.
@@ -170,14 +171,39 @@ def measure_column(
         if len(rows) >= LEAST_ECHOES:
             reason = f"its median is {blank.reflectance:.3g}: it holds neither dB nor shares of 1"
         return replace(blank, refused=reason), rows[:0], np.empty(0)
-    constant = 4.0 * facing / rows["light"]
-    result = summarise(blank, constant)
+    constant, held, air_err = _take_off_air(4.0 * facing / rows["light"], rows["distance"], attenuation)
+    result = replace(summarise(blank, constant), air=held)
     # By both: classes of one alone differ where that one is noisy.
     order = np.argsort(facing * rows["light"], kind="stable")
     classes = np.array_split(constant[order], min(CLASSES, len(rows) // LEAST_ECHOES))
     apart = float(np.std([np.median(some) for some in classes])) / result.constant
     inner = MEDIAN_ERROR * result.spread / np.sqrt(len(rows) - 1)
-    return replace(result, relative_error=float(np.hypot(np.hypot(reflectance_error, apart), inner))), rows, constant
+    error = float(np.sqrt(reflectance_error**2 + apart**2 + inner**2 + air_err**2))
+    return replace(result, relative_error=error), rows, constant
+
+
+def _take_off_air(
+    constant: np.ndarray, distance: np.ndarray, attenuation: float
+) -> tuple[np.ndarray, float | None, float]:
+    """Constants by a vendor's reflectances without the air that these still hold; its share, None where the ranges do
+    not show it; and the error that follows.
+
+    Such reflectances, and constants, fall with the range as the air's transmission does.
+    """
+    loss = 2.0e-4 * np.log(10.0) * attenuation * distance
+    value = np.log(constant)
+    off = np.abs(value - np.median(value))
+    kept = off <= 4.0 * MAD_TO_STD * np.median(off)
+    apart = loss[kept] - loss[kept].mean()
+    squares = float(apart @ apart)
+    whole = float(np.median(loss))
+    if not squares > 0.0:
+        return constant, None, whole
+    held = -float(apart @ value[kept]) / squares
+    error = float(np.std(value[kept] - value[kept].mean() + held * apart)) / np.sqrt(squares)
+    if error > MOST_HELD_ERROR or abs(held - 0.5) > 1.0:
+        return constant, None, whole
+    return constant * np.exp(held * loss), held, error * whole
 
 
 def summarise(blank: TargetResult, constant: np.ndarray) -> TargetResult:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +30,7 @@ from wavebatch.surveying.calibrating.target_constants import (
 )
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
-from wavebatch.surveying.matching.setting import read_day, read_sensor_name
+from wavebatch.surveying.matching.setting import SCANNERS, read_day, read_sensor_name
 from wavebatch.surveying.sensor import SensorSource
 
 MOST_ECHOES = 200_000
@@ -73,7 +73,7 @@ def build_calibration(
         for target, rows in zip(targets, found, strict=not options.column)
     ]
     if options.column:
-        measured = [measure_column(options.column, found[0], options.reflectance_error)]
+        measured = [measure_column(options.column, found[0], options.reflectance_error, source.air)]
     results = [result for result, _, _ in measured]
     whole = combine_targets(results, _fit_errors([used for _, used, _ in measured]))
     if whole is None:
@@ -81,7 +81,7 @@ def build_calibration(
         reasons = miss or "; ".join(f"{result.name}: {result.refused}" for result in results)
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])
-    ranging = math.hypot(measure_ranging(source.sensor, used["distance"], options.air), source.sent.growth)
+    ranging = math.hypot(measure_ranging(source.sensor, used["distance"], source.air), source.sent.growth)
     channels = tuple(
         describe_channel(replace(row, relative_error=float(np.hypot(row.relative_error, ranging))), source)
         for row in _measure_channels(measured)
@@ -93,7 +93,8 @@ def build_calibration(
     return Calibration(
         constant=whole.constant,
         relative_error=float(np.hypot(np.hypot(whole.relative_error, apart), ranging)),
-        attenuation=options.air,
+        attenuation=source.air,
+        haze=source.haze,
         divergence=divergence,
         strip=source.path.name,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -107,7 +108,7 @@ def build_calibration(
         height=float(np.median(-used["ray"][:, 2] * used["distance"])),
         distance=float(np.median(used["distance"])),
         fingerprint=take_fingerprint(source.path, facts.packets.file),
-        targets=tuple(results),
+        targets=tuple(_split_targets(measured) if len(channels) > 1 else results),
         channels=channels,
         **source.sent.describe(),
         notes=tuple(_list_doubts(source, results, channels, options)),
@@ -141,6 +142,16 @@ def _measure_channels(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndar
     return found
 
 
+def _split_targets(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndarray]]) -> Iterator[TargetResult]:
+    """What each channel has of each target: channels differ in gain, so that no median is common to them."""
+    for result, rows, constant in measured:
+        if result.constant is None:
+            yield result
+        for channel in np.unique(rows["channel"]).tolist():
+            name = f"digitizer {channel // SCANNERS}, scanner channel {channel % SCANNERS}"
+            yield replace(summarise(result, constant[rows["channel"] == channel]), channel=name)
+
+
 def describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstant:
     """Return the row with how its channel records, for the comparison with other strips."""
     digitizer = source.reader.facts.digitizers[row.digitizer]
@@ -167,6 +178,13 @@ def _list_doubts(
     """What a person should look at before the calibration is used."""
     yield from filter(None, (source.sensor.doubt(), *source.sent.notes))
     for result in results:
+        if options.column and result.air is None and source.air:
+            yield (
+                f"{result.name}: its ranges are too alike to show whether it still holds the air: the error of the "
+                f"constant, {100 * result.relative_error:.1f} %, holds all of that; ask the vendor, or take targets"
+            )
+        elif options.column and result.air > 0.5:
+            yield f"{result.name}: it falls with the range as if it still held {result.air:.0%} of the air: taken off"
         if result.edge is not None:
             yield (
                 f"{result.name}: echoes near its outline give a constant {100 * result.edge:+.1f} % off that of its "

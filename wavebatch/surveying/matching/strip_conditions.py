@@ -17,7 +17,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.light import AIR_DOUBT
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.matching.setting import Setting, compare_scenes, read_day, read_sensor_name
-from wavebatch.surveying.sensor import SensorSource
+from wavebatch.surveying.sensor import FOOT, SensorSource
 
 SAME_DIVERGENCE = 0.03
 """Relative difference up to which divergences are equal."""
@@ -37,6 +37,9 @@ FAR = 1.3
 
 SAME_RATE = 1.02
 """Ratio up to which pulse rates are equal."""
+
+LIKE_FEET = 0.35
+"""Logarithm by which light may differ from what feet taken for metres make of it: other surfaces, and more air."""
 
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
@@ -69,9 +72,10 @@ def find_growth(
     parts, lines = [UNSTATED if not min(row.relative_error for row in rows) else 0.0], []
     day = read_day(reader)
     slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
+    haze = sensor.haze / calibration.haze if calibration.haze and attenuation is None else 1.0
     if day and calibration.flight and day != calibration.flight:
         apart = abs((date.fromisoformat(day) - date.fromisoformat(calibration.flight)).days)
-        own = sensor.distance or 0.0 if attenuation is None else 0.0
+        own = haze * (sensor.distance or 0.0) if attenuation is None else 0.0
         air = slope * math.hypot(own, calibration.distance or 0.0)
         parts.append(math.hypot(OTHER_MONTH if apart > 30 else OTHER_DAY, air))
         lines.append(
@@ -79,7 +83,11 @@ def find_growth(
             f"grows by {100 * parts[-1]:.0f} %, {100 * air:.0f} % of it for the air"
         )
     elif calibration.distance and sensor.distance:
-        parts.append(slope * abs(sensor.distance - calibration.distance))
+        more, less = haze * sensor.distance - calibration.distance, 0.0
+        if haze != 1.0:
+            # What heights above sea take off the air is known to a half as well.
+            less = (sensor.distance - calibration.distance) / calibration.haze - more
+        parts.append(slope * math.hypot(more, less))
         ratio = sensor.distance / calibration.distance
         if max(ratio, 1 / ratio) > FAR:
             lines.append(
@@ -115,7 +123,10 @@ def compare_setting(calibration: Calibration, found: Setting, system: SystemPuls
         compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
         # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
         light = found.brightest.get(row.digitizer)
-        compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or other surfaces: light {which} is")
+        surfaces = "other surfaces"
+        if light and row.brightest and abs(math.log(light / row.brightest * FOOT**2)) < LIKE_FEET:
+            surfaces += ", or coordinates in feet (which make it 10.8 times as bright)"
+        compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or {surfaces}: light {which} is")
         scene = found.scenes.get(row.digitizer)
         off = compare_scenes(scene, row.scene) if scene and len(row.scene) == len(scene) else 0.0
         if off:
@@ -138,7 +149,7 @@ def compare_air(
     if abs(off) < LEAST_AIR:
         return 0.0
     warnings.append(
-        f"calibration: --attenuation {attenuation:g} dB/km contradicts the {calibration.attenuation:g} dB/km with "
+        f"calibration: --attenuation {attenuation:g} dB/km contradicts the {calibration.attenuation:.2g} dB/km with "
         f"which the constant was measured on the same day: light changes by {100 * math.expm1(off):+.0f} %, which is "
         "in the error; give `wavebatch calibrate` the same --attenuation"
     )

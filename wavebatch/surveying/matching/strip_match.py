@@ -93,6 +93,8 @@ def match_strip(
     if not any(row.is_described for row in calibration.channels):
         return calibration, tuple(warnings)
     growth, reasons = find_growth(calibration, reader, sensor, attenuation)
+    if calibration.haze and attenuation is None:
+        calibration = replace(calibration, attenuation=calibration.attenuation / calibration.haze * sensor.haze)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
     setting = measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0)
     if all(row.sha256 != own_strip for row in calibration.strips):

@@ -106,7 +106,10 @@ def find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     """Echoes of any width that are the strongest by ten to one of their waveform, not near an edge or clipped."""
     echoes = fit_lone(block, pooled_noise(block, system), system, MIN_SNR, fraction=0.5)
     top = system.saturation or float(block.samples.max())
-    return echoes.take(np.flatnonzero((echoes.amplitude > 0.08 * top) & (echoes.amplitude < top)))
+    # Three retro-reflectors make no ground weak: the light that a share, or FEW, of the waveforms reach is bright.
+    peaks = np.sort(block.samples.max(axis=1))
+    bright = float(peaks[-min(FEW, 1 + len(peaks) // 10)])
+    return echoes.take(np.flatnonzero((echoes.amplitude > 0.08 * bright) & (echoes.amplitude < top)))
 
 
 def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: Figures) -> SystemPulse:

@@ -161,7 +161,7 @@ def _compare_system(look: Look, survey: Survey) -> str:
         return ""
     ratio = look.width / system.sigma_ref
     if ratio < LEAST_WIDTH or (ratio > LARGEST_WIDTH and look.steady > STEADY):
-        pulse = f"the saved pulse {system.sigma_ref:.2f} ns"
+        pulse = f"the saved pulse {system.sigma_ref:.2f} ns" + "; steep slopes widen echoes as well" * (ratio > 1)
         return f"its echoes are {look.width:.2f} ns wide (Gaussian sigma), {pulse}"
     if look.misfit > LARGEST_MISFIT:
         return f"the saved pulse misses its strong echoes by {100 * look.misfit:.0f} % of the amplitude"

@@ -75,11 +75,11 @@ def _draw_swath(swath: tuple[float, ...]) -> str:
 
 
 def _list_targets(found: Calibration) -> str:
-    rows = [[one.name, one.reflectance, one.echoes, _constant(one.constant, one.relative_error or one.spread),
+    rows = [[one.label, one.reflectance, one.echoes, _constant(one.constant, one.relative_error or one.spread),
              markup.percent(one.spread), markup.rounded(one.incidence_deg, ".1f"),
              "used" if one.constant is not None else one.refused or "refused"] for one in found.targets]  # fmt: skip
     head = ["target", "reflectance", "echoes", "constant", "spread %", "incidence deg", ""]
-    used = [(one.name, one.constant, one.constant * (one.relative_error or one.spread or 0.0))
+    used = [(one.label, one.constant, one.constant * (one.relative_error or one.spread or 0.0))
             for one in found.targets if one.constant is not None]  # fmt: skip
     charts = [draw_values(*map(list, zip(*used, strict=True)), title="Constant of each target with its error",
                           label=UNIT)] if used else []  # fmt: skip
