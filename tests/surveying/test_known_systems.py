@@ -18,6 +18,7 @@ from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems import known_systems as module
+from wavebatch.surveying.systems.doubt import doubt_survey
 from wavebatch.surveying.systems.known_systems import (
     compare_pulses,
     draw_pulse,
@@ -114,6 +115,12 @@ def test_a_small_strip_takes_the_known_pulse_that_its_own_looks_like(first):
 def test_a_small_strip_of_the_other_known_sensor_looks_like_it(leica, tmp_path):
     small = _survey(cut_strip(leica, tmp_path / "cut.las", 100))
     assert find_likeness(small.system, 1.0).known.name == "leica-als"
+
+
+def test_fifty_packets_with_hardly_an_isolated_echo_are_a_guess(leica, tmp_path):
+    """Five Gaussians explained the fifty packets that they were learned from: 82 % more echoes, and no word."""
+    small = _survey(cut_strip(leica, tmp_path / "cut.las", 50))
+    assert [one.code for one in doubt_survey(small)] == ["pulse-guess"]
 
 
 OTHERS = {

@@ -190,7 +190,7 @@ def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
         "schema": SYSTEM_SCHEMA,
         "version": saved.version,
         **facts,
-        "warnings": [*facts.get("warnings", ()), *map(asdict, doubt_survey(saved.survey.system, saved.survey.figures))],
+        "warnings": [*facts.get("warnings", ()), *map(asdict, doubt_survey(saved.survey))],
         "fingerprint": dict(saved.fingerprint),
         "waveforms": saved.survey.waveforms,
         "system": describe_system(saved.survey.system),
