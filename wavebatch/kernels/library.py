@@ -21,6 +21,7 @@ FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
     "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse", "render_pulses",
     "measure_changes", "pair_differences", "judge_packets",
+    "interpolate_columns",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
