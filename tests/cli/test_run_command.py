@@ -1,6 +1,7 @@
 """`wavebatch run` as a user types it: exit codes, one line per failure, streams, options."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ from batch_tools import read_cloud
 from click.testing import CliRunner
 
 from wavebatch.cli import COMMANDS, main
+from wavebatch.tools.simulate import simulate_strip
 
 
 def _run(*arguments):
@@ -202,6 +204,24 @@ def test_help_imports_neither_numpy_nor_laspy():
     assert done.stderr.strip() == "[]"
     for name in COMMANDS:
         assert f"  {name}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "command, unused",
+    [("info STRIP", "laspy scipy wavebatch.stages wavebatch.surveying.survey"), ("run STRIP -o OUT", "laspy pyproj")],
+)
+def test_commands_import_only_what_they_use(tmp_path, command, unused):
+    strip = tmp_path / "a.laz"
+    simulate_strip("mixed", strip, pulses=500)
+    words = command.replace("STRIP", str(strip)).replace("OUT", str(tmp_path / "out")).split()
+    code = (
+        f"import sys\nfrom wavebatch.cli import main\n"
+        f"try:\n    main({words!r})\nexcept SystemExit as end:\n    assert not end.code\n"
+        f"print(sorted(set({unused.split()!r}) & sys.modules.keys()))"
+    )
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("WAVEBATCH_")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=plain)
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))

@@ -28,7 +28,7 @@ from wavebatch.files.cloud.echo_reader import name_standard, read_field
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.files.las.checked_header import CheckedHeader
-from wavebatch.files.las.point_formats import read_classes
+from wavebatch.files.las.point_formats import read_classes, split_numbers
 from wavebatch.stages.chain import STAGES, Chain
 
 WITHOUT_STAGE = ("echo_time", "echo_flags")
@@ -178,10 +178,8 @@ class RowSelector:
 
     def _count_last(self, rows: np.ndarray, left: np.ndarray) -> int:
         """Rows (m,) that are the last of their pulse and left out by --where; left: number of the reason (m,)."""
-        header, form = self.layout.source.header, self.layout.point_format
-        lost = rows[left == len(LEFT_OUT)]
-        number, last = (read_field(lost, form, name, header) for name in ("return_number", "number_of_returns"))
-        return int(np.count_nonzero(number == last))
+        number, total = split_numbers(rows[left == len(LEFT_OUT)])
+        return int(np.count_nonzero(number == total))
 
     def _test(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> Iterator[np.ndarray | bool]:
         """Whether rows (m,) are written as far as each reason of LEFT_OUT is concerned, bool (m,) or for all."""

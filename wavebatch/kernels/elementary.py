@@ -51,6 +51,30 @@ def solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     return columns.T
 
 
+def interpolate(x: np.ndarray, at: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Columns of a table, linear between its rows and level beyond them.
+
+    Parameters
+    ----------
+    x : float (n,)
+    at : float (k,)
+        Abscissas of the rows, ascending; k > 0.
+    table : float (k, m)
+
+    Returns
+    -------
+    float64 (n, m)
+        The bits of `np.interp`, which looks for the rows of each column anew; NaN where x is.
+    """
+    x, at, table = (np.ascontiguousarray(array, np.float64) for array in (x, at, table))
+    if x.ndim != 1 or table.ndim != 2 or at.shape != table.shape[:1] or not len(at):
+        raise ValueError(f"a table of shape {table.shape} has no rows at {at.shape} places")
+    out = np.empty((len(x), table.shape[1]))
+    n, k, m = (ctypes.c_int64(number) for number in (len(x), *table.shape))
+    call("interpolate_columns", n, x, k, m, at, table, out)
+    return out
+
+
 def _kind(x: np.ndarray | float) -> type:
     return np.float32 if getattr(x, "dtype", None) == np.float32 else np.float64
 

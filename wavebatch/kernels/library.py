@@ -20,7 +20,8 @@ _POINTER = ctypes.c_void_p
 FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
     "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse", "render_pulses",
-    "measure_changes", "pair_differences",
+    "measure_changes", "pair_differences", "judge_packets",
+    "interpolate_columns",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -129,6 +130,28 @@ class CGroups(ctypes.Structure):
     """`Groups` of kernels/c/signal.h."""
 
     _fields_ = _fields(_POINTER, "waveform low high first number")
+
+
+class CPoints(ctypes.Structure):
+    """`Points` of kernels/c/packets.h."""
+
+    _fields_ = [*_fields(ctypes.c_int64, "n stride"), *_fields(_POINTER, "index offset size location x y z")]
+
+
+class CRules(ctypes.Structure):
+    """`Rules` of kernels/c/packets.h."""
+
+    _fields_ = [
+        *_fields(_POINTER, "known good odd packs width samples packed"),
+        *_fields(ctypes.c_int64, "least end is_range"),
+        *_fields(ctypes.c_double, "unit longest furthest"),
+    ]
+
+
+class CJudged(ctypes.Structure):
+    """`Judged` of kernels/c/packets.h."""
+
+    _fields_ = _fields(_POINTER, "reason n_samples keys short packed")
 
 
 class Samples(NamedTuple):

@@ -271,14 +271,16 @@ def _flag_saturated(block: WaveformBlock, noise: Noise, level: float, table: Ech
     clipped = block.samples >= level
     if block.missing is not None:
         clipped &= ~block.missing
-    rows = np.flatnonzero(clipped.any(axis=1)[table.waveform])
+    s = block.samples.shape[1]
+    place = np.flatnonzero(clipped)
+    is_clipped = np.zeros(len(clipped), bool)
+    is_clipped[place // s] = True
+    rows = np.flatnonzero(is_clipped[table.waveform])
     if not len(rows):
         return table
     # The first clipped sample after the beginning of an echo must lie before its end. Looked up in the list of clipped
     # samples: echoes x samples would be 4e8 for one waveform of 65,535 samples with spikes.
-    row, at = np.nonzero(clipped)
-    s = block.samples.shape[1]
-    place = np.append(row * s + at, len(clipped) * s)
+    place = np.append(place, len(clipped) * s)
     time, reach = table.time[rows], 1.5 * table.sigma[rows]
     low = np.ceil(np.clip((time - reach) / block.spacing, 0, s)).astype(np.int64)
     high = np.floor(np.clip((time + reach) / block.spacing, -1, s - 1)).astype(np.int64)

@@ -13,7 +13,7 @@ import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import exp, log, solve
+from wavebatch.kernels.elementary import exp, interpolate, log, solve
 from wavebatch.kernels.fit.pulse_shape import (
     GAUSSIAN,
     NO_SKEW,
@@ -292,12 +292,12 @@ def error_factors(
         return np.ones((len(width), 4))
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
     widths, factors, by_level = _factor_table(shape, limits, noise.correlation, noise.whitening)
-    found = np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
+    found = interpolate(width, widths, factors)
     if level_err is None:
         return found
     if noise.whitening:
         level_err = level_err * noise.std / noise.quiet
-    return np.hypot(found, level_err[:, None] * np.stack([np.interp(width, widths, one) for one in by_level.T], axis=1))
+    return np.hypot(found, level_err[:, None] * interpolate(width, widths, by_level))
 
 
 @lru_cache(maxsize=8)

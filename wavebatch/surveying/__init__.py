@@ -15,6 +15,19 @@ How a strip is surveyed:
 `wavebatch check`.
 """
 
-from wavebatch.surveying.survey import SAMPLE, Decision, Part, Survey, join_digitizers, survey_block, survey_blocks
+from __future__ import annotations
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from wavebatch.surveying.survey import SAMPLE, Decision, Part, Survey, join_digitizers, survey_block, survey_blocks
 
 __all__ = ["SAMPLE", "Decision", "Part", "Survey", "join_digitizers", "survey_block", "survey_blocks"]
+
+
+def __getattr__(name: str) -> object:
+    """Import the survey when it is first used: `info` looks at strips without one."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from wavebatch.surveying import survey
+
+    return getattr(survey, name)

@@ -17,8 +17,6 @@ from wavebatch.core.no_data import without_nan
 from wavebatch.files.strip.describe import describe_samples
 from wavebatch.files.strip.header_check import audit_header
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
-from wavebatch.stages.chain_file import load_chain, load_profile
-from wavebatch.surveying.survey import survey_blocks
 
 _MATCHED = 1024
 """Waveforms whose echoes are compared with the returns."""
@@ -79,6 +77,8 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
 
 
 def _check_chain(path: Path) -> Findings:
+    from wavebatch.stages.chain_file import load_chain  # stages and survey: half of the start of `info`
+
     try:
         chain = load_chain(path)
     except (ConfigError, InputError) as error:
@@ -141,6 +141,9 @@ def _match_returns(reader: StripReader, scan: StripScan) -> tuple[int, int]:
     blocks = list(reader.sample_blocks(scan, _MATCHED)) if scan.with_waveform else []
     if not blocks:
         return 0, 0
+    from wavebatch.stages.chain_file import load_profile
+    from wavebatch.surveying.survey import survey_blocks
+
     system, chain = survey_blocks(blocks, learn=False).system, load_profile("accurate")
     matched = returns = 0
     for block in blocks:

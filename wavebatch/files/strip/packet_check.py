@@ -12,10 +12,11 @@ from enum import IntEnum
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.files.strip.facts import StripFacts
-from wavebatch.files.strip.packet_vectors import RANGE_RATIO, measure_ratio
+from wavebatch.files.strip.packet_vectors import RANGE_RATIO, VECTORS
 from wavebatch.files.strip.packets import BLOCK_BYTES, COMPRESSED, MAX_SAMPLES, PacketFile, refuse_compressed
+from wavebatch.kernels.packets import FIELDS, Geometry, PacketRules, judge_packets
 
 INDEX_BITS = np.uint64(8)
 """Bits of the descriptor index in a key; see `Judged.keys`."""
@@ -29,9 +30,14 @@ MAX_SPACING = 1000.0
 MAX_LOCATION = 1e9
 """Largest return location [ps]: 1 ms is 150 km of range; a larger one is damage."""
 
+_NAMES = (
+    "wavepacket_index", "wavepacket_offset", "wavepacket_size", "return_point_wave_location", *VECTORS,
+)  # fmt: skip
+"""Fields that decide, in the order of `kernels.packets.FIELDS`."""
+
 
 class Reason(IntEnum):
-    """Reason why the packet of a point cannot be used."""
+    """Reason why the packet of a point cannot be used; kernels/c/packets.h has the same numbers."""
 
     USABLE = 0
     NO_WAVEFORM = 1
@@ -93,22 +99,21 @@ class Judge:
 
     def __init__(self, facts: StripFacts) -> None:
         self._facts = facts
-        self._known, self._good, self._compressed, self._packs = (np.zeros(256, bool) for _ in range(4))
-        self._width, self._samples = np.ones(256, np.int64), np.zeros(256, np.int64)
-        self._odd, self._packed = np.zeros(256, bool), np.full(256, -1, np.int64)
+        known, good, odd, packs, self._compressed = (np.zeros(256, bool) for _ in range(5))
+        width, samples, packed = np.ones(256, np.int64), np.zeros(256, np.int64), np.full(256, -1, np.int64)
         for index, digitizer in facts.digitizers.items():
-            self._known[index] = True
-            self._good[index] = 0 < digitizer.bits <= MOST_BITS and 0 < digitizer.spacing <= MAX_SPACING
-            self._good[index] &= 0 < digitizer.n_samples <= MAX_SAMPLES
+            known[index] = True
+            good[index] = 0 < digitizer.bits <= MOST_BITS and 0 < digitizer.spacing <= MAX_SPACING
+            good[index] &= 0 < digitizer.n_samples <= MAX_SAMPLES
             kind = facts.compression.get(index, 0)
-            self._packs[index] = kind == COMPRESSED and digitizer.bits in (8, 16)
-            self._compressed[index] = kind != 0 and not self._packs[index] and digitizer.n_samples > 0
-            if self._good[index]:
-                self._width[index], self._samples[index] = digitizer.width, digitizer.n_samples
-                self._odd[index] = digitizer.bits not in WHOLE_BITS
+            packs[index] = kind == COMPRESSED and digitizer.bits in (8, 16)
+            self._compressed[index] = kind != 0 and not packs[index] and digitizer.n_samples > 0
+            if good[index]:
+                width[index], samples[index] = digitizer.width, digitizer.n_samples
+                odd[index] = digitizer.bits not in WHOLE_BITS
                 if digitizer.bits in PACKED_BITS:
-                    self._packed[index] = packed_bytes(digitizer.n_samples, digitizer.bits)
-        self._least, self._end = facts.packets.offsets
+                    packed[index] = packed_bytes(digitizer.n_samples, digitizer.bits)
+        self._rules = PacketRules(known, good, odd, packs, width, samples, packed, *facts.packets.offsets)
 
     def judge(self, points: np.ndarray, form: str, overfull: np.ndarray | None = None) -> Judged:
         """Check the packets of points.
@@ -131,39 +136,22 @@ class Judge:
         InputError
             If a point refers to compressed packets.
         """
-        index = np.ascontiguousarray(points["wavepacket_index"])
-        size = points["wavepacket_size"].astype(np.int64)
-        offset = points["wavepacket_offset"].astype(np.uint64)
-        has = (index > 0) & (size > 0)
-        self._refuse_compressed(index[has])
-        n_samples = np.minimum(self._samples[index], size // self._width[index])
-        packs = self._packs[index]
-        # A compressed packet has all samples of its descriptor, in any number of bytes.
-        n_samples = np.where(packs & (size > self._width[index]), self._samples[index], np.where(packs, 0, n_samples))
-        # Only the size of the packet shows whether samples of 12 bits have two bytes each.
-        packed = (size == self._packed[index]) & ~packs
-        n_samples = np.where(packed, self._samples[index], n_samples)
-        room = self._end - np.where(packed | packs, size, n_samples * self._width[index])
-        inside = (room >= 0) & (offset <= np.maximum(room, 0).astype(np.uint64))
-        keys = (offset << INDEX_BITS) | index
-        reason = np.zeros(len(points), np.uint8)
+        fields = dict(zip(FIELDS, (points[name] for name in _NAMES), strict=True))
+        if self._compressed.any():
+            self._refuse_compressed(fields["index"][(fields["index"] > 0) & (fields["size"] > 0)])
+        geometry = Geometry(form == "range", PS_PER_NS / HALF_C, RANGE_RATIO, MAX_LOCATION)
+        reason, n_samples, keys, short, packed = judge_packets(fields, self._rules, geometry)
         if overfull is not None and len(overfull):
             place = np.minimum(np.searchsorted(overfull, keys), len(overfull) - 1)
-            reason[overfull[place] == keys] = Reason.OVERFULL
-        reason[~_has_geometry(points, form)] = Reason.NO_GEOMETRY
-        reason[~inside] = Reason.CUT
-        reason[offset < np.uint64(self._least)] = Reason.OUTSIDE
-        reason[n_samples == 0] = Reason.EMPTY
-        reason[self._odd[index] & (n_samples < self._samples[index])] = Reason.PACKED
-        reason[~self._good[index]] = Reason.BAD_DESCRIPTOR
-        reason[~self._known[index]] = Reason.NO_DESCRIPTOR
-        reason[~has] = Reason.NO_WAVEFORM
-        if packs.any():
-            rows = np.flatnonzero(packs & (reason == Reason.USABLE))
-            reason[rows[~self._decode(index[rows], offset[rows], size[rows])]] = Reason.DAMAGED
-        good = reason == Reason.USABLE
-        short = good & (n_samples < self._samples[index])
-        return Judged(reason, np.where(good, n_samples, 0).astype(np.int32), keys, short, packed)
+            reason[(overfull[place] == keys) & (reason == Reason.USABLE)] = Reason.OVERFULL
+        if self._rules.packs.any():
+            rows = np.flatnonzero(self._rules.packs[fields["index"]] & (reason == Reason.USABLE))
+            index, offset, size = (fields[name][rows] for name in ("index", "offset", "size"))
+            whole = self._decode(index, offset, size.astype(np.int64))
+            reason[rows[~whole]] = Reason.DAMAGED
+        bad = reason != Reason.USABLE
+        n_samples[bad], short[bad] = 0, False
+        return Judged(reason, n_samples, keys, short, packed)
 
     def _decode(self, index: np.ndarray, offset: np.ndarray, size: np.ndarray) -> np.ndarray:
         """Whether compressed packets are whole, bool (n,): only decoding them shows it."""
@@ -172,7 +160,7 @@ class Judge:
         try:
             for kind in np.unique(index).tolist():
                 same = np.flatnonzero(index == kind)
-                n_samples, bits = int(self._samples[kind]), 8 * int(self._width[kind])
+                n_samples, bits = int(self._rules.samples[kind]), 8 * int(self._rules.width[kind])
                 for rows in np.array_split(same, -(-len(same) * n_samples * bits // 8 // BLOCK_BYTES)):
                     good[rows] = packets.decode(offset[rows], size[rows], n_samples, bits)[1]
         finally:
@@ -188,10 +176,3 @@ class Judge:
 def packed_bytes(n_samples: int, bits: int) -> int:
     """Return the bytes of a packet of packed samples."""
     return -(-n_samples * bits // 8)
-
-
-def _has_geometry(points: np.ndarray, form: str) -> np.ndarray:
-    """Whether return location and vector of points are possible, so that the packet has a place in space."""
-    ratio = measure_ratio(points, form)
-    location = np.abs(widen(points["return_point_wave_location"]))
-    return (ratio > 0) & (ratio <= RANGE_RATIO) & (location <= MAX_LOCATION)

@@ -18,3 +18,4 @@
 #include "signal.h"
 #include "elementary.h"
 #include "wdz.h"
+#include "packets.h"

@@ -1,0 +1,20 @@
+"""Tables between their rows, by the library: the bits of NumPy's interp."""
+
+import numpy as np
+import pytest
+
+from wavebatch.kernels.elementary import interpolate
+
+
+@pytest.mark.parametrize("rows", [2, 3, 12])
+def test_interpolation_has_the_bits_of_numpy(rng, rows):
+    at, table = np.sort(rng.uniform(0, 50, rows)), rng.normal(1, 0.3, (rows, 4))
+    x = np.concatenate([rng.uniform(-10, 60, 5000), at, np.nextafter(at, 0), [np.nan, np.inf, -np.inf]])
+    twin = np.stack([np.interp(x, at, column) for column in table.T], axis=1)
+    assert interpolate(x, at, table).tobytes() == twin.tobytes()
+
+
+def test_a_table_without_its_places_is_refused():
+    for at, table in ((np.zeros(3), np.zeros((2, 4))), (np.zeros(0), np.zeros((0, 4)))):
+        with pytest.raises(ValueError, match="has no rows"):
+            interpolate(np.zeros(5), at, table)
