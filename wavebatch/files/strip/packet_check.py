@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_vectors import RANGE_RATIO, measure_ratio
 from wavebatch.files.strip.packets import BLOCK_BYTES, COMPRESSED, MAX_SAMPLES, PacketFile, refuse_compressed
@@ -193,5 +193,5 @@ def packed_bytes(n_samples: int, bits: int) -> int:
 def _has_geometry(points: np.ndarray, form: str) -> np.ndarray:
     """Whether return location and vector of points are possible, so that the packet has a place in space."""
     ratio = measure_ratio(points, form)
-    location = np.abs(widen(points["return_point_wave_location"]))
+    location = np.abs(widen_integers(points["return_point_wave_location"]))
     return (ratio > 0) & (ratio <= RANGE_RATIO) & (location <= MAX_LOCATION)
