@@ -6,7 +6,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.fit.bounds import crlb
-from wavebatch.stages.score import QUANTITIES, TOLERANCE_NS, ErrorStats, find_isolated, match_echoes
+from wavebatch.stages.score import QUANTITIES, TOLERANCE_NS, ErrorStats, find_isolated_echoes, match_echoes
 
 _CLASS_FLAGS = {
     "overlapped": EchoFlag.OVERLAPPED,
@@ -106,7 +106,7 @@ def score(
 def _classify(truth: EchoTable) -> dict[str, np.ndarray]:
     return {
         "all": np.ones(len(truth), bool),
-        "isolated": find_isolated(truth),
+        "isolated": find_isolated_echoes(truth),
         **{name: (truth.flags & np.uint16(flag)) != 0 for name, flag in _CLASS_FLAGS.items()},
     }
 

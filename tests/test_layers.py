@@ -173,3 +173,14 @@ def test_no_other_dependency_at_run_time():
 def test_no_folder_holds_more_than_a_person_can_look_over():
     for folder in {path.parent for path in MODULES}:
         assert len(list(folder.glob("*.py"))) <= 15, folder
+
+
+def test_no_two_classes_have_one_name():
+    """A public class of a module says what it is without its folder."""
+    places: dict[str, list[Path]] = {}
+    for path in MODULES:
+        for node in ast.parse(path.read_text("utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(path)
+    assert len(places) > 100
+    assert {name: paths for name, paths in places.items() if len(paths) > 1} == {}

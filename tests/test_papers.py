@@ -222,9 +222,9 @@ def drop_from_backscatter(monkeypatch, load):
 
 
 def drop_from_section(monkeypatch, load):
-    right = radiometry.cross_section
+    right = radiometry.compute_cross_section
     wrong = lambda gamma, distance, beam: right(gamma, distance, beam) / distance**2 * 600**2  # noqa: E731
-    monkeypatch.setattr(radiometry, "cross_section", wrong)
+    monkeypatch.setattr(radiometry, "compute_cross_section", wrong)
     return load("s0_wagner").table_of_cross_sections(1000, 0)
 
 

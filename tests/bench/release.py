@@ -19,7 +19,7 @@ from bench.stability_tables import format_stability
 from bench.system import measure_system
 
 from wavebatch.tools.bench.chains import choose_chains, list_methods, load_chains
-from wavebatch.tools.bench.command import BenchOptions, Progress, run_bench
+from wavebatch.tools.bench.command import BenchOptions, BenchProgress, run_bench
 from wavebatch.tools.bench.report import format_document, write_outputs
 
 SCENES = ("mixed", "open", "forest", "empty")
@@ -28,7 +28,9 @@ STABILITY_WAVEFORMS, STABILITY_SURVEY = 900, 3072
 """Waveforms per stiff case, and per survey: every receiver is surveyed several times."""
 
 
-def measure_release(options: BenchOptions, cases: Sequence[Case], large: bool, progress: Progress) -> dict[str, Any]:
+def measure_release(
+    options: BenchOptions, cases: Sequence[Case], large: bool, progress: BenchProgress
+) -> dict[str, Any]:
     """The document of `run_bench` with rows of other decomposers, `stability`, `system` and `promises`."""
     document = run_bench(options, progress, lambda scene, groups: measure_peers(scene, groups, progress))
     document["failure_kinds"] = FAILURES
@@ -40,7 +42,7 @@ def measure_release(options: BenchOptions, cases: Sequence[Case], large: bool, p
 
 
 def measure_cases(
-    options: BenchOptions, cases: Sequence[Case], progress: Progress, waveforms: int = STABILITY_WAVEFORMS
+    options: BenchOptions, cases: Sequence[Case], progress: BenchProgress, waveforms: int = STABILITY_WAVEFORMS
 ) -> list[dict[str, Any]]:
     """The stiff cases by all chains of the options."""
     methods = list_methods() if options.all_methods else {}

@@ -8,7 +8,7 @@ from wavebatch.kernels.physics.radiometry import (
     attenuation_of_visibility,
     backscatter,
     backscatter_error,
-    cross_section,
+    compute_cross_section,
     diffuse_reflectance,
     energy_error,
     mean_haze,
@@ -36,7 +36,7 @@ def test_the_numbers_of_the_specification(attenuation, expected):
         constant * np.pi * BETA**2 / 4,
         gamma,
         float(diffuse_reflectance(gamma, angle)),
-        float(cross_section(gamma, 700.0, BETA)),
+        float(compute_cross_section(gamma, 700.0, BETA)),
         gamma * np.cos(angle),
     )
     assert [f"{value:.6e}" for value in found[:2]] == [f"{value:.6e}" for value in expected[:2]]
@@ -55,12 +55,12 @@ def test_what_is_not_known_is_nan():
     distance = np.array([np.nan, 0.0, -5.0, np.inf, 700.0])
     gamma = backscatter(2.6e-8, distance, np.full(5, 45.0), np.full(5, 2.4), 0.0)
     assert np.isfinite(gamma).tolist() == [False] * 4 + [True]
-    assert np.isnan(cross_section(gamma, distance, BETA)[:4]).all()
+    assert np.isnan(compute_cross_section(gamma, distance, BETA)[:4]).all()
     assert np.isnan(diffuse_reflectance(1.0, np.radians([86.0, 90.0, 120.0]))).all()
 
 
 def test_float32_input_keeps_the_fourth_power():
-    wide = cross_section(np.float32(1.0), np.float32(3000.0), BETA)
+    wide = compute_cross_section(np.float32(1.0), np.float32(3000.0), BETA)
     assert wide.dtype == np.float64 and wide == pytest.approx(np.pi / 4 * 1.5**2, rel=1e-12)
 
 
@@ -84,7 +84,7 @@ def test_errors_are_those_of_repeated_measurements():
     relative = backscatter_error(energy, distance, r_err, c_err, 0.5)
     assert relative == pytest.approx(np.std(gamma) / np.mean(gamma), rel=0.02)
     assert reflectance_error(relative, angle, angle_err) == pytest.approx(np.std(rho) / np.mean(rho), rel=0.02)
-    section = cross_section(gamma, r, BETA)
+    section = compute_cross_section(gamma, r, BETA)
     assert backscatter_error(energy, distance, r_err, c_err, 0.5, power=4) == pytest.approx(
         np.std(section) / np.mean(section), rel=0.02
     )

@@ -8,7 +8,7 @@ import pytest
 from wavebatch.kernels.geometry import voxels
 from wavebatch.kernels.geometry.voxels import (
     KEY_BITS,
-    Samples,
+    VoxelSamples,
     cross_voxels,
     differences_along,
     fits_keys,
@@ -134,7 +134,7 @@ def test_sums_over_time_spread_every_sample_over_its_step(rng):
     spacing = rng.choice([0.5, 1.0, 2.0], count.sum())
     time = np.concatenate([np.cumsum(2 + rng.uniform(0, 3, n)) for n in count])
     value = rng.integers(0, 1 << 40, (len(time), 2))
-    samples = Samples(time, spacing, value)
+    samples = VoxelSamples(time, spacing, value)
     ray = np.repeat(np.arange(5), 30)
     until = rng.uniform(-3, 90, 150)
     until[::7] = time[rng.integers(0, len(time), len(until[::7]))]
@@ -146,7 +146,7 @@ def test_sums_over_time_spread_every_sample_over_its_step(rng):
             assert abs(found[row, column] - expected) <= 1
     whole = sum_before(samples, first, count, np.arange(5), np.full(5, np.inf))
     assert np.array_equal(whole, [value[one : one + n].sum(axis=0) for one, n in zip(first, count, strict=True)])
-    none = sum_before(Samples(*(part[:0] for part in samples)), first[:1], count[1:2], ray[:2] * 0, until[:2])
+    none = sum_before(VoxelSamples(*(part[:0] for part in samples)), first[:1], count[1:2], ray[:2] * 0, until[:2])
     assert none.tolist() == [[0, 0], [0, 0]]
 
 

@@ -12,7 +12,7 @@ from scoring import score
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.fit.bounds import crlb
-from wavebatch.stages.score import ErrorStats, find_isolated, list_pairs, match_echoes
+from wavebatch.stages.score import ErrorStats, find_isolated_echoes, list_pairs, match_echoes
 
 
 def match_naively(found, truth, tolerance):
@@ -145,11 +145,11 @@ def test_classes_are_scored_apart():
 
 def test_isolated_means_alone_inside_and_not_clipped():
     truth = EchoTable.build([0, 0, 1, 1, 2], [10, 21.9, 10, 22.0, 10], [50] * 5, [2] * 5)
-    assert find_isolated(truth).tolist() == [False, False, True, True, True]
+    assert find_isolated_echoes(truth).tolist() == [False, False, True, True, True]
     for flag in (EchoFlag.NEAR_EDGE, EchoFlag.SATURATED, EchoFlag.OVERLAPPED):
-        assert not find_isolated(truth.with_flags(flag, np.ones(5, bool))).any()
+        assert not find_isolated_echoes(truth.with_flags(flag, np.ones(5, bool))).any()
     wide = replace(truth, sigma=np.array([2, 2, 2, 2.1, 2], np.float32))
-    assert find_isolated(wide).tolist() == [False, False, False, False, True]
+    assert find_isolated_echoes(wide).tolist() == [False, False, False, False, True]
 
 
 def test_scores_of_nothing_are_not_numbers_and_no_warnings():

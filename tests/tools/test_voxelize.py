@@ -18,7 +18,7 @@ from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.writer import FullwaveWriter
-from wavebatch.kernels.physics.radiometry import backscatter, cross_section
+from wavebatch.kernels.physics.radiometry import backscatter, compute_cross_section
 from wavebatch.surveying import Survey, survey_block
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.sensor import SensorRequest
@@ -440,7 +440,7 @@ def test_cross_sections_are_those_of_the_echoes(level, tmp_path):
     summary, found = voxelize(level, tmp_path / "v.npz", 1.0, calibration=CALIBRATION)
     truth = load(level.with_suffix(".npz"))
     gamma = backscatter(2.5e-8, truth["range"], truth["amplitude"], truth["sigma"], 0.22)
-    expected = cross_section(gamma, truth["range"], 0.5e-3)
+    expected = compute_cross_section(gamma, truth["range"], 0.5e-3)
     assert summary.sensor == "direction vectors" and summary.unknown == 0
     assert np.sum(found["cross_section"], dtype=np.float64) == pytest.approx(expected.sum(), rel=0.02)
     assert list(found)[:3] == ["index", "energy", "cross_section"]
@@ -686,7 +686,7 @@ def test_profiles_of_pulses_add_up_to_the_voxels(level, tmp_path):
     truth = load(level.with_suffix(".npz"))
     gamma = backscatter(2.5e-8, truth["range"], truth["amplitude"], truth["sigma"], 0.22)
     each = np.add.reduceat(made["cross_section"].astype(float), made["first"])
-    assert np.median(each) == pytest.approx(np.median(cross_section(gamma, truth["range"], 0.5e-3)), rel=0.03)
+    assert np.median(each) == pytest.approx(np.median(compute_cross_section(gamma, truth["range"], 0.5e-3)), rel=0.03)
     pulse = np.repeat(np.arange(len(made["point"])), made["count"])
     height = (made["start"][pulse] + made["step"][pulse] * made["time"][:, None])[:, 2]
     centre = np.bincount(pulse, made["energy"] * height) / np.bincount(pulse, made["energy"])

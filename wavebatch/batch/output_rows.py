@@ -20,7 +20,7 @@ from wavebatch.core.no_data import count_reasons
 from wavebatch.core.order import find_order
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.disk.raw_bytes import take_whole_records, widen
+from wavebatch.files.disk.raw_bytes import take_whole_records, widen_integers
 from wavebatch.files.las.point_formats import locate, split_numbers
 from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, number_returns
 
@@ -316,7 +316,7 @@ def _number_rows(
 
 def _locations(records: np.ndarray) -> np.ndarray:
     """Return locations [ns], which order points that share a packet; NaN comes first."""
-    return np.nan_to_num(widen(records["return_point_wave_location"]) / PS_PER_NS, nan=-np.inf)
+    return np.nan_to_num(widen_integers(records["return_point_wave_location"]) / PS_PER_NS, nan=-np.inf)
 
 
 def _columns(

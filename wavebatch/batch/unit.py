@@ -27,7 +27,7 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
-from wavebatch.surveying.choose_chain import Choice, try_chain
+from wavebatch.surveying.choose_chain import ChainChoice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius, measure_slope
 from wavebatch.surveying.prepare import prepare
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, judge_scale, refuse_units
@@ -57,7 +57,7 @@ class Prepared:
     facts: StripFacts
     scan: StripScan
     units: int
-    choice: Choice
+    choice: ChainChoice
     layout: OutputLayout
     report: RunReport
     """Timing of the preparation, and how many points have lost their packets."""
@@ -175,8 +175,8 @@ def _hold_height(reader: StripReader, request: SensorRequest, sensor: SensorSour
 
 
 def _see_level(
-    reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource
-) -> tuple[Choice, tuple[str, ...]]:
+    reader: StripReader, scan: StripScan, job: StripJob, choice: ChainChoice, sensor: SensorSource
+) -> tuple[ChainChoice, tuple[str, ...]]:
     """The choice with the widths of surfaces that face the sensor, where angles are computed and no saved survey has
     them; and what is doubtful about the beam."""
     parameters = angle_parameters(job.chain)

@@ -11,7 +11,7 @@ from wavebatch.cli.messages import count, row
 if TYPE_CHECKING:
     from wavebatch.tools.compare.chains import Matchup
     from wavebatch.tools.compare.clouds import Comparison
-    from wavebatch.tools.compare.differences import Spread
+    from wavebatch.tools.compare.differences import ErrorSpread
 
 def list_lines(result: Comparison) -> Iterator[str]:
     """The tables of every comparison of echoes."""
@@ -55,7 +55,7 @@ def _known(value: float, form: str) -> str:
     return "no-data" if math.isnan(value) else format(value, form)
 
 
-def _list_groups(kind: str, groups: dict[str, dict[str, Spread]], units: dict[str, str]) -> Iterator[str]:
+def _list_groups(kind: str, groups: dict[str, dict[str, ErrorSpread]], units: dict[str, str]) -> Iterator[str]:
     """Differences by LAS class or by number of echoes, where there are several."""
     if len(groups) < 2:
         return

@@ -13,7 +13,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.optional import need
 from wavebatch.core.trajectory import Trajectory, apply_lever_arm
-from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads, widen
+from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads, widen_integers
 
 SBET_RECORD = np.dtype([(name, "<f8") for name in (
     "time", "latitude", "longitude", "height", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch", "heading",
@@ -88,7 +88,7 @@ def _read_sbet(path: Path, size: int) -> dict[str, np.ndarray]:
     records = np.memmap(path, SBET_RECORD, "r")
     step = max(1, -(-len(records) // MOST_RECORDS))
     names = ("time", "latitude", "longitude", "height", *_ATTITUDE, "wander")
-    columns = {name: widen(records[name][::step]) for name in names}
+    columns = {name: widen_integers(records[name][::step]) for name in names}
     columns["z"], wander = columns.pop("height"), columns.pop("wander")
     inside = (np.abs(columns["latitude"]) <= np.pi / 2) & (np.abs(columns["longitude"]) <= 2 * np.pi)
     if not (inside & np.isfinite(columns["time"])).mean() > 0.99:

@@ -17,7 +17,7 @@ from wavebatch.stages.pulse_tables import describe_echoes, pulse_shape, shape_li
 ReferenceKind = Literal["gaussian", "system", "given"]
 
 
-class Reference(NamedTuple):
+class PulseReference(NamedTuple):
     """Samples of a reference pulse."""
 
     taps: np.ndarray
@@ -33,7 +33,7 @@ class Reference(NamedTuple):
 
 def reference_pulse(
     system: SystemPulse, spacing: float, kind: ReferenceKind, reach: float = 5.0, pulse: str = ""
-) -> Reference:
+) -> PulseReference:
     """Sample the reference pulse: a Gaussian of the system's width, the pulse of the survey, or a given one.
 
     Parameters
@@ -64,16 +64,16 @@ def reference_pulse(
     half = int(np.ceil(reach * system.sigma_ref / spacing))
     x = np.arange(-half, half + 1, dtype=np.float64)
     if kind == "gaussian":
-        return Reference(exp(-0.5 * (x * spacing / system.sigma_ref) ** 2), float(half))
+        return PulseReference(exp(-0.5 * (x * spacing / system.sigma_ref) ** 2), float(half))
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
     flat = np.array([[1.0, 0.0, limits.ref]])
     (peak, datum, _), *_ = describe_echoes(shape, limits, flat, np.ones((1, 3)), np.zeros((1, 2)))[0]
     taps = evaluate_pulse(shape, x[:, None], np.full(1, -datum), np.full(1, limits.ref))[0][:, 0]
-    return Reference(taps / peak, float(half))
+    return PulseReference(taps / peak, float(half))
 
 
 @lru_cache(maxsize=8)
-def _read_pulse(text: str) -> Reference:
+def _read_pulse(text: str) -> PulseReference:
     try:
         samples = np.array([float(word) for word in text.split()])
     except ValueError as error:
@@ -85,4 +85,4 @@ def _read_pulse(text: str) -> Reference:
     samples = samples / samples.max()
     top = np.array([int(np.argmax(samples))])
     peak, height = refine_peaks(samples[:, None], np.zeros(1, np.int64), top)
-    return Reference(samples / height[0], float(peak[0]))
+    return PulseReference(samples / height[0], float(peak[0]))

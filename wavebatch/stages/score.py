@@ -167,7 +167,7 @@ class ErrorStats:
         )
 
 
-def find_isolated(truth: EchoTable) -> np.ndarray:
+def find_isolated_echoes(truth: EchoTable) -> np.ndarray:
     """Find echoes to which the closed bounds apply: alone, inside the window, not clipped.
 
     Parameters

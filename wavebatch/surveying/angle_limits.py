@@ -21,7 +21,7 @@ from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import Decision, Part, Survey
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.flat_ground import Reference, measure_reference, sample_slopes
+from wavebatch.surveying.flat_ground import GroundReference, measure_reference, sample_slopes
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 
 SLOPE = 30.0
@@ -112,7 +112,7 @@ def predict_angles(
 
 def sample_reference(
     reader: StripReader, scan: StripScan, source: SensorSource, system: SystemPulse, spacing: float
-) -> Reference:
+) -> GroundReference:
     """Measure the widths of surfaces of known slope on a sample of a strip; see `flat_ground.measure_reference`.
 
     Parameters

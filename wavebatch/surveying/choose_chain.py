@@ -57,7 +57,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class ChainChoice:
     """The chain and the survey that a strip is run with, and the reasons; picklable."""
 
     chain: Chain
@@ -113,7 +113,7 @@ def sample_size(reader: StripReader, scan: StripScan) -> int:
     return int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, SAMPLE))
 
 
-def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Request) -> Choice:
+def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Request) -> ChainChoice:
     """Choose the pulse and the chain of a strip.
 
     Parameters
@@ -142,14 +142,14 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
     if request.tolerance is not None:
         return _choose_by_tolerance(block, found, request.tolerance, str(reader.facts.path))
     if not request.auto:
-        return Choice(chain, found)
-    return Choice(choose_chain(found), found, decide(found))
+        return ChainChoice(chain, found)
+    return ChainChoice(choose_chain(found), found, decide(found))
 
 
-def _choose_by_tolerance(block: WaveformBlock | None, found: Survey, tolerance: float, strip: str) -> Choice:
+def _choose_by_tolerance(block: WaveformBlock | None, found: Survey, tolerance: float, strip: str) -> ChainChoice:
     chains = {name: load_profile(name) for name in COSTS}
     if block is None:
-        return Choice(chains[COSTS[0]], found)
+        return ChainChoice(chains[COSTS[0]], found)
     predictions = predict_errors(block, found.system, chains)
     fitting = leave_out_false(predictions)
     good = [prediction for prediction in fitting if prediction.range_error <= tolerance]
@@ -161,14 +161,14 @@ def _choose_by_tolerance(block: WaveformBlock | None, found: Survey, tolerance: 
         raise ConfigError(
             f"{strip}: no shipped chain meets a tolerance of {tolerance:g} m; predicted errors are {errors}: allow more"
         )
-    return Choice(chains[good[0].name], found, predictions=tuple(predictions))
+    return ChainChoice(chains[good[0].name], found, predictions=tuple(predictions))
 
 
 def _in_words(prediction: Prediction) -> str:
     return f"{100 * prediction.false_share:.0f} % of its echoes would be false"
 
 
-def try_chain(reader: StripReader, scan: StripScan, choice: Choice, request: Request) -> Choice:
+def try_chain(reader: StripReader, scan: StripScan, choice: ChainChoice, request: Request) -> ChainChoice:
     """Find out whether the user's chain takes the strip's pulse for several echoes.
 
     Parameters
@@ -202,7 +202,7 @@ def try_chain(reader: StripReader, scan: StripScan, choice: Choice, request: Req
     return replace(choice, predictions=tuple(predictions))
 
 
-def describe_choice(choice: Choice, request: Request) -> dict[str, Any]:
+def describe_choice(choice: ChainChoice, request: Request) -> dict[str, Any]:
     """Return how the chain was chosen, for reports: decisions with reasons, or predicted errors."""
     report: dict[str, Any] = {
         "by": request.describe(choice.chain) or "user",
@@ -216,7 +216,7 @@ def describe_choice(choice: Choice, request: Request) -> dict[str, Any]:
     return report
 
 
-def describe_survey(choice: Choice, request: Request, fingerprint: Mapping[str, Any]) -> dict[str, Any]:
+def describe_survey(choice: ChainChoice, request: Request, fingerprint: Mapping[str, Any]) -> dict[str, Any]:
     """Return the pulse and where it comes from, for reports.
 
     Parameters

@@ -74,7 +74,7 @@ class Slopes(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
+class GroundReference:
     """What echoes of surfaces of known slope show."""
 
     system: SystemPulse
@@ -218,7 +218,7 @@ def _measure_slopes(block: WaveformBlock, around: Surroundings, radius: float) -
     return Slopes(block, *(np.radians(values.astype(np.float64)) for values in (angle, error)))
 
 
-def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: float) -> Reference:
+def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: float) -> GroundReference:
     """Measure variance and scatter of the widths of surfaces that face the sensor, and the beam's divergence.
 
     Parameters
@@ -248,7 +248,7 @@ def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: f
         for index, other in system.digitizers.items()
     }
     main = found.get(None, np.empty((4, 0)))
-    return Reference(replace(_refer(system, main), digitizers=others), main.shape[1], *_fit_divergence(*main))
+    return GroundReference(replace(_refer(system, main), digitizers=others), main.shape[1], *_fit_divergence(*main))
 
 
 def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:

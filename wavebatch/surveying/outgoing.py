@@ -17,7 +17,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, stack_pulse
-from wavebatch.kernels.signal.outgoing import Reference, measure_outgoing
+from wavebatch.kernels.signal.outgoing import OutgoingReference, measure_outgoing
 from wavebatch.surveying import Decision, Survey
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
@@ -53,7 +53,7 @@ class OutgoingShape(NamedTuple):
     pulses: int
 
 
-def learn_shape(samples: np.ndarray, spacing: float, reference: Reference) -> OutgoingShape | None:
+def learn_shape(samples: np.ndarray, spacing: float, reference: OutgoingReference) -> OutgoingShape | None:
     """Learn the shape of outgoing pulses.
 
     Parameters
@@ -127,7 +127,7 @@ def _describe(stack: Stack, fit: PulseFit, spacing: float, pulses: int) -> Outgo
 
 def save_outgoing(
     shape: OutgoingShape,
-    reference: Reference,
+    reference: OutgoingReference,
     spacing: float,
     bits: int,
     name: str,

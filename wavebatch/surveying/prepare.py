@@ -16,7 +16,7 @@ from wavebatch.files.pulse_energy import NONE
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.calibration import Calibration, needs_sensor
-from wavebatch.surveying.choose_chain import Choice, Request, make_choice
+from wavebatch.surveying.choose_chain import ChainChoice, Request, make_choice
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
 from wavebatch.surveying.matching.strip_match import match_strip
@@ -37,7 +37,7 @@ class Positions(Enum):
 class Setup:
     """What a strip is decomposed with; picklable."""
 
-    choice: Choice
+    choice: ChainChoice
     """Chain and survey, with the reasons."""
     sensor: SensorSource = UNKNOWN
     calibration: Calibration | None = None

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Any
 
-from wavebatch.batch.workers.futures import settle
+from wavebatch.batch.workers.futures import settle_future
 from wavebatch.core.errors import ConfigError
 
 _CONNECT = 4.0
@@ -71,7 +71,7 @@ def _check_keys(address: str) -> None:
 def _call_in_time(seconds: float, function: Callable) -> Any:
     """The result of `function()`; TimeoutError where it takes longer, while its thread goes on."""
     future: Future = Future()
-    threading.Thread(target=settle, args=(future, function), daemon=True).start()
+    threading.Thread(target=settle_future, args=(future, function), daemon=True).start()
     return future.result(timeout=seconds)
 
 

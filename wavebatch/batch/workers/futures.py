@@ -37,7 +37,7 @@ def end_future(future: Future, result: Any = None, error: BaseException | None =
             future.set_exception(error)
 
 
-def settle(future: Future, function: Callable, *arguments: Any) -> Future:
+def settle_future(future: Future, function: Callable, *arguments: Any) -> Future:
     """Run `function(*arguments)` here; its result or its error becomes that of `future`."""
     try:
         future.set_result(function(*arguments))

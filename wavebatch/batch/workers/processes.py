@@ -26,7 +26,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.workers.futures import end_future, settle, wait_uninterrupted
+from wavebatch.batch.workers.futures import end_future, settle_future, wait_uninterrupted
 from wavebatch.batch.workers.serve import PATIENCE, serve_calls
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
@@ -84,7 +84,7 @@ class Workers:
     def submit(self, function: Callable, *arguments: Any) -> Future:
         """Return the future result of `function(*arguments)`; both must be picklable."""
         if self.jobs == 1:
-            return settle(Future(), function, *arguments)
+            return settle_future(Future(), function, *arguments)
         payload = pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL)
         self._needs_main = self._needs_main or _MAIN in payload
         self._workers = [worker for worker in self._workers if worker.serves]

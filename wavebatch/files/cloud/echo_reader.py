@@ -18,7 +18,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.column_names import STYLES
 from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
@@ -160,11 +160,11 @@ class CloudReader(Closing):
         if name in COLUMNS:
             return self.read_extra(raw, self._sources[name]) if name in self._sources else np.nan
         if name == "ray" and self.has_packets:
-            ray = np.stack([widen(raw[axis]) for axis in ("x_t", "y_t", "z_t")], axis=1)
+            ray = np.stack([widen_integers(raw[axis]) for axis in ("x_t", "y_t", "z_t")], axis=1)
             ray[~np.isfinite(ray).all(axis=1)] = 0.0  # damaged: as if there were none
             return ray
         if name == "gps_time" and self.has_gps_time:
-            return widen(raw["gps_time"])
+            return widen_integers(raw["gps_time"])
         readers = {
             "xyz": lambda: np.stack([read_field(raw, self.point_format, axis, self) for axis in "xyz"], axis=1),
             "flags": lambda: self.read_flags(raw),
@@ -189,7 +189,7 @@ def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) 
         return read_angles(raw)
     import laspy
 
-    values = widen(np.asarray(laspy.PackedPointRecord(raw, laspy.PointFormat(point_format))[name]))
+    values = widen_integers(np.asarray(laspy.PackedPointRecord(raw, laspy.PointFormat(point_format))[name]))
     values[~np.isfinite(values)] = np.nan
     return values
 

@@ -82,7 +82,7 @@ def take_whole_records(records: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return plain[rows].view(records.dtype)
 
 
-def widen(values: np.ndarray) -> np.ndarray:
+def widen_integers(values: np.ndarray) -> np.ndarray:
     """Return floating-point values as f8; a signalling NaN of a damaged file becomes a plain NaN without a warning."""
     with np.errstate(invalid="ignore"):
         return values.astype(np.float64) * 1.0  # a copy alone would keep a signalling NaN of 8 bytes

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.header import STANDARD_DTYPES
 
 RECORD_SIZE = 192
@@ -110,7 +110,7 @@ class ExtraRecord:
 
     def read(self, stored: np.ndarray) -> np.ndarray:
         """Return physical values, f8 (n,), of stored values (n,); NaN for no data and for damage."""
-        values, no_data = widen(stored), self.no_data
+        values, no_data = widen_integers(stored), self.no_data
         with np.errstate(over="ignore", invalid="ignore"):
             if self.scaling is not None:
                 values = values * self.scaling[0] + self.scaling[1]

@@ -58,7 +58,7 @@ class Segments:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Piece:
+class PulsePiece:
     """Consecutive pulses with their segments."""
 
     first: int
@@ -135,7 +135,7 @@ class PulseReader(Closing):
         self._pulses.close()
         self._waves.close()
 
-    def pieces(self) -> Iterator[Piece]:
+    def pieces(self) -> Iterator[PulsePiece]:
         """Yield all pulses, piece by piece; raises InputError for waves that are not in the file."""
         header = self.header
         for first in range(0, header.count, self._step):
@@ -157,12 +157,12 @@ class PulseReader(Closing):
             yield begin, begin + max(many, 1)
             begin += max(many, 1)
 
-    def _read(self, first: int, pulses: np.ndarray) -> Piece:
+    def _read(self, first: int, pulses: np.ndarray) -> PulsePiece:
         header = self.header
         anchor = pulses["anchor"] * header.scales + header.offsets
         direction = (pulses["target"].astype(np.float64) - pulses["anchor"]) * (header.scales / 1000)
         waves = Waves(header.waves, self._waves.fileno(), header.waves_size)
-        return Piece(first, pulses, anchor, direction, self._walk(first, pulses, waves), waves)
+        return PulsePiece(first, pulses, anchor, direction, self._walk(first, pulses, waves), waves)
 
     def _walk(self, first: int, pulses: np.ndarray, waves: Waves) -> Segments:
         """The segments of pulses, by pulse, sampling and place in the waves."""

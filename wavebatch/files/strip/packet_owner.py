@@ -40,7 +40,7 @@ _HIGHEST, _WHERE, _LOCATION, _INTENSITY, _OWN, _OTHERS, _DEPTH = range(7)
 """Columns of a table of returns."""
 
 
-def sample_size(longest: int) -> int:
+def size_of_sample(longest: int) -> int:
     """Return how many waveforms are looked at where the longest has so many samples."""
     return int(np.clip(_SAMPLES // max(longest, 1), _SHORTEST, _WAVEFORMS))
 

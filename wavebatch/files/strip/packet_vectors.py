@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from wavebatch.core.units import HALF_C, PS_PER_NS
-from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.disk.raw_bytes import widen_integers
 
 OPTIONS = ("auto", "toward", "away")
 VECTORS = ("x_t", "y_t", "z_t")
@@ -69,7 +69,7 @@ class DirectionTally:
 
     def add_pairs(self, xyz: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
         """Add the votes of pairs of usable points that share a packet: xyz f8 (2, n, 3) [m], records (n,)."""
-        a, b = widen(first["return_point_wave_location"]), widen(second["return_point_wave_location"])
+        a, b = widen_integers(first["return_point_wave_location"]), widen_integers(second["return_point_wave_location"])
         use = np.flatnonzero(np.abs(a - b) > _APART)
         use = use[:: max(1, len(use) // _PER_CALL)]
         if not len(use):
@@ -98,20 +98,20 @@ def measure_ratio(points: np.ndarray, form: str) -> np.ndarray:
     length = np.sqrt((vectors * vectors).sum(axis=1)) * (PS_PER_NS / HALF_C)
     if form == "range":
         with np.errstate(divide="ignore", invalid="ignore"):
-            length = length / np.abs(widen(points["return_point_wave_location"]))
+            length = length / np.abs(widen_integers(points["return_point_wave_location"]))
     return length
 
 
 def stack_vectors(points: np.ndarray) -> np.ndarray:
     """Return the vectors of records (n,) as stored, f8 (n, 3)."""
-    return np.stack([widen(points[name]) for name in VECTORS], axis=1)
+    return np.stack([widen_integers(points[name]) for name in VECTORS], axis=1)
 
 
 def read_toward(points: np.ndarray, direction: str, form: str) -> np.ndarray:
     """Return vectors toward the sensor [m/ps], f8 (n, 3), with the length of the file."""
     vectors = stack_vectors(points)
     if form == "range":
-        vectors /= -widen(points["return_point_wave_location"])[:, None]
+        vectors /= -widen_integers(points["return_point_wave_location"])[:, None]
     return vectors if direction == "toward" else -vectors
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from wavebatch.core.order import even_places
 from wavebatch.core.units import HALF_C, PS_PER_NS
-from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.packet_vectors import read_toward
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -61,7 +61,7 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
 
     def take(start: int, stop: int) -> float:
         points = reader.read_points(start, stop)
-        xyz, time = locate(points, reader.facts.header), widen(points["gps_time"])
+        xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         pairs.append(_pair_returns(xyz, time))
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
         kept.append(_read_vectors(points[rows], xyz[rows], time[rows], scan))
@@ -91,10 +91,10 @@ def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
     units = _choose_units(scan)
     for start, stop in units[:: max(1, -(-len(units) // SCALE_PLACES))]:
         points = reader.read_points(start, min(start + SLICE_POINTS, stop))
-        xyz, time = locate(points, reader.facts.header), widen(points["gps_time"])
+        xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         with np.errstate(all="ignore"):
             vectors = read_toward(points, scan.vectors.direction, scan.vectors.form)
-            place = widen(points["return_point_wave_location"])
+            place = widen_integers(points["return_point_wave_location"])
             same = (time[1:] == time[:-1]) & (points["wavepacket_offset"][1:] == points["wavepacket_offset"][:-1])
             by_time = np.abs(np.diff(place)) * np.sqrt((vectors[1:] ** 2).sum(axis=1))
             apart = np.sqrt((np.diff(xyz, axis=0) ** 2).sum(axis=1))

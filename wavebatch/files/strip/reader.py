@@ -17,12 +17,12 @@ from wavebatch.core.order import even_places
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.raw_bytes import reading, take_whole_records, widen
+from wavebatch.files.disk.raw_bytes import reading, take_whole_records, widen_integers
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
-from wavebatch.files.strip.packet_owner import compare_returns, is_strange, sample_size
+from wavebatch.files.strip.packet_owner import compare_returns, is_strange, size_of_sample
 from wavebatch.files.strip.packet_vectors import OPTIONS, VectorDecision, read_toward
 from wavebatch.files.strip.packets import PacketFile, block_rows
 from wavebatch.files.strip.sample_form import PLAIN, SampleForm, read_packet_samples
@@ -154,7 +154,7 @@ class StripReader(Closing):
             return ""
         used = scan.by_descriptor.keys() & self.facts.digitizers
         longest = max(self.facts.digitizers[index].n_samples for index in used)
-        table = compare_returns(self._sample_returns(scan, sample_size(longest)))
+        table = compare_returns(self._sample_returns(scan, size_of_sample(longest)))
         if not is_strange(table):
             return ""
         return (
@@ -344,7 +344,7 @@ class _Geometry:
         place = expand(self._starts[rows], counts)
         records = self._take(self._entry[place])
         xyz = locate(records, self._facts.header)
-        location = widen(records["return_point_wave_location"])
+        location = widen_integers(records["return_point_wave_location"])
         owner = np.cumsum(counts) - counts
         lead = take_whole_records(records, owner)
         toward = read_toward(lead, self._unit.vectors.direction, self._unit.vectors.form)
@@ -354,7 +354,7 @@ class _Geometry:
             samples=samples,
             first=int(owners[0]),
             point=owners,
-            gps_time=widen(lead["gps_time"]),
+            gps_time=widen_integers(lead["gps_time"]),
             origin=xyz[owner] + location[owner, None] * toward,
             direction=-PS_PER_NS * toward,
             returns=ReturnTable(

@@ -36,7 +36,7 @@ class Crossings(NamedTuple):
     """The voxel, int64 (m, 3)."""
 
 
-class Samples(NamedTuple):
+class VoxelSamples(NamedTuple):
     """Samples with signal along rays, ray after ray, each in the order of time."""
 
     time: np.ndarray
@@ -161,7 +161,7 @@ def unpack_index(key: np.ndarray) -> np.ndarray:
 
 
 def sum_before(
-    samples: Samples, first: np.ndarray, count: np.ndarray, ray: np.ndarray, time: np.ndarray
+    samples: VoxelSamples, first: np.ndarray, count: np.ndarray, ray: np.ndarray, time: np.ndarray
 ) -> np.ndarray:
     """Sums of the samples of each ray up to given times.
 

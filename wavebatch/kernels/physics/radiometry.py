@@ -129,7 +129,7 @@ def backscatter(
     return constant * light / transmit(distance, attenuation)
 
 
-def cross_section(gamma: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
+def compute_cross_section(gamma: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
     """Backscatter cross section: gamma times the area that the beam illuminates.
 
     Parameters

@@ -30,7 +30,7 @@ PEAK_ERROR = 1.1
 samples, 1.0 to 1.15."""
 
 
-class Reference(NamedTuple):
+class OutgoingReference(NamedTuple):
     """What all outgoing pulses of a channel have in common."""
 
     width: float
@@ -62,7 +62,7 @@ class OutgoingPulses(NamedTuple):
     """Standard deviation, f8 (n,)."""
 
 
-def find_reference(samples: np.ndarray) -> Reference | None:
+def find_reference(samples: np.ndarray) -> OutgoingReference | None:
     """Return what outgoing pulses have in common.
 
     Parameters
@@ -72,7 +72,7 @@ def find_reference(samples: np.ndarray) -> Reference | None:
 
     Returns
     -------
-    Reference or None
+    OutgoingReference or None
         None where most of them show no pulse.
     """
     values = samples.astype(np.float32)
@@ -87,7 +87,7 @@ def find_reference(samples: np.ndarray) -> Reference | None:
     used = number >= 3
     if not used.any():
         level = float(np.median(least))
-        return Reference(width, 1.0, 1.0, level, 0.0) if np.median(height) > LEAST_HEIGHT else None
+        return OutgoingReference(width, 1.0, 1.0, level, 0.0) if np.median(height) > LEAST_HEIGHT else None
     means = np.where(quiet, values, 0).sum(axis=1)[used] / number[used]
     rest = np.where(quiet[used], values[used] - means[:, None], 0)
     freedom = float((number[used] - 1).sum())
@@ -100,7 +100,7 @@ def find_reference(samples: np.ndarray) -> Reference | None:
     within = noise**2 * gain / float(np.median(number[used]))
     total = float(MAD_TO_STD * np.median(np.abs(means - level))) ** 2
     spread = float(np.sqrt(max(total - within, 0.0)))
-    return Reference(width, noise, gain, level, spread) if np.median(height) > LEAST_HEIGHT * noise else None
+    return OutgoingReference(width, noise, gain, level, spread) if np.median(height) > LEAST_HEIGHT * noise else None
 
 
 def _correlation(away: np.ndarray, quiet: np.ndarray, lag: int) -> float:
@@ -112,14 +112,14 @@ def _correlation(away: np.ndarray, quiet: np.ndarray, lag: int) -> float:
     return max(float(product * quiet.sum() / max((away**2).sum(), 1e-12)), 0.0)
 
 
-def measure_outgoing(samples: np.ndarray, reference: Reference) -> OutgoingPulses:
+def measure_outgoing(samples: np.ndarray, reference: OutgoingReference) -> OutgoingPulses:
     """Measure outgoing pulses.
 
     Parameters
     ----------
     samples : unsigned integers (n, s), count
         Recordings of one length.
-    reference : Reference
+    reference : OutgoingReference
 
     Returns
     -------
@@ -157,7 +157,7 @@ def measure_outgoing(samples: np.ndarray, reference: Reference) -> OutgoingPulse
     return OutgoingPulses(*(np.where(seen, measure, np.nan) for measure in measures))
 
 
-def _find_levels(values: np.ndarray, peak: np.ndarray, reference: Reference) -> tuple[np.ndarray, np.ndarray]:
+def _find_levels(values: np.ndarray, peak: np.ndarray, reference: OutgoingReference) -> tuple[np.ndarray, np.ndarray]:
     """Level of each shot and its variance: its quiet samples, drawn to the level of all shots."""
     quiet = np.arange(values.shape[1]) < (peak - QUIET * reference.width)[:, None]
     number = quiet.sum(axis=1)

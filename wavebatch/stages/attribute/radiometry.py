@@ -72,7 +72,7 @@ def cross_section(block: WaveformBlock, noise: Noise, system: SystemPulse, echoe
     """
     light = measure_light(block, system, echoes, 4)
     divergence = np.nan if system.radiometry.divergence is None else 1e-3 * system.radiometry.divergence
-    section = radiometry.cross_section(light.gamma, light.distance, divergence)
+    section = radiometry.compute_cross_section(light.gamma, light.distance, divergence)
     unknown = (NoData.NO_DIVERGENCE, system.radiometry.divergence is None)
     relative = np.hypot(light.relative_error, 2.0 * system.radiometry.divergence_error)
     return add_column(echoes, "cross_section", section, relative, *light.cases[:2], unknown, *light.cases[2:])

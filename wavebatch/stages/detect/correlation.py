@@ -29,13 +29,13 @@ from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
 from wavebatch.stages.reference_pulse import reference_pulse
 
-Candidates = tuple[np.ndarray, np.ndarray, np.ndarray]
+CorrelationPeaks = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Waveform, time [samples], amplitude."""
 
 
-def _in_parts(signal: np.ndarray, std: np.ndarray, detect: Callable[..., Candidates]) -> Candidates:
+def _in_parts(signal: np.ndarray, std: np.ndarray, detect: Callable[..., CorrelationPeaks]) -> CorrelationPeaks:
     """Candidates of the columns of signal (s, n), a few hundred at a time, so that arrays stay in the cache."""
-    found: list[Candidates] = [(np.empty(0, np.int64), np.empty(0), np.empty(0))]
+    found: list[CorrelationPeaks] = [(np.empty(0, np.int64), np.empty(0), np.empty(0))]
     for begin in range(0, signal.shape[1], COLUMNS_AT_A_TIME):
         part = slice(begin, begin + COLUMNS_AT_A_TIME)
         waveform, time, amplitude = detect(np.ascontiguousarray(signal[:, part]), std[part])
@@ -77,7 +77,7 @@ def correlation(
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     energy = float(np.sum(given.taps**2))
 
-    def detect(signal: np.ndarray, std: np.ndarray) -> Candidates:
+    def detect(signal: np.ndarray, std: np.ndarray) -> CorrelationPeaks:
         padded = pad_samples(signal, given.middle)
         correlations = slide_taps(padded, given.taps)
         waveform, sample = find_peaks(correlations, np.float32(threshold * np.sqrt(energy)) * std)
@@ -132,7 +132,7 @@ def asdf(
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     gain = np.float32(threshold * np.sqrt(np.sum(given.taps**2)))
 
-    def detect(signal: np.ndarray, std: np.ndarray) -> Candidates:
+    def detect(signal: np.ndarray, std: np.ndarray) -> CorrelationPeaks:
         height = signal.max(axis=0)
         difference, correlations = square_differences(signal, given.taps, height)
         values = np.ascontiguousarray(difference.T)

@@ -25,7 +25,7 @@ from wavebatch.kernels.physics.radiometry import usual_attenuation
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.choose_chain import Choice, Request
+from wavebatch.surveying.choose_chain import ChainChoice, Request
 from wavebatch.surveying.matching.setting import SCANNERS, Setting, measure_setting
 from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
 from wavebatch.surveying.prepare import Positions, prepare
@@ -96,7 +96,7 @@ class EchoSource:
 
     reader: StripReader
     scan: StripScan
-    choice: Choice
+    choice: ChainChoice
     chain: Chain
     """The chosen one, and the stage that gives the energy."""
     system: SystemPulse

@@ -16,7 +16,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.order import robust_std
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -180,7 +180,7 @@ def _measure_rate(reader: StripReader) -> float | None:
     """Pulses per second by the shortest usual distance of GPS times: pulses without a point leave longer ones."""
     count, rates = reader.facts.header.point_count, []
     for start in np.unique(np.linspace(0, max(count - SLICE_POINTS, 0), SLICES).astype(np.int64)).tolist():
-        step = np.diff(widen(reader.read_points(start, min(start + SLICE_POINTS, count))["gps_time"]))
+        step = np.diff(widen_integers(reader.read_points(start, min(start + SLICE_POINTS, count))["gps_time"]))
         later = step[np.isfinite(step) & (step > 0)]
         if not len(later) or np.mean(step >= 0) < LEAST_IN_ORDER:
             continue

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from wavebatch.files.pulsewaves.reader import Piece, Segments
+from wavebatch.files.pulsewaves.reader import PulsePiece, Segments
 
 SATURATED = 0.8
 """Share of the sensitive channel's largest counts from which the other channel is used: receivers bend before they
@@ -33,7 +33,7 @@ class Overlaps:
     """Heights of the sensitive and of the other channel at the same time [count]."""
     pairs: int = 0
 
-    def add(self, piece: Piece, first: np.ndarray, second: np.ndarray) -> None:
+    def add(self, piece: PulsePiece, first: np.ndarray, second: np.ndarray) -> None:
         """Add pairs of segments: rows of the sensitive and of the other channel."""
         self.pairs += len(first)
         if self.pairs > MOST_PAIRS and self.products:

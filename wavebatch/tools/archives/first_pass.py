@@ -14,8 +14,8 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.pulsewaves.header import OUTGOING, RETURNING
-from wavebatch.files.pulsewaves.reader import Piece, PulseReader
-from wavebatch.kernels.signal.outgoing import Reference, find_reference, measure_outgoing
+from wavebatch.files.pulsewaves.reader import PulsePiece, PulseReader
+from wavebatch.kernels.signal.outgoing import OutgoingReference, find_reference, measure_outgoing
 from wavebatch.surveying.outgoing import STACKED, OutgoingShape, learn_shape
 from wavebatch.tools.archives.channels import Overlaps, code_segments, decode, find_partners, group_rows
 
@@ -37,7 +37,7 @@ class Outgoing:
 
     kind: int
     """Channel, bits and spacing as `code_segments` with length 0."""
-    reference: Reference
+    reference: OutgoingReference
     shape: OutgoingShape | None
     energy: float
     """Mean [count samples]."""
@@ -114,7 +114,7 @@ def make_plan(reader: PulseReader) -> Plan:
     )  # fmt: skip
 
 
-def _add(found: _Found, piece: Piece, every: int) -> None:
+def _add(found: _Found, piece: PulsePiece, every: int) -> None:
     segments, pulses = piece.segments, piece.pulses
     returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
     for code, count in zip(*np.unique(code_segments(segments, returning), return_counts=True), strict=True):

@@ -12,7 +12,7 @@ import numpy as np
 from wavebatch.files.las.geo_keys import GeoKeys
 from wavebatch.files.las.geotiff_wkt import build_utm
 from wavebatch.files.las.header import GEOTIFF_ID, Vlr
-from wavebatch.files.pulsewaves.reader import Piece, PulseReader
+from wavebatch.files.pulsewaves.reader import PulsePiece, PulseReader
 from wavebatch.tools.archives.utm import find_utm_zone, project_utm
 
 SCALE = 0.001
@@ -43,7 +43,7 @@ class Frame:
     """GeoTIFF keys that still hold."""
     notes: tuple[str, ...]
 
-    def place(self, piece: Piece) -> Piece:
+    def place(self, piece: PulsePiece) -> PulsePiece:
         """Return the piece with its pulses in the coordinates of the strip."""
         if not self.zone:
             return piece

@@ -9,7 +9,7 @@ import numpy as np
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.pulsewaves.header import OUTGOING, RETURNING, PulseHeader
-from wavebatch.files.pulsewaves.reader import Piece, Segments
+from wavebatch.files.pulsewaves.reader import PulsePiece, Segments
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.signal.outgoing import measure_outgoing
@@ -53,7 +53,7 @@ class Counts:
     """Pulses whose outgoing recording shows no pulse."""
 
 
-def choose_segments(piece: Piece, plan: Plan, counts: Counts) -> np.ndarray:
+def choose_segments(piece: PulsePiece, plan: Plan, counts: Counts) -> np.ndarray:
     """Return the rows of the segments that become packets, sorted by pulse and time."""
     segments = piece.segments
     returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
@@ -71,7 +71,7 @@ def choose_segments(piece: Piece, plan: Plan, counts: Counts) -> np.ndarray:
 
 
 def build_points(
-    piece: Piece, plan: Plan, writer: FullwaveWriter, header: PulseHeader, counts: Counts, *, detect: bool
+    piece: PulsePiece, plan: Plan, writer: FullwaveWriter, header: PulseHeader, counts: Counts, *, detect: bool
 ) -> np.ndarray:
     """Write the packets of a piece and return its points, sorted by pulse and time."""
     segments = piece.segments
@@ -143,7 +143,7 @@ def _place_returns(samples: np.ndarray, noise: float, *, detect: bool) -> tuple[
 
 def _fill_places(
     points: np.ndarray,
-    piece: Piece,
+    piece: PulsePiece,
     chosen: Segments,
     sample: np.ndarray,
     writer: FullwaveWriter,
@@ -161,7 +161,7 @@ def _fill_places(
     points["return_point_wave_location"] = sample * chosen.spacing * PS_PER_NS
 
 
-def _fill_pulses(points: np.ndarray, piece: Piece, pulse: np.ndarray, plan: Plan, header: PulseHeader) -> None:
+def _fill_pulses(points: np.ndarray, piece: PulsePiece, pulse: np.ndarray, plan: Plan, header: PulseHeader) -> None:
     """Fields that all returns of a pulse share, and return numbers; points are sorted by pulse and time."""
     records = piece.pulses[pulse]
     begin = np.searchsorted(pulse, pulse, side="left")
@@ -194,7 +194,7 @@ class _Sent:
     """Time of the peak after the strip's mean one, f8 (n,) [ns]; 0 where it is not known."""
 
 
-def _measure_sent(piece: Piece, outgoing: Outgoing, counts: Counts) -> _Sent:
+def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: Counts) -> _Sent:
     """Measure the first outgoing segment of each pulse.
 
     A digitizer does not start in step with the laser: its samples lie up to half a spacing off. Where the outgoing

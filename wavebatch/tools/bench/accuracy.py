@@ -14,7 +14,7 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.stages.score import ISOLATED, QUANTITIES, find_isolated, list_pairs, match_echoes
+from wavebatch.stages.score import ISOLATED, QUANTITIES, find_isolated_echoes, list_pairs, match_echoes
 from wavebatch.surveying import Survey, survey_block
 from wavebatch.tools.bench.figures import Figure, root_mean_square, share_figure
 from wavebatch.tools.bench.truth import describe_truth, find_bounds
@@ -87,7 +87,7 @@ def make_group(
         number=number,
         block=block,
         truth=describe_truth(truth, recording.pulse),
-        isolated=find_isolated(truth),
+        isolated=find_isolated_echoes(truth),
         bounds=find_bounds(recording, truth, len(block)),
         survey=survey,
         clear=truth.amplitude >= clear * recording.recorded_noise,

@@ -28,8 +28,8 @@ from wavebatch.tools.simulate import Scene, find_scene, simulate_blocks, simulat
 
 SCHEMA = "wavebatch.bench/1"
 
-Progress = Callable[[str], None]
-Rows = list[dict[str, Any]]
+BenchProgress = Callable[[str], None]
+BenchRows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +55,8 @@ class BenchOptions:
 
 def run_bench(
     options: BenchOptions,
-    progress: Progress = lambda text: None,
-    measure_others: Callable[[Scene, list[Group]], Rows] = lambda scene, groups: [],
+    progress: BenchProgress = lambda text: None,
+    measure_others: Callable[[Scene, list[Group]], BenchRows] = lambda scene, groups: [],
 ) -> dict[str, Any]:
     """Runs a benchmark and returns its document of plain values.
 
@@ -87,8 +87,8 @@ def run_bench(
 
 
 def _measure_scene(
-    scene: Scene, chains: Mapping[str, Chain], options: BenchOptions, place: int, progress: Progress,
-    measure_others: Callable[[Scene, list[Group]], Rows],
+    scene: Scene, chains: Mapping[str, Chain], options: BenchOptions, place: int, progress: BenchProgress,
+    measure_others: Callable[[Scene, list[Group]], BenchRows],
 ) -> dict[str, Any]:  # fmt: skip
     seed = derive_seed(options.seed, place)
     groups = make_groups(scene, options.waveforms, seed, progress)
@@ -114,7 +114,7 @@ def _measure_scene(
 
 
 def _time(
-    scene: Scene, group: Group, chains: Mapping[str, Chain], options: BenchOptions, seed: int, progress: Progress
+    scene: Scene, group: Group, chains: Mapping[str, Chain], options: BenchOptions, seed: int, progress: BenchProgress
 ) -> dict[str, Laps]:
     timed = {name: (chain, group.system) for name, chain in chains.items()}
     block, strip = group.block, None
@@ -135,7 +135,7 @@ def make_row(name: str, kind: str, tally: AccuracyTally, laps: Laps) -> dict[str
     return {"name": name, "kind": kind, "waveforms": tally.waveforms, "figures": figures, **times}
 
 
-def _mark_front(rows: Rows) -> None:
+def _mark_front(rows: BenchRows) -> None:
     """Adds to every row whether no other chain is as good in time, error and wrong echoes, and better in one of them.
 
     Peers get other and fewer waveforms: they are never on the front.

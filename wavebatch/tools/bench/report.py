@@ -17,10 +17,10 @@ from wavebatch.files.text_file import write_text
 from wavebatch.stages.score import QUANTITIES
 from wavebatch.tools.bench.plot import NO_PLOT, plot_scene
 
-Column = tuple[str, str, float, int]
+ReportColumn = tuple[str, str, float, int]
 """Head, name of the figure, factor, decimals."""
 
-SHARES: tuple[Column, ...] = (
+SHARES: tuple[ReportColumn, ...] = (
     ("complete %", "completeness", 100, 2),
     ("correct %", "correctness", 100, 2),
     ("exact %", "exact_count", 100, 2),
@@ -28,13 +28,13 @@ SHARES: tuple[Column, ...] = (
     ("isolated %", "found_isolated", 100, 2),
     ("overlapped %", "found_overlapped", 100, 2),
 )
-LENGTHS: tuple[Column, ...] = (
+LENGTHS: tuple[ReportColumn, ...] = (
     ("all cm", "rmse_all_cm", 1, 2),
     ("isolated cm", "rmse_isolated_cm", 1, 2),
     ("overlapped cm", "rmse_overlapped_cm", 1, 2),
 )
 
-REPORTED: tuple[Column, ...] = (
+REPORTED: tuple[ReportColumn, ...] = (
     ("no flag", "time_calibration_not_flagged", 1.0, 2),
     ("flag", "time_calibration_flagged", 1.0, 2),
     ("neighbours found", "time_calibration_not_hidden", 1.0, 2),
@@ -44,7 +44,7 @@ REPORTED: tuple[Column, ...] = (
 """Errors of times over the reported ones: echoes without and with a flag of UNCLEAN, and by what was found around."""
 
 
-def _ratios(kind: str) -> tuple[Column, ...]:
+def _ratios(kind: str) -> tuple[ReportColumn, ...]:
     columns = tuple((name, f"{name}_ratio_{kind}", 1.0, 3) for name in QUANTITIES)
     return (*columns, ("gross %", f"gross_{kind}", 100, 2), ("err column", f"time_calibration_{kind}", 1.0, 3))
 
@@ -113,13 +113,13 @@ def _speed_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return align(lines)
 
 
-def _figure_table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[str]:
+def _figure_table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[ReportColumn]) -> list[str]:
     lines = [[title, *(column[0] for column in columns)]]
     lines += [[row["name"], *(figure_text(row, column) for column in columns)] for row in rows]
     return align(lines)
 
 
-def figure_text(row: Mapping[str, Any], column: Column) -> str:
+def figure_text(row: Mapping[str, Any], column: ReportColumn) -> str:
     """A figure of a row with its error; a dash where there is no figure."""
     _, name, factor, decimals = column
     figure = row["figures"][name]

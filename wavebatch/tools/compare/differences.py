@@ -28,7 +28,7 @@ GROUPS = {"class": "classification", "echoes": "total"}
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class ErrorSpread:
     """Differences a minus b of one quantity, over the echoes that both sides have."""
 
     number: int
@@ -69,12 +69,12 @@ class Differences:
         part["isolated"] = b["isolated"] if "isolated" in b.dtype.names else np.zeros(len(b), bool)
         self._sample.add(part)
 
-    def spreads(self) -> dict[str, Spread]:
+    def spreads(self) -> dict[str, ErrorSpread]:
         """Median, mean, rms and NMAD of a minus b, for each quantity that both sides have."""
         data = self._sample.read()
         return {name: _spread(sums, data[name]) for name, sums in self.sums.items() if sums[0]}
 
-    def groups(self) -> dict[str, dict[int, dict[str, Spread]]]:
+    def groups(self) -> dict[str, dict[int, dict[str, ErrorSpread]]]:
         """The same by kind of GROUPS and by number: of the class, and of the echoes that the pulse has.
 
         A pair belongs to the group of its echo of b; where b has no groups (all are 0), to that of its echo of a.
@@ -120,13 +120,13 @@ class Differences:
         }
 
 
-def _spread(sums: np.ndarray, values: np.ndarray) -> Spread:
+def _spread(sums: np.ndarray, values: np.ndarray) -> ErrorSpread:
     """The spread from number, sum and sum of squares of all pairs, and from the differences of a sample of them."""
     number, total, squares = sums.tolist()
     values = values[~np.isnan(values)]
     median = np.median(values) if len(values) else np.nan
     nmad = MAD_TO_STD * np.median(np.abs(values - median)) if len(values) else np.nan
-    return Spread(int(number), float(median), total / number, float(np.sqrt(squares / number)), float(nmad))
+    return ErrorSpread(int(number), float(median), total / number, float(np.sqrt(squares / number)), float(nmad))
 
 
 def measure_lag(a: np.ndarray, b: np.ndarray) -> np.ndarray:

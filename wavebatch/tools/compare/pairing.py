@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
 from wavebatch.tools.compare.breakdown import Breakdown, Table, name_class
-from wavebatch.tools.compare.differences import SPEED, Differences, Spread
+from wavebatch.tools.compare.differences import SPEED, Differences, ErrorSpread
 
 MOST_PER_PULSE = 64
 """More echoes than this with one GPS time are not a pulse: such times are missing or rounded."""
@@ -51,9 +51,9 @@ class Comparison:
     counts_a: dict[int, int]
     """Pulses by number of echoes in a; pulses without an echo in a are known from b."""
     counts_b: dict[int, int]
-    differences: dict[str, Spread]
+    differences: dict[str, ErrorSpread]
     """time along the ray [ns, later is positive]; echo_time [ns], amplitude [DN], echo_width [ns] if both have it."""
-    differences_by: dict[str, dict[str, dict[str, Spread]]] = field(default_factory=dict)
+    differences_by: dict[str, dict[str, dict[str, ErrorSpread]]] = field(default_factory=dict)
     """The same by `class` (LAS classes of b, or of a if b has none) and by `echoes` (of the pulse, likewise)."""
     errors: dict[str, dict[str, ErrorStats]] = field(default_factory=dict)
     """Only with a truth: errors by class (all, isolated, overlapped) and quantity.
@@ -234,7 +234,7 @@ def check_tolerance(tolerance_ns: float) -> float:
     return tolerance_ns
 
 
-def _name_groups(groups: dict[str, dict[int, dict[str, Spread]]]) -> dict[str, dict[str, dict[str, Spread]]]:
+def _name_groups(groups: dict[str, dict[int, dict[str, ErrorSpread]]]) -> dict[str, dict[str, dict[str, ErrorSpread]]]:
     """Groups of differences with names: of LAS classes, and numbers of echoes as text, as JSON has them."""
     names = {"class": name_class, "echoes": str}
     return {kind: {names[kind](number): one for number, one in group.items()} for kind, group in groups.items()}

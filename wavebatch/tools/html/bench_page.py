@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from wavebatch.tools.bench.report import LENGTHS, SHARES, Column, figure_text, rate_text
+from wavebatch.tools.bench.report import LENGTHS, SHARES, ReportColumn, figure_text, rate_text
 from wavebatch.tools.html import markup
 from wavebatch.tools.html.charts import draw_scatter, figures
 from wavebatch.tools.html.page import write_page
@@ -55,5 +55,5 @@ def _rate(row: Mapping[str, Any]) -> float | str:
     return 1e6 / row["kernels"]["median"] if row["kernels"]["median"] else ""
 
 
-def _figure(row: Mapping[str, Any], column: Column) -> str:
+def _figure(row: Mapping[str, Any], column: ReportColumn) -> str:
     return markup.text(figure_text(row, column).replace("+-", "\u00b1 "))

@@ -73,7 +73,7 @@ def figures(parts: Sequence[str], kind: str = "") -> str:
     return f'<div class="figures {kind}">' + "\n".join(drawn) + "</div>" if drawn else ""
 
 
-def draw_pulse(system: SystemPulse, spacing: float, title: str = "System pulse") -> str:
+def chart_pulse(system: SystemPulse, spacing: float, title: str = "System pulse") -> str:
     """The pulse that is fitted, height 1 at its peak, with a Gaussian of its width and the distance of samples."""
     time, pulse = sample_pulse(system, spacing)
     gaussian = evaluate_pulse(GAUSSIAN, time / system.sigma_ref, np.float64(0.0), np.float64(1.0))[0]

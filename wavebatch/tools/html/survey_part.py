@@ -9,7 +9,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.toml_file import format_toml
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SYSTEM_SCHEMA, parse_survey
-from wavebatch.tools.html.charts import draw_counts, draw_pulse, figures
+from wavebatch.tools.html.charts import chart_pulse, draw_counts, figures
 from wavebatch.tools.html.markup import facts, paragraph, significant, table
 
 
@@ -24,8 +24,8 @@ def draw_survey(survey: Survey) -> str:
     """Figures, pulses and shares of a survey."""
     system, found, waveforms = survey.system, survey.figures, survey.waveforms
     spacing = found.spacing_ns or 1.0
-    pulses = [draw_pulse(system, spacing)]
-    pulses += [draw_pulse(one, spacing, f"Pulse of digitizer {index}") for index, one in system.digitizers.items()]
+    pulses = [chart_pulse(system, spacing)]
+    pulses += [chart_pulse(one, spacing, f"Pulse of digitizer {index}") for index, one in system.digitizers.items()]
     shares = {"empty": found.empty_share, "single": found.single_share, "overlapped": found.overlapped_share}
     if None not in shares.values():
         counts = {name: round(value * waveforms) for name, value in shares.items()}

@@ -24,7 +24,7 @@ from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.point_formats import WITHOUT_WAVES
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.writer import FullwaveWriter
-from wavebatch.stages.score import find_isolated
+from wavebatch.stages.score import find_isolated_echoes
 from wavebatch.tools.simulate.blocks import Simulated, seed_block, simulate_seed_block
 from wavebatch.tools.simulate.geometry import EAST, NORTH, FlightLine
 from wavebatch.tools.simulate.returns import DiscreteReceiver, Returns, fill_packets, list_returns
@@ -291,7 +291,7 @@ def _list_truth(simulated: Simulated, packet: np.ndarray, offset: np.ndarray) ->
         "incidence_angle": np.degrees(rays.incidence[rows]),
         "range": rays.distance[rows] + past_ground,
         "flags": truth.flags,
-        "isolated": find_isolated(truth),
+        "isolated": find_isolated_echoes(truth),
         "overlapped": (truth.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0,
     }
 

@@ -16,7 +16,7 @@ from wavebatch.files.disk.key_sums import HELD, KeyedSums
 from wavebatch.kernels.geometry.voxels import (
     KEY_BITS,
     Crossings,
-    Samples,
+    VoxelSamples,
     cross_voxels,
     differences_along,
     fits_keys,
@@ -153,7 +153,7 @@ class VoxelGrid(Closing):
         first = np.append(True, ray[1:] != ray[:-1])[: len(ray)]
         caught, ground = (_count(part, LIGHT_UNIT) for part in rule.weigh(rays))
         summed = [caught, ground, _count(samples["energy"], self._unit), _count(samples["section"], SECTION_UNIT)]
-        summed = Samples(samples["time"], samples["spacing"], np.stack(summed, axis=1))
+        summed = VoxelSamples(samples["time"], samples["spacing"], np.stack(summed, axis=1))
         each = np.arange(len(table))
         last = sum_before(summed, table["first"], table["count"], each, np.full(len(table), np.inf))
         before = sum_before(summed, table["first"], table["count"], ray, found.enter)

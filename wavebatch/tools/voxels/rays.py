@@ -215,7 +215,7 @@ def _measure_sections(
     with np.errstate(over="ignore", invalid="ignore"):
         attenuation = system.radiometry.attenuation
         gamma = radiometry.backscatter(constant[row], distance, value, system.sigma_ref, attenuation)
-        section = radiometry.cross_section(gamma, distance, 1e-3 * system.radiometry.divergence)
+        section = radiometry.compute_cross_section(gamma, distance, 1e-3 * system.radiometry.divergence)
     # A sample without range makes the sum of its waveform NaN, which the comparison counts as unknown.
     with np.errstate(invalid="ignore", over="ignore"):
         unknown = ~(np.bincount(row, section, minlength=len(block)) <= MOST_SECTION)
