@@ -28,7 +28,7 @@ def backscatter(constant, distance, amplitude, sigma, attenuation):
     return constant * distance**2 * amplitude * sigma / transmit(distance, attenuation)
 
 
-def cross_section(gamma, distance, divergence):
+def compute_cross_section(gamma, distance, divergence):
     """Gamma times the area of the footprint."""
     return gamma * math.pi * (distance * divergence / 2) ** 2 if 0 < distance < math.inf else math.nan
 

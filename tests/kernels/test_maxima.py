@@ -88,7 +88,11 @@ def naive_clusters(samples, candidates, margin, reach, most, tail):
     for row in np.unique(candidates.waveform):
         y = (samples.counts[row] - samples.baseline[row]).astype(np.float32)
         if samples.missing is not None:
-            y[samples.missing[row]] = 0
+            missing = samples.missing[row]
+            y[missing] = 0
+            for i in range(1, s - 1):
+                if missing[i] and not missing[i - 1] and not missing[i + 1]:
+                    y[i] = np.float32(0.5) * (y[i - 1] + y[i + 1])
         smooth, level = naive.smooth_121(y), 2 * GAIN_121 * samples.std[row]
         members = np.flatnonzero(candidates.waveform == row)
         at = [int(np.rint(np.clip(candidates.time[i], 0, s - 1))) for i in members]

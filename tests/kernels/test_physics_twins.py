@@ -57,7 +57,7 @@ def test_radiometry_is_that_of_single_echoes(echoes):
     pairs = [
         ("transmit", (usual, 0.3)),
         ("backscatter", (2e-8, distance, amplitude, sigma, 0.3)),
-        ("cross_section", (gamma, distance, BETA)),
+        ("compute_cross_section", (gamma, distance, BETA)),
         ("diffuse_reflectance", (gamma, angle)),
         ("energy_error", (amplitude, sigma, 0.7, 0.02)),
         ("reflectance_error", (np.abs(error), angle, 0.03)),

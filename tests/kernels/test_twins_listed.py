@@ -21,6 +21,7 @@ TWINS = {
         "describe_left": "naive_describe.describe", "measure_changes": "naive_describe.measure_change",
         "gather_pulse": "naive_describe.gather",
     },
+    "kernels": {"judge_packets": "naive_packets.judge_packet"},
     "geometry": {
         "find_bend": "test_bends.naive_gains", "fit_facet": "naive.fit_slope",
         "find_pulses": "naive_geometry.find_pulses", "find_nearest": "naive_geometry.find_nearest",
@@ -45,7 +46,8 @@ TWINS = {
         "direct_width": "naive_signal.lobe_edges", "judge_energies": "naive_physics.judge_energies",
         "receive_power": "naive_physics.receive_power", "spread_cross_section": "naive_physics.spread_cross_section",
         "transmit": "naive_physics.transmit", "backscatter": "naive_physics.backscatter",
-        "cross_section": "naive_physics.cross_section", "diffuse_reflectance": "naive_physics.diffuse_reflectance",
+        "compute_cross_section": "naive_physics.compute_cross_section",
+        "diffuse_reflectance": "naive_physics.diffuse_reflectance",
         "energy_error": "naive_physics.energy_error", "backscatter_error": "naive_physics.backscatter_error",
         "slope_error": "naive_physics.slope_error", "reflectance_error": "naive_physics.reflectance_error",
     },
@@ -80,7 +82,7 @@ TWINS = {
 LIBRARIES = {
     "exp": "math.exp", "log": "math.log", "log1p": "math.log1p", "solve": "np.linalg.solve",
     "fit_parabola": "np.polyfit", "fit_bounded": "least_squares", "fit_one_gaussian": "least_squares",
-    "wiener_taps": "wiener_taps", "correlation_matrix": "correlation_matrix",
+    "interpolate": "np.interp", "wiener_taps": "wiener_taps", "correlation_matrix": "correlation_matrix",
 }  # fmt: skip
 """Kernels that a test compares with a function of NumPy, SciPy or the standard library."""
 

@@ -120,7 +120,7 @@ def test_a_small_strip_of_the_other_known_sensor_looks_like_it(leica, tmp_path):
 def test_fifty_packets_with_hardly_an_isolated_echo_are_a_guess(leica, tmp_path):
     """Five Gaussians explained the fifty packets that they were learned from: 82 % more echoes, and no word."""
     small = _survey(cut_strip(leica, tmp_path / "cut.las", 50))
-    assert [one.code for one in doubt_survey(small)] == ["pulse-guess"]
+    assert [one.code for one in doubt_survey(small.system, small.figures, small.waveforms)] == ["pulse-guess"]
 
 
 OTHERS = {

@@ -128,7 +128,7 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
     found = [*warn("forced-system", _name_forced(prepared)), *warn("nothing-selected", _miss_all(prepared, report))]
     found += warn("empty", _find_nothing(prepared, report))
     found += warn("foreign-packets", _doubt_waveforms(prepared, report))
-    found += doubt_survey(choice.survey) if echoes else ()
+    found += doubt_survey(choice.survey.system, choice.survey.figures, choice.survey.waveforms) if echoes else ()
     found += () if choice.doubted else warn("failed-fits", _doubt_fits(prepared, report))
     found += warn("reflectance", _doubt_reflectance(report))
     if choice.doubted and echoes:

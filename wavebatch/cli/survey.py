@@ -186,11 +186,12 @@ def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
     from wavebatch.surveying.systems.doubt import doubt_survey
     from wavebatch.surveying.systems.figures import describe_figures
 
+    doubts = doubt_survey(saved.survey.system, saved.survey.figures, saved.survey.waveforms)
     return {
         "schema": SYSTEM_SCHEMA,
         "version": saved.version,
         **facts,
-        "warnings": [*facts.get("warnings", ()), *map(asdict, doubt_survey(saved.survey))],
+        "warnings": [*facts.get("warnings", ()), *map(asdict, doubts)],
         "fingerprint": dict(saved.fingerprint),
         "waveforms": saved.survey.waveforms,
         "system": describe_system(saved.survey.system),

@@ -77,8 +77,10 @@ class Candidate:
     length: np.ndarray
     """Of the description of each waveform [nats], float64 (n,)."""
     echoes: int
+    known: bool
+    """From elsewhere, not learned."""
     gaussians: int
-    """Of the pulse, as far as they had to be learned: 2 for one from elsewhere, so that a plain Gaussian goes first."""
+    """Of the pulse, as far as they had to be learned: 2 for one that is known, so that a plain Gaussian goes first."""
     seen: float
     """Change of the shape that the median of the strongest echoes shows."""
 
@@ -163,13 +165,14 @@ def choose_pulse(
     few = thin_block(held, FEWEST)
     given = given or {}
     every = {**starts, **given}
-    looked = [_judge(few, name, system, 0.003, known=name in given) for name, system in every.items()]
+    looked = [_judge(few, name, system, CHANGES[1], known=name in given) for name, system in every.items()]
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
-    found = [_try_changes(held, one.name, one.system, known=one.name in given) for one in hopeful]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
-    found += [_try_changes(held, name, system) for name, system in _learn(learn, begin)]
-    return _decide(found)
+    tried = {one.name: one.system for one in hopeful} | dict(_learn(learn, begin))
+    found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
+    leader = min(found, key=lambda one: one.typical)
+    return _decide([_try_changes(held, one) if one.exceeds(leader) < HOPELESS else one for one in found])
 
 
 def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, SystemPulse]]:
@@ -201,11 +204,12 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     written = 0.0 if known else 3 * gaussians * 0.5 * log(max(np.count_nonzero(explained.sums.used), 1)) / len(block)
     length = describe_waveforms(block, borne, explained, change) + written
     return Candidate(
-        name, system, change, length, len(explained.echoes), 2 if known else gaussians, measure_change(borne, explained)
+        name, system, change, length, len(explained.echoes), known, 2 if known else gaussians,
+        measure_change(borne, explained),
     )
 
 
-def _try_changes(block: WaveformBlock, name: str, system: SystemPulse, *, known: bool = False) -> Candidate:
+def _try_changes(block: WaveformBlock, judged: Candidate) -> Candidate:
     """The pulse with the least change of shape that no other one beats surely, of those that its echoes show.
 
     Neighbours too close to be found change the shape of some echoes, which is no change from shot to shot.
@@ -214,7 +218,8 @@ def _try_changes(block: WaveformBlock, name: str, system: SystemPulse, *, known:
     for change in CHANGES:
         if len(tried) > 2 and tried[-1].exceeds(tried[-2]) > SURE:
             break  # more of it loses more echoes
-        tried.append(_judge(block, name, system, change, known=known))
+        same = change == judged.change
+        tried.append(judged if same else _judge(block, judged.name, judged.system, change, known=judged.known))
     tried = [one for one in tried if one.change <= STEP_OF_CHANGES * one.seen]
     best = min(tried, key=lambda one: one.typical)
     return next(one for one in tried if one.exceeds(best) < SURE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,10 +16,8 @@ from wavebatch.surveying.measuring.choose_pulse import SMALL
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.measuring.residuals import hides_noise
+from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import find_source
-
-if TYPE_CHECKING:
-    from wavebatch.surveying.survey import Survey
 
 WEAKER, REACH = 0.5, 15
 """Height over that of a stronger echo, and distance from it [system widths], up to which one may be a part of it."""
@@ -33,11 +30,10 @@ MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
 called a guess; of a known pulse, from which its noise is."""
 
 
-def doubt_survey(survey: Survey) -> Iterator[StripWarning]:
+def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Iterator[StripWarning]:
     """Say that pulse or noise is a guess: too few echoes to learn a pulse from, echoes that another one does not find,
     or no samples to measure noise in.
     """
-    system, figures = survey.system, survey.figures
     alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
     if alone is None:
         return
@@ -45,7 +41,7 @@ def doubt_survey(survey: Survey) -> Iterator[StripWarning]:
     most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
     reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
     # So few that the judge sees what the pulse was learned from: many Gaussians explain any waveforms.
-    if alone < FEW and not known and (survey.waveforms < SMALL or not system.components):
+    if alone < FEW and not known and (waveforms < SMALL or not system.components):
         reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
     measured = system.noise.by_kind
     unseen = measured.get("quiet") == 0 and "outside" not in measured
