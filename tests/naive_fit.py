@@ -4,6 +4,8 @@ import naive
 import numpy as np
 from scipy.optimize import brentq
 
+from wavebatch.kernels.fit.learn_pulse import fit_bounded
+
 GAIN_121 = np.sqrt(6.0) / 4.0
 
 
@@ -20,6 +22,29 @@ def whiten(n, clipped, near, far):
         white[begin:end, begin:end] = np.linalg.inv(np.linalg.cholesky(np.array(rho)[lag]))
         begin = end + 1
     return white
+
+
+def fit_stack(stack, components, weight):
+    """Twin of kernels/c/stack.h: weight, delay and sigma of each Gaussian (c, 3), fitted between their bounds."""
+    start = np.ravel(components).astype(float)
+    width, end = start[2], stack.lag[-1]
+
+    def earliest(sigma):
+        return np.minimum(np.maximum(-2.0 * width, 2 * sigma - 4.0 * width), end - width)
+
+    def as_delays(p):
+        first = earliest(p[2::3])
+        return np.stack([p[::3], first + p[1::3] * (end - first), p[2::3]], axis=1)
+
+    def misfit(p):
+        drawn = sum(w * np.exp(-0.5 * ((stack.lag - d) / s) ** 2) for w, d, s in as_delays(p))
+        return (drawn - stack.value) * weight
+
+    first = earliest(start[2::3])
+    start[1::3] = (start[1::3] - first) / (end - first)
+    low, high = (np.tile(side, len(start) // 3) for side in ([-0.3, 0.0, 0.35 * width], [2.0, 1.0, 12.0 * width]))
+    start = np.clip(start, low, high)
+    return as_delays(fit_bounded(misfit, lambda p: naive.differentiate(misfit, p, 1e-6), start, low, high, 200))
 
 
 def slopes(p, x, **shape):

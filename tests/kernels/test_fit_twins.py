@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from wavebatch.kernels.elementary import exp, log, log1p, solve
 from wavebatch.kernels.fit.closed_form import estimate_starts, fit_parabola, start_errors
 from wavebatch.kernels.fit.hermite import residual_moments
-from wavebatch.kernels.fit.learn_pulse import fit_bounded, stack_pulse
+from wavebatch.kernels.fit.learn_pulse import Stack, fit_bounded, refine_gaussians, stack_pulse
 from wavebatch.kernels.fit.problem import Solution, choose
 from wavebatch.kernels.fit.pulse_shape import (
     TAIL_STEP,
@@ -148,6 +148,26 @@ def test_bounded_fits_are_those_of_scipy(rng, bounded):
     found = fit_bounded(misfit, lambda p: naive.differentiate(misfit, p), start, low, high, 200)
     expected = least_squares(misfit, start, bounds=(low, high), xtol=1e-12, ftol=1e-12).x
     assert found == pytest.approx(expected, abs=1e-4) and (found[0] == 1.1) == bounded
+
+
+@pytest.mark.parametrize("components", [1, 2, 3, 4])
+@pytest.mark.parametrize("hard", [False, True])
+def test_sums_of_gaussians_are_fitted_as_by_the_twin(rng, components, hard):
+    """Hard: an undershoot deeper than allowed, and a tail that two sigmas keep from beginning before the pulse."""
+    lag = np.sort(rng.uniform(-12, 60, 300))
+    true = np.array([[1.0, 0.3, 2.0], [0.3, 5.0, 2.5], [-0.5 if hard else -0.1, 11.0, 3.0], [0.2, 4.0, 11.0]])
+    value = sum(w * np.exp(-0.5 * ((lag - d) / s) ** 2) for w, d, s in true[:components])
+    value = value + 1e-3 * rng.standard_normal(len(lag))
+    stack = Stack(lag, value, np.full(len(lag), 1e-3))
+    start = true[:components] * [1.0, 1.0, 1.1] + [0.0, 0.1, 0.0]
+    start[:, 0] = np.maximum(start[:, 0], -0.2)
+    found = refine_gaussians(stack, start)
+    expected = naive_fit.fit_stack(stack, start, np.ones(len(lag)))
+    weight, delay, _ = expected[0]
+    assert found.datum == pytest.approx(delay, abs=1e-4)
+    assert found.components == pytest.approx(expected / [weight, 1, 1] - [0, delay, 0], abs=3e-4)
+    if hard and components > 2:
+        assert (found.components[:, 0] * weight).min() == pytest.approx(-0.3, abs=1e-6), "it is held at its bound"
 
 
 def test_chosen_solutions_are_those_of_a_loop(rng):

@@ -19,7 +19,7 @@ TWINS = {
         "tail_reach": "naive_fit.tail_reach", "measure_pulse": "naive_fit.measure", "render_echoes": "naive.model",
         "skewed_pulse": "naive.pulse", "render_skewed": "naive.model", "render_pulses": "naive_describe.render",
         "describe_left": "naive_describe.describe", "measure_changes": "naive_describe.measure_change",
-        "gather_pulse": "naive_describe.gather",
+        "gather_pulse": "naive_describe.gather", "refine_gaussians": "naive_fit.fit_stack",
     },
     "kernels": {"judge_packets": "naive_packets.judge_packet"},
     "geometry": {
@@ -99,8 +99,7 @@ NO_TWIN = {
     "predict_noise": "tests put it into the equations that it solves",
     "find_seam": "tests on plain counts with a known seam",
     "bound_time": "a formula; crlb, which has a twin, is made of it",
-    "fit_gaussians": "its fit is fit_bounded, its model naive.pulse; tests learn known sums again",
-    "refine_gaussians": "the same from another start",
+    "fit_gaussians": "its fit is that of refine_gaussians; tests learn known sums again",
     "as_pulse": "a structure; the library's tests refuse wrong ones",
     "count_echoes": "a sum; describe_left, which has a twin, is called with it",
     "fit_skewed": "the same with the skewed pulse",

@@ -21,7 +21,7 @@ FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
     "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse", "render_pulses",
     "measure_changes", "pair_differences", "judge_packets",
-    "interpolate_columns",
+    "interpolate_columns", "fit_stack",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -101,6 +101,17 @@ class CDescribed(ctypes.Structure):
         *_fields(ctypes.c_double, "variance gain change"),
         ("ahead", ctypes.c_double * 2),
         ("left_over", ctypes.c_double),
+    ]
+
+
+class CStacked(ctypes.Structure):
+    """`Stacked` of kernels/c/stack.h."""
+
+    _fields_ = [
+        *_fields(ctypes.c_int64, "n m"),
+        *_fields(_POINTER, "lag value weight low high"),
+        *_fields(ctypes.c_double, "early onset last end damping most_damping settled"),
+        *_fields(ctypes.c_int64, "most"),
     ]
 
 

@@ -17,5 +17,6 @@
 #include "describe.h"
 #include "signal.h"
 #include "elementary.h"
+#include "stack.h"
 #include "wdz.h"
 #include "packets.h"

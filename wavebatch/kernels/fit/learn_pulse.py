@@ -1,4 +1,7 @@
-"""The system pulse from isolated echoes: aligned, stacked, fitted by a sum of Gaussians (docs/algorithms.md R2)."""
+"""The system pulse from isolated echoes: aligned, stacked, fitted by a sum of Gaussians (docs/algorithms.md R2).
+
+The loops of the fit are C (kernels/c/stack.h).
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from wavebatch.core.order import group_medians
 from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
+from wavebatch.kernels.library import CStacked, call, place
 
 STEP, IN_BIN = 0.2, 10.0
 """Grid of the stack [samples]; coarser where fewer echoes would fall into a bin than IN_BIN."""
@@ -97,9 +101,9 @@ def _dither(time: np.ndarray, length: int, std: float) -> np.ndarray:
     The median of whole counts is one of them, and so off by up to half a step: it gave pulses a tail of .5 %. From the
     times, so that the order of the echoes changes nothing.
     """
-    place = time[:, None] * SCATTER[0] + np.arange(length) * SCATTER[1]
-    place -= np.floor(place)
-    return ((place - 0.5) * (std * np.sqrt(12.0))).astype(np.float32)
+    fraction = time[:, None] * SCATTER[0] + np.arange(length) * SCATTER[1]
+    fraction -= np.floor(fraction)
+    return ((fraction - 0.5) * (std * np.sqrt(12.0))).astype(np.float32)
 
 
 class PulseFit(NamedTuple):
@@ -181,47 +185,32 @@ def _sum(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
     return np.einsum("bc,c->b", exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2), weight)
 
 
-def _slopes(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
-    """Derivatives of `_sum` by weight, delay and sigma of every component (b, 3 c)."""
-    weight, delay, sigma = parameters.reshape(-1, 3).T
-    z = (lag[:, None] - delay) / sigma
-    bell = exp(-0.5 * z * z)
-    steep = weight * bell * z / sigma
-    return np.stack([bell, steep, steep * z], axis=2).reshape(len(lag), -1)
-
-
 def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = MOST_EVALUATIONS) -> np.ndarray:
     """The sum of Gaussians fitted from a start, in at most `most` evaluations.
 
     The parameters are weight, place and sigma; the place is the delay as a share of the way from the earliest that is
     allowed to a component of this sigma to the end of the stack. Beyond the end nothing holds a component.
     """
-    width, end = abs(start[2]), stack.lag[-1]
-    low = np.tile([-DEEPEST, 0.0, 0.35 * width], len(start) // 3)
-    high = np.tile([2.0, 1.0, 12.0 * width], len(start) // 3)
+    width, end, number = abs(start[2]), stack.lag[-1], len(start) // 3
+    low = np.tile([-DEEPEST, 0.0, 0.35 * width], number)
+    high = np.tile([2.0, 1.0, 12.0 * width], number)
+    early, onset, last = -EARLIEST * width, ONSET * width, end - width
 
     def earliest(sigma: np.ndarray) -> np.ndarray:
-        return np.minimum(np.maximum(-EARLIEST * width, 2 * sigma - ONSET * width), end - width)
+        return np.minimum(np.maximum(early, 2 * sigma - onset), last)
 
-    def plain(p: np.ndarray) -> np.ndarray:
-        q, first = p.copy(), earliest(p[2::3])
-        q[1::3] = first + p[1::3] * (end - first)
-        return q
-
-    def slopes(p: np.ndarray) -> np.ndarray:
-        jacobian = _slopes(plain(p), stack.lag)
-        first = earliest(p[2::3])
-        moves = (first > -EARLIEST * width) & (first < end - width)
-        jacobian[:, 2::3] += 2 * moves * (1 - p[1::3]) * jacobian[:, 1::3]
-        jacobian[:, 1::3] *= end - first
-        return jacobian * weight[:, None]
-
-    def misfit(p: np.ndarray) -> np.ndarray:
-        return (_sum(plain(p), stack.lag) - stack.value) * weight
-
-    first, begin = start.copy(), earliest(start[2::3])
-    first[1::3] = (start[1::3] - begin) / (end - begin)
-    return plain(fit_bounded(misfit, slopes, np.clip(first, low, high), low, high, most))
+    found, begin = start.copy(), earliest(start[2::3])
+    found[1::3] = (start[1::3] - begin) / (end - begin)
+    found = np.clip(found, low, high)
+    columns = [np.ascontiguousarray(column, np.float64) for column in (stack.lag, stack.value, weight)]
+    structure = CStacked(
+        len(weight), number, *(place(column, np.float64) for column in (*columns, low, high)),
+        early, onset, last, end, FIRST_DAMPING, MOST_DAMPING, FIT_SETTLED, most,
+    )  # fmt: skip
+    call("fit_stack", structure, found)
+    begin = earliest(found[2::3])
+    found[1::3] = begin + found[1::3] * (end - begin)
+    return found
 
 
 def fit_bounded(
@@ -247,9 +236,8 @@ def fit_bounded(
 
     Notes
     -----
-    Levenberg and Marquardt's steps, cut off at the bounds; a parameter that would leave its bounds is held there. For a
-    few hundred samples and 15 parameters it takes a third of the time of scipy's `least_squares`, whose steps cost more
-    than the model.
+    Levenberg and Marquardt's steps, cut off at the bounds; a parameter that would leave its bounds is held there. With
+    four parameters it takes a third of the time of scipy's `least_squares`, whose steps cost more than the model.
     """
     at, rest = start, misfit(start)
     cost, damping = float(np.einsum("b,b->", rest, rest)), FIRST_DAMPING
@@ -289,8 +277,8 @@ def _add_component(stack: Stack, weight: np.ndarray, parameters: np.ndarray, res
     width = parameters[2]
     smooth = np.convolve(residual, np.ones(5) / 5, mode="same")
     starts = [
-        np.r_[parameters, smooth[place], stack.lag[place], factor * width]
-        for place in sorted({int(np.argmax(smooth)), int(np.argmin(smooth))})
+        np.r_[parameters, smooth[at], stack.lag[at], factor * width]
+        for at in sorted({int(np.argmax(smooth)), int(np.argmin(smooth))})
         for factor in (0.7, 1.5, 4.0)
     ]
     sharper = np.r_[parameters, -0.2, parameters[1], 1.3 * width]
