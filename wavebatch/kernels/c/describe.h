@@ -45,14 +45,18 @@ static void clear_desk(Desk *d) {
 static double lay_out(const Described *w, int64_t i, Desk *d) {
     float *x = (float *)d->x, *weight = (float *)d->weight, *rest = (float *)d->rest;
     const int64_t begin = i * w->length;
-    double sum = 0;
+    double sum = 0, inverse = 1 / sqrt(w->variance), size = 0.5 * log_double(w->variance * w->left_over);
     for (int64_t t = 0; t < d->vectors * LANES; t++) {
         int counts = t < w->length && w->used[begin + t];
-        double variance = counts ? w->variance + w->gain * fmax(w->model[begin + t], 0) : 1;
+        if (counts && w->gain > 0) {
+            double variance = w->variance + w->gain * fmax(w->model[begin + t], 0);
+            inverse = 1 / sqrt(variance);
+            size = 0.5 * log_double(variance * w->left_over);
+        }
         x[t] = counts ? t : OUTSIDE;
-        weight[t] = counts ? 1 / sqrt(variance) : 0;
+        weight[t] = counts ? inverse : 0;
         rest[t] = counts ? w->left[begin + t] * weight[t] : 0;
-        if (counts) sum += 0.5 * log_double(variance * w->left_over);
+        if (counts) sum += size;
     }
     return sum;
 }
@@ -92,19 +96,25 @@ static void find_reach(const Pulse *shape, double width, double *before, double 
     }
 }
 
-/* Half the negative logarithm of the determinant of the correlations of all that is fitted of k echoes: those that share
-   their samples are worth less than their errors say. */
-static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t k) {
-    const int64_t p = 3 * k;
-    double sum = 0, low = INFINITY, high = -INFINITY;
+/* Vectors that k echoes reach, the first of them in `from`. */
+static int64_t find_vectors(const Described *w, int64_t first, int64_t k, int64_t *from) {
+    double low = INFINITY, high = -INFINITY;
     for (int64_t j = first; j < first + k; j++) {
         double before, after;
         find_reach(&w->pulse, w->width[j], &before, &after);
         low = fmin(low, w->time[j] - before);
         high = fmax(high, w->time[j] + after);
     }
-    const int64_t from = fmin(fmax(low, 0), w->length - 1) / LANES, to = VECTORS((int64_t)fmin(fmax(high, 0), w->length - 1) + 1);
-    const int64_t vectors = to - from;
+    *from = fmin(fmax(low, 0), w->length - 1) / LANES;
+    return VECTORS((int64_t)fmin(fmax(high, 0), w->length - 1) + 1) - *from;
+}
+
+/* Half the negative logarithm of the determinant of the correlations of all that is fitted of k echoes: those that share
+   their samples are worth less than their errors say. */
+static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t k) {
+    int64_t from;
+    const int64_t p = 3 * k, vectors = find_vectors(w, first, k, &from);
+    double sum = 0;
     for (int64_t j = 0; j < k; j++) draw_echo(w, first + j, d->x + from, vectors, d->rows + 3 * j * vectors);
     for (int64_t r = 0; r < p; r++) {
         lanes *row = d->rows + r * vectors;
@@ -128,12 +138,15 @@ static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t 
 /* Takes a change of an echo's shape off what is left, as far as it is likely, and returns what it costs. The two
    directions are the next after those of the fit, as in `hermite_moments`. */
 static double change_shape(const Described *w, Desk *d, int64_t echo, double *heights, double *energies) {
-    const int64_t vectors = d->vectors;
+    int64_t from;
+    const int64_t vectors = find_vectors(w, echo, 1, &from);
+    const lanes *x = d->x + from, *weight = d->weight + from;
+    lanes *rest = d->rest + from;
     const float time = w->time[echo], inverse = 1 / w->width[echo];
     double cost = 0, energy = 0;
-    draw_echo(w, echo, d->x, vectors, d->modes);
+    draw_echo(w, echo, x, vectors, d->modes);
     for (int64_t v = 0; v < vectors; v++) {
-        lanes z = least_of(most_of((d->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
+        lanes z = least_of(most_of((x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
         d->modes[3 * vectors + v] = d->modes[2 * vectors + v] * z;
         d->modes[4 * vectors + v] = d->modes[3 * vectors + v] * z;
     }
@@ -149,11 +162,11 @@ static double change_shape(const Described *w, Desk *d, int64_t echo, double *he
     }
     for (int64_t r = 3; r < 5; r++) {
         lanes *row = d->modes + r * vectors;
-        for (int64_t v = 0; v < vectors; v++) row[v] *= d->weight[v] * (float)(energy * w->amplitude[echo]);
+        for (int64_t v = 0; v < vectors; v++) row[v] *= weight[v] * (float)(energy * w->amplitude[echo]);
         innovate(w, row, vectors);
-        double own = dot(row, row, vectors), height = dot(row, d->rest, vectors) / (own + 1 / (w->change * w->change));
+        double own = dot(row, row, vectors), height = dot(row, rest, vectors) / (own + 1 / (w->change * w->change));
         if (heights) { heights[r - 3] = height; energies[r - 3] = own; continue; }
-        for (int64_t v = 0; v < vectors; v++) d->rest[v] -= row[v] * (float)height;
+        for (int64_t v = 0; v < vectors; v++) rest[v] -= row[v] * (float)height;
         cost += 0.5 * (height / w->change) * (height / w->change) + 0.5 * log_double(1 + w->change * w->change * own);
     }
     return cost;
@@ -289,23 +302,47 @@ EXPORT int64_t render_pulses(const Described *w, float *out) {
     return good ? 0 : -1;
 }
 
+typedef uint8_t bytes __attribute__((vector_size(LANES)));
+
+INLINE lane_bits read_flags(const uint8_t *a, const uint8_t *b, size_t count, int any) {
+    bytes first = {0}, second = {0};
+    memcpy(&first, a, count);
+    memcpy(&second, b, count);
+    return __builtin_convertvector(any ? first | second : first & second, lane_bits) != 0;
+}
+
+/* The next `count` pairs, at most LANES. */
+INLINE void add_pairs(const float *a, int64_t ahead, const uint8_t *quiet, const uint8_t *high, const uint8_t *low, size_t count, wide *sums) {
+    lanes first = ALL(0), second = ALL(0);
+    memcpy(&first, a, count * sizeof(float));
+    memcpy(&second, a + ahead, count * sizeof(float));
+    lane_bits kinds[4] = {read_flags(quiet, quiet + ahead, count, 0)};
+    if (high) {
+        kinds[1] = kinds[0] & read_flags(high, high + ahead, count, 1);
+        kinds[2] = kinds[0] & read_flags(low, low + ahead, count, 1);
+        kinds[3] = kinds[1] & kinds[2];
+    }
+    const lanes step = second - first, square = step * step;
+    for (int64_t k = 0; k < (high ? 4 : 1); k++) {
+        sums[2 * k] += __builtin_convertvector(-kinds[k], wide);
+        sums[2 * k + 1] += __builtin_convertvector(pick(kinds[k], square, ALL(0)), wide);
+    }
+}
+
 /* Pairs of quiet samples `lag` apart of waveforms in columns, signal (s, n): number, and sum of squared differences, of
    all pairs, of those with a sample of `high`, of `low`, and of both: out (4, 2). Without masks only the first. */
 EXPORT int64_t pair_differences(int64_t s, int64_t n, const float *signal, const uint8_t *quiet, const uint8_t *high,
                                 const uint8_t *low, int64_t lag, double *out) {
-    memset(out, 0, 8 * sizeof(double));
-    for (int64_t t = 0; t + lag < s; t++) {
-        const int64_t a = t * n, b = (t + lag) * n;
-        for (int64_t i = 0; i < n; i++) {
-            if (!(quiet[a + i] & quiet[b + i])) continue;
-            const double step = signal[b + i] - signal[a + i], square = step * step;
-            out[0] += 1; out[1] += square;
-            if (!high) continue;
-            const int is_high = high[a + i] | high[b + i], is_low = low[a + i] | low[b + i];
-            if (is_high) { out[2] += 1; out[3] += square; }
-            if (is_low) { out[4] += 1; out[5] += square; }
-            if (is_high & is_low) { out[6] += 1; out[7] += square; }
-        }
+    wide sums[8] = {0};
+    const int64_t ahead = lag * n, end = (s - lag) * n;
+    int64_t i = 0;
+    if (high) {
+        for (; i + LANES <= end; i += LANES) add_pairs(signal + i, ahead, quiet + i, high + i, low + i, LANES, sums);
+        if (i < end) add_pairs(signal + i, ahead, quiet + i, high + i, low + i, end - i, sums);
+    } else {
+        for (; i + LANES <= end; i += LANES) add_pairs(signal + i, ahead, quiet + i, NULL, NULL, LANES, sums);
+        if (i < end) add_pairs(signal + i, ahead, quiet + i, NULL, NULL, end - i, sums);
     }
+    for (int64_t k = 0; k < 8; k++) out[k] = sums[k][0] + sums[k][1] + sums[k][2] + sums[k][3];
     return 0;
 }
