@@ -5,6 +5,7 @@ import naive_fit
 import naive_signal
 import numpy as np
 import pytest
+from scipy.linalg import toeplitz
 
 from wavebatch.kernels.signal import noise as noise_kernels
 from wavebatch.kernels.signal.deconvolve import correlate_pulse, deconvolve_wiener, wiener_taps
@@ -13,7 +14,7 @@ from wavebatch.kernels.signal.filters import curvature_taps, filter_autocorrelat
 from wavebatch.kernels.signal.noise import (
     PooledNoise,
     colour_factors,
-    correlation_matrix,
+    coloured_variance,
     find_ends,
     find_levels,
     keep_longest,
@@ -240,8 +241,13 @@ def test_coloured_noise_widens_errors_as_its_covariance_says():
             naive_signal.colour_factors(correlation, *columns)
         )
     assert colour_factors((), *columns) == (1.0, 1.0, 1.0, 1.0)
-    matrix = correlation_matrix((0.5, 0.2), 5)
-    assert matrix[0].tolist() == [1.0, 0.5, 0.2, 0.0, 0.0] and (matrix == matrix.T).all()
+
+
+def test_sums_of_coloured_samples_vary_as_their_matrix_says(rng):
+    for correlation, size in (((0.5, 0.2), 7), ((0.6, 0.0, 0.1, -0.1), 3), ((), 4), ((0.9,), 1)):
+        rows = rng.standard_normal((3, size))
+        matrix = toeplitz(np.r_[1.0, correlation, np.zeros(size)][:size])
+        assert coloured_variance(rows, correlation) == pytest.approx([row @ matrix @ row for row in rows])
 
 
 @pytest.mark.parametrize("correlation", [(0.8, 0.64, 0.5), (0.5,), (0.86, 0.59, 0.25), (-0.3, -0.1)])

@@ -82,7 +82,7 @@ TWINS = {
 LIBRARIES = {
     "exp": "math.exp", "log": "math.log", "log1p": "math.log1p", "solve": "np.linalg.solve",
     "fit_parabola": "np.polyfit", "fit_bounded": "least_squares", "fit_one_gaussian": "least_squares",
-    "interpolate": "np.interp", "wiener_taps": "wiener_taps", "correlation_matrix": "correlation_matrix",
+    "interpolate": "np.interp", "wiener_taps": "wiener_taps", "coloured_variance": "toeplitz",
 }  # fmt: skip
 """Kernels that a test compares with a function of NumPy, SciPy or the standard library."""
 

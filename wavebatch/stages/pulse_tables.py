@@ -23,7 +23,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     find_datum,
     measure_pulse,
 )
-from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, correlation_matrix, whitening_filter
+from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, coloured_variance, whitening_filter
 
 
 def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
@@ -332,9 +332,9 @@ def _factors_at(
     if shape.components:
         peak, by_peak = _change_with_width(pulse_measures(shape, limits), np.float64(width))
         whole[0] += by_peak / peak * width * main[2]
-    given = np.sum(whole * whole, axis=1)
+    given = np.einsum("is,is->i", whole, whole)
     weights = np.einsum("if,sf->is", whole, bare)
-    variance = np.einsum("is,st,it->i", weights, correlation_matrix(correlation, joint.shape[1]), weights)
+    variance = coloured_variance(weights, correlation)
     return np.stack([np.sqrt(np.maximum(variance / given, LEAST_FACTOR)), weights.sum(axis=1) / np.sqrt(given)])
 
 

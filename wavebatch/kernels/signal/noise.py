@@ -669,32 +669,30 @@ def colour_factors(
         return 1.0, 1.0, 1.0, 1.0
     joint = np.stack([pulse, by_time, by_width], axis=1).astype(np.float64)
     weights = solve(np.einsum("sp,sq->pq", joint, joint), joint.T)
-    matrix = correlation_matrix(correlation, len(joint))
-    rows = (joint[:, 0], *weights)
-    return tuple(float(np.sqrt(max(_gain(row, matrix), LEAST_FACTOR))) for row in rows)
+    rows = np.stack([joint[:, 0], *weights])
+    gain = coloured_variance(rows, correlation) / np.einsum("rs,rs->r", rows, rows)
+    return tuple(np.sqrt(np.maximum(gain, LEAST_FACTOR)).tolist())
 
 
-def _gain(row: np.ndarray, matrix: np.ndarray) -> float:
-    """Variance of the sum of samples with these weights (s,) in coloured noise, over that in white noise."""
-    return float(np.einsum("i,i->", row, np.einsum("ij,j->i", matrix, row)) / np.einsum("i,i->", row, row))
-
-
-def correlation_matrix(correlation: tuple[float, ...] | np.ndarray, size: int) -> np.ndarray:
-    """Correlation of noise between any two of `size` samples.
+def coloured_variance(rows: np.ndarray, correlation: tuple[float, ...] | np.ndarray) -> np.ndarray:
+    """Variance of sums of samples in coloured noise, over the variance of one sample.
 
     Parameters
     ----------
+    rows : float64 (r, s)
+        Weights of the samples.
     correlation : (k,)
-        At lags 1, 2, ... [samples]; beyond them 0.
-    size : int
+        Of the noise at lags 1, 2, ... [samples]; beyond them 0.
 
     Returns
     -------
-    float64 (size, size)
+    float64 (r,)
     """
-    rho = np.asarray(correlation, np.float64)
-    lag = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
-    return np.r_[1.0, rho, 0.0][np.minimum(lag, len(rho) + 1)]
+    found = np.einsum("rs,rs->r", rows, rows)
+    for lag, rho in enumerate(correlation[: rows.shape[1] - 1], 1):
+        if rho:
+            found += 2 * rho * np.einsum("rs,rs->r", rows[:, lag:], rows[:, :-lag])
+    return found
 
 
 def predict_noise(correlation: tuple[float, ...] | np.ndarray) -> tuple[float, float] | None:
