@@ -507,6 +507,7 @@ def test_several_scanner_channels_with_packets_are_refused_as_laz(tmp_path):
         CloudWriter(layout, tmp_path / "out.laz", provenance={}) as cloud,
     ):
         cloud.write(rows)
+        cloud.commit()
     assert os.listdir(tmp_path) == ["a.las"]
     one = rows[::3].copy()
     write(layout, tmp_path / "one.laz", one)  # a single channel is fine, whichever it is

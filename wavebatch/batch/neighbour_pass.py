@@ -24,7 +24,7 @@ import numpy as np
 
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, spread
-from wavebatch.batch.unit import Prepared, SolvedBlocks, solve_unit, unpack
+from wavebatch.batch.unit import Prepared, SolvedBlocks, UnitResult, finish_rows, solve_unit, unpack
 from wavebatch.core.echoes import COLUMNS, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.core.process import Seconds
@@ -157,14 +157,14 @@ class SecondPass:
         rows, state = self._units.popleft()
         return end_unit, (blob, self._states.read(state.start, state.stop), self._found.read(rows.start, rows.stop))
 
-    def take(self, result: Found | tuple[np.ndarray, RunReport]) -> tuple[np.ndarray | None, RunReport]:
-        """Take the result of the oldest call: rows of the cloud, None for a tile; and its report."""
+    def take(self, result: Found | UnitResult) -> UnitResult | RunReport:
+        """Take the result of the oldest call: a finished unit, or of a tile the report."""
         if not self._tiles_left:
             self._units_left -= 1
             return result
         self._found.put(*result[:2])
         self._tiles_left -= 1
-        return None, result[2]
+        return result[2]
 
     def close(self) -> None:
         """Remove all temporary files; harmless twice."""
@@ -226,7 +226,7 @@ def _mark_edges(prepared: Prepared, solved: SolvedBlocks) -> SolvedBlocks:
     ]
 
 
-def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, RunReport]:
+def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> UnitResult:
     """Make the rows of a unit that are written, once the second pass has been over its points.
 
     Parameters
@@ -240,8 +240,7 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndar
 
     Returns
     -------
-    rows : structured array (m,)
-    report : RunReport
+    UnitResult
     """
     _gather.cache_clear()  # tiles are done: their memory is needed for the unit
     prepared: Prepared = unpack(blob)
@@ -260,10 +259,9 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndar
     values |= _solve_again(prepared.job.chain, solved, values, timing)
     columns = {name: spread(name, column, made.echo) for name, column in values.items() if name in COLUMNS}
     prepared.layout.fill(made.rows, columns)
-    rows, left = prepared.selector.select(made.rows, {**made.columns, **columns})
     reasons = count_reasons({name: codes[made.counted] for name, codes in values.items()})
-    report = replace(made.report, no_data={**made.report.no_data, **reasons}, timing=timing)
-    return rows, report + left
+    report = replace(made.report, no_data={**made.report.no_data, **reasons})
+    return finish_rows(prepared, made.rows, {**made.columns, **columns}, report, timing)
 
 
 def _solve_again(

@@ -263,7 +263,7 @@ class _Batch:
             return
         with self._failing(strip):
             before = strip.written
-            strip.take(self._workers)
+            strip.take()
             done, units = strip.written, strip.prepared.units
             if done > before:
                 self._tell({"event": "unit", "strip": str(strip.job.path), "done": done, "of": units})

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import functools
 import pickle
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.process import Seconds
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.files.disk.row_parcel import RowParcel
+from wavebatch.files.las.write_points import Statistics
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.stages.chain import Chain, Solved, Step
@@ -86,6 +88,16 @@ class Prepared:
     def selector(self) -> RowSelector:
         """Chooses the rows that are written."""
         return RowSelector.plan(self.job.selection, self.job.chain, self.layout)
+
+
+class UnitResult(NamedTuple):
+    """What a unit becomes."""
+
+    rows: RowParcel
+    """Those that are written, in the cloud's layout."""
+    statistics: Statistics
+    """Of these rows."""
+    report: RunReport
 
 
 def prepare_strip(job: StripJob) -> Prepared:
@@ -200,7 +212,7 @@ def _take_reference(system: SystemPulse, seen: SystemPulse) -> SystemPulse:
     return replace(system, digitizers=others, widths=seen.widths)
 
 
-def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:
+def process_unit(blob: bytes, number: int, block_size: int | None = None) -> UnitResult:
     """Make the output rows of one unit.
 
     Parameters
@@ -214,17 +226,45 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
 
     Returns
     -------
-    rows : structured array (m,)
-        Those that are written, in the cloud's layout.
-    report : RunReport
+    UnitResult
     """
     prepared: Prepared = unpack(blob)
     timing: dict[str, Seconds] = {}
     _, _, made = solve_unit(prepared, number, block_size, timing)
+    return finish_rows(prepared, made.rows, made.columns, made.report, timing)
+
+
+def finish_rows(
+    prepared: Prepared,
+    rows: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    report: RunReport,
+    timing: dict[str, Seconds],
+) -> UnitResult:
+    """Choose the rows of a unit that are written.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    rows : structured array (m,)
+        All rows of the unit, in the cloud's layout.
+    columns : mapping of str to array (m,)
+        Those that the selection needs.
+    report : RunReport
+        Of the unit; it gets what the selection leaves out.
+    timing : dict
+        Seconds of every step so far; they become those of the report.
+
+    Returns
+    -------
+    UnitResult
+    """
     start = Seconds.now()
-    rows, left = prepared.selector.select(made.rows, made.columns)
-    timing["assemble"] += Seconds.now() - start
-    return rows, replace(made.report + left, timing=timing)
+    rows, left = prepared.selector.select(rows, columns)
+    statistics = Statistics(rows.dtype, prepared.layout.extra_records)
+    statistics.add(rows)
+    timing["assemble"] = timing.get("assemble", Seconds()) + (Seconds.now() - start)
+    return UnitResult(RowParcel(rows), statistics, replace(report + left, timing=timing))
 
 
 def solve_unit(

@@ -53,8 +53,6 @@ class Cluster:
     """
 
     is_remote = True
-    jobs = 1
-    """Threads of this machine that compress."""
 
     def __init__(self, address: str, folder: Path, files: Sequence[Path] = ()) -> None:
         self.address, self._folder, self._files = address, folder.absolute(), files
