@@ -93,9 +93,15 @@ def pack_chunk(path: Path, parts: list[Part], point_format: int) -> tuple[Chunk,
         Where they cannot be compressed.
     """
     start = Seconds.now()
-    rows = [rows.read(first, stop) for rows, first, stop in parts]
+    rows = np.concatenate([rows.read(first, stop) for rows, first, stop in parts])
+    (chunk,) = pack_rows(path, rows, point_format)
+    return chunk, Seconds.now() - start
+
+
+def pack_rows(path: Path, rows: np.ndarray, point_format: int) -> list[Chunk]:
+    """Compress rows that begin where a chunk does; arguments and errors as for `pack_chunk`."""
+    parts = (rows[first : first + CHUNK_POINTS] for first in range(0, len(rows), CHUNK_POINTS))
     try:
-        chunk = compress_rows(rows[0] if len(rows) == 1 else np.concatenate(rows), point_format)
+        return [compress_rows(part, point_format) for part in parts]
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return chunk, Seconds.now() - start

@@ -251,7 +251,7 @@ class _Batch:
             self._active.append(strip)
             with self._failing(strip):
                 strip.claim()
-                report = strip.start()
+                report = strip.start(self._workers.jobs)
                 self._tell({"event": "start", "strip": str(strip.job.path)})
                 if report is None:
                     return strip
@@ -264,8 +264,8 @@ class _Batch:
         with self._failing(strip):
             before = strip.written
             strip.take()
-            done, units = strip.written, strip.prepared.units
-            if done > before:
+            if strip.written > before:
+                done, units = strip.written, strip.prepared.units
                 self._tell({"event": "unit", "strip": str(strip.job.path), "done": done, "of": units})
             if strip.is_complete:
                 report = strip.finish()

@@ -25,16 +25,18 @@ from wavebatch.batch.job import StripJob
 from wavebatch.batch.neighbour_pass import Found, SecondPass, begin_unit
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.packing import Packing, pack_chunk
-from wavebatch.batch.unit import Prepared, UnitResult, prepare_strip, process_unit
+from wavebatch.batch.unit import Prepared, UnitResult, prepare_strip, process_unit, scan_units
 from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
 from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.writer import CloudWriter
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target
 from wavebatch.files.las.laz_encode import Chunk
 from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.files.text_file import draft_text
 
 
@@ -64,6 +66,9 @@ class StripTask:
         self._claim: Claim | None = None
         self._writer: CloudWriter | None = None
         self._second: SecondPass | None = None
+        self._runs: deque[tuple[int, int]] = deque()
+        """Units that several processes scan, not yet submitted; empty where one process scans the strip."""
+        self._scanned: list[ScanPart] = []
         self._packing = Packing()
         self._report = RunReport()
         self._described: dict[str, Any] = {}
@@ -81,8 +86,8 @@ class StripTask:
             self._claim.discard()
             self._claim = None
 
-    def start(self) -> RunReport | None:
-        """Look at strip and outputs before any work.
+    def start(self, jobs: int) -> RunReport | None:
+        """Look at strip and outputs before any work; up to `jobs` processes will scan the strip.
 
         Returns
         -------
@@ -97,6 +102,8 @@ class StripTask:
         options, job = self._options, self.job
         with job.open() as reader:
             self.facts = reader.facts
+            runs = reader.cut_scan(jobs)
+            self._runs = deque(runs if len(runs) > 1 else ())
         packet_file = self.facts.packets.file
         self._files = [job.path] + ([packet_file] if packet_file not in (None, job.path) else [])
         self._state = self._stat()
@@ -115,7 +122,7 @@ class StripTask:
     def has_more(self) -> bool:
         """Whether there is a call to submit now."""
         if self.prepared is None:
-            return not self.pending
+            return bool(self._runs) or not self.pending
         if self._submitted < self.prepared.units or self._packing.has_chunk(last=self._has_all_rows):
             return True
         return self._second is not None and self._second.has_more
@@ -130,10 +137,13 @@ class StripTask:
         return self.written == self.prepared.units and (self._second is None or self._second.is_complete)
 
     def submit(self, workers: Workers | Cluster) -> None:
-        """Submit the next call: the preparation, then chunks of rows, unit by unit, and those of a second pass."""
+        """Submit the next call: scan, preparation, then chunks of rows and units, and those of a second pass."""
         if self.prepared is None:
             job = self.job.absolute() if workers.is_remote else self.job
-            self._call(workers, self._take_prepared, prepare_strip, job)
+            if self._runs:
+                self._call(workers, self._take_scanned, scan_units, job, *self._runs.popleft())
+            else:
+                self._call(workers, self._take_prepared, prepare_strip, job, self._scanned)
         elif self._packing.has_chunk(last=self._has_all_rows):
             rows, point_format = self._packing.next_chunk(), self.prepared.layout.point_format
             self._call(workers, self._take_chunk, pack_chunk, self.job.path, rows, point_format)
@@ -156,8 +166,14 @@ class StripTask:
         """Use the oldest result: open the output, keep rows for a chunk, or write one."""
         self._takers.popleft()(self.pending.popleft().result())
 
+    def _take_scanned(self, scanned: tuple[ScanPart, Seconds]) -> None:
+        part, took = scanned
+        self._scanned.append(part)
+        self._report += RunReport(timing={"scan": took})
+
     def _take_prepared(self, prepared: Prepared) -> None:
         self.prepared = prepared
+        self._scanned = []
         self._report += prepared.report
         self._open()
 
@@ -185,6 +201,8 @@ class StripTask:
         """Rows of LAS are written at once, those of LAZ wait until they fill a chunk."""
         start = Seconds.now()
         self._writer.count_rows(unit.statistics)
+        for chunk in unit.chunks:
+            self._writer.append(chunk)
         if self.job.options.format == "laz":
             self._packing.add(unit.rows)
         else:
@@ -263,7 +281,7 @@ class StripTask:
 
     def _close(self) -> None:
         """Remove temporary files."""
-        for one in (self._second, self._packing, self.prepared and self.prepared.scan):
+        for one in (*self._scanned, self._second, self._packing, self.prepared and self.prepared.scan):
             if one is not None:
                 one.close()
 
@@ -284,4 +302,6 @@ def _close_result(future: Future) -> None:
     """A call that ends after its strip was dropped may leave temporary files: of the scan, or of rows."""
     with contextlib.suppress(Exception):
         result = future.result()
-        (result.scan if isinstance(result, Prepared) else result.rows).close()
+        for one in (result.scan,) if isinstance(result, Prepared) else result:
+            if isinstance(one, Closing):
+                one.close()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import pickle
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -17,15 +17,18 @@ import numpy as np
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.batch.packing import pack_rows
 from wavebatch.batch.selection import RowSelector
 from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.process import Seconds
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.disk.row_parcel import RowParcel
+from wavebatch.files.las.laz_encode import Chunk
 from wavebatch.files.las.write_points import Statistics
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
+from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
@@ -94,18 +97,30 @@ class UnitResult(NamedTuple):
     """What a unit becomes."""
 
     rows: RowParcel
-    """Those that are written, in the cloud's layout."""
+    """Those that are written and not yet compressed, in the cloud's layout."""
     statistics: Statistics
-    """Of these rows."""
+    """Of all rows that are written."""
     report: RunReport
+    chunks: Sequence[Chunk] = ()
+    """Of LAZ: the only unit of a strip is compressed at once."""
 
 
-def prepare_strip(job: StripJob) -> Prepared:
+def scan_units(job: StripJob, first: int, last: int) -> tuple[ScanPart, Seconds]:
+    """Scan some units of a strip; what was found, and the time that it took. Raises InputError as the scan."""
+    start = Seconds.now()
+    with job.open() as reader:
+        part = reader.scan_units(first, last)
+    return part, Seconds.now() - start
+
+
+def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
     """Scan and survey a strip, choose its chain, find the sensor, and plan its output.
 
     Parameters
     ----------
     job : StripJob
+    parts : sequence of ScanPart
+        From `scan_units`, all units in order; none where this process scans them.
 
     Returns
     -------
@@ -124,7 +139,7 @@ def prepare_strip(job: StripJob) -> Prepared:
         facts = reader.facts
         job = replace(job, selection=job.selection.place(facts))
         RowSelector.plan(job.selection, job.chain, plan_layout(job, facts))
-        scan = reader.scan(force=job.request.force)
+        scan = reader.scan(force=job.request.force, parts=parts)
         try:
             scanned = Seconds.now()
             setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, calibration=job.calibration,
@@ -264,7 +279,12 @@ def finish_rows(
     statistics = Statistics(rows.dtype, prepared.layout.extra_records)
     statistics.add(rows)
     timing["assemble"] = timing.get("assemble", Seconds()) + (Seconds.now() - start)
-    return UnitResult(RowParcel(rows), statistics, replace(report + left, timing=timing))
+    chunks: list[Chunk] = []
+    if prepared.units == 1 and prepared.job.options.format == "laz":
+        start = Seconds.now()
+        chunks, rows = pack_rows(prepared.job.path, rows, prepared.layout.point_format), rows[:0]
+        timing["write"] = Seconds.now() - start
+    return UnitResult(RowParcel(rows), statistics, replace(report + left, timing=timing), chunks)
 
 
 def solve_unit(

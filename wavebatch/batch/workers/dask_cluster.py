@@ -58,6 +58,8 @@ class Cluster:
         self.address, self._folder, self._files = address, folder.absolute(), files
         self._workers: dict[str, int] = {}
         """Threads of each worker that is known to fit; others get no call."""
+        self.jobs = 1
+        """Threads of all workers."""
         self.limit = 2
         self._client: Any = None
         self._scratch: Path | None = None
@@ -71,7 +73,8 @@ class Cluster:
             stack.enter_context(silent())
             self._client = stack.enter_context(connected(self.address))
             self._workers = self._find_workers()
-            self.limit = 2 * sum(self._workers.values())
+            self.jobs = sum(self._workers.values())
+            self.limit = 2 * self.jobs
             self._check_versions()
             with reporting(self._folder):
                 self._folder.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import read_exactly
 from wavebatch.files.disk.temp_folders import make_folder, reporting_scratch
 
@@ -19,7 +20,7 @@ KEPT = 1 << 16
 """Bytes that travel themselves: a file costs more."""
 
 
-class RowParcel:
+class RowParcel(Closing):
     """Rows (m,), in memory or in a file; the last to use them calls `close`."""
 
     def __init__(self, rows: np.ndarray) -> None:
