@@ -1,4 +1,4 @@
-"""A strip that several processes scan in parts: the scan is that of one process, for any parts and any order of points."""
+"""A strip that several processes scan in parts: the scan is that of one process, for any parts and order of points."""
 
 import dataclasses
 import itertools
