@@ -372,6 +372,12 @@ def test_a_worker_that_joins_later_and_does_not_fit_gets_no_work(tmp_path):
         dask.stop()
 
 
+def _busy_pid():
+    """The process, after some time in which others may take calls."""
+    time.sleep(0.3)
+    return os.getpid()
+
+
 @pytest.mark.slow
 def test_workers_that_join_later_take_part_and_replace_those_that_die(tmp_path, monkeypatch):
     """Calls of a worker that is gone go to the one that came, also those that dask keeps for the first."""
@@ -386,20 +392,14 @@ def test_workers_that_join_later_take_part_and_replace_those_that_die(tmp_path, 
             second = dask.start_worker()
             dask.wait_until(lambda: len(cluster._look()) == 2)
             assert (cluster.jobs, cluster.limit) == (2, 4)
-            seen = set()
-            while len(seen) < 2:
-                future = cluster.submit(os.getpid)
-                while not cluster.wait([future]):
-                    pass
-                seen.add(future.result())
-            assert seen == {first.pid, second.pid}
+            futures = [cluster.submit(_busy_pid) for _ in range(8)]
+            assert {future.result(timeout=300) for future in futures} == {first.pid, second.pid}
             for process in first, second:
                 process.kill()
                 process.wait()
             left = cluster.submit(os.getpid)
             third = dask.start_worker()
-            while not cluster.wait([left]):
-                pass
+            cluster.wait([left])
             assert left.result() == third.pid
     finally:
         dask.stop()

@@ -147,7 +147,7 @@ def plan_strip(job: StripJob, options: RunOptions) -> dict[str, Any]:
     """
     (job,) = with_flight([job], load_flight([job], options))
     task = StripTask(job, options, alone=False)
-    done = task.start() is not None
+    done = task.start(jobs=1) is not None
     facts = task.facts
     layout, is_laz = plan_layout(job, facts), job.options.format == "laz"
     RowSelector.plan(job.selection.place(layout.source), job.chain, layout)
