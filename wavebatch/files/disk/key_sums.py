@@ -96,6 +96,8 @@ class KeyedSums(Closing):
         if high <= run.last:
             end = min(int(np.searchsorted(run.marks, np.uint64(high))) * STRIDE, end)
         size = self._dtype.itemsize
+        if self._file is None:
+            raise ValueError("the sums are closed")
         with reporting_scratch():
             self._file.seek((run.first + begin) * size)
             data = self._file.read((end - begin) * size)

@@ -20,6 +20,7 @@ from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import reading, take_whole_records, widen_integers
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
+from wavebatch.files.point_dtypes import field_names
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
 from wavebatch.files.strip.packet_owner import compare_returns, is_strange, size_of_sample
@@ -150,7 +151,8 @@ class StripReader(Closing):
 
     def _find_stranger(self, scan: StripScan) -> str:
         """Why the packets of the .wdp are certainly those of another strip; empty where they may be its own."""
-        if not scan.with_waveform or self.facts.packets.internal:
+        file = self.facts.packets.file
+        if not scan.with_waveform or self.facts.packets.internal or file is None:
             return ""
         used = scan.by_descriptor.keys() & self.facts.digitizers
         longest = max(self.facts.digitizers[index].n_samples for index in used)
@@ -158,7 +160,7 @@ class StripReader(Closing):
         if not is_strange(table):
             return ""
         return (
-            f"{self.facts.packets.file.name} belongs to another strip: in a sample of {len(table)} packets, returns "
+            f"{file.name} belongs to another strip: in a sample of {len(table)} packets, returns "
             "lie on echoes no more often than by chance, and are not as strong as these"
         )
 
@@ -166,6 +168,8 @@ class StripReader(Closing):
         """Yield about `n_waveforms` waveforms, each block with the intensities of its returns."""
         for unit, rows in self.sample_units(scan, n_waveforms):
             for block, _ in self.read_rows(unit, rows, n_waveforms):
+                if block.returns is None:
+                    continue
                 # The few returns that stand in another unit get the intensity of a point of this one.
                 near = np.clip(block.returns.point - unit.start, 0, len(unit.points) - 1)
                 yield block, unit.points["intensity"][near].astype(float)
@@ -375,7 +379,7 @@ class _Geometry:
 
 def read_scanner(records: np.ndarray) -> np.ndarray | None:
     """Scanner channels of records (n,), u1 (n,); None for point formats 4 and 5."""
-    if "classification_flags" not in records.dtype.names:
+    if "classification_flags" not in field_names(records.dtype):
         return None
     return (records["classification_flags"] >> 4) & 3
 

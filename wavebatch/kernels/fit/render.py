@@ -51,7 +51,8 @@ def render_echoes(
         t, w, height = (values[part].astype(np.float32) for values in (time, width, amplitude))
         owner, reach = waveform[part], _reach(shape, w)
         for first in range(0, s, COLUMNS):
-            columns, near = slice(first, first + COLUMNS), slice(None)
+            columns = slice(first, first + COLUMNS)
+            near: slice | np.ndarray = slice(None)
             if s > COLUMNS:
                 near = np.flatnonzero((t > first - reach) & (t < first + COLUMNS + reach))
             _add(signal[:, columns], shape, x[columns], owner[near], t[near], w[near], height[near])

@@ -279,8 +279,8 @@ def find_edges(
     spacing = float(np.median(tree.query(few, k=[min(RING, len(able))])[0]))
     # The footprint reaches over the edge, and so does that of the pulses behind it that still see this surface.
     most = 2.0 * reach + spacing
-    given = (values[able] for values in (level, points[:, 2], ray, time, before, after))
-    rows = able[_may_lie_apart(*given, most)]
+    given = [values[able] for values in (level, points[:, 2], ray, time, before, after)]
+    rows = able[_may_lie_apart(most, *given)]
     number = int(np.clip(np.ceil(1.5 * np.pi * (most / max(spacing, 1e-6)) ** 2), RING, MOST_NEIGHBOURS))
     for start in range(0, len(rows), _LARGEST_CHUNK):
         own = rows[start : start + _LARGEST_CHUNK]
@@ -295,8 +295,8 @@ def find_edges(
 
 
 def _may_lie_apart(
-    level: np.ndarray, z: np.ndarray, ray: np.ndarray, time: np.ndarray, before: np.ndarray, after: np.ndarray,
     most: float,
+    level: np.ndarray, z: np.ndarray, ray: np.ndarray, time: np.ndarray, before: np.ndarray, after: np.ndarray,
 ) -> np.ndarray:
     """Whether the cell of an echo, or one of those around it, has heights that lie outside of its packet, bool (m,)."""
     cell = np.floor((level - level.min(axis=0)) / most)

@@ -32,7 +32,7 @@ class Crossings(NamedTuple):
     """Time at which the ray enters the voxel, float64 (m,), ns."""
     inside: np.ndarray
     """Time for which it is inside, float64 (m,), ns."""
-    index: np.ndarray
+    voxel: np.ndarray
     """The voxel, int64 (m, 3)."""
 
 
