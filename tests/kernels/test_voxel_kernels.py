@@ -5,7 +5,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry import voxels
 from wavebatch.kernels.geometry.voxels import (
     KEY_BITS,
     VoxelSamples,
@@ -79,14 +78,13 @@ def test_rays_do_not_know_of_each_other():
     parts = [cross_voxels(*(values[row : row + 1] for values in rays), 0.3) for row in range(0, 500, 7)]
     for row, part in zip(range(0, 500, 7), parts, strict=True):
         mine = whole.ray == row
-        for name in ("enter", "inside", "index"):
+        for name in ("enter", "inside", "voxel"):
             assert np.array_equal(getattr(whole, name)[mine], getattr(part, name))
 
 
-def test_slices_of_rays_cover_all_and_stay_small(monkeypatch):
-    monkeypatch.setattr(voxels, "AT_A_TIME", 2000)
+def test_slices_of_rays_cover_all_and_stay_small():
     rays = draw_rays(np.random.default_rng(5), 300)
-    slices = split_rays(*rays, 0.2)
+    slices = split_rays(*rays, 0.2, crossings=2000)
     assert np.concatenate([np.arange(300)[part] for part in slices]).tolist() == list(range(300))
     for part in slices:
         found = cross_voxels(*(values[part] for values in rays), 0.2)

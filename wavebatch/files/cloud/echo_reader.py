@@ -117,9 +117,9 @@ class CloudReader(Closing):
         """Close the file."""
         self._points.close()
 
-    def read_pieces(self, size: int = _PIECE) -> Iterator[np.ndarray]:
-        """Yield the points of the file in order, at most `size` at a time."""
-        size = max(min(size, _PIECE_BYTES // self._point_length), 1)
+    def read_pieces(self, size: int = _PIECE, most: int = _PIECE_BYTES) -> Iterator[np.ndarray]:
+        """Yield the points of the file in order, at most `size`, and `most` bytes of records, at a time."""
+        size = max(min(size, most // self._point_length), 1)
         for start in range(0, self.point_count, size):
             raw = self._points.read(start, min(start + size, self.point_count))
             if self.keep is not None:

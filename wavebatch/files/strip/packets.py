@@ -199,10 +199,16 @@ def settle_headerless(place: PacketPlace, points: np.ndarray) -> PacketPlace:
 
 
 class PacketFile:
-    """Reads the samples of many packets at once; compressed: indices of descriptors with compressed packets."""
+    """Reads the samples of many packets at once.
 
-    def __init__(self, place: PacketPlace, compressed: Collection[int] = ()) -> None:
-        self._place, self._compressed = place, compressed
+    compressed: indices of descriptors with compressed packets. span: bytes up to which all between the packets is read
+    in one piece; gap: bytes between two packets that are read over.
+    """
+
+    def __init__(
+        self, place: PacketPlace, compressed: Collection[int] = (), *, span: int = _SPAN, gap: int = _GAP
+    ) -> None:
+        self._place, self._compressed, self._span, self._gap = place, compressed, span, gap
         self._file: FileIO | None = None
         self._buffer = np.empty(0, np.uint8)
         if place.file is not None:
@@ -257,7 +263,7 @@ class PacketFile:
         ends = np.minimum(starts + sizes, self._place.end)[order]
         samples, good = np.zeros((len(starts), n_samples), f"<u{bits // 8}"), np.zeros(len(starts), bool)
         with reporting_reads(self._place.file or Path(), "packets ", "; check the disk"):
-            for a, z in _find_runs(starts[order], int(sizes.max(initial=0)), BLOCK_BYTES):
+            for a, z in _find_runs(starts[order], int(sizes.max(initial=0)), self._gap, BLOCK_BYTES):
                 first, last = int(starts[order[a]]), int(ends[a:z].max())
                 buffer = self._take_buffer(last - first)
                 self._fill(buffer, first)
@@ -276,7 +282,7 @@ class PacketFile:
             self._fill(rows.reshape(-1), first)
             return rows
         span = last - first + width
-        if span <= max(_SPARSE * n * width, _SPAN):
+        if span <= max(_SPARSE * n * width, self._span):
             buffer = self._take_buffer(span)
             self._fill(buffer, first)
             return _pick(buffer, starts - first, width)
@@ -285,7 +291,7 @@ class PacketFile:
     def _gather_sparse(self, starts: np.ndarray, width: int) -> np.ndarray:
         order = np.argsort(starts, kind="stable")
         ordered = starts[order]
-        runs = [(a, z, int(ordered[a]), int(ordered[z - 1]) + width) for a, z in _find_runs(ordered, width)]
+        runs = [(a, z, int(ordered[a]), int(ordered[z - 1]) + width) for a, z in _find_runs(ordered, width, self._gap)]
         buffer = self._take_buffer(sum(end - begin for _, _, begin, end in runs))
         place = np.empty(len(starts), np.int64)
         at = 0
@@ -306,9 +312,9 @@ class PacketFile:
         return self._buffer[:size]
 
 
-def _find_runs(ordered: np.ndarray, width: int, most: int = 2**62) -> Iterator[tuple[int, int]]:
+def _find_runs(ordered: np.ndarray, width: int, gap: int, most: int = 2**62) -> Iterator[tuple[int, int]]:
     """Slices of sorted starts with only small gaps, and at most about so many bytes long."""
-    cut = np.diff(ordered) > width + _GAP
+    cut = np.diff(ordered) > width + gap
     cut |= np.diff((ordered - ordered[:1]) // most) > 0
     cuts = np.flatnonzero(cut) + 1
     edges = [0, *cuts.tolist(), len(ordered)]

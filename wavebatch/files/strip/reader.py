@@ -105,6 +105,8 @@ class StripReader(Closing):
         Where packet vectors point; "auto" decides from the points.
     headerless : bool
         Accept a .wdp without its 60-byte header.
+    unit_points, unit_bytes : int
+        Most points of a unit, and bytes of their records.
 
     Raises
     ------
@@ -112,7 +114,10 @@ class StripReader(Closing):
         If the strip cannot be read as what it claims to be.
     """
 
-    def __init__(self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False) -> None:
+    def __init__(
+        self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False,
+        unit_points: int = UNIT_POINTS, unit_bytes: int = UNIT_BYTES,
+    ) -> None:  # fmt: skip
         if direction not in OPTIONS:
             raise ConfigError(f"direction {direction!r}: must be one of {', '.join(OPTIONS)}")
         if isinstance(path, StripFacts):
@@ -121,6 +126,7 @@ class StripReader(Closing):
             with reading(Path(path)):
                 facts = find_facts(Path(path), direction, headerless)
         self.facts = facts
+        self._unit_points = max(1, min(unit_points, unit_bytes // facts.header.point_length))
         self._points = open_points(facts)
         try:
             self._judge = Judge(facts)
@@ -140,7 +146,7 @@ class StripReader(Closing):
         tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
         packets of another strip.
         """
-        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points())
+        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points)
         if not scan.problems and (stranger := self._find_stranger(scan)):
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
             scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
@@ -176,10 +182,7 @@ class StripReader(Closing):
 
     def unit_count(self) -> int:
         """Return the number of units."""
-        return -(-self.facts.header.point_count // self._unit_points())
-
-    def _unit_points(self) -> int:
-        return max(1, min(UNIT_POINTS, UNIT_BYTES // self.facts.header.point_length))
+        return -(-self.facts.header.point_count // self._unit_points)
 
     def read_points(self, start: int, stop: int) -> np.ndarray:
         """Return records [start, stop) of the file."""

@@ -128,7 +128,8 @@ class Surroundings:
 
 
 def measure_normals(
-    points: np.ndarray, ray: np.ndarray, around: Surroundings, *, radius: float, min_points: int, max_error: float
+    points: np.ndarray, ray: np.ndarray, around: Surroundings, *, radius: float, min_points: int, max_error: float,
+    pairs: int = PAIRS,
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Angle between ray and surface normal at each point.
 
@@ -148,6 +149,8 @@ def measure_normals(
         Smallest number of neighbours.
     max_error : float, deg
         Angles that are less certain are not given.
+    pairs : int
+        Pairs of neighbours at a time, about; bounds memory.
 
     Returns
     -------
@@ -172,7 +175,7 @@ def measure_normals(
         point, offset = around.find(points[rows], radius)
         angles, errors, gap[rows] = _judge(offset, point, unit[rows], min_points, np.radians(max_error))
         angle[rows], error[rows] = np.degrees(angles), np.degrees(errors)
-        size = int(np.clip(PAIRS * len(rows) // max(len(point), 1), 64, _LARGEST_CHUNK))
+        size = int(np.clip(pairs * len(rows) // max(len(point), 1), 64, _LARGEST_CHUNK))
     return (angle, error), gap
 
 

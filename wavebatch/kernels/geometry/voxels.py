@@ -115,13 +115,17 @@ def cross_voxels(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np
     return Crossings(ray, enter, inside, index)
 
 
-def split_rays(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float) -> list[slice]:
+def split_rays(
+    start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float, crossings: int = AT_A_TIME
+) -> list[slice]:
     """Slices of the rays that `cross_voxels` can handle at a time in bounded memory.
 
     Parameters
     ----------
     start, step, begin, end, size
         As for `cross_voxels`.
+    crossings : int
+        Most of a slice of several rays.
 
     Returns
     -------
@@ -134,7 +138,7 @@ def split_rays(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.n
         if at:
             most = np.maximum.accumulate(number[at:])
         cost = most * np.arange(1, len(most) + 1)
-        taken = max(int(np.searchsorted(cost, AT_A_TIME, side="right")), 1)
+        taken = max(int(np.searchsorted(cost, crossings, side="right")), 1)
         slices.append(slice(at, at + taken))
         at += taken
     return slices

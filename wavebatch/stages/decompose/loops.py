@@ -100,7 +100,7 @@ def residual_loop(
     varies = find_varying(block.samples)
     parts: list[EchoTable] = []
     while len(rows) or not parts:
-        found = _LOOP_FITS[model](block, noise, system, echoes, **options)
+        found = _LOOP_FITS[fitted](block, noise, system, echoes, **options)
         residual = _residual(block, noise, system, shape, found)
         height = residual.max(axis=1, initial=0)
         number = found.count(len(rows))
