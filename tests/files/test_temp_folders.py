@@ -146,6 +146,7 @@ if "TEST_KILLS" in os.environ:
 """As sitecustomize: workers do not run the script of the user."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_the_next_run_clears_up_after_one_that_was_killed(tmp_path, edit_points, jobs):
     strips, temporary, out = tmp_path / "in", tmp_path / "tmp", tmp_path / "out"

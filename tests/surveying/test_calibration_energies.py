@@ -108,6 +108,7 @@ def test_logs_that_stand_still_or_drift_alone_are_named_and_in_the_error(tmp_pat
     assert np.mean(np.abs(off) < stated) > 0.6
 
 
+@pytest.mark.slow
 def test_two_lasers_that_take_turns_without_a_mark_are_named_and_in_the_error(tmp_path, flickering, monkeypatch):
     render = facet_strips._render
 

@@ -36,6 +36,7 @@ def test_echoes_of_a_canopy_are_found_with_the_survey_of_any_tile(surveys):
     assert np.mean(counts[0] != counts[1]) < 0.05
 
 
+@pytest.mark.quick_cases("1")
 @pytest.mark.parametrize("seed", [1, 2])
 def test_leaves_that_are_too_weak_to_be_seen_are_no_noise(seed):
     """They stand below the limit in every seventh packet: the noise of a pulse was 24 and 32 % too large."""
