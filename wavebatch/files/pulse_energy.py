@@ -80,10 +80,16 @@ class PulseEnergy:
         """The mean over the reference."""
         return self.mean / (self.reference or self.mean)
 
+    def read_column(self, points: np.ndarray) -> np.ndarray:
+        """Return the extra byte of point records (n,), f8; raises ValueError for energies of a text file."""
+        if self.field is None or self.record is None:
+            raise ValueError(f"{self.source} is no extra byte")
+        return self.record.read(points[self.field])
+
     def read(self, points: np.ndarray) -> np.ndarray:
         """Return the energies of the pulses of point records (n,), f8, NaN where unknown, in the unit of the source."""
-        if self.field is not None and self.record is not None:
-            values = self.record.read(points[self.field])
+        if self.field is not None:
+            values = self.read_column(points)
             return np.where(values > 0, values, np.nan)
         time, known = points["gps_time"].astype(np.float64), np.asarray(self.time)
         after = np.clip(np.searchsorted(known, time), 1, len(known) - 1)
