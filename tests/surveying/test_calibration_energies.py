@@ -53,6 +53,7 @@ def write_log(path, strip, change):
     return path
 
 
+@pytest.mark.slow
 def test_a_weaker_laser_that_its_log_knows_is_right(tmp_path, flickering):
     found = load_calibration(flickering / "with.toml")
     assert found.energy_mean == pytest.approx(1.0, abs=0.005) and found.energy_source == "pulse_energy"

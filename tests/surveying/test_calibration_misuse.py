@@ -145,6 +145,7 @@ def test_light_that_falls_from_side_to_side_is_fitted_by_three_strips(tmp_path, 
     assert parse_calibration(older, "older").swath == pytest.approx((*found.swath[:3], 0.0))
 
 
+@pytest.mark.quick_cases("ab")
 @pytest.mark.parametrize("strips", ["ab", "ac"])
 def test_light_that_falls_from_side_to_side_is_an_error_where_strips_leave_it_open(tmp_path, one_side, strips):
     found, said = calibrate(one_side, "--scan-angle", strips=[f"{name}.las" for name in strips])
@@ -194,6 +195,7 @@ def calibrated(tmp_path_factory):
 SENSOR = Sensor(**BASE, light=LIGHT)
 
 
+@pytest.mark.slow
 def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibrated):
     other = replace(SENSOR, start=(-30.0, 20.0), time=START + 600)
     write_strip(tmp_path / "b.las", GROUND, other, 6000, seed=2)
@@ -287,6 +289,7 @@ def test_a_target_that_is_declared_too_large_has_an_error_that_holds(tmp_path, r
     assert abs(4 / (2 * LIGHT) / found.constant - 1) < 1.1 * off
 
 
+@pytest.mark.slow
 def test_a_target_that_is_clipped_is_refused(tmp_path):
     bright = replace(SLOW, bits=8, energy_spread=0.03, light=235 / 0.5 * 700**2 * 10 ** (2e-4 * 0.22 * 700))
     write_strip(tmp_path / "a.las", [Facet(0.5, inside=disc(4.0)), Facet(0.28)], bright, 8000, seed=3)
@@ -330,7 +333,7 @@ def test_a_trajectory_that_is_late_is_named_and_in_the_error(tmp_path, calibrate
     assert np.mean(off < cloud["range_error"]) > 0.5 and np.nanmedian(cloud["range_error"]) < (1.0 if late else 0.1)
 
 
-@pytest.mark.quick_cases("0.2")
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.2, -0.4])
 def test_vectors_that_are_turned_against_a_trajectory_are_in_the_errors_of_angles(tmp_path, monkeypatch, turn):
     """Packet vectors 0.2 deg off the points: one angle of eight was within its error."""
@@ -462,6 +465,7 @@ def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, ca
             sensor.refuse_units(SimpleNamespace(facts=facts), scan)
 
 
+@pytest.mark.slow
 def test_feet_without_pairs_of_returns_are_said(tmp_path, calibrated):
     """Light 10.8 times too bright was put down to another gain or other surfaces."""
     write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 600), 8000, seed=81)
@@ -500,7 +504,7 @@ def test_strips_of_two_zones_are_not_tied(tmp_path, dim_edges):
     assert call("calibrate", tmp_path / "a.las", tmp_path / "c.las", *options).exit_code == 0
 
 
-@pytest.mark.quick_cases("True")
+@pytest.mark.slow
 @pytest.mark.parametrize("scanners", [False, True])
 def test_lines_of_targets_have_the_constant_of_one_channel(tmp_path, scanners):
     two = replace(SENSOR, gains={1: 1.0, 2: 0.5}, scanners=scanners)
