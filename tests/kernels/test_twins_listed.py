@@ -46,7 +46,7 @@ def _names():
             texts[path.stem] = path.read_text("utf-8")
             body = [node for node in ast.parse(texts[path.stem]).body if not isinstance(node, ast.ImportFrom)]
             nodes = [one for node in body for one in ast.walk(node) if type(one) in kinds]
-            used[path.stem] = {getattr(one, kinds[type(one)]) for one in nodes}
+            used[path] = {getattr(one, kinds[type(one)]) for one in nodes}
     return used, texts
 
 
@@ -60,5 +60,5 @@ def test_twins_stand_beside_their_kernels_in_a_test():
     for kernel, twin in [*COMPILED.values(), *HARD.items()]:
         module, _, function = twin.rpartition(".")
         assert module in ("", "math", "np", "np.linalg") or f"\ndef {function}(" in texts[module], twin
-        beside = any({kernel, function} <= names for stem, names in used.items() if stem.startswith("test_"))
+        beside = any({kernel, function} <= names for path, names in used.items() if path.name.startswith("test_"))
         assert beside, f"no test compares {kernel} with {twin}"
