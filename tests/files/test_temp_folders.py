@@ -137,7 +137,7 @@ from wavebatch.files.disk import spool
 from wavebatch.files.strip import reader
 spool.KEPT, reader.UNIT_POINTS = 0, 500
 
-def kill(task, workers):
+def kill(task, *arguments):
     os.kill(os.getpid(), signal.SIGKILL)
 
 if "TEST_KILLS" in os.environ:

@@ -119,10 +119,10 @@ class Waves:
 class PulseReader(Closing):
     """Reads the pulses of a PulseWaves file in order, piece by piece. A context manager.
 
-    pulses, size: most pulses, and about the most bytes of waves, of a piece.
+    pulses, size: most pulses (None: PULSES), and about the most bytes of waves, of a piece.
     """
 
-    def __init__(self, header: PulseHeader, *, pulses: int = PULSES, size: int = PIECE_BYTES) -> None:
+    def __init__(self, header: PulseHeader, *, pulses: int | None = None, size: int = PIECE_BYTES) -> None:
         self.header, self._size = header, size
         self._pulses = open_regular(header.path)
         try:
@@ -131,7 +131,7 @@ class PulseReader(Closing):
             self._pulses.close()
             raise
         each = max(header.waves_size // max(header.count, 1), 1)
-        self._step = int(np.clip(size // each, 1, pulses))
+        self._step = int(np.clip(size // each, 1, pulses or PULSES))
 
     def close(self) -> None:
         """Close both files."""

@@ -105,8 +105,8 @@ class StripReader(Closing):
         Where packet vectors point; "auto" decides from the points.
     headerless : bool
         Accept a .wdp without its 60-byte header.
-    unit_points, unit_bytes : int
-        Most points of a unit, and bytes of their records.
+    unit_points, unit_bytes : int or None
+        Most points of a unit, and bytes of their records; None: UNIT_POINTS, UNIT_BYTES.
 
     Raises
     ------
@@ -116,7 +116,7 @@ class StripReader(Closing):
 
     def __init__(
         self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False,
-        unit_points: int = UNIT_POINTS, unit_bytes: int = UNIT_BYTES,
+        unit_points: int | None = None, unit_bytes: int | None = None,
     ) -> None:  # fmt: skip
         if direction not in OPTIONS:
             raise ConfigError(f"direction {direction!r}: must be one of {', '.join(OPTIONS)}")
@@ -126,7 +126,8 @@ class StripReader(Closing):
             with reading(Path(path)):
                 facts = find_facts(Path(path), direction, headerless)
         self.facts = facts
-        self._unit_points = max(1, min(unit_points, unit_bytes // facts.header.point_length))
+        most = (unit_bytes or UNIT_BYTES) // facts.header.point_length
+        self._unit_points = max(1, min(unit_points or UNIT_POINTS, most))
         self._points = open_points(facts)
         try:
             self._judge = Judge(facts)

@@ -116,7 +116,7 @@ def cross_voxels(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np
 
 
 def split_rays(
-    start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float, crossings: int = AT_A_TIME
+    start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float, crossings: int | None = None
 ) -> list[slice]:
     """Slices of the rays that `cross_voxels` can handle at a time in bounded memory.
 
@@ -124,8 +124,8 @@ def split_rays(
     ----------
     start, step, begin, end, size
         As for `cross_voxels`.
-    crossings : int
-        Most of a slice of several rays.
+    crossings : int or None
+        Most of a slice of several rays; None: AT_A_TIME.
 
     Returns
     -------
@@ -138,7 +138,7 @@ def split_rays(
         if at:
             most = np.maximum.accumulate(number[at:])
         cost = most * np.arange(1, len(most) + 1)
-        taken = max(int(np.searchsorted(cost, crossings, side="right")), 1)
+        taken = max(int(np.searchsorted(cost, crossings or AT_A_TIME, side="right")), 1)
         slices.append(slice(at, at + taken))
         at += taken
     return slices
