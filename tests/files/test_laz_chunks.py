@@ -103,7 +103,7 @@ def test_chunks_of_another_number_of_points_are_refused(tmp_path, counts):
     """lazrs 0.8 seeks the wrong points in a file of such chunks."""
     with open_file(tmp_path / "a.laz", 1) as file, pytest.raises(ValueError, match="only the last LAZ chunk"):
         for count in counts:
-            file.append(compress_rows(make_rows(1, CHUNK_POINTS), 1)._replace(count=count))
+            file.append(compress_rows(make_rows(1, CHUNK_POINTS), 1)._replace(points=count))
 
 
 def test_chunks_of_one_scanner_channel_each_are_written_and_others_refused(tmp_path):

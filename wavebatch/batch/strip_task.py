@@ -14,7 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,13 +22,13 @@ from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.job import StripJob
-from wavebatch.batch.neighbour_pass import Found, SecondPass, begin_unit
+from wavebatch.batch.neighbour_pass import SecondPass, begin_unit
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.packing import Packing, pack_chunk
 from wavebatch.batch.unit import Prepared, UnitResult, prepare_strip, process_unit, scan_units
 from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import Workers
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import InputError, StageError
 from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.closing import Closing
@@ -38,6 +38,8 @@ from wavebatch.files.las.laz_encode import Chunk
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.files.text_file import draft_text
+
+T = TypeVar("T")
 
 
 class StripTask:
@@ -51,13 +53,15 @@ class StripTask:
         Whether no other strip may be under way: it is tried again after a worker process died.
     """
 
+    facts: StripFacts
+    """From `start` on."""
+
     def __init__(self, job: StripJob, options: RunOptions, alone: bool) -> None:
         self.job = job
         self.alone = alone
         self.pending: deque[Future] = deque()
         self._takers: deque[Callable[[Any], None]] = deque()
         """Who takes the result of each."""
-        self.facts: StripFacts | None = None
         self.prepared: Prepared | None = None
         self.written = 0
         self._options = options
@@ -119,6 +123,11 @@ class StripTask:
             check_target(target(self.job, options.folder), overwrite=options.overwrite or options.resume)
 
     @property
+    def ready(self) -> Prepared:
+        """What the preparation found; it must have ended."""
+        return _given(self.prepared)
+
+    @property
     def has_more(self) -> bool:
         """Whether there is a call to submit now."""
         if self.prepared is None:
@@ -134,7 +143,7 @@ class StripTask:
 
     @property
     def _has_all_rows(self) -> bool:
-        return self.written == self.prepared.units and (self._second is None or self._second.is_complete)
+        return self.written == self.ready.units and (self._second is None or self._second.is_complete)
 
     def submit(self, workers: Workers | Cluster) -> None:
         """Submit the next call: scan, preparation, then chunks of rows and units, and those of a second pass."""
@@ -155,7 +164,7 @@ class StripTask:
                 self._call(workers, self._take_begun, begin_unit, *arguments)
             self._submitted += 1
         else:
-            function, arguments = self._second.next_call(self._blob)
+            function, arguments = _given(self._second).next_call(self._blob)
             self._call(workers, self._take_second, function, *arguments)
 
     def _call(self, workers: Workers | Cluster, take: Callable[[Any], None], function: Callable, *given: Any) -> None:
@@ -165,6 +174,8 @@ class StripTask:
     def take(self) -> None:
         """Use the oldest result: open the output, keep rows for a chunk, or write one."""
         self._takers.popleft()(self.pending.popleft().result())
+        if self._second is not None and self.written == self.ready.units:
+            self._report += self._second.cut()
 
     def _take_scanned(self, scanned: tuple[ScanPart, Seconds]) -> None:
         part, took = scanned
@@ -175,7 +186,7 @@ class StripTask:
         self.prepared = prepared
         self._scanned = []
         self._report += prepared.report
-        self._open()
+        self._open(prepared)
 
     def _take_unit(self, unit: UnitResult) -> None:
         self.written += 1
@@ -184,14 +195,12 @@ class StripTask:
     def _take_begun(self, begun: tuple[tuple[np.ndarray, np.ndarray], RunReport]) -> None:
         start = Seconds.now()
         entries, report = begun
-        self._second.add(*entries)
+        _given(self._second).add(*entries)
         self.written += 1
         self._report += report + RunReport(timing={"write": Seconds.now() - start})
-        if self.written == self.prepared.units:
-            self._report += self._second.cut()
 
-    def _take_second(self, result: Found | UnitResult) -> None:
-        made = self._second.take(result)
+    def _take_second(self, result: Any) -> None:
+        made = _given(self._second).take(result)
         if isinstance(made, UnitResult):
             self._add_rows(made)
         else:
@@ -199,27 +208,27 @@ class StripTask:
 
     def _add_rows(self, unit: UnitResult) -> None:
         """Rows of LAS are written at once, those of LAZ wait until they fill a chunk."""
-        start = Seconds.now()
-        self._writer.count_rows(unit.statistics)
+        start, writer = Seconds.now(), _given(self._writer)
+        writer.count_rows(unit.statistics)
         for chunk in unit.chunks:
-            self._writer.append(chunk)
+            writer.append(chunk)
         if self.job.options.format == "laz":
             self._packing.add(unit.rows)
         else:
             rows = unit.rows.read(0, len(unit.rows))
-            self._writer.append(Chunk(len(rows), rows.view(np.uint8)))
+            writer.append(Chunk(len(rows), rows.view(np.uint8)))
             unit.rows.close()
         self._report += unit.report + RunReport(timing={"write": Seconds.now() - start})
 
     def _take_chunk(self, packed: tuple[Chunk, Seconds]) -> None:
         start = Seconds.now()
         chunk, took = packed
-        self._writer.append(chunk)
+        _given(self._writer).append(chunk)
         self._packing.end_chunk()
         self._report += RunReport(timing={"write": took + (Seconds.now() - start)})
 
-    def _open(self) -> None:
-        options, prepared = self._options, self.prepared
+    def _open(self, prepared: Prepared) -> None:
+        options = self._options
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
         command = self.job.options.command(self.job.path.name)
         provenance = {**self._described, "command": command, **report_file.describe_chain(prepared)}
@@ -244,25 +253,25 @@ class StripTask:
         StageError
             Where counts do not add up.
         """
-        options, job = self._options, self.job
+        options, job, prepared, writer = self._options, self.job, self.ready, _given(self._writer)
         start = Seconds.now()
         self._report.check(job.options.points, str(job.path))
-        self._report += RunReport(remarks=(*_name_stranger(self.prepared), *find_remarks(self.prepared, self._report)))
+        self._report += RunReport(remarks=(*_name_stranger(prepared), *find_remarks(prepared, self._report)))
         if self._stat() != self._state:
             raise InputError(f"{job.path}: changed while it was read; run it again once it is complete")
         cloud = report_file.cloud_path(job, options.folder)
         report = report_file.report_path(job, options.folder)
         replaces = options.overwrite or options.resume
-        size = self._writer.complete()
+        size = writer.complete()
         self._report += RunReport(timing={"publish": Seconds.now() - start})
-        warnings = find_warnings(self.prepared, self._report, self._writer.dropped)
+        warnings = find_warnings(prepared, self._report, writer.dropped)
         self._report = replace(self._report, warnings=warnings)
-        document = report_file.build_document(self.prepared, self._described, self._report, cloud, size)
+        document = report_file.build_document(prepared, self._described, self._report, cloud, size)
         draft = draft_text(report, report_file.format_report(document), overwrite=replaces)
         try:
             if replaces:
                 report.unlink(missing_ok=True)  # before the new cloud: an old report must not vouch for it
-            self._writer.publish(draft)
+            writer.publish(draft)
         finally:
             draft.discard()
         self._close()
@@ -281,7 +290,7 @@ class StripTask:
 
     def _close(self) -> None:
         """Remove temporary files."""
-        for one in (*self._scanned, self._second, self._packing, self.prepared and self.prepared.scan):
+        for one in (*self._scanned, self._packing, self._second, None if self.prepared is None else self.prepared.scan):
             if one is not None:
                 one.close()
 
@@ -289,6 +298,13 @@ class StripTask:
         """Size and time of the input files, to see whether they change during the run."""
         stats = [os.stat(path) for path in self._files]
         return [(stat.st_size, stat.st_mtime_ns) for stat in stats]
+
+
+def _given(value: T | None) -> T:
+    """The value of a step that has been done."""
+    if value is None:
+        raise StageError("a step of the strip was called too early; please report it as a bug")
+    return value
 
 
 def _name_stranger(prepared: Prepared) -> tuple[str, ...]:

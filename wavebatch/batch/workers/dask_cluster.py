@@ -140,7 +140,8 @@ class Cluster:
             if there := self._look():
                 self._heard = time.monotonic()
                 for promise in futures:
-                    if not promise.workers & there:  # dask would wait until these workers come back
+                    # Dask would wait until these workers come back.
+                    if isinstance(promise, _Promise) and not promise.workers & there:
                         self._send(promise)
             if self._client.status == "closed" or time.monotonic() - self._heard > PATIENCE:
                 raise self._lost("no worker answers")

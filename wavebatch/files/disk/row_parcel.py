@@ -25,31 +25,31 @@ class RowParcel(Closing):
 
     def __init__(self, rows: np.ndarray) -> None:
         self.count, self._dtype = len(rows), rows.dtype
-        self._rows: np.ndarray | None = rows
-        self._path: Path | None = None
+        self._rows: np.ndarray | Path = np.ascontiguousarray(rows)
+        """Or the file that has them."""
 
     def __len__(self) -> int:
         return self.count
 
     def __getstate__(self) -> dict[str, Any]:
         """Move the rows to a file; without room for it they travel themselves."""
-        if self._path is None and self._rows.nbytes > KEPT:
+        if isinstance(self._rows, np.ndarray) and self._rows.nbytes > KEPT:
             with contextlib.suppress(OSError):
                 path = make_folder() / "rows"
                 self._rows.tofile(path)
-                self._path, self._rows = path, None
+                self._rows = path
         return self.__dict__
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Return rows [start, stop)."""
-        if self._rows is not None:
+        if isinstance(self._rows, np.ndarray):
             return self._rows[start:stop]
         rows = np.empty(stop - start, self._dtype)
-        with reporting_scratch(), open(self._path, "rb", buffering=0) as file:
+        with reporting_scratch(), open(self._rows, "rb", buffering=0) as file:
             read_exactly(file.fileno(), rows.view(np.uint8), start * rows.itemsize)
         return rows
 
     def close(self) -> None:
         """Remove the file; may be called twice."""
-        if self._path is not None:
-            shutil.rmtree(self._path.parent, ignore_errors=True)
+        if isinstance(self._rows, Path):
+            shutil.rmtree(self._rows.parent, ignore_errors=True)

@@ -28,7 +28,7 @@ _ITEMS_AT = 34
 class Chunk(NamedTuple):
     """Records as their bytes in the file; of LAZ one chunk."""
 
-    count: int
+    points: int
     data: np.ndarray
     """u1 (k,)."""
 
@@ -68,7 +68,7 @@ class PointEncoder:
 
     def append(self, chunk: Chunk) -> None:
         """Write what another process has encoded."""
-        self._file.write(chunk.data)
+        self._file.write(chunk.data.data)
 
     def finish(self) -> None:
         """Write what is left to be written."""
@@ -106,10 +106,10 @@ class _LazEncoder(PointEncoder):
             self._held, self._count = [held[whole:].copy()], self._count - whole
 
     def append(self, chunk: Chunk) -> None:
-        if self._chunks and self._chunks[-1][0] != CHUNK_POINTS or chunk.count > CHUNK_POINTS:
+        if self._chunks and self._chunks[-1][0] != CHUNK_POINTS or chunk.points > CHUNK_POINTS:
             raise ValueError(f"only the last LAZ chunk may have another number of points than {CHUNK_POINTS}")
         super().append(chunk)
-        self._chunks.append((chunk.count, len(chunk.data)))
+        self._chunks.append((chunk.points, len(chunk.data)))
 
     def finish(self) -> None:
         if self._count:

@@ -167,13 +167,13 @@ class _Scanner:
         try:
             suspects = near.suspects()
             packets, reach = near.count_packets(suspects), near.reach
-            overfull = [np.empty(0, np.uint64), *near.overfull]
+            full = [np.empty(0, np.uint64), *near.overfull]
             if suspects.any():
                 more, far_reach, far_overfull = self._go_far(suspects)
                 packets, reach = packets + more, max(reach, far_reach)
-                overfull.append(far_overfull)
+                full.append(far_overfull)
             found.seal()
-            overfull = np.unique(np.concatenate(overfull))
+            overfull = np.unique(np.concatenate(full))
             if suspects.any():
                 self._vote_far()
             if len(overfull):
