@@ -192,7 +192,9 @@ def _see_level(
     used = used.with_radiometry(divergence=divergence)
     seen = sample_reference(reader, scan, sensor, used, survey.figures.spacing_ns or 0.0)
     doubt = seen.doubt()
-    error = abs(seen.divergence / divergence - 1.0) if doubt else survey.system.radiometry.divergence_error
+    error = survey.system.radiometry.divergence_error
+    if doubt and seen.divergence and divergence:
+        error = abs(seen.divergence / divergence - 1.0)
     system = _take_reference(survey.system, seen.system).with_radiometry(divergence_error=error)
     return replace(choice, survey=replace(survey, system=system)), (doubt,) if doubt else ()
 
@@ -289,8 +291,8 @@ def _mark_edges(prepared: Prepared, solved: SolvedBlocks) -> SolvedBlocks:
     # In the order of packets: blocks of several digitizers come in another one with blocks of another size.
     order = np.argsort(np.concatenate([index[block.echoes.waveform] for index, block in solved]), kind="stable")
     edge = np.empty(len(order), bool)
-    given = (np.concatenate(values)[order] for values in zip(*parts, strict=True))
-    edge[order] = find_edges(*given, INSET * beam * distance)
+    place, ray, time, before, after = (np.concatenate(values)[order] for values in zip(*parts, strict=True))
+    edge[order] = find_edges(place, ray, time, before, after, INSET * beam * distance)
     ends = np.cumsum([len(block.echoes) for _, block in solved])
     return [
         (index, block._replace(echoes=hide_edges(block.echoes.with_attributes(edge=part))))
