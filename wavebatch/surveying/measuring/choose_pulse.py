@@ -327,10 +327,11 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> fl
     # Those that a description cannot tell apart: half the logarithm of the waveforms is what a parameter costs.
     alike = 0.5 * log(len(block))
     best = min(place for place in tried.known if tried.exceed(place) <= alike)
+    further = 0.0
     if best - 1 in tried.known and best + 1 in tried.known and tried.exceed(best + 1) > alike:
         before, after = tried.exceed(best - 1), tried.exceed(best + 1)
-        best += 0.5 * (before - after) / (before + after)
-    return float(MISFITS[0] * 2.0**best)
+        further = 0.5 * (before - after) / (before + after)
+    return float(MISFITS[0] * 2.0 ** (best + further))
 
 
 class _TriedMisfits:
