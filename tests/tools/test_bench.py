@@ -102,7 +102,7 @@ def test_document_is_plain_json_and_its_tables_show_all(document):
     text = format_release(document)
     assert text.startswith(format_document(document)) and "isolated, time error / bound" in text
     for row in document["scenes"][0]["rows"]:
-        assert f"\n{row['name']}" in text
+        assert f"\n  {row['name']}" in text
     assert "constant 0, 12 or 255" in text and "cheapest chain with an error of 50 cm" in text
     assert f"{100 * find_row(document, 'fast')['figures']['exact_count']['value']:.2f} +-" in text
 

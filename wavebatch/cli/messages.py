@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import math
 import os
 import sys
 import traceback
@@ -22,6 +21,7 @@ import click
 from wavebatch.cli.program import log_file
 from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError, StageError
+from wavebatch.tools.sheets.sheet import Sheet, list_lines
 
 EXIT_USAGE = 2
 """Wrong usage or chain file; nothing was started."""
@@ -208,12 +208,17 @@ def print_safely(text: str) -> bool:
         return False
 
 
-def print_result(as_json: bool, document: Any, lines: Iterable[str], mode: str = "") -> None:
-    """The result of a command on stdout: the document as JSON, with its mode, or the lines."""
+def print_result(as_json: bool, document: Any, sheet: Sheet, mode: str = "") -> None:
+    """The result of a command on stdout: the document as JSON, with its mode, or the lines of the sheet."""
     if as_json:
         print_json(document, mode)
     else:
-        print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
+        print_sheet(sheet)
+
+
+def print_sheet(sheet: Sheet) -> None:
+    """A result as text on stdout."""
+    print_text("\n".join(printable(part) for line in list_lines(sheet) for part in line.split("\n")))
 
 
 def print_summary(summary: Any, lines: Iterable[str]) -> None:
@@ -221,19 +226,6 @@ def print_summary(summary: Any, lines: Iterable[str]) -> None:
     answer(summary)
     for line in lines:
         tell(line)
-
-
-def count(number: int, name: str) -> str:
-    """`1 echo`, `2 echoes`."""
-    if number == 1:
-        return f"1 {name}"
-    return f"{number} {name}{'es' if name.endswith(('o', 's', 'x', 'ch')) else 's'}"
-
-
-def row(name: str, values: Iterable[Any], form: str = "", *, width: int = 10) -> str:
-    """A line of a table: the name as it is, then values of one width to the right; form: of floats, NaN is `-`."""
-    texts = (("-" if math.isnan(v) else format(v, form)) if isinstance(v, float) else str(v) for v in values)
-    return name + " ".join(f"{text:>{width}}" for text in texts)
 
 
 def one_line(error: BaseException) -> str:

@@ -241,7 +241,7 @@ def check_html(target: Path | None, *, will_exist: bool = False) -> None:
     will_exist: its folder will be made.
     """
     if target is not None and not (will_exist and not target.parent.exists()):
-        from wavebatch.tools.html.page import check_page
+        from wavebatch.tools.sheets.page import check_page
 
         check_page(target)
 

@@ -14,8 +14,9 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, counting, print_summary
+from wavebatch.cli.messages import counting, print_summary
 from wavebatch.cli.program.completion import complete_scenes
+from wavebatch.core.units import count
 from wavebatch.tools.simulate import (
     CANOPIES,
     OTHER_NAMES,

@@ -16,8 +16,9 @@ import click
 
 from wavebatch import __version__
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, talk, tell
+from wavebatch.cli.messages import answer, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.geojson_crs import GEOJSON_CRS, GeoJsonCrs, plan_crs

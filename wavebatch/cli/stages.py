@@ -14,6 +14,7 @@ from wavebatch.cli.options import common_options
 from wavebatch.cli.program.completion import complete_stages
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
+from wavebatch.tools.sheets.sheet import Note, Sheet
 
 if TYPE_CHECKING:
     from wavebatch.stages.chain import Parameter, Stage
@@ -46,7 +47,7 @@ def stages(name: str | None, as_json: bool, quiet: bool, debug: bool) -> None:
     chosen = [stage for stage in chosen if name in (None, stage.name, stage.kind)]
     width = max(len(stage.name) for stage in chosen)
     lines = [_explain(STAGES[name])] if one else [f"{stage.name:<{width}}  {stage.summary}" for stage in chosen]
-    print_result(as_json, [_describe(stage) for stage in chosen], lines)
+    print_result(as_json, [_describe(stage) for stage in chosen], Sheet("stages", list(map(Note, lines))))
 
 
 def _types(parameter: Parameter) -> str:

@@ -12,11 +12,12 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import NearestGroup, answer, count, tell
+from wavebatch.cli.messages import NearestGroup, answer, tell
 from wavebatch.cli.plot.clouds import histogram, map_, output_option, read_range
 from wavebatch.cli.plot.sections import cube, profile, section
 from wavebatch.cli.program.completion import complete_flags
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import count
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.text_file import write_text

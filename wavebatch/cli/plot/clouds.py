@@ -13,9 +13,10 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, tell
+from wavebatch.cli.messages import answer, tell
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import count
 from wavebatch.files.figure_file import check_picture
 
 output_option = shared.output_option("Picture to write: .png, .svg or .pdf.")

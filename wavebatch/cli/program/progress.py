@@ -13,9 +13,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from wavebatch.cli.messages import count, one_line, print_safely, printable, write_message
+from wavebatch.cli.messages import one_line, print_safely, printable, write_message
 from wavebatch.cli.program import log_file
 from wavebatch.core.errors import StripWarning
+from wavebatch.core.units import count
 
 
 class Progress:

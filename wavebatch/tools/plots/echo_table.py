@@ -13,8 +13,8 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
-from wavebatch.tools.csv_table import format_csv
 from wavebatch.tools.plots.waveform import WaveformView
+from wavebatch.tools.sheets.sheet import format_csv
 
 MOST_LISTED = 40
 """Most echoes in the table of a picture; the CSV has all."""
