@@ -32,10 +32,9 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
 from wavebatch.tools.bench import command, report
 from wavebatch.tools.bench.accuracy import AccuracyTally, Group, make_group, make_groups
-from wavebatch.tools.bench.command import BenchOptions, run_bench
+from wavebatch.tools.bench.command import BenchOptions, run_bench, shape_scene
 from wavebatch.tools.bench.report import format_document
-from wavebatch.tools.bench.scenes import shape_scene
-from wavebatch.tools.bench.worker import BenchWorkerDied, Worker, peak_memory
+from wavebatch.tools.bench.speed import BenchWorkerDied, Worker, peak_memory
 from wavebatch.tools.simulate import Recording, find_scene, simulate_block, simulate_blocks, simulate_strip
 
 SMALL = BenchOptions(

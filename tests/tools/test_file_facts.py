@@ -15,7 +15,7 @@ from writer_tools import data_file, write_source
 import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.files.las.header import Vlr
-from wavebatch.tools.inspect.file_facts import _describe_time, describe_file
+from wavebatch.tools.file_facts import _describe_time, describe_file
 
 
 @pytest.mark.parametrize("point_format", [0, 1, 3, 6, 8])

@@ -30,7 +30,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "slice": ("wavebatch.cli.slice:slice_", "Find straight surface lines in the scan lines of a strip."),
     "voxelize": ("wavebatch.cli.voxelize:voxelize", "Deconvolve waveforms into the voxels of a 3D grid."),
     "plot": ("wavebatch.cli.plot:plot", "Draw waveforms with their fit, histograms and maps."),
-    "grid": ("wavebatch.cli.gis.grid:grid", "Write columns of clouds as a GeoTIFF."),
+    "grid": ("wavebatch.cli.grid:grid", "Write columns of clouds as a GeoTIFF."),
     "calibrate": ("wavebatch.cli.calibrate:calibrate", "Find the calibration constant from known reflectances."),
     "bench": ("wavebatch.cli.bench:bench", "Measure error and run time of chains on simulated truth."),
 }

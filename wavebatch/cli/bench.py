@@ -13,7 +13,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import print_result, talk
-from wavebatch.cli.program.completion import complete_scenes
+from wavebatch.cli.program.command import complete_scenes
 from wavebatch.tools.bench.command import BenchOptions, run_bench
 
 

@@ -1,6 +1,6 @@
 """`wavebatch info` shows what a strip holds, `wavebatch check` what is wrong with strips and chain files.
 
-Only prints; the facts come from `tools.inspect` and `surveying.inspect_strip`.
+Only prints; the facts come from `tools.file_facts` and `surveying.inspect_strip`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, print_sheet, print_text, printable, talk
-from wavebatch.cli.program.completion import complete_files
+from wavebatch.cli.program.command import complete_files
 from wavebatch.core.units import count
-from wavebatch.tools.inspect.file_facts import describe_file
+from wavebatch.tools.file_facts import describe_file
 from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet
 
 _SHOWN = 20

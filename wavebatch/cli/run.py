@@ -28,8 +28,8 @@ from wavebatch.cli.messages import (
     printable,
     talk,
     tell,
+    typed_command,
 )
-from wavebatch.cli.program.log_file import typed_command
 from wavebatch.cli.program.progress import Progress
 from wavebatch.core.errors import WARNINGS, ConfigError, InputError
 from wavebatch.core.suggest import nearest

@@ -15,7 +15,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import counting, print_summary
-from wavebatch.cli.program.completion import complete_scenes
+from wavebatch.cli.program.command import complete_scenes
 from wavebatch.core.units import count
 from wavebatch.tools.simulate import (
     CANOPIES,

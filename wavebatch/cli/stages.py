@@ -11,7 +11,7 @@ import click
 
 from wavebatch.cli.messages import print_result, talk
 from wavebatch.cli.options import common_options
-from wavebatch.cli.program.completion import complete_stages
+from wavebatch.cli.program.command import complete_stages
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.tools.sheets.sheet import Note, Sheet

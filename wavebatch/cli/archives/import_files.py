@@ -15,7 +15,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, counting, tell
-from wavebatch.cli.program.completion import complete_files
+from wavebatch.cli.program.command import complete_files
 from wavebatch.core.units import count
 from wavebatch.tools.archives.import_file import SUFFIXES, ImportOptions, ImportSummary, import_file
 

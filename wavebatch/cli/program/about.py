@@ -12,8 +12,7 @@ from pathlib import Path
 import click
 
 from wavebatch import __version__
-from wavebatch.cli.program.command import group_options
-from wavebatch.cli.program.examples import EXAMPLES
+from wavebatch.cli.program.command import EXAMPLES, group_options
 
 LIBRARIES = ("numpy", "scipy", "laspy", "lazrs")
 """Libraries on which results and files depend."""

@@ -1,19 +1,210 @@
-"""The class of all commands: help with examples and groups, and options that settings can give.
+"""The class of all commands: help with examples and groups, options that settings can give, and completion by TAB.
 
-`LazyGroup` gives each command this class when it is loaded, so that a new command only declares itself.
+`LazyGroup` gives each command this class when it is loaded, so that a new command only declares itself. The examples
+and groups are those of --help, of the manual pages and of the page Commands.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 
 import click
+from click.shell_completion import CompletionItem
 
-from wavebatch.batch.options import HEADINGS, OPTIONS
+from wavebatch.batch.options import AIR, CHAIN, HEADINGS, OPTIONS, OUTPUT, READING, RUNNING, WHICH
 from wavebatch.cli.messages import talk
-from wavebatch.cli.program.examples import ALSO_USUAL, EXAMPLES, FEWEST, GROUPS, MANY, USUAL
 from wavebatch.cli.program.settings import OLD_NAMES, add_variables, drop_rivals, read_settings, tell_settings
+
+EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
+    "run": (
+        ("wavebatch run strip.las -o clouds", "one strip; the chain is chosen by a survey of it"),
+        ("wavebatch run strips/ -o clouds --survey flight --jobs 0 --html run.html",
+         "a flight on all processors, with a report page"),
+        ("wavebatch run strips/ -o clouds --resume", "go on after an interruption"),
+        ("wavebatch run strip.las -o clouds --trajectory flight.txt --columns +range",
+         "with a trajectory, and the range as a column"),
+        ("wavebatch run strip.las -o clouds --dry-run", "show chain, columns and sizes; write nothing"),
+    ),
+    "info": (("wavebatch info strip.las", "points, packets, descriptors and samples"),),
+    "check": (
+        ("wavebatch check strip.las mychain.toml", "one line per problem; exit code 1 if there is any"),
+    ),
+    "survey": (
+        ("wavebatch survey strip.las", "noise, pulse and scene, and which chain the strip needs"),
+        ("wavebatch survey strip.las -o system.toml --chain chain.toml", "save both for `run --system` and `--chain`"),
+    ),
+    "import": (
+        ("wavebatch import flight.pls -o flight.las", "flight.las and flight.wdp, and flight.system.toml"),
+        ("wavebatch import archive/ -o strips --resume", "all files of a folder; go on after an interruption"),
+    ),
+    "export": (
+        ("wavebatch export strip.las -o repaired.laz", "packets as the LAS specification has them"),
+        ("wavebatch export strip.las -o strip.npz", "waveforms with their geometry as arrays"),
+    ),
+    "stages": (
+        ("wavebatch stages", "list all algorithms"),
+        ("wavebatch stages decompose.adaptive", "one with parameters, units, source and a TOML example"),
+    ),
+    "simulate": (
+        ("wavebatch simulate forest -o forest.laz --pulses 50000 --truth truth.npz", "a strip with known echoes"),
+    ),
+    "compare": (
+        ("wavebatch compare clouds/strip.laz strip.las", "a cloud with the vendor's returns"),
+        ("wavebatch compare --strip strip.las fast accurate", "two chains on the waveforms of a strip"),
+        ("wavebatch compare clouds/strip.laz --truth truth.npz --min-completeness 0.95",
+         "with the truth; exit code 1 below 95 %"),
+    ),
+    "stats": (("wavebatch stats clouds/*.laz", "return numbers, separations and flags of clouds"),),
+    "synthesize": (
+        ("wavebatch synthesize cloud.laz -o strip.las", "waveforms from the returns of a cloud"),
+        ("wavebatch synthesize cloud.laz -o strip.las --intensity reflectance --sensor-height 1200 --shares equal",
+         "by the lidar equation, with partial footprints"),
+    ),
+    "slice": (("wavebatch slice strip.las -o lines.csv", "straight surface lines in the scan lines"),),
+    "voxelize": (("wavebatch voxelize strip.las --size 1 -o voxels.npz", "cross sections in voxels of 1 m"),),
+    "plot": (),
+    "plot waveform": (
+        ("wavebatch plot waveform strip.las -o fits.png", "six waveforms, spread over the strip"),
+        ("wavebatch plot waveform strip.las -o bad.svg --flags NOT_CONVERGED,AT_BOUND", "fits to look at"),
+        ("wavebatch plot waveform strip.las -o sheet.png --random 100 --sheet", "a sheet of 100 random waveforms"),
+    ),
+    "plot histogram": (
+        ('wavebatch plot histogram clouds/*.laz --column z --where "classification == 2" -o ground.png', "ground only"),
+        ("wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png", "widths of all clouds"),
+    ),
+    "plot map": (
+        ("wavebatch plot map clouds/ --column amplitude --size 1 -o map.png", "mean amplitude in cells of 1 m"),
+    ),
+    "plot section": (
+        ("wavebatch plot section clouds/ --width 2 --column echo_width -o side.png",
+         "2 m wide, along the longer extent"),
+    ),
+    "plot profile": (
+        ("wavebatch plot profile voxels.npz --column energy -o heights.png", "energy by height"),
+        ("wavebatch plot profile lines.csv --column length -o lines.png", "length of surface lines by height"),
+    ),
+    "plot cube": (
+        ("wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png", "scan line 3, and all pulses at 250 ns"),
+    ),
+    "grid": (
+        ("wavebatch grid clouds/ --column amplitude --column echo_width --statistic median --size 1 -o x.tif",
+         "two bands for GIS"),
+        ("wavebatch grid clouds/ --statistic density --size 5 -o density.tif", "points per square metre"),
+        ("wavebatch grid clouds/ --column z --statistic max --where 'classification != 7' -o top.tif",
+         "without points of noise"),
+    ),
+    "calibrate": (
+        ("wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml",
+         "for `run --calibration cal.toml`"),
+        ("wavebatch calibrate *.laz --targets targets.csv --scan-angle --html cal.html -o cal.toml",
+         "with light that falls across the swath"),
+    ),
+    "bench": (
+        ("wavebatch bench strip.las -o bench", "all shipped chains on echoes like those of the strip"),
+        ("wavebatch bench --scene open --tolerance 0.02m", "the cheapest chain with 2 cm of range error"),
+    ),
+}  # fmt: skip
+"""Per command: a line to type, and what it is for."""
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "Options": ("grid columns", "slice most"),
+    READING: ("grid crs",),
+    CHAIN: ("waveforms", "divergence"),
+    AIR: ("reflectance_error", "scan_angle"),
+    WHICH: ("flags", "packets", "point_numbers", "times", "most", "random", "limit"),
+    OUTPUT: ("html_file", "report", "as_json"),
+    RUNNING: ("dry_run", "fail_on", "progress", "verbose", "quiet", "log_path", "log_level", "config", "debug", "help"),
+}
+"""Names of options under a heading of --help, besides those of RunOptions. Others come first, under Options.
+
+With the command in front where the name means something else in others."""
+
+FEWEST = 8
+"""Pages with fewer options than this have no groups."""
+
+MANY, USUAL, ALSO_USUAL = 40, "Options that most runs need", ("html_file",)
+"""Pages with more options than MANY begin with those that RunOptions calls usual, and these."""
+
+
+def complete_files(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Let the shell complete file names; those of lists, which begin with `@`, are found here.
+
+    bash ends a word at `@`: it gives the sign as an argument of its own, but replaces it too.
+    """
+    given = context.params.get(parameter.name or "") if context is not None else None
+    apart = isinstance(given, tuple) and bool(given) and str(given[-1]) == "@"
+    if not (apart or incomplete.startswith("@")):
+        return [CompletionItem(incomplete, type="file")]
+    folder, start = os.path.split(incomplete.removeprefix("@"))
+    try:
+        entries = sorted(os.scandir(folder or "."), key=lambda entry: entry.name)
+    except OSError:
+        return []
+    found = []
+    for entry in entries:
+        if entry.name.startswith(start) and (start or not entry.name.startswith(".")):
+            found.append(CompletionItem("@" + os.path.join(folder, entry.name) + "/" * entry.is_dir()))
+    return found
+
+
+def complete_profiles(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the shipped chains and auto."""
+    from wavebatch.stages.chain_file import list_profiles
+
+    return [name for name in ("auto", *list_profiles()) if name.startswith(incomplete)]
+
+
+def complete_flags(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the last of several flags with commas."""
+    from wavebatch.core.echoes import EchoFlag
+
+    return _complete_last(incomplete, (flag.name or "" for flag in EchoFlag), upper=True)
+
+
+def complete_written(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the last of several columns that `run` can write, with commas, each with or without `+`."""
+    from wavebatch.core.echoes import COLUMNS
+
+    names = [name for name, column in COLUMNS.items() if column.extra_bytes]
+    last = incomplete.rpartition(",")[2]
+    return _complete_last(incomplete, (f"+{name}" for name in names) if last.startswith("+") else names)
+
+
+def complete_columns(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete columns that clouds of wavebatch usually have."""
+    from wavebatch.core.echoes import COLUMNS
+
+    standard = ("x", "y", "z", "intensity", "return_number", "number_of_returns", "classification", "scan_angle",
+                "user_data", "point_source_id", "gps_time")  # fmt: skip
+    names = [*(name for name, column in COLUMNS.items() if column.extra_bytes), *standard]
+    return [name for name in dict.fromkeys(names) if name.startswith(incomplete)]
+
+
+def complete_stages(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the names of stages, those of other packages too."""
+    from wavebatch.stages.chain import STAGES
+    from wavebatch.stages.plugins import load_plugins
+
+    load_plugins()
+    return sorted(name for name in STAGES if name.startswith(incomplete))
+
+
+def complete_scenes(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the scenes of `simulate` and `bench`."""
+    from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES
+
+    return [name for name in (*SCENES, *OTHER_NAMES) if name.startswith(incomplete)]
+
+
+def _complete_last(incomplete: str, names: Iterable[str], *, upper: bool = False) -> list[str]:
+    """Complete the part after the last comma; names that stand before it are not offered again."""
+    before, comma, last = incomplete.rpartition(",")
+    last = last.upper() if upper else last
+    given = {(part.upper() if upper else part).lstrip("+") for part in before.split(",")}
+    return [f"{before}{comma}{name}" for name in names if name.startswith(last) and name.lstrip("+") not in given]
+
 
 MAYBE_NAN = ("no_data",)
 """Options whose number may be NaN."""

@@ -19,7 +19,7 @@ from wavebatch.files.disk.publish import reporting
 from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.score import QUANTITIES
-from wavebatch.tools.bench.figures import find_front
+from wavebatch.tools.bench.accuracy import find_front
 from wavebatch.tools.sheets.sheet import Cell, Later, Note, Part, Picture, Sheet, Table, list_lines
 
 ReportColumn = tuple[str, str, float, int]

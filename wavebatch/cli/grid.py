@@ -13,8 +13,8 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, talk, tell
-from wavebatch.cli.plot.clouds import find_clouds, select
-from wavebatch.cli.program.completion import complete_columns
+from wavebatch.cli.plot import find_clouds, select
+from wavebatch.cli.program.command import complete_columns
 from wavebatch.core.units import count
 from wavebatch.tools.rasters.grid import GridOptions, GridResult, write_grid
 
