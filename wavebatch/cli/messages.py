@@ -1,7 +1,8 @@
 """What the commands print: messages and one-line errors on stderr, results as text or JSON on stdout.
 
 Every command of `wavebatch.cli` uses this module. stdout holds only results, so that programs can read it; everything
-for people goes to stderr, and with its time into the file of --log-file, whatever --quiet says. Errors of wavebatch become one line and an exit code in `report_errors`.
+for people goes to stderr, and with its time into the file of --log-file, whatever --quiet says. Errors of wavebatch
+become one line and an exit code in `report_errors`.
 """
 
 from __future__ import annotations
