@@ -17,7 +17,7 @@ from wavebatch.kernels.geometry import hough
 from wavebatch.kernels.physics import radar, radiometry
 from wavebatch.stages.attribute import width_angle
 from wavebatch.stages.decompose import skew
-from wavebatch.tools.simulate import from_returns, return_light
+from wavebatch.tools.simulate import from_returns, returns
 from wavebatch.tools.slices import segments
 
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "papers"
@@ -91,22 +91,22 @@ def double_amplitudes(monkeypatch, load):
 
 
 def double_strengths(monkeypatch, load):
-    measured = return_light.LightModel.measure
+    measured = returns.LightModel.measure
     double = lambda *a: replace((light := measured(*a)), strength=2 * light.strength)  # noqa: E731
-    monkeypatch.setattr(return_light.LightModel, "measure", double)
+    monkeypatch.setattr(returns.LightModel, "measure", double)
     return load("s4_ussyshkin").table_of_synthesis(3000, 0)
 
 
 def fill_the_beam_twice(monkeypatch, load):
     """Each return takes the whole beam, whatever the others take."""
-    monkeypatch.setattr(return_light, "share_equally", lambda total, starts: np.ones(len(total)))
+    monkeypatch.setattr(returns, "share_equally", lambda total, starts: np.ones(len(total)))
     return load("s4_ussyshkin").table_of_footprints(3000, 0)
 
 
 def forget_a_power_of_the_range(monkeypatch, load):
     """Received powers that fall with R instead of R^2."""
-    right = return_light._receive
-    monkeypatch.setattr(return_light, "_receive", lambda rho, rows, radar, path: right(rho, rows, radar, path) * (
+    right = returns._receive
+    monkeypatch.setattr(returns, "_receive", lambda rho, rows, radar, path: right(rho, rows, radar, path) * (
         radar.height - rows["xyz"][:, 2]) / 1000.0)  # fmt: skip
     return load("s4_ussyshkin").table_of_footprints(3000, 0)
 
@@ -163,13 +163,13 @@ def refine_without_weights(monkeypatch, load):
 
 def keep_the_peaks_of_wide_echoes(monkeypatch, load):
     """Returns that are wider than the pulse, but as high."""
-    measured = return_light.LightModel.measure
+    measured = returns.LightModel.measure
 
     def wrong(self, *others):
         light = measured(self, *others)
         return replace(light, strength=light.strength * light.sigma / self.options.sigma)
 
-    monkeypatch.setattr(return_light.LightModel, "measure", wrong)
+    monkeypatch.setattr(returns.LightModel, "measure", wrong)
     return load("s4_ussyshkin").table_of_widths(3000, 0)
 
 

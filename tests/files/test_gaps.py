@@ -22,7 +22,7 @@ from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.tools.compare.chains import measure_fit
 from wavebatch.tools.plots.waveform import build_views
 from wavebatch.tools.simulate import StripOptions, simulate_strip
-from wavebatch.tools.slices.lines import _shape
+from wavebatch.tools.slices.segments import _shape
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
 
 DETECTORS = sorted(name for name, stage in STAGES.items() if name.startswith("detect."))

@@ -20,8 +20,7 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import EAST, GROUND, NORTH, FlightLine
 from wavebatch.tools.slices import lines, output
-from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
-from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
+from wavebatch.tools.slices.segments import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
 
 FLIGHT = FlightLine(pulse_rate=50_000, half_angle=12.0, look_ahead=0.0)
 PULSES = 4000

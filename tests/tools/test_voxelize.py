@@ -26,8 +26,7 @@ from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.blocks import simulate_block
 from wavebatch.tools.simulate.geometry import FlightLine
-from wavebatch.tools.simulate.pulses import find_pulse
-from wavebatch.tools.simulate.render import Recording
+from wavebatch.tools.simulate.render import Recording, find_pulse
 from wavebatch.tools.simulate.strip import WKT, StripOptions
 from wavebatch.tools.voxels.ceiling import Ceiling
 from wavebatch.tools.voxels.floor import Floor

@@ -130,7 +130,7 @@ def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: di
     from wavebatch.core.suggest import nearest
     from wavebatch.surveying.choose_chain import COSTS
     from wavebatch.surveying.system_file import load_survey
-    from wavebatch.tools.api.chain import AUTO
+    from wavebatch.tools.api.strip import AUTO
     from wavebatch.tools.compare.chains import find_contender, match_sides
 
     if truth is not None:

@@ -275,7 +275,7 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
 
     check_picture(output, overwrite=options["overwrite"])
     slices = cut_cube(cube_file, {name: options[name] for name in "xyt"})
-    from wavebatch.tools.slices.draw import draw_cube
+    from wavebatch.tools.slices.output import draw_cube
 
     draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
     tell(f"{output}: {', '.join(one.title for one in slices)}")
@@ -358,7 +358,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
     if tabular:
-        from wavebatch.tools.plots.echo_table import format_echoes
+        from wavebatch.tools.plots.waveform import format_echoes
 
         write_text(output, format_echoes(views), overwrite=options["overwrite"])
     else:
@@ -378,7 +378,7 @@ def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, opti
         end = max(view.time[-1] for view in views)
         raise ConfigError(f"--times {shown[0]:g}:{shown[1]:g}: no sample lies there; the waveforms end at {end:g} ns")
     if options["sheet"]:
-        from wavebatch.tools.plots.draw_sheet import draw_waveform_sheet
+        from wavebatch.tools.plots.draw_waveform import draw_waveform_sheet
 
         draw_waveform_sheet(views, output, times=shown, **more)
         return

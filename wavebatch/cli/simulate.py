@@ -32,7 +32,7 @@ from wavebatch.tools.simulate import (
 )
 from wavebatch.tools.simulate.from_returns import SynthesisSummary, synthesize_strip
 from wavebatch.tools.simulate.render import Recording
-from wavebatch.tools.simulate.return_light import EQUAL, Radar, SynthesisOptions
+from wavebatch.tools.simulate.returns import EQUAL, Radar, SynthesisOptions
 
 _RECORDING = ("n_samples", "spacing", "baseline", "noise_std", "rho", "noise_gain", "saturation")
 """Options that change the recording of the scene."""

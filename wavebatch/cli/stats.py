@@ -23,8 +23,7 @@ from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.return_stats.areas import RANKS, AreaGrid, AreaStats, PolygonSet, Separation, describe_pairs
-from wavebatch.tools.return_stats.dead_zones import BIN, BINS, LEAST_PAIRS, DeadZone
-from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
+from wavebatch.tools.return_stats.returns import BIN, BINS, LEAST_PAIRS, DeadZone, ReturnStats, count_returns
 from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv
 
 EXIT_UNREADABLE = 1

@@ -31,7 +31,7 @@ from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
-from wavebatch.tools.api.chain import AUTO, load_chain
+from wavebatch.tools.api.strip import AUTO, load_chain
 
 
 class RunKeywords(TypedDict, total=False):

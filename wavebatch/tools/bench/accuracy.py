@@ -22,8 +22,7 @@ from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 from wavebatch.stages.score import ISOLATED, QUANTITIES, find_isolated_echoes, list_pairs, match_echoes
 from wavebatch.surveying import Survey, survey_block
 from wavebatch.tools.simulate import Scene, simulate_blocks
-from wavebatch.tools.simulate.pulses import PulseModel, main_lobe, spread_lobes
-from wavebatch.tools.simulate.render import Recording, paint_echoes
+from wavebatch.tools.simulate.render import PulseModel, Recording, main_lobe, paint_echoes, spread_lobes
 
 NOTHING = float("nan")
 

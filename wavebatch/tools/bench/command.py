@@ -31,7 +31,7 @@ from wavebatch.stages.chain_file import effective, load_chain, load_profile
 from wavebatch.surveying import SAMPLE, Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.survey import pool_blocks
-from wavebatch.tools.api.chain import AUTO
+from wavebatch.tools.api.strip import AUTO
 from wavebatch.tools.bench.accuracy import (
     AccuracyTally,
     Group,

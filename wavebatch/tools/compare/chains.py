@@ -27,7 +27,7 @@ from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
-from wavebatch.tools.api.chain import AUTO, load_chain
+from wavebatch.tools.api.strip import AUTO, load_chain
 from wavebatch.tools.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.tools.compare.pairing import SPEED, Comparison, Pairing, check_tolerance
 from wavebatch.tools.even_sample import EvenSample
