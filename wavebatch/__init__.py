@@ -40,10 +40,9 @@ _MODULES = {
     "stages.chain": ("Chain", "Range", "Step", "stage"),
     "batch.options": ("RunOptions",),
     "surveying.survey": ("Decision", "Survey"),
-    "tools.api.chain": ("auto_chain", "load_chain"),
     "tools.api.cloud": ("read_cloud",),
     "tools.api.run": ("run",),
-    "tools.api.strip": ("Strip", "open_strip", "survey"),
+    "tools.api.strip": ("Strip", "auto_chain", "load_chain", "open_strip", "survey"),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 

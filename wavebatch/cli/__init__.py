@@ -22,7 +22,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "survey": ("wavebatch.cli.survey:survey", "Measure noise, pulse and scene of a strip; choose its chain."),
     "import": ("wavebatch.cli.archives.import_files:import_", "Make strips of PulseWaves files."),
     "export": ("wavebatch.cli.archives.export:export", "Write strips for other programs: repaired LAS, or arrays."),
-    "stages": ("wavebatch.cli.stages:stages", "List the algorithms, or explain one with its parameters."),
+    "stages": ("wavebatch.cli.inspect:stages", "List the algorithms, or explain one with its parameters."),
     "simulate": ("wavebatch.cli.simulate:simulate", "Simulate a strip with known echoes."),
     "compare": ("wavebatch.cli.compare:compare", "Compare clouds or chains with each other, returns or truth."),
     "stats": ("wavebatch.cli.stats:stats", "Count return numbers, separations and flags of clouds."),
