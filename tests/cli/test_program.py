@@ -16,8 +16,7 @@ import wavebatch as wb
 from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.messages import log_is_open
-from wavebatch.cli.program.about import roff
-from wavebatch.cli.program.command import EXAMPLES, GROUPS, ProgramCommand, group_options
+from wavebatch.cli.program.command import EXAMPLES, GROUPS, ProgramCommand, group_options, roff
 from wavebatch.cli.program.settings import HARMLESS, NO_VARIABLE, OLD_NAMES
 from wavebatch.core.errors import ConfigError
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions

@@ -65,7 +65,7 @@ class LazyGroup(NearestGroup):
 
 def _print_version(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
     if wanted and not context.resilient_parsing:
-        from wavebatch.cli.program.about import describe_version
+        from wavebatch.cli.program.command import describe_version
 
         click.echo(describe_version())
         context.exit()
@@ -74,7 +74,7 @@ def _print_version(context: click.Context, parameter: click.Parameter, wanted: b
 def _write_man_pages(context: click.Context, parameter: click.Parameter, folder: Path | None) -> None:
     if folder is not None and not context.resilient_parsing:
         from wavebatch.cli.messages import report_errors, talk
-        from wavebatch.cli.program.about import write_man_pages
+        from wavebatch.cli.program.command import write_man_pages
 
         pages = report_errors()(write_man_pages)(main, folder)
         talk(f"{folder}: {len(pages)} manual pages written")

@@ -10,8 +10,7 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 NO_VALUE = "\u2013"
 """Shown on pages where there is no value."""
@@ -20,8 +19,7 @@ WIDE, WIDER = 18, 36
 """Columns before the value of a fact, and of an indented one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Fact:
+class Fact(NamedTuple):
     """A named value: text, or a number in a form."""
 
     name: str
@@ -31,16 +29,14 @@ class Fact:
     """As for `format`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Note:
+class Note(NamedTuple):
     """A sentence; kind `warning` or `problem`: it is printed behind this word, and marked on a page."""
 
     text: str
     kind: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Cell:
+class Cell(NamedTuple):
     """A cell of a table with words of its own."""
 
     text: str
@@ -54,8 +50,7 @@ class Cell:
     """Sentences that a page shows on a click; the cell is marked then."""
 
 
-@dataclass(frozen=True, slots=True)
-class Table:
+class Table(NamedTuple):
     """Rows of text, numbers and cells; nothing is shown of a table without rows."""
 
     heads: Sequence[str]
@@ -72,15 +67,13 @@ class Table:
     """A page has fields that hide rows."""
 
 
-@dataclass(frozen=True, slots=True)
-class Code:
+class Code(NamedTuple):
     """Text of many lines, as it is."""
 
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
+class Picture(NamedTuple):
     """A drawn picture."""
 
     title: str
@@ -93,16 +86,14 @@ class Picture:
     """`sheet`: it keeps its size; others share a line."""
 
 
-@dataclass(frozen=True, slots=True)
-class Later:
+class Later(NamedTuple):
     """Parts that only a page has, made when it is written; what cannot be read for them becomes a note."""
 
     draw: Callable[[], Iterable[Part]]
     what: str = "pictures"
 
 
-@dataclass(frozen=True, slots=True)
-class Sheet:
+class Sheet(NamedTuple):
     """Parts under a title."""
 
     title: str
