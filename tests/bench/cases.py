@@ -1,6 +1,6 @@
 """The stiff cases: the hazards H1 to H16 of docs/algorithms.md 3 that can be simulated, each at fixed values.
 
-`stability` runs every chain on them. tools.simulate.hazards draws at random values instead, for the scene `stiff`.
+`stability` runs every chain on them. tools.simulate.scenes draws at random values instead, for the scene `stiff`.
 """
 
 from __future__ import annotations

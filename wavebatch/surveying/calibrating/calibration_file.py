@@ -13,6 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
@@ -58,7 +59,8 @@ _CONSTANT: dict[str, Key] = {
 }
 """Keys of any constant of a channel."""
 
-_CHANNEL: dict[str, Key | Rows] = _CONSTANT | {
+_CHANNEL: dict[str, Key | Rows] = {
+    **_CONSTANT,
     "spread": Key("spread", 0.0, 1e6, optional=True),
     "echoes": Key("echoes", 0, 10**12, optional=True, kind=int),
     "shot_energy": Key("shot_energy", 0.0, 1e6, optional=True),
@@ -139,7 +141,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     table.check_schema(CALIBRATION_SCHEMA)
     values = read_keys(table, _NUMBERS)
     section = values.pop("section_constant", None)
-    texts = {key: str(table.values.get(key, "")) for key in _TEXTS}
+    texts: dict[str, Any] = {key: str(table.values.get(key, "")) for key in _TEXTS}
     if texts["flight"]:
         with contextlib.suppress(ValueError):
             texts["flight"] = datetime.date.fromisoformat(texts["flight"]).isoformat()
@@ -162,7 +164,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
 
 def _read_swath(table: TomlTable) -> tuple[float, ...]:
     table.check_keys(_SWATH)
-    most, *terms = (table.number(key, *limits) for key, limits in _SWATH.items())
+    most, *terms = (table.number(key, low, high) for key, (low, high) in _SWATH.items())
     return (math.radians(most), *terms)
 
 
