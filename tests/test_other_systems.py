@@ -87,6 +87,7 @@ def test_a_run_without_posix_gives_the_same_cloud(elsewhere, tiny_strip, cloud, 
     assert _wavebatch(elsewhere, *command, "--resume").returncode == 0
 
 
+@pytest.mark.slow
 def test_lists_of_windows_and_a_console_of_an_old_code_page(elsewhere, tiny_strip, tmp_path):
     strip = tmp_path / "Überflug 1.las"
     strip.write_bytes(tiny_strip.read_bytes())
