@@ -1,9 +1,9 @@
-import pytest
 
 """`bench --all-methods`: one row for every detector and decomposer."""
 
 import json
 
+import pytest
 from bench.cases import list_cases
 from bench.stability import FAILURES, measure_stability
 from bench.stability_tables import format_stability

@@ -259,6 +259,7 @@ def test_a_strip_of_five_packets_gives_one_line(tmp_path):
         measure_real(small)
 
 
+@pytest.mark.slow
 def test_command_measures_strips_and_goes_on_after_one_that_fails(strip, tmp_path, capsys):
     small = make_raw(5, n_samples=60).write(tmp_path / "five.las")
     assert main([str(small), str(strip), "-o", str(tmp_path / "out")]) == 1
