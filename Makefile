@@ -73,7 +73,7 @@ test: $(VENV)/.test
 	$(PYTEST) -m 'not slow'
 
 slow: $(VENV)/.test
-	@echo "The slow tests: about 15 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
+	@echo "The slow tests: about 12 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
 	$(PYTEST) -m slow
 
 test-all: test slow
