@@ -127,7 +127,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     Returns
     -------
     Calibration
-        Without `targets` and `fingerprint`, which nothing uses after the measurement.
+        Without `targets`, which nothing uses after the measurement.
 
     Raises
     ------
@@ -156,7 +156,10 @@ def parse_calibration(text: str, name: str) -> Calibration:
         channels[key] = channel
     strips = tuple(map(_read_strip, table.tables("flight_strip")))
     swath = _read_swath(table.table("scan_angle")) if "scan_angle" in table.values else ()
-    found = Calibration(**values, **texts, channels=tuple(channels.values()), strips=strips, swath=swath)
+    fingerprint = dict(table.table("fingerprint").values) if "fingerprint" in table.values else {}
+    found = Calibration(
+        **values, **texts, channels=tuple(channels.values()), strips=strips, swath=swath, fingerprint=fingerprint
+    )
     if section is not None:
         _check_section(section, found, name)
     return found
