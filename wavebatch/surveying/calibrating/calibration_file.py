@@ -86,7 +86,7 @@ _DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
 _TEXTS = ("strip", "date", "conditions", "sensor", "software", "flight", "chain", "decomposer", "energy_source",
           "energy_unit")  # fmt: skip
-_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0), "odd": (-10.0, 10.0, 0.0)}
+_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0), "odd": (-10.0, 10.0)}
 """Keys of [scan_angle] with their limits: the constant grows by exp(square u^2 + fourth u^4 + odd u), u = angle to the
 right of the flight / most_deg."""
 _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
@@ -167,7 +167,9 @@ def parse_calibration(text: str, name: str) -> Calibration:
 
 def _read_swath(table: TomlTable) -> tuple[float, ...]:
     table.check_keys(_SWATH)
-    most, *terms = (table.number(key, low, high) for key, (low, high) in _SWATH.items())
+    even = {key: limits for key, limits in _SWATH.items() if key != "odd"}
+    most, *terms = (table.number(key, low, high) for key, (low, high) in even.items())
+    terms.append(table.number("odd", *_SWATH["odd"], default=0.0))  # older files have none
     return (math.radians(most), *terms)
 
 
