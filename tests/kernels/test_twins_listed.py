@@ -20,6 +20,7 @@ TWINS = {
         "skewed_pulse": "naive.pulse", "render_skewed": "naive.model", "render_pulses": "naive_describe.render",
         "describe_left": "naive_describe.describe", "measure_changes": "naive_describe.measure_change",
         "gather_pulse": "naive_describe.gather", "refine_gaussians": "naive_fit.fit_stack",
+        "describe_whole": "naive_fit.describe_whole", "keep_echoes": "naive_fit.keep",
     },
     "kernels": {"judge_packets": "naive_packets.judge_packet"},
     "geometry": {
@@ -108,6 +109,7 @@ NO_TWIN = {
     "tabulate_pulse": "tests fit tabulated pulses as the pulses that they were made of",
     "misfit_of_angles": "tests at known ridges compare its error with the true angle",
     "is_flat": "one comparison",
+    "grow_tree": "SciPy's tree, imported when it is needed",
     "along_ray": "a projection; find_rays, which has a twin, is made of it",
     "on_ray": "a distance; find_rays, which has a twin, is made of it",
     "measure_angles": "tests of known planes, and of the scatter that its error states",
