@@ -85,7 +85,7 @@ class RowFilter:
         rings = [ring for polygon in self.polygons for ring in polygon.rings]
         corners = hashlib.sha256(b"".join(ring.tobytes() + b"|" for ring in rings)).hexdigest() if rings else None
         crs = next((polygon.file.crs for polygon in self.polygons if polygon.file is not None), None)
-        return {"file": Path(self.polygon).name, "corners_sha256": corners, "crs": crs}
+        return {"file": Path(self.polygon or "").name, "corners_sha256": corners, "crs": crs}
 
     def list_wanted(self) -> tuple[str, ...]:
         """Return the wavebatch columns that --where names exactly, so that the chain gets their stages."""
@@ -132,7 +132,9 @@ class RowSelector:
             "carried": {one.record.name: field for one, field in fields if not layout.dtype[field].shape},
         }
         kinds = [{name: (kind, meant) for name, meant in known.items()} for kind, known in names.items()]
-        sources = {name: resolve(name, *kinds) for name in (() if where is None else where.columns)}
+        if where is None:
+            return cls(selection, layout, {})
+        sources = {name: resolve(name, *kinds) for name in where.columns}
         for name in [name for name, source in sources.items() if source is None]:
             makers = [stage.name for stage in STAGES.values() if name in stage.makes and name in COLUMNS]
             remedy = nearest(name, [one for known in kinds for one in known])
@@ -224,9 +226,10 @@ def build_selection(options: RunOptions) -> RowFilter:
     chosen = () if classes is None else tuple(sorted({int(number) for number in classes}))
     if classes is not None and not (chosen and 0 <= chosen[0] <= chosen[-1] <= 255):
         raise ConfigError(f"--classes: {list(classes)} must be numbers from 0 to 255, e.g. 2,6")
-    box = None if bbox is None else tuple(map(float, bbox))
+    box: Any = None if bbox is None else tuple(map(float, bbox))
     if box is not None and not (len(box) == 4 and box[0] < box[2] < math.inf and box[1] < box[3] < math.inf):
-        raise ConfigError(f"--bbox: {list(bbox)} must be west, south, east, north, with west < east and south < north")
+        given = list(bbox or [])
+        raise ConfigError(f"--bbox: {given} must be west, south, east, north, with west < east and south < north")
     return RowFilter(
         drop_flags=flags,
         classes=chosen,

@@ -23,7 +23,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     find_datum,
     measure_pulse,
 )
-from wavebatch.kernels.fit.whole_pulse import STRETCHED, SUMMED, WholePulse, describe_whole
+from wavebatch.kernels.fit.whole_pulse import NO_ROWS, STRETCHED, SUMMED, WholePulse, describe_whole
 from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, coloured_variance, whitening_filter
 
 
@@ -110,7 +110,8 @@ def fit_misfit(system: SystemPulse, spacing: float) -> float:
     z = np.arange(-np.ceil(6 * ref), np.ceil(6 * ref) + 1) / ref
     bell = exp(-0.5 * z * z)
     both = (8 * z**3 - 12 * z) * bell, (16 * z**4 - 48 * z**2 + 12) * bell
-    gains = [np.sum(np.convolve(one, noise_filter(system)[2]) ** 2) / np.sum(one * one) for one in both]
+    taps = whitening_filter(system.noise.whitening, system.noise.std / system.noise.quiet)[2]
+    gains = [np.sum(np.convolve(one, taps) ** 2) / np.sum(one * one) for one in both]
     return system.misfit * max(float(np.sqrt(max(gains))), 1.0)
 
 
@@ -336,7 +337,7 @@ def _factors_at(
     whole = main.copy()
     whole[1] += _find_delay(shape, limits.ref, np.full(1, width))[1] * main[2]
     if shape.components:
-        peak, by_peak = _change_with_width(pulse_measures(shape, limits), np.float64(width))
+        peak, by_peak = _change_with_width(pulse_measures(shape, limits), np.array(width))
         whole[0] += by_peak / peak * width * main[2]
     given = np.einsum("is,is->i", whole, whole)
     weights = np.einsum("if,sf->is", whole, bare)
@@ -398,8 +399,8 @@ def whole_pulse(shape: PulseShape, limits: ShapeLimits, widths: np.ndarray) -> W
     if not shape.components:
         return WholePulse(STRETCHED, datum=_unit_datum(shape), ref=limits.ref, least=LEAST_WIDTH)
     near = _near_table(shape, limits)
-    wide = (_rows(_wide_table(shape, limits)),) if (widths > near.width[-1]).any() else ()
-    return WholePulse(SUMMED, _rows(near), *wide, datum=matched_gaussian(shape, limits.ref)[0])
+    wide = _rows(_wide_table(shape, limits)) if (widths > near.width[-1]).any() else NO_ROWS
+    return WholePulse(SUMMED, _rows(near), wide, datum=matched_gaussian(shape, limits.ref)[0])
 
 
 def _rows(table: PulseMeasures) -> np.ndarray:

@@ -18,11 +18,12 @@ from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.signal.noise import whitening_filter
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled
-from wavebatch.stages.pulse_tables import model_parameters, noise_filter, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 from wavebatch.stages.score import match_echoes
 
 WAVEFORMS = 2048
@@ -128,7 +129,7 @@ def leave_out_false(predictions: Sequence[Prediction]) -> list[Prediction]:
 
 
 def simulate_again(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rng: np.random.Generator
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rng: np.random.Generator, length: int | None = None
 ) -> tuple[WaveformBlock, SystemPulse]:
     """Simulate waveforms that hold given echoes, with the strip's pulse, new baselines and new noise.
 
@@ -140,6 +141,8 @@ def simulate_again(
     echoes : EchoTable
         Their rows refer to `block`.
     rng : numpy.random.Generator
+    length : int, optional
+        Samples of a waveform; by default as many as in the block.
 
     Returns
     -------
@@ -147,7 +150,7 @@ def simulate_again(
     system : SystemPulse
         Without the defects of the strip's waveforms: simulated ones have none.
     """
-    n, s = block.samples.shape
+    n, s = len(block), length or block.samples.shape[1]
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
     start = [echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing]
     amplitude, time, width = model_parameters(shape, limits, np.stack(start, axis=1).astype(np.float64)).T
@@ -162,14 +165,14 @@ def simulate_again(
     counts = np.clip(np.rint(signal.astype(np.float64)), 0, top).astype(np.min_scalar_type(block.digitizer.max_count))
     trial = WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
     plain = replace(system, defects=Defects())
-    return replace(trial, digitizer=block.digitizer), plain
+    return replace(trial, digitizer=replace(block.digitizer, n_samples=s)), plain
 
 
 def _draw_noise(rng: np.random.Generator, n: int, s: int, system: SystemPulse) -> np.ndarray:
     """Noise that fits of this system see with a standard deviation of 1: coloured where they whiten it, f4 (n, s)."""
     noise = rng.standard_normal((n, s), dtype=np.float32)
     if system.noise.whitening:
-        rows = noise_filter(system).astype(np.float32)
+        rows = whitening_filter(system.noise.whitening, system.noise.std / system.noise.quiet).astype(np.float32)
         for i in range(s):
             before = min(i, 2)
             for j in range(1, before + 1):

@@ -17,7 +17,7 @@ from wavebatch.core.echoes import COLUMNS, Column
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
+from wavebatch.files.point_dtypes import STANDARD_DTYPES, field_names, list_dimensions
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ _SHORT = {
 _STANDARD = frozenset(
     re.sub("[_ ]", "", name.casefold())
     for number in STANDARD_DTYPES
-    for name in (*list_dimensions(number), *STANDARD_DTYPES[number].names)
+    for name in (*list_dimensions(number), *field_names(STANDARD_DTYPES[number]))
 )
 """Normalised names of the standard LAS dimensions."""
 

@@ -20,7 +20,7 @@ from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_names import resolve
 from wavebatch.files.cloud.echo_reader import CloudReader, name_standard, read_field
 from wavebatch.files.las.point_formats import ANGLE_UNIT
-from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
+from wavebatch.files.point_dtypes import STANDARD_DTYPES, field_names, list_dimensions
 
 _PLACE = np.dtype([("x", "<f8"), ("y", "<f8")])
 
@@ -134,7 +134,7 @@ class ColumnReader(CloudReader):
 
     def _describe_standard(self, name: str) -> ColumnFacts:
         fields = STANDARD_DTYPES[self.point_format]
-        step = 0.0 if name in fields.names and fields[name].kind == "f" else 1.0
+        step = 0.0 if name in field_names(fields) and fields[name].kind == "f" else 1.0
         if name in "xyz":
             step = abs(float(self.scales["xyz".index(name)]))
         elif name == "scan_angle":

@@ -24,7 +24,7 @@ from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.point_formats import read_angles, read_classes, split_numbers
 from wavebatch.files.las.read_points import open_points
-from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
+from wavebatch.files.point_dtypes import STANDARD_DTYPES, field_names, list_dimensions
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
 """Columns that are read if the cloud has them."""
@@ -58,8 +58,8 @@ _PIECE_BYTES = 1 << 26
 class Placing(Protocol):
     """A header or a reader: what stored positions mean."""
 
-    scales: tuple[float, float, float]
-    offsets: tuple[float, float, float]
+    scales: tuple[float, ...]
+    offsets: tuple[float, ...]
 
 class CloudReader(Closing):
     """Reads a LAS or LAZ file in pieces. A context manager.
@@ -76,14 +76,15 @@ class CloudReader(Closing):
         self.dtype = dtype
         checked = read_checked_header(self.path, waveforms=False)
         self.point_count: int = checked.header.point_count
-        self.scales, self.offsets = checked.header.scales, checked.header.offsets
+        self.scales: tuple[float, ...] = checked.header.scales
+        self.offsets: tuple[float, ...] = checked.header.offsets
         units = read_crs(self.path, checked.header)[1]
         self.metres = metres_per_unit(units)
         """Metres of a step of 1 in x, y and z; NaN in degrees."""
         self.unit = name_units(units)
         self.bounds = checked.header.mins, checked.header.maxs
         self.point_format: int = checked.header.point_format
-        fields = STANDARD_DTYPES[self.point_format].names
+        fields = field_names(STANDARD_DTYPES[self.point_format])
         self.has_gps_time = "gps_time" in fields
         self.has_packets = "wavepacket_index" in fields
         self.extra = {field: record for field, record in checked.extra.items() if not record.dtype.shape}
@@ -93,8 +94,8 @@ class CloudReader(Closing):
         self.written = {column: name for column, name in written.items() if _may_hold(self.extra[name], column)}
         """The file's name of each wavebatch column, by its provenance; empty without one. Columns that another
         program has stored as several numbers, or flags as signed ones, are none."""
-        self._sources = self._find_ours((*dtype.names, "echo_flags"))
-        self.columns = tuple(name for name in dtype.names if name in self._sources)
+        self._sources = self._find_ours((*field_names(dtype), "echo_flags"))
+        self.columns = tuple(name for name in field_names(dtype) if name in self._sources)
         """The wavebatch columns among the fields that the cloud has."""
         self.has_flags = "echo_flags" in self._sources
         self.records = np.empty(0)
@@ -116,9 +117,9 @@ class CloudReader(Closing):
         """Close the file."""
         self._points.close()
 
-    def read_pieces(self, size: int = _PIECE) -> Iterator[np.ndarray]:
-        """Yield the points of the file in order, at most `size` at a time."""
-        size = max(min(size, _PIECE_BYTES // self._point_length), 1)
+    def read_pieces(self, size: int = _PIECE, most: int = _PIECE_BYTES) -> Iterator[np.ndarray]:
+        """Yield the points of the file in order, at most `size`, and `most` bytes of records, at a time."""
+        size = max(min(size, most // self._point_length), 1)
         for start in range(0, self.point_count, size):
             raw = self._points.read(start, min(start + size, self.point_count))
             if self.keep is not None:
@@ -146,10 +147,10 @@ class CloudReader(Closing):
         return self.extra[field].read(raw[field])
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
-        if "ray" in self.dtype.names and self.has_packets:
+        if "ray" in field_names(self.dtype) and self.has_packets:
             raw = raw[raw["wavepacket_index"] != 0]
         rows = np.zeros(len(raw), self.dtype)
-        for name in self.dtype.names:
+        for name in field_names(self.dtype):
             values = self._read_named(raw, name)
             if values is not None:
                 rows[name] = values
@@ -210,7 +211,7 @@ def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> di
     counts only if it is stored as that style stores it: RIEGL's Amplitude, for example, is in dB.
     """
     wanted = set(columns)
-    names = [(column, column, None) for column in COLUMNS if column in wanted]
+    names: list[tuple[str, str, float | None]] = [(column, column, None) for column in COLUMNS if column in wanted]
     for style in STYLES.values():
         names += [(key, naming.name, naming.scale) for key, naming in style.items() if not naming.decibel]
     found: dict[str, str] = {}

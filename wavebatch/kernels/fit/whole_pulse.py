@@ -18,16 +18,16 @@ from wavebatch.kernels.library import call, place
 AS_FITTED, STRETCHED, SUMMED = range(3)
 """The parameters are those of the echo; the pulse is stretched; it is a sum, described by tables."""
 
-_NO_ROWS = np.empty((0, 5))
+NO_ROWS = np.empty((0, 5))
 
 
 class WholePulse(NamedTuple):
     """A pulse by its fitted width [samples]."""
 
     kind: int = AS_FITTED
-    near: np.ndarray = _NO_ROWS
+    near: np.ndarray = NO_ROWS
     """SUMMED, for usual widths, float64 (k, 5): width, ascending; peak and its slope; sigma and its slope."""
-    wide: np.ndarray = _NO_ROWS
+    wide: np.ndarray = NO_ROWS
     """The same for wider ones; without rows where there is none."""
     datum: float = 0.0
     """SUMMED: after the fitted time [samples]. STRETCHED: of width 1."""
@@ -113,7 +113,9 @@ def keep_echoes(
     m, n = len(solution.parameters), len(solution.number)
     factors, std = np.ascontiguousarray(factors, np.float64), np.ascontiguousarray(std, np.float32)
     waveform = np.ascontiguousarray(clusters.waveform, np.int64)
-    fits = [np.ascontiguousarray(column, kind) for column, kind in zip(solution, _SOLUTION, strict=True)]
+    fits: list[np.ndarray] = [
+        np.ascontiguousarray(column, kind) for column, kind in zip(solution, _SOLUTION, strict=True)
+    ]
     shapes = [(n,)] * 4 + [(m, 4), (m, 4), (m, 2), (m,), (m, 4), (n,)]
     if [column.shape for column in (*fits, factors, waveform)] != shapes or fits[0].sum() != m or (fits[0] < 0).any():
         raise ValueError("columns of fits, clusters or factors differ in length")

@@ -13,6 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
@@ -58,7 +59,8 @@ _CONSTANT: dict[str, Key] = {
 }
 """Keys of any constant of a channel."""
 
-_CHANNEL: dict[str, Key | Rows] = _CONSTANT | {
+_CHANNEL: dict[str, Key | Rows] = {
+    **_CONSTANT,
     "spread": Key("spread", 0.0, 1e6, optional=True),
     "echoes": Key("echoes", 0, 10**12, optional=True, kind=int),
     "shot_energy": Key("shot_energy", 0.0, 1e6, optional=True),
@@ -84,7 +86,7 @@ _DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
 _TEXTS = ("strip", "date", "conditions", "sensor", "software", "flight", "chain", "decomposer", "energy_source",
           "energy_unit")  # fmt: skip
-_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0), "odd": (-10.0, 10.0, 0.0)}
+_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0), "odd": (-10.0, 10.0)}
 """Keys of [scan_angle] with their limits: the constant grows by exp(square u^2 + fourth u^4 + odd u), u = angle to the
 right of the flight / most_deg."""
 _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
@@ -125,7 +127,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     Returns
     -------
     Calibration
-        Without `targets` and `fingerprint`, which nothing uses after the measurement.
+        Without `targets`, which nothing uses after the measurement.
 
     Raises
     ------
@@ -139,7 +141,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     table.check_schema(CALIBRATION_SCHEMA)
     values = read_keys(table, _NUMBERS)
     section = values.pop("section_constant", None)
-    texts = {key: str(table.values.get(key, "")) for key in _TEXTS}
+    texts: dict[str, Any] = {key: str(table.values.get(key, "")) for key in _TEXTS}
     if texts["flight"]:
         with contextlib.suppress(ValueError):
             texts["flight"] = datetime.date.fromisoformat(texts["flight"]).isoformat()
@@ -154,7 +156,10 @@ def parse_calibration(text: str, name: str) -> Calibration:
         channels[key] = channel
     strips = tuple(map(_read_strip, table.tables("flight_strip")))
     swath = _read_swath(table.table("scan_angle")) if "scan_angle" in table.values else ()
-    found = Calibration(**values, **texts, channels=tuple(channels.values()), strips=strips, swath=swath)
+    fingerprint = dict(table.table("fingerprint").values) if "fingerprint" in table.values else {}
+    found = Calibration(
+        **values, **texts, channels=tuple(channels.values()), strips=strips, swath=swath, fingerprint=fingerprint
+    )
     if section is not None:
         _check_section(section, found, name)
     return found
@@ -162,7 +167,9 @@ def parse_calibration(text: str, name: str) -> Calibration:
 
 def _read_swath(table: TomlTable) -> tuple[float, ...]:
     table.check_keys(_SWATH)
-    most, *terms = (table.number(key, *limits) for key, limits in _SWATH.items())
+    even = {key: limits for key, limits in _SWATH.items() if key != "odd"}
+    most, *terms = (table.number(key, low, high) for key, (low, high) in even.items())
+    terms.append(table.number("odd", *_SWATH["odd"], default=0.0))  # older files have none
     return (math.radians(most), *terms)
 
 

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.files.toml_file import TomlTable, check_number
@@ -176,8 +176,8 @@ def read_figures(table: TomlTable) -> Figures:
 
 def _read_look(numbers: Mapping[str, float]) -> Look | None:
     """What strips record; None where a part of it is missing."""
-    level = {name: numbers.get(f"flight_level_{name}") for name in Level._fields}
-    rest = [numbers.get(f"flight_{name}") for name in _LOOK]
+    level: dict[str, Any] = {name: numbers.get(f"flight_level_{name}") for name in Level._fields}
+    rest: list[Any] = [numbers.get(f"flight_{name}") for name in _LOOK]
     clip = level.pop("clip")
     if None in rest or None in level.values():
         return None

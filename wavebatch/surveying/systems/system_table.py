@@ -128,7 +128,7 @@ def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
     needed = (*(key for key, entry in NUMBERS.items() if not entry.optional), "components", _NOISE)
     table.check_keys((*NUMBERS, *ROWS, _NOISE, extra), needed, REMEDY)
     parts: dict[str, dict[str, Any]] = defaultdict(dict)
-    for field, value in read_keys(table, NUMBERS | ROWS).items():
+    for field, value in read_keys(table, {**NUMBERS, **ROWS}).items():
         part, _, name = field.rpartition(".")
         parts[part][name] = value
     own = parts[""]
