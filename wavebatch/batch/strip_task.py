@@ -14,7 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -22,11 +22,9 @@ from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.job import StripJob
-from wavebatch.batch.neighbour_pass import SecondPass, begin_unit
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.packing import Packing, pack_chunk
 from wavebatch.batch.unit import Prepared, UnitResult, prepare_strip, process_unit, scan_units
-from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError, StageError
 from wavebatch.core.process import Seconds
@@ -38,6 +36,10 @@ from wavebatch.files.las.laz_encode import Chunk
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.files.text_file import draft_text
+
+if TYPE_CHECKING:
+    from wavebatch.batch.neighbour_pass import SecondPass
+    from wavebatch.batch.workers.dask_cluster import Cluster
 
 T = TypeVar("T")
 
@@ -161,6 +163,8 @@ class StripTask:
             if self._second is None:
                 self._call(workers, self._take_unit, process_unit, *arguments)
             else:
+                from wavebatch.batch.neighbour_pass import begin_unit
+
                 self._call(workers, self._take_begun, begin_unit, *arguments)
             self._submitted += 1
         else:
@@ -236,6 +240,8 @@ class StripTask:
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
         if prepared.second_step is not None:
+            from wavebatch.batch.neighbour_pass import SecondPass  # 20 ms that other runs do not need
+
             self._second = SecondPass(prepared.second_step, prepared.layout.source.header.scales, cloud)
 
     def finish(self) -> RunReport:

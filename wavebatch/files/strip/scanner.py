@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.order import distinct
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import take_whole_records
 from wavebatch.files.disk.spool import Spool
@@ -173,7 +174,7 @@ class _Scanner:
                 packets, reach = packets + more, max(reach, far_reach)
                 full.append(far_overfull)
             found.seal()
-            overfull = np.unique(np.concatenate(full))
+            overfull = distinct(np.concatenate(full))
             if suspects.any():
                 self._vote_far()
             if len(overfull):
