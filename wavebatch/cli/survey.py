@@ -298,6 +298,8 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
     yield _line("system pulse", f"{_name_model(system)}; {width}")
     for weight, delay, sigma in system.components:
         yield f"  {weight:8.4f} at {delay:8.3f} ns, sigma {sigma:7.3f} ns"
+    if figures.sent_fwhm_ns is not None:
+        yield _line("outgoing pulses", f"full width at half maximum {figures.sent_fwhm_ns:.3f} ns, as import found it")
     like = _find_likeness(saved)
     if like is not None:
         taken = f"{like['sensor']}: its shipped pulse is used"
