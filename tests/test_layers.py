@@ -16,7 +16,7 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 
 INSIDE = {
     "batch": [
-        {"counts", "options", "output_rows", "workers"}, {"selection"}, {"job"}, {"unit"},
+        {"counts", "options", "output_rows", "workers"}, {"job"}, {"unit"},
         {"explain", "neighbour_pass"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
     ],
     "surveying/measuring": [

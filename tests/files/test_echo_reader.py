@@ -10,8 +10,7 @@ import pytest
 from strips import make_raw
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnReader
-from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader
+from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader, ColumnReader
 from wavebatch.files.las.header import STANDARD_DTYPES
 from wavebatch.tools.api.cloud import read_cloud
 
@@ -63,7 +62,7 @@ def test_clouds_of_every_format_without_waveforms_are_read(tmp_path, point_forma
 
 
 def test_the_piece_is_small_where_records_are_long(tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.files.cloud.echo_reader._PIECE_BYTES", 1000)
+    monkeypatch.setattr("wavebatch.files.cloud.cloud_reader._PIECE_BYTES", 1000)
     path = tmp_path / "a.las"
     write_cloud(path, 1)
     with CloudReader(path) as reader:

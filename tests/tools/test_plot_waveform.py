@@ -18,6 +18,7 @@ from wavebatch.core.condition import parse_condition
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.strip import reader as io_strip
 from wavebatch.files.strip.reader import StripReader
@@ -181,7 +182,7 @@ def test_pulses_are_found_by_time_and_flag(tiny_strip):
             for block, table in tables
             for row in np.unique(table.waveform[(table.flags & bits) != 0])
         )
-        wanted = Wanted(flags=int(bits), most=4)
+        wanted = Wanted(chosen=PointFilter(flags=int(bits)), most=4)
         places = find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE))
         assert [view.point for view in read_views(reader, scan, places, chain, PULSE)] == flagged[:4]
         with pytest.raises(InputError, match="no echo"):

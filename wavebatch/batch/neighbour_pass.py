@@ -191,7 +191,7 @@ def begin_unit(blob: bytes, number: int, block_size: int | None) -> tuple[tuple[
     prepared: Prepared = unpack(blob)
     timing: dict[str, Seconds] = {}
     solved, echoes, made = solve_unit(prepared, number, block_size, timing)
-    needed = {name: made.columns[name] for name in ("echo_flags", *prepared.selector.needed)}
+    needed = {name: made.columns[name] for name in ("echo_flags", *prepared.needed)}
     chain = prepared.job.chain
     kept = [(index, chain.keep_needed(block)) for index, block in solved] if chain.after_second else []
     kept = _mark_edges(prepared, kept)
@@ -260,7 +260,7 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndar
     values |= _solve_again(prepared.job.chain, solved, values, timing)
     columns = {name: spread(name, column, made.echo) for name, column in values.items() if name in COLUMNS}
     prepared.layout.fill(made.rows, columns)
-    rows, left = prepared.selector.select(made.rows, {**made.columns, **columns})
+    rows, left = prepared.choose_rows(made.rows, {**made.columns, **columns})
     reasons = count_reasons({name: codes[made.counted] for name, codes in values.items()})
     report = replace(made.report, no_data={**made.report.no_data, **reasons}, timing=timing)
     return rows, report + left

@@ -8,20 +8,21 @@ from __future__ import annotations
 
 import functools
 import pickle
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from wavebatch.batch.counts import RunReport
-from wavebatch.batch.job import StripJob, plan_layout
+from wavebatch.batch.counts import LEFT_OUT, RunReport, count_flags
+from wavebatch.batch.job import StripJob, UnitRows, plan_filter, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
-from wavebatch.batch.selection import RowSelector
 from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.process import Seconds
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
+from wavebatch.files.las.point_formats import split_numbers
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.stages.chain import Chain, Solved, Step
@@ -59,6 +60,8 @@ class Prepared:
     units: int
     choice: ChainChoice
     layout: OutputLayout
+    chosen: PlannedFilter
+    """Chooses the rows that are written, from UnitRows."""
     report: RunReport
     """Timing of the preparation, and how many points have lost their packets."""
     sensor: SensorSource = UNKNOWN
@@ -80,12 +83,41 @@ class Prepared:
         """The step whose columns need a second pass over the strip's points; None where nothing wanted needs them."""
         chain, step = self.job.chain, self.job.chain.second_step
         made = {name for one in (step, *chain.after_second) if one is not None for name in one.stage.makes}
-        return None if made.isdisjoint([*self.job.columns, *self.selector.needed]) else step
+        return None if made.isdisjoint([*self.job.columns, *self.needed]) else step
 
     @property
-    def selector(self) -> RowSelector:
-        """Chooses the rows that are written."""
-        return RowSelector.plan(self.job.selection, self.job.chain, self.layout)
+    def needed(self) -> tuple[str, ...]:
+        """The computed columns that decide which rows are written."""
+        return tuple(one.name for one in self.chosen.columns.values() if one.kind == "computed")
+
+    def choose_rows(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, RunReport]:
+        """Choose the rows that are written.
+
+        Parameters
+        ----------
+        rows : structured array (m,)
+            In the cloud's layout.
+        columns : mapping of str to array (m,)
+            Those `needed` and echo_flags as they were computed, whatever the cloud's names and units.
+
+        Returns
+        -------
+        rows : structured array (k,)
+            Those that are written.
+        report : RunReport
+            Points and flags that are written, and points left out by reason.
+        """
+        left = self.chosen.test(UnitRows(rows, columns), len(rows))
+        kept = left == 0
+        numbers = dict(zip(("", *REASONS), np.bincount(left, minlength=len(REASONS) + 1).tolist(), strict=True))
+        number, total = split_numbers(rows[left == len(REASONS)])
+        report = RunReport(
+            counts={"points_out": numbers[""]},
+            last_left_out=int(np.count_nonzero(number == total)),
+            left_out={name: numbers[name] for name in LEFT_OUT if numbers[name]},
+            flags=count_flags(columns["echo_flags"][kept]),
+        )
+        return rows if kept.all() else rows[kept], report
 
 
 def prepare_strip(job: StripJob) -> Prepared:
@@ -110,8 +142,7 @@ def prepare_strip(job: StripJob) -> Prepared:
     start = Seconds.now()
     with job.open() as reader:
         facts = reader.facts
-        job = replace(job, selection=job.selection.place(facts))
-        RowSelector.plan(job.selection, job.chain, plan_layout(job, facts))
+        plan_filter(job, plan_layout(job, facts))
         scan = reader.scan(force=job.request.force)
         try:
             scanned = Seconds.now()
@@ -136,14 +167,14 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.calibration is not None:
                 doubts += StripWarning.of("energy", setup.sent.notes)
             layout = plan_layout(job, facts)
-            RowSelector.plan(job.selection, job.chain, layout)
+            chosen = plan_filter(job, layout)
             units = reader.unit_count()
         except BaseException:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": Seconds.now() - surveyed}
     report = RunReport(counts={"points_cut": scan.cut}, timing=timing)
-    found = choice, layout, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
+    found = choice, layout, chosen, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
     return Prepared(job, facts, scan, units, *found)
 
 
@@ -222,7 +253,7 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
     timing: dict[str, Seconds] = {}
     _, _, made = solve_unit(prepared, number, block_size, timing)
     start = Seconds.now()
-    rows, left = prepared.selector.select(made.rows, made.columns)
+    rows, left = prepared.choose_rows(made.rows, made.columns)
     timing["assemble"] += Seconds.now() - start
     return rows, replace(made.report + left, timing=timing)
 
@@ -246,7 +277,7 @@ def solve_unit(
     echoes : UnitEchoes
         The same echoes, by packet.
     made : Assembled
-        With the columns that the selection needs.
+        With the columns that decide which rows are written.
     """
     start = Seconds.now()
     echoes_mode = prepared.job.options.points == "echoes"
@@ -257,9 +288,9 @@ def solve_unit(
         solved = list(_run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
     start = Seconds.now()
     echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
-    layout, needed = prepared.layout, prepared.selector.needed
+    layout, needed = prepared.layout, prepared.needed
     if echoes_mode:
-        made = assemble_echoes(unit, echoes, layout, needed, prepared.job.selection.drop_flags)
+        made = assemble_echoes(unit, echoes, layout, needed, prepared.job.chosen.drop_flags)
     else:
         made = assemble_returns(unit, echoes, layout, needed)
     timing["assemble"] = Seconds.now() - start

@@ -19,6 +19,7 @@ from wavebatch.cli.messages import count, print_json, print_text, printable, row
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
@@ -72,7 +73,7 @@ def stats(
         failed.append(error)
         talk(f"error: {error}")
 
-    each, total = count_returns(files, skip, divisions=divisions, where=where)
+    each, total = count_returns(files, skip, divisions=divisions, chosen=PointFilter(where=where))
     if output is not None and failed:
         talk(f"error: {output}: not written, because {count(len(failed), 'cloud')} of {len(files)} cannot be read")
     elif output is not None:

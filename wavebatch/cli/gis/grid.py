@@ -13,7 +13,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, count, talk, tell
-from wavebatch.cli.plot.clouds import find_clouds, select
+from wavebatch.cli.plot.clouds import choose_points, find_clouds
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.tools.rasters.grid import GridOptions, GridResult, write_grid
 
@@ -45,8 +45,7 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
 
     paths = find_clouds(clouds, options)
     check_raster(output, overwrite=options["overwrite"])
-    selection = select(next(iter(columns), None), options, *columns[1:])
-    how = shared.from_options(GridOptions, options, selection=selection)
+    how = shared.from_options(GridOptions, options, columns=columns, chosen=choose_points(options))
     found = write_grid(paths, output, how, overwrite=options["overwrite"])
     layout = found.layout
     if layout.crs is None:

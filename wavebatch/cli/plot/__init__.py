@@ -74,6 +74,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     Exit code: 0 done, 1 the strip cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.core.condition import read_flags
+    from wavebatch.files.cloud.point_filter import PointFilter
     from wavebatch.tools.plots.packets import Wanted
 
     named = any(options[name] for name in ("packets", "point_numbers", "times"))
@@ -91,8 +92,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         if options[name]:
             raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
     (check_target if tabular else check_picture)(output, overwrite=options["overwrite"])
-    flags = read_flags(options["flags"])
-    wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
+    chosen = PointFilter(flags=read_flags(options["flags"]), where=options["where"])
+    wanted = shared.from_options(Wanted, options, points=options["point_numbers"], chosen=chosen)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
     if tabular:
         from wavebatch.tools.plots.echo_table import format_echoes

@@ -51,13 +51,13 @@ def draws_clouds(
     return decorate
 
 
-def select(column: str | None, options: dict[str, Any], *others: str) -> Any:
-    """The selection of columns and of the flags in the options."""
+def choose_points(options: dict[str, Any]) -> Any:
+    """The points that --flags, --drop-flags and --where choose."""
     from wavebatch.core.condition import read_flags
-    from wavebatch.tools.plots.values import Selection
+    from wavebatch.files.cloud.point_filter import PointFilter
 
-    flags = read_flags(options["flags"]), read_flags(options["drop_flags"])
-    return Selection(column, *flags, others, options["where"])
+    flags, dropped = read_flags(options["flags"]), read_flags(options["drop_flags"])
+    return PointFilter(flags=flags, drop_flags=dropped, where=options["where"])
 
 
 def list_tally(tally: Any) -> dict[str, int]:
@@ -107,20 +107,21 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
     from wavebatch.tools.plots.histogram import count_points_by_flag, count_values
     from wavebatch.tools.plots.values import Clouds
 
-    selection = select(options["column"], options)
-    if Clouds(clouds, selection).facts.is_flags:
+    column, chosen = options["column"], choose_points(options)
+    if Clouds(clouds, (column,), chosen).facts.is_flags:
         for name in ("bins", "limits", "each", "by", "counts"):
             if options[name]:
                 option = "--range" if name == "limits" else f"--{name}"
                 raise ConfigError(f"{option} is of no use for flags, which are counted by name")
-        flags = count_points_by_flag(clouds, selection)
+        flags = count_points_by_flag(clouds, column, chosen)
         from wavebatch.tools.plots.draw_cloud import draw_flags
 
         draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
         total, text = flags.total, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
         text += f", {total.left_out} left out" * bool(total.left_out)
     else:
-        found = count_values(clouds, selection, **{name: options[name] for name in ("bins", "limits", "each", "by")})
+        how = {name: options[name] for name in ("bins", "limits", "each", "by")}
+        found = count_values(clouds, column, chosen, **how)
         from wavebatch.tools.plots.draw_cloud import draw_cloud_histogram
 
         draw_cloud_histogram(found, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
@@ -149,8 +150,7 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
     from wavebatch.tools.plots.raster import grid_values
 
     column, statistic = options["column"], options["statistic"]
-    selection = select(column, options)
-    found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bbox"])
+    found = grid_values(clouds, column, statistic, choose_points(options), size=options["size"], bounds=options["bbox"])
     from wavebatch.tools.plots.draw_cloud import draw_cloud_map
 
     draw_cloud_map(found, output, overwrite=options["overwrite"])

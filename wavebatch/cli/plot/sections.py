@@ -14,7 +14,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, tell
-from wavebatch.cli.plot.clouds import describe_tally, draws_clouds, list_tally, output_option, select
+from wavebatch.cli.plot.clouds import choose_points, describe_tally, draws_clouds, list_tally, output_option
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.figure_file import check_picture
@@ -62,7 +62,7 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     from wavebatch.tools.plots.sections import cut_section
 
     column = options["column"] or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
-    found = cut_section(paths, select(column, options), line=options["line"], width=options["width"])
+    found = cut_section(paths, column, choose_points(options), line=options["line"], width=options["width"])
     from wavebatch.tools.plots.sections import draw_section
 
     draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
@@ -101,7 +101,7 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     if segments := is_segments(paths[0]):
         found = profile_segments(paths, column, statistic, **how)
     else:
-        found = measure_profile(paths, select(column, options), statistic, **how)
+        found = measure_profile(paths, column, statistic, choose_points(options), **how)
     from wavebatch.tools.plots.sections import draw_profile
 
     draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader
+from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.html.charts import draw_histogram, draw_map

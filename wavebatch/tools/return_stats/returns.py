@@ -13,12 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
-from wavebatch.files.cloud.column_reader import select_points
-from wavebatch.files.cloud.echo_reader import RETURN_DTYPE, CloudReader
+from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.disk.buckets import count_buckets, spread_keys, tell_pulses_apart, time_keys
 from wavebatch.files.disk.spool import Spool
 from wavebatch.tools.return_stats.areas import (
@@ -92,12 +91,12 @@ def count_returns(
     skip: Callable[[InputError], None] | None = None,
     *,
     divisions: Sequence[Division] = (),
-    where: Condition | None = None,
+    chosen: PointFilter = EVERY,
 ) -> tuple[list[ReturnStats], ReturnStats]:
     """Statistics of each cloud and of all together, for points in any order.
 
     A pulse is the points of equal GPS time in a cloud; if times do not separate pulses, a run of rising return numbers.
-    where: count only points that meet it. divisions: count also by areas; a pulse belongs, with all its returns, to the
+    chosen: count only these points. divisions: count also by areas; a pulse belongs, with all its returns, to the
     area of its first return. skip: called with the InputError of a cloud that cannot be read, which is then left out;
     without it, the error is raised.
     Memory does not grow with the clouds; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
@@ -105,7 +104,7 @@ def count_returns(
     each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0
     for path in clouds:
         try:
-            tally = _tally_cloud(Path(path), divisions, where)
+            tally = _tally_cloud(Path(path), divisions, chosen)
         except InputError as error:
             if skip is None:
                 raise
@@ -127,10 +126,10 @@ def pulses_told_apart(reader: CloudReader) -> bool:
     return rows is None or tell_pulses_apart(rows["gps_time"])
 
 
-def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | None) -> _Tally:
+def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter) -> _Tally:
     with CloudReader(path, RETURN_DTYPE) as reader:
         by_time = pulses_told_apart(reader)  # by all points
-        select_points(reader, where)
+        reader.select(chosen)
         placed = [division.place(path) for division in divisions]
         tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=list(map(AreaTally, placed)))
         tally.notes = [line for division in placed for line in [division.miss(path)] if line]

@@ -17,7 +17,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.cloud.echo_reader import RETURN_DTYPE, CloudReader
+from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.las.header import is_projection, read_header
 from wavebatch.files.strip.writer import FullwaveWriter

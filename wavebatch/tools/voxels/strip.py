@@ -16,13 +16,13 @@ from typing import Annotated, Any
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.order import even_places
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.cloud.column_reader import find_keep
+from wavebatch.files.cloud.cloud_reader import CloudReader
+from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter
 from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.pulse_energy import PulseEnergy
@@ -79,8 +79,8 @@ class VoxelOptions:
     reflectance_ratio: Annotated[float | None, Range(LOWEST, HIGHEST)] = option(
         None, "Reflectance of the canopy over that of the ground.", form="RATIO", unset="estimated from the strip"
     )
-    where: Condition | None = None
-    """Use only pulses of which a return meets this, with all of their signal."""
+    chosen: PointFilter = PointFilter()
+    """Use only pulses of which a return is chosen, with all of their signal."""
     energy: str | None = None
     """Energy of each emitted pulse, by which the signal is divided; see `find_pulse_energy`."""
 
@@ -171,7 +171,7 @@ def voxelize_strip(
     """
     strip, target = Path(strip), Path(target)
     check_target(target, strip)
-    keep = None if options.where is None else find_keep(strip, options.where)
+    keep = _plan(strip, options.chosen)
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: the voxels are written to this file; choose another name")
@@ -249,6 +249,14 @@ def voxelize_strip(
                 reflectance_ratio_source=rule.source,
                 hidden_light=rule.hidden_light,
             )
+
+
+def _plan(strip: Path, chosen: PointFilter) -> PlannedFilter | None:
+    """The filter for the points of the strip; None where it leaves none out."""
+    if not chosen:
+        return None
+    with CloudReader(strip) as reader:
+        return reader.plan(chosen)
 
 
 def _write_both(
@@ -362,7 +370,7 @@ def _describe(
         "headroom_m": options.headroom,
         "all_crossed": options.all_crossed,
         "ground_height_m": options.ground_height,
-        "where": None if options.where is None else options.where.text,
+        "where": None if options.chosen.where is None else options.chosen.where.text,
         "deconvolution": asdict(deconvolution) | {"iterations": deconvolution.steps},
         "system": describe_system(pulse),
         "calibration": None if calibration is None else calibration.describe(),

@@ -1,13 +1,16 @@
-"""Point clouds read in pieces: positions, GPS times and wavebatch's columns under the names of any style.
+"""Point clouds of any program, read in pieces: fields that are asked for, or columns by any of their names.
 
-All commands that read clouds use `CloudReader` with the fields that they need, or a ColumnReader, which is built on it.
-Files may come from any program: all bytes are read and checked by wavebatch.
+All commands that read clouds use `CloudReader` with the fields that they need, or a ColumnReader for columns that a
+user names. Units and meanings come from the file; wavebatch's declarations are used only for its columns. All bytes are
+read and checked by wavebatch.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -15,14 +18,16 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.column_names import STYLES
+from wavebatch.core.suggest import nearest
+from wavebatch.files.cloud.column_names import STYLES, resolve
+from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.point_formats import read_angles, read_classes, split_numbers
+from wavebatch.files.las.point_formats import ANGLE_UNIT, read_angles, read_classes, split_numbers
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
 
@@ -55,6 +60,41 @@ RETURN_DTYPE = np.dtype(
 _PIECE = 250_000
 _PIECE_BYTES = 1 << 26
 
+_PLACE = np.dtype([("x", "<f8"), ("y", "<f8")])
+
+_UNITS = {
+    "x": "m", "y": "m", "z": "m", "gps_time": "s", "scan_angle": "deg", "scan_angle_rank": "deg",
+    "return_point_wave_location": "ps", "wavepacket_offset": "bytes", "wavepacket_size": "bytes",
+    "x_t": "m/ps", "y_t": "m/ps", "z_t": "m/ps",
+}  # fmt: skip
+"""Units of the standard fields that have one."""
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnFacts:
+    """Name, unit and meaning of a column, as the file or the LAS standard declares them."""
+
+    name: str
+    """Name in the file."""
+    unit: str
+    """`-` if it has none or the file does not give it."""
+    meaning: str
+    """Short description; empty if the file does not give one."""
+    step: float
+    """Difference between two neighbouring values that can be stored; 0 for floating-point numbers."""
+    is_flags: bool = False
+    """Whether values are EchoFlag bits, which have no mean."""
+    is_standard: bool = False
+    """Whether it is a field of the point format, not an extra dimension."""
+
+    @property
+    def label(self) -> str:
+        """Name, meaning and unit for an axis."""
+        title = f"{self.name}: {self.meaning}" if self.meaning else self.name
+        return f"{title} [{self.unit}]"
+
+
+
 class Placing(Protocol):
     """A header or a reader: what stored positions mean."""
 
@@ -77,6 +117,7 @@ class CloudReader(Closing):
         checked = read_checked_header(self.path, waveforms=False)
         self.point_count: int = checked.header.point_count
         self.scales, self.offsets = checked.header.scales, checked.header.offsets
+        self._header = checked.header
         units = read_crs(self.path, checked.header)[1]
         self.metres = metres_per_unit(units)
         """Metres of a step of 1 in x, y and z; NaN in degrees."""
@@ -99,10 +140,9 @@ class CloudReader(Closing):
         self.has_flags = "echo_flags" in self._sources
         self.records = np.empty(0)
         """The raw records of the last piece."""
-        self.keep: Callable[[np.ndarray], np.ndarray] | None = None
-        """Which raw records (n,) are read, bool (n,); None: all. `column_reader.select_points` sets it."""
         self.left_out = 0
-        """Points that `keep` has left out so far."""
+        """Points that the filter of `select` has left out so far."""
+        self._filter: PlannedFilter | None = None
         self._points = open_points(checked)
 
     def measure_in_metres(self) -> None:
@@ -121,12 +161,29 @@ class CloudReader(Closing):
         size = max(min(size, _PIECE_BYTES // self._point_length), 1)
         for start in range(0, self.point_count, size):
             raw = self._points.read(start, min(start + size, self.point_count))
-            if self.keep is not None:
-                chosen = np.asarray(raw)[self.keep(raw)]
-                self.left_out += len(raw) - len(chosen)
-                raw = chosen
+            if self._filter is not None:
+                kept = self._filter.test(raw, len(raw)) == 0
+                self.left_out += len(raw) - int(np.count_nonzero(kept))
+                raw = np.asarray(raw)[kept]
             self.records = raw
             yield self._convert(raw)
+
+    def plan(self, chosen: PointFilter) -> PlannedFilter:
+        """Return the filter for raw records of this file, which also works after the file is closed.
+
+        Raises ConfigError for a column that there is not, and for polygons that cannot be placed.
+        """
+        standard = {
+            "x": lambda raw: read_field(raw, self.point_format, "x", self._header),
+            "y": lambda raw: read_field(raw, self.point_format, "y", self._header),
+            "classification": read_classes,
+            **({"echo_flags": self.read_flags} if self.has_flags else {}),
+        }
+        return chosen.plan(standard, self.find_value, str(self.path))
+
+    def select(self, chosen: PointFilter) -> None:
+        """Let the reader give only the points that a filter chooses; raises as `plan`."""
+        self._filter = self.plan(chosen) if chosen else None
 
     def read_flags(self, raw: np.ndarray) -> np.ndarray:
         """Return the EchoFlag bits of raw records, u2 (n,); 0 where the cloud has no flags."""
@@ -144,6 +201,64 @@ class CloudReader(Closing):
     def read_extra(self, raw: np.ndarray, field: str) -> np.ndarray:
         """Return the physical values (n,) of an extra dimension of raw records, with NaN for no data."""
         return self.extra[field].read(raw[field])
+
+    def list_columns(self) -> list[str]:
+        """Return the names of all columns of the file."""
+        standard = [name for name in list_dimensions(self.point_format) if name not in ("X", "Y", "Z")]
+        return [*self.extra, "x", "y", "z", *standard]
+
+    def find_value(self, column: str) -> ReadColumn:
+        """Return the function from raw records (n,) to the values of a column (n,), NaN for no data.
+
+        Positions are in the unit of the file, also after `measure_in_metres`. It also works after the file is closed.
+        Raises ConfigError if there is no such column.
+        """
+        return self.find_column(column)[1]
+
+    def find_column(self, column: str | None, *, stored: bool = False) -> tuple[ColumnFacts, ReadColumn]:
+        """Return facts and reading function of a column; stored: its name is that in the file."""
+        if column is None:
+            return ColumnFacts("points", "-", "", 1.0), lambda raw: np.ones(len(raw))
+        known = self.list_columns()
+        ours = {} if stored else self._find_ours(COLUMNS, decibel=True)
+        written = {name: found for name, found in ours.items() if name in self.written}
+        standard = name_standard(self.point_format)
+        wanted, column = column, resolve(column, written, {name: name for name in self.extra} | standard, ours)
+        if column in self.extra:
+            return self._describe_extra(column), lambda raw: self.read_extra(raw, column)
+        if column in known:
+            return self._describe_standard(column), lambda raw: read_field(raw, self.point_format, column, self._header)
+        missing = resolve(wanted, {name: name for name in COLUMNS})
+        if missing:
+            raise ConfigError(
+                f"{self.path}: has no column {wanted!r}; `wavebatch run` writes {missing} into clouds"
+                + (f": add --columns +{missing}" if self.written else ", and this is none of them")
+            )
+        hint = nearest(wanted, known)
+        has = "" if hint.startswith("known") else f" Columns of the file: {', '.join(known)}"
+        raise ConfigError(f"{self.path}: has no column {wanted!r}; {hint}{has}")
+
+    def _describe_extra(self, field: str) -> ColumnFacts:
+        """Facts from the description in the file; for a wavebatch column from its declaration."""
+        record = self.extra[field]
+        text = record.description
+        found = re.search(r"\[([^\[\]]+)\]\s*$", text)
+        unit, meaning = (found[1], text[: found.start()].strip()) if found else ("-", text.strip())
+        stored = {stored: column for column, stored in self.written.items()}
+        name = stored.get(field) or re.sub(r"^wb\d*[ _]", "", field)
+        if name in COLUMNS and found and unit == COLUMNS[name].unit:
+            meaning = COLUMNS[name].meaning
+        step = 0.0 if record.dtype.kind == "f" else abs((record.scaling or (1.0,))[0])
+        return ColumnFacts(field, unit, meaning, step, self._sources.get("echo_flags") == field)
+
+    def _describe_standard(self, name: str) -> ColumnFacts:
+        fields = STANDARD_DTYPES[self.point_format]
+        step = 0.0 if name in fields.names and fields[name].kind == "f" else 1.0
+        if name in "xyz":
+            step = abs(float(self.scales["xyz".index(name)]))
+        elif name == "scan_angle":
+            step = ANGLE_UNIT
+        return ColumnFacts(name, _UNITS.get(name, "-"), "", step, is_standard=True)
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
         if "ray" in self.dtype.names and self.has_packets:
@@ -176,6 +291,41 @@ class CloudReader(Closing):
             "source": lambda: raw["point_source_id"],
         }
         return readers[name]() if name in readers else None
+
+
+class ColumnReader(CloudReader):
+    """A CloudReader of columns for every point: rows have x, y [m] and `values`, f8 (k,) (NaN: no data).
+
+    columns: names of extra dimensions or standard fields, or wavebatch columns in the names of any style. If no name
+    fits exactly, case, spaces and underscores are ignored. None: the value is 1 for every point.
+    missing_ok: columns that the file does not have are left out.
+    `facts` describes the columns.
+    Raises InputError if the file cannot be read, ConfigError if it has no such column.
+    """
+
+    def __init__(self, path: Path, *columns: str | None, missing_ok: bool = False) -> None:
+        super().__init__(path, _PLACE)
+        found = []
+        try:
+            for name in columns:
+                try:
+                    found.append(self.find_column(name))
+                except ConfigError:
+                    if not missing_ok:
+                        raise
+        except BaseException:
+            self.close()
+            raise
+        self.facts: tuple[ColumnFacts, ...] = tuple(facts for facts, _ in found)
+        self._values = [read for _, read in found]
+
+    def _convert(self, raw: np.ndarray) -> np.ndarray:
+        rows = np.zeros(len(raw), [*_PLACE.descr, ("values", "<f8", (len(self._values),))])
+        rows["x"], rows["y"] = (read_field(raw, self.point_format, axis, self) for axis in "xy")
+        for place, read in enumerate(self._values):
+            rows["values"][:, place] = read(raw)
+        return rows
+
 
 def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) -> np.ndarray:
     """Return the values (n,) of a field of raw records, NaN for those that are not finite.
@@ -224,3 +374,19 @@ def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> di
 def _may_hold(record: ExtraRecord, column: str) -> bool:
     """Whether numbers of a dimension may be a column: flags are unsigned integers."""
     return column != "echo_flags" or record.dtype.kind == "u"
+
+
+def check_alike(readers: Iterable[tuple[Path, ColumnFacts]]) -> ColumnFacts:
+    """Return the facts of a column that several clouds have; raises ConfigError if their units differ.
+
+    Its name is the shortest: one cloud may have `wb_amplitude` beside an `amplitude` of its strip.
+    """
+    readers = list(readers)
+    first_path, first = readers[0]
+    for path, facts in readers[1:]:
+        if (facts.unit, facts.is_flags) != (first.unit, first.is_flags):
+            raise ConfigError(
+                f"{path}: {facts.name} is in [{facts.unit}], {first.name} of {first_path} in [{first.unit}]; plot them "
+                "one by one"
+            )
+    return replace(first, name=min((facts.name for _, facts in readers), key=len))
