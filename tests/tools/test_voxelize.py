@@ -423,7 +423,7 @@ def test_a_point_cloud_holds_what_the_npz_holds(tmp_path, point_format, output, 
     assert meta == [json.loads(str(found["meta"]))] and meta[0]["deconvolution"]["iterations"] == 40
 
 
-CALIBRATION = Calibration(2.5e-8, 0.03, 0.22, 0.5)
+CALIBRATION = Calibration(2.5e-8, 0.03, 0.22, divergence=0.5)
 
 
 @pytest.fixture(scope="module")
