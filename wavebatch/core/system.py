@@ -26,17 +26,17 @@ class ReceiverNoise:
         float, Range(0.0, 1e10), Key("baseline_spread_dn", "its standard deviation between waveforms", needed=True)
     ] = 0.0
     """Standard deviation of the true baseline between waveforms [count]."""
-    recovery: Annotated[
-        float, Range(0.0, 1e9), Key("recovery_ns", "after strong signal, until the level is back")
-    ] = 0.0
+    recovery: Annotated[float, Range(0.0, 1e9), Key("recovery_ns", "after strong signal, until the level is back")] = (
+        0.0
+    )
     """Time after a strong signal until the level is back to what it was before it [ns]."""
     std: Annotated[
         float, Range(1e-3, 1e10), Key("noise_std_dn", "noise of one sample, for thresholds and errors", needed=True)
     ] = QUANTISATION_STD
     """Noise of one sample that thresholds and errors use [count]."""
-    by_kind: Annotated[
-        Mapping[str, Annotated[float, Range(0.0, 1e30)]], Key("noise_by_kind_dn", needed=True)
-    ] = field(default_factory=dict)
+    by_kind: Annotated[Mapping[str, Annotated[float, Range(0.0, 1e30)]], Key("noise_by_kind_dn", needed=True)] = field(
+        default_factory=dict
+    )
     """The estimates that `std` was chosen from: quiet, outside of echoes, core ... [count]."""
     correlation: Annotated[
         tuple[Annotated[float, Range(-1.0, 1.0)], ...],
@@ -49,8 +49,9 @@ class ReceiverNoise:
     """Signal-dependent noise variance per count of signal [count] (docs/algorithms.md H12)."""
     whitening: Annotated[
         tuple[Annotated[float, Range(-2.0, 2.0)], ...],
-        Key("whitening",
-            "what predicts the noise of a sample from the two before it; empty: fits take noise for white"),
+        Key(
+            "whitening", "what predicts the noise of a sample from the two before it; empty: fits take noise for white"
+        ),
     ] = ()
     """What predicts the noise of a sample from the two before it; empty where fits take noise for white."""
 
@@ -75,9 +76,7 @@ class Defects:
     """Standard deviation of the slopes of baselines [count/ns]; 0 where baselines are level."""
     spikes: Annotated[float, Range(0.0, 1e6), Key("spikes", "of one sample, per waveform, taken off")] = 0.0
     """Spikes of one sample per waveform; 0 where they are not taken off."""
-    transient: Annotated[
-        float, Range(0.0, 1e9), Key("transient_ns", "at the start of waveforms, left out")
-    ] = 0.0
+    transient: Annotated[float, Range(0.0, 1e9), Key("transient_ns", "at the start of waveforms, left out")] = 0.0
     """Time at the start of every waveform in which its receiver is not at rest [ns]."""
 
     def __bool__(self) -> bool:
@@ -95,9 +94,9 @@ class LevelWidths:
     """Their variance minus that of the system pulse [ns2]: zero or negative, because the echoes that the pulse was
     learned from come from slopes too.
     """
-    error: Annotated[
-        float | None, Range(0.0, 1e8), Key("level_error_ns2", "standard deviation of level_variance")
-    ] = None
+    error: Annotated[float | None, Range(0.0, 1e8), Key("level_error_ns2", "standard deviation of level_variance")] = (
+        None
+    )
     """Standard deviation of `variance` [ns2]; None where it was not measured, infinite where surfaces of known slope
     were sought and not found, so that widths mean no angle.
     """

@@ -267,9 +267,7 @@ class SystemPulse:
         float | None, Range(-0.9, 0.9), Key("skew", "of the best skewed pulse, whichever pulse was chosen")
     ] = None
     """Skew of the best skewed pulse, whichever pulse the survey chose; None where it was not measured."""
-    skew_spread: Annotated[
-        float, Range(0.0, 10.0), Key("skew_spread", "of the skews of single echoes about it")
-    ] = 0.0
+    skew_spread: Annotated[float, Range(0.0, 10.0), Key("skew_spread", "of the skews of single echoes about it")] = 0.0
     """Standard deviation of the skews of single echoes about it: ground and plants differ; 0 where not measured."""
     defects: Annotated[Defects, Key()] = Defects()
     ringing: Annotated[
@@ -290,9 +288,7 @@ class SystemPulse:
     """Least energy of an echo [standard deviations of the noise's], where that is more than the chain asks for: a
     survey raises it where noise makes more echoes than expected.
     """
-    misfit: Annotated[
-        float, Range(0.0, 1.0), Key("misfit", "of strong echoes to the pulse, as a share of them")
-    ] = 0.0
+    misfit: Annotated[float, Range(0.0, 1.0), Key("misfit", "of strong echoes to the pulse, as a share of them")] = 0.0
     """How far strong echoes deviate from the pulse, as a share of their amplitude. A fall of chi2 that this explains
     does not add an echo.
     """

@@ -16,7 +16,7 @@ import types
 import typing
 from collections.abc import Collection, Mapping
 from datetime import date
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.schema import Key, Range
@@ -26,6 +26,7 @@ MOST_ROWS = 1024
 """Rows of a list in a file: the correlation and the tail of a pulse have fewer than 64."""
 
 _Record = TypeVar("_Record")
+_EVERY = Range(-math.inf, math.inf)
 
 
 class Entry(NamedTuple):
@@ -38,7 +39,7 @@ class Entry(NamedTuple):
     """
     kinds: tuple[type, ...]
     """Of the value or record, or of each number of a row."""
-    limits: tuple[Range | None, ...]
+    limits: tuple[Range, ...]
     key: Key
     needed: bool
     optional: bool
@@ -47,58 +48,42 @@ class Entry(NamedTuple):
 
 @functools.cache
 def list_entries(kind: type) -> tuple[Entry, ...]:
-    """List the fields of a dataclass that have a Key, and all of a NamedTuple."""
-    hints, found = typing.get_type_hints(kind, include_extras=True), []
-    if dataclasses.is_dataclass(kind):
-        defaults = {one.name for one in dataclasses.fields(kind)
-                    if (one.default, one.default_factory) != (dataclasses.MISSING, dataclasses.MISSING)}  # fmt: skip
-        usual = None
-    else:
-        defaults, usual = set(kind._field_defaults), Key()  # type: ignore[attr-defined]
-    for name, annotation in hints.items():
-        hint, *notes = typing.get_args(annotation) if _origin(annotation) is typing.Annotated else (annotation,)
-        key = next((note for note in notes if isinstance(note, Key)), usual)
-        if key is None:
+    """List the fields of a dataclass that have a Key."""
+    hints, found = get_type_hints(kind, include_extras=True), []
+    for one in dataclasses.fields(kind):
+        hint, notes = _split(hints[one.name])
+        if not (keys := [note for note in notes if isinstance(note, Key)]):
             continue
-        optional = _origin(hint) in (types.UnionType, typing.Union)
-        hint = next(part for part in typing.get_args(hint) if part is not type(None)) if optional else hint
-        shape, parts = _read_shape(hint, key)
-        kinds, limits = zip(*map(_split, parts), strict=True)
-        limits = limits if any(limits) else tuple(note for note in notes if isinstance(note, Range)) or limits
-        is_record = shape == "record"
-        key = key._replace(name=key.name if is_record else key.name or name)
-        needed = key.needed or (name not in defaults and key.missing is None)
-        found.append(Entry(name, shape, kinds, limits, key, needed, optional))
+        optional = get_origin(hint) in (types.UnionType, typing.Union)
+        hint = next(part for part in get_args(hint) if part is not type(None)) if optional else hint
+        shape, parts = _read_shape(hint, keys[0])
+        split = [(hint, notes)] if shape == "value" else list(map(_split, parts))
+        limits = tuple(next((note for note in more if isinstance(note, Range)), _EVERY) for _, more in split)
+        key = keys[0] if shape == "record" else keys[0]._replace(name=keys[0].name or one.name)
+        has_none = one.default is one.default_factory is dataclasses.MISSING and key.missing is None
+        kinds = tuple(part for part, _ in split)
+        found.append(Entry(one.name, shape, kinds, limits, key, key.needed or has_none, optional))
     return tuple(found)
 
 
-def _origin(hint: Any) -> Any:
-    return typing.get_origin(hint)
+def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+    """A type, and the notes of its annotation."""
+    if get_origin(hint) is not typing.Annotated:
+        return hint, ()
+    kind, *notes = get_args(hint)
+    return kind, tuple(notes)
 
 
 def _read_shape(hint: Any, key: Key) -> tuple[str, tuple[Any, ...]]:
     """Shape of a field, and the types of its parts."""
-    inner = typing.get_args(hint)
-    if _origin(hint) is tuple:
-        if _is_record(inner[0]):
-            return "records", inner[:1]
-        return "rows", typing.get_args(inner[0]) if _origin(inner[0]) is tuple else inner[:1]
-    if _origin(hint) is Mapping:
-        numbered, named = "{}" in key.name, inner[0] is str
-        return "numbered" if numbered else "table" if named else "pairs", inner[1:] if numbered or named else inner
-    return "record" if _is_record(hint) else "value", (hint,)
-
-
-def _split(hint: Any) -> tuple[type, Range | None]:
-    """A type, and its range where it has one."""
-    if _origin(hint) is not typing.Annotated:
-        return hint, None
-    kind, *notes = typing.get_args(hint)
-    return kind, next((note for note in notes if isinstance(note, Range)), None)
-
-
-def _is_record(hint: Any) -> bool:
-    return isinstance(hint, type) and (dataclasses.is_dataclass(hint) or hasattr(hint, "_fields"))
+    inner = get_args(hint)
+    if get_origin(hint) is tuple:
+        shape = "records" if dataclasses.is_dataclass(inner[0]) else "rows"
+        return shape, get_args(inner[0]) if get_origin(inner[0]) is tuple else inner[:1]
+    if get_origin(hint) is Mapping:
+        shape = "numbered" if "{}" in key.name else "table" if inner[0] is str else "pairs"
+        return shape, inner if shape == "pairs" else inner[1:]
+    return "record" if dataclasses.is_dataclass(hint) else "value", (hint,)
 
 
 def list_keys(kind: type, prefix: str = "") -> dict[str, Entry]:
@@ -124,9 +109,7 @@ def describe_record(value: Any) -> dict[str, Any]:
     None and infinite numbers are None, which a file leaves out; a mapping of numbers becomes sorted pairs; empty lists
     are left out where their Key does not ask for them.
     """
-    values: dict[str, Any] = {}
-    tables: dict[str, Any] = {}
-    lists: dict[str, Any] = {}
+    values, tables, lists = {}, {}, {}  # type: dict[str, Any], dict[str, Any], dict[str, Any]
     for one in list_entries(type(value)):
         part, key = getattr(value, one.field), one.key.name
         if one.shape == "record":
@@ -134,7 +117,7 @@ def describe_record(value: Any) -> dict[str, Any]:
                 (lists if isinstance(item, list) else tables if isinstance(item, dict) else values)[key + name] = item
         elif one.shape == "numbered":
             for number, item in part.items():
-                inner = describe_record(item) if _is_record(one.kinds[0]) else {"": one.kinds[0](item)}
+                inner = describe_record(item) if dataclasses.is_dataclass(one.kinds[0]) else {"": one.kinds[0](item)}
                 values |= {key.format(number) + name: plain for name, plain in inner.items()}
         elif one.shape == "table":
             tables[key] = {name: one.kinds[0](item) for name, item in part.items()}
@@ -161,7 +144,7 @@ def read_record(
     Parameters
     ----------
     kind : type
-        A dataclass, or a NamedTuple.
+        A dataclass.
     table : TomlTable
     remedy : str, optional
         What to do where a key is missing.
@@ -212,7 +195,7 @@ def _read_fields(kind: type, table: TomlTable, prefix: str) -> tuple[dict[str, A
 
 def _read_numbered(one: Entry, table: TomlTable, key: str) -> dict[int, Any]:
     """Values by number; none where a part of one is missing."""
-    is_record, pattern = _is_record(one.kinds[0]), re.escape(key).replace(r"\{\}", "([0-9]{1,3})")
+    is_record, pattern = dataclasses.is_dataclass(one.kinds[0]), re.escape(key).replace(r"\{\}", "([0-9]{1,3})")
     matches = filter(None, (re.fullmatch(pattern + r"\w*" * is_record, name) for name in table.values))
     found: dict[int, Any] = {}
     for number in dict.fromkeys(int(match[1]) for match in matches):
@@ -232,8 +215,7 @@ def _read_entry(one: Entry, table: TomlTable, key: str) -> Any:
     if one.shape in ("rows", "pairs"):
         rows = _read_rows(one, table, key)
         return rows if one.shape == "rows" else dict(rows)
-    (kind,), (limits,) = one.kinds, one.limits
-    low, high = limits or (-math.inf, math.inf)
+    (kind,), ((low, high),) = one.kinds, one.limits
     if one.shape == "table":
         inner = table.table(key)
         return {name: inner.number(name, low, high) for name in inner.values}
@@ -253,10 +235,8 @@ def _read_rows(one: Entry, table: TomlTable, key: str) -> Any:
     if len(rows) > MOST_ROWS:
         raise ConfigError(f"{where} holds {len(rows)} rows, at most {MOST_ROWS} are read")
     read = tuple(
-        tuple(
-            kind(check_number(value, *(limits or (-math.inf, math.inf)), f"{where} row {number}"))
-            for value, kind, limits in zip(row, one.kinds, one.limits, strict=True)
-        )
+        tuple(kind(check_number(value, *limits, f"{where} row {number}"))
+              for value, kind, limits in zip(row, one.kinds, one.limits, strict=True))
         for number, row in enumerate(rows, 1)
-    )
+    )  # fmt: skip
     return tuple(row[0] for row in read) if single else read

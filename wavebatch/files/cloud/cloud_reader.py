@@ -51,8 +51,15 @@ CLOUD_DTYPE = np.dtype(
 
 RETURN_DTYPE = np.dtype(
     [
-        ("gps_time", "<f8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("intensity", "<u2"),
-        ("scan_angle", "<f4"), ("echo_width", "<f4"), ("flags", "<u2"), ("source", "<u2"),
+        ("gps_time", "<f8"),
+        ("xyz", "<f8", 3),
+        ("number", "u1"),
+        ("total", "u1"),
+        ("intensity", "<u2"),
+        ("scan_angle", "<f4"),
+        ("echo_width", "<f4"),
+        ("flags", "<u2"),
+        ("source", "<u2"),
     ]  # fmt: skip
 )
 """One return of a cloud. Keep it small: statistics hold many of them in memory."""
@@ -94,12 +101,12 @@ class ColumnFacts:
         return f"{title} [{self.unit}]"
 
 
-
 class Placing(Protocol):
     """A header or a reader: what stored positions mean."""
 
     scales: tuple[float, float, float]
     offsets: tuple[float, float, float]
+
 
 class CloudReader(Closing):
     """Reads a LAS or LAZ file in pieces. A context manager.
@@ -343,6 +350,7 @@ def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) 
     values[~np.isfinite(values)] = np.nan
     return values
 
+
 def name_standard(point_format: int) -> dict[str, str]:
     """Return the names of the fields of a point format, x, y and z for its integers, each with the field that it means.
 
@@ -351,6 +359,7 @@ def name_standard(point_format: int) -> dict[str, str]:
     names = ("x", "y", "z", *(name for name in list_dimensions(point_format) if name not in ("X", "Y", "Z")))
     angle = next(name for name in names if name in ("scan_angle", "scan_angle_rank"))
     return {**{name: name for name in names}, "scan_angle": angle, "scan_angle_rank": angle}
+
 
 def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> dict[str, str]:
     """Return the field of each column that the cloud has, by the names of its extra dimensions alone.
@@ -370,6 +379,7 @@ def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> di
             if record is not None and (record.scaling is None) == (scale is None) and _may_hold(record, column):
                 found.setdefault(column, field)
     return found
+
 
 def _may_hold(record: ExtraRecord, column: str) -> bool:
     """Whether numbers of a dimension may be a column: flags are unsigned integers."""

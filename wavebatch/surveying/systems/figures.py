@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 from wavebatch.core.schema import Key, Range
 from wavebatch.core.units import QUANTISATION_STD
@@ -21,11 +21,12 @@ MOST_FIGURE = 1e30
 
 Figure = Annotated[float | None, Range(-MOST_FIGURE, MOST_FIGURE), Key()]
 Share = Annotated[float | None, Range(0.0, 1.0), Key()]
-Number = Annotated[float, Range(-MOST_FIGURE, MOST_FIGURE)]
-Size = Annotated[float, Range(0.0, MOST_FIGURE)]
+Number = Annotated[float, Range(-MOST_FIGURE, MOST_FIGURE), Key()]
+Size = Annotated[float, Range(0.0, MOST_FIGURE), Key()]
 
 
-class Level(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Level:
     """Level and noise of a descriptor's quiet samples, with what is needed for their errors."""
 
     waveforms: Size
@@ -33,7 +34,7 @@ class Level(NamedTuple):
     spread: Size
     std: Size
     samples: Size
-    clip: Annotated[float | None, Range(-MOST_FIGURE, MOST_FIGURE)] = None
+    clip: Figure = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +42,16 @@ class Look:
     """What a strip, or all strips of a flight, record; of the main digitizer."""
 
     level: Annotated[Level, Key("level_")]
-    width: Annotated[Size, Key()]
+    width: Size
     """Gaussian width of the narrowest echoes that repeat [ns]; 0 where there are too few."""
     steady: Annotated[float, Range(0.0, 1.0), Key()]
     """Share of the clear echoes that have nearly this width."""
-    misfit: Annotated[Size, Key()]
+    misfit: Size
     """What the flight's pulse leaves of the better half of strong echoes, beyond noise, as a share of the amplitude."""
 
 
-class Kind(NamedTuple):
+@dataclass(frozen=True, slots=True, order=True)
+class Kind:
     """How the samples of a descriptor were made."""
 
     bits: Number
@@ -149,6 +151,6 @@ def read_figures(table: TomlTable) -> Figures:
     if found.look is None:
         return found
     level = found.look.level
-    whole = level._replace(waveforms=int(level.waveforms), samples=int(level.samples))
-    whole = whole._replace(std=max(level.std, QUANTISATION_STD))
-    return replace(found, look=replace(found.look, level=whole))
+    counts = {"waveforms": int(level.waveforms), "samples": int(level.samples)}
+    level = replace(level, **counts, std=max(level.std, QUANTISATION_STD))
+    return replace(found, look=replace(found.look, level=level))
