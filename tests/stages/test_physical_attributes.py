@@ -8,7 +8,7 @@ import pytest
 from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain
+from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain_no_data
 from wavebatch.core.system import LevelWidths, Radiometry, ReceiverNoise
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -376,9 +376,9 @@ def test_reasons_of_single_echoes_and_that_they_add_up():
 def test_the_first_reason_counts_and_all_are_explained():
     values = np.array([1.0, np.nan, np.nan, np.inf])
     first = np.array([True, True, False, False])
-    codes = explain(values, (NoData.NO_SENSOR, first), (NoData.CUT, np.array([True, True, True, False])))
+    codes = explain_no_data(values, (NoData.NO_SENSOR, first), (NoData.CUT, np.array([True, True, True, False])))
     assert codes.tolist() == [NoData.KNOWN, NoData.NO_SENSOR, NoData.CUT, NoData.OTHER]
-    assert explain(values, (NoData.NO_SENSOR, True)).tolist() == [0, 1, 1, 1]
+    assert explain_no_data(values, (NoData.NO_SENSOR, True)).tolist() == [0, 1, 1, 1]
     assert set(REASONS) == set(NoData) - {NoData.KNOWN}
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.report_file import _sum_up as sum_up
-from wavebatch.stages.chain_file import effective, load_chain
+from wavebatch.stages.chain_file import effective, load_chain_file
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration
 from wavebatch.surveying.system_file import format_survey, load_survey
 
@@ -44,7 +44,7 @@ def read_written(path):
     if path.name.endswith(".calibration.toml"):
         found = load_calibration(path)
         return {"read": plain(found), "described": plain(found.describe())}
-    return effective(load_chain(path))
+    return effective(load_chain_file(path))
 
 
 def check_within(expected, found):

@@ -43,7 +43,7 @@ def load_profile(name: str) -> Chain:
     return parse_chain((_shipped() / f"{name}.toml").read_text("utf-8"), f"profile {name}")
 
 
-def load_chain(path: Path | str) -> Chain:
+def load_chain_file(path: Path | str) -> Chain:
     """Load the chain of a TOML file.
 
     Parameters

@@ -13,7 +13,7 @@ import numpy as np
 import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.no_data import SUFFIX, NoData, explain
+from wavebatch.core.no_data import SUFFIX, NoData, explain_no_data
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_2PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
@@ -282,4 +282,4 @@ def add_column(
 
 def add_reason(echoes: EchoTable, name: str, *cases: tuple[NoData, np.ndarray | bool]) -> EchoTable:
     """Add the reason why values of a column are missing; arguments as for `add_column`."""
-    return echoes.with_attributes(**{f"{name}{SUFFIX}": explain(echoes.attributes[name], *cases)})
+    return echoes.with_attributes(**{f"{name}{SUFFIX}": explain_no_data(echoes.attributes[name], *cases)})

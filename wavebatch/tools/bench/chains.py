@@ -11,7 +11,7 @@ from pathlib import Path
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.stages.chain_file import effective, load_chain, load_profile
+from wavebatch.stages.chain_file import effective, load_chain_file, load_profile
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.tools.api.chain import AUTO
@@ -30,7 +30,7 @@ def load_chains(files: Sequence[Path]) -> dict[str, Chain]:
         name = path.stem if path.stem not in chains else str(path)
         if name in chains:
             raise ConfigError(f"{path}: given twice; give every chain file once")
-        chains[name] = load_chain(path)
+        chains[name] = load_chain_file(path)
     return chains
 
 

@@ -1,6 +1,6 @@
 """Voxels as a sparse .npz, or as a point cloud with a point at the centre of each.
 
-`strip.voxelize_strip` calls `check_target` before it reads the strip, and `write_voxels` at the end.
+`strip.voxelize_strip` calls `check_voxel_target` before it reads the strip, and `write_voxels` at the end.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Piece = tuple[np.ndarray, Mapping[str, np.ndarray]]
 """Index (m, 3) and columns of some voxels."""
 
 
-def check_target(target: Path, strip: Path) -> None:
+def check_voxel_target(target: Path, strip: Path) -> None:
     """Raises ConfigError for an unknown suffix or where the output is the strip, InputError if it cannot be written."""
     if target.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{target}: voxels are written as {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")

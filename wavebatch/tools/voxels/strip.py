@@ -39,7 +39,7 @@ from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.floor import Floor
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.tools.voxels.light import find_rule
-from wavebatch.tools.voxels.output import Piece, VoxelSpace, check_target, write_voxels
+from wavebatch.tools.voxels.output import Piece, VoxelSpace, check_voxel_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
 from wavebatch.tools.voxels.profile_file import ProfileWriter
 from wavebatch.tools.voxels.pulses import Batch, read_batches
@@ -170,7 +170,7 @@ def voxelize_strip(
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
-    check_target(target, strip)
+    check_voxel_target(target, strip)
     keep = _plan(strip, options.chosen)
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
