@@ -11,19 +11,20 @@ import time
 from pathlib import Path
 
 import click
-import fuzzing
 import pytest
 from fuzz_damage import apply_edits, damage, find_texts, list_fields
 from fuzz_inputs import COMMANDS
 from fuzz_options import SOUND
-from fuzzing import Case, Fuzzer, fuzz, load_kept
+from fuzzing import Case, Fuzzer, Limits, fuzz, load_kept
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks a process per case")
 
 
 @pytest.fixture(scope="module")
 def fuzzer(tmp_path_factory):
-    return Fuzzer(tmp_path_factory.mktemp("fuzz"))
+    made = Fuzzer(tmp_path_factory.mktemp("fuzz"))
+    yield made
+    made.close()
 
 
 @pytest.mark.parametrize("case", load_kept(), ids=lambda case: case.kind)
@@ -163,37 +164,35 @@ def _drop(words):
         (lambda words: len(words) > os.write(2, b"x"), "a library writes to stderr"),
     ],
 )
-def test_the_fuzzer_sees_every_kind_of_failure(fuzzer, monkeypatch, what, why):
-    monkeypatch.setattr(fuzzing, "main", _plant(what))
-    if "ran" in why:
-        monkeypatch.setattr(fuzzing, "MOST_SECONDS", 0.3)
-    if "waits" in why:
-        monkeypatch.setattr(fuzzing, "MOST_WAITING", 1)
-    monkeypatch.setattr(fuzzing, "MOST_MEMORY", 600 << 20)
-    assert re.search(why, fuzzer.run(Case("strip.las", "survey {input} -o {out}/a.toml", [])))
+def test_the_fuzzer_sees_every_kind_of_failure(fuzzer, what, why):
+    limits = Limits(0.3 if "ran" in why else 10, 1 if "waits" in why else 15, 600 << 20)
+    planted = Fuzzer(fuzzer.base.parent, _plant(what), limits)
+    assert re.search(why, planted.run(Case("strip.las", "survey {input} -o {out}/a.toml", [])))
+    planted.close()
 
 
-def test_a_failing_case_is_made_small(fuzzer, monkeypatch):
-    """Only the edit that matters is kept."""
+def test_a_failing_case_is_made_small(fuzzer):
+    """Hypothesis finds damage that matters and keeps little else."""
 
     def look(words):
-        with open(words[0], "rb") as file:
-            assert file.read(4) == b"LASF"
+        for name in words:
+            if name.endswith(".las") and os.path.exists(name):
+                with open(name, "rb") as file:
+                    assert file.read(4) == b"LASF"
 
-    monkeypatch.setattr(fuzzing, "main", _plant(lambda words: look(words[1:])))
-    edits = [["set", 500, "00"], ["set", 1, "00"], ["insert", 900, "ff", 3]]
-    case = Case("strip.las", "info {input}", edits)
-    assert fuzzer.run(case)
-    assert fuzzer.shrink(case).edits == [["set", 1, "00"]]
+    planted = Fuzzer(fuzzer.base.parent, _plant(look))
+    known = set()
+    case, why = fuzz(planted, 2000, 1, known, float("inf"))
+    assert "AssertionError" in why and len(case.edits) == 1 and len(known) == 1
+    assert planted.run(case) and planted.run(case._replace(edits=[])) == ""
+    planted.close()
 
 
 @pytest.mark.slow
-def test_hundreds_of_damaged_inputs_break_no_promise(tmp_path):
-    seed = int(os.environ.get("FUZZ_SEED", "1"))
-    said = []
-    assert list(fuzz(tmp_path, float("inf"), seed, tell=said.append, most=600)) == []
-    assert int(said[-1].split()[0]) >= 600
-    inside = {line.split()[0]: int(line.split()[-6]) for line in said[1:-1]}
-    assert sum(number > 0 for number in inside.values()) > 0.6 * len(
-        inside
-    )  # commands and kinds of which some end well
+def test_hundreds_of_damaged_inputs_break_no_promise(fuzzer):
+    fresh = Fuzzer(fuzzer.base.parent)
+    assert fuzz(fresh, 600, int(os.environ.get("FUZZ_SEED", "1")), set(), float("inf")) is None
+    assert sum(sum(codes.values()) for name, codes in fresh.codes.items() if name.startswith("[")) >= 600
+    inside = [codes[0] > 0 for codes in fresh.codes.values()]
+    assert sum(inside) > 0.6 * len(inside)  # commands and kinds of which some end well
+    fresh.close()

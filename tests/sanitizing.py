@@ -193,19 +193,18 @@ def look_for(samples: Samples, candidates: Candidates, rng: np.random.Generator)
 def damage_strips(folder: Path, cases: int, seed: int) -> list[str]:
     """What is wrong with damaged strips and odd chains in commands that fit."""
     from fuzz_inputs import COMMANDS
-    from fuzzing import Fuzzer
+    from fuzz_options import Options
+    from fuzzing import Fuzzer, draw_case
 
-    fuzzer, rng, wrong = Fuzzer(folder), random.Random(seed), []
+    fuzzer, options, rng, wrong = Fuzzer(folder), Options(), random.Random(seed), []
     kinds = {kind for kind, commands in COMMANDS.items() if any(one.startswith(FITTING) for one in commands)}
     while cases > 0:
-        group = []
-        while len(group) < min(20, cases):
-            case = fuzzer.draw(rng)
-            if case.kind in kinds and case.command.startswith(FITTING) and "--jobs" not in case.command:
-                group.append(case)
-        cases -= len(group)
-        for case, why in zip(group, fuzzer.run_group(group), strict=True):
+        case = draw_case(fuzzer.sound, options, rng)
+        if case.kind in kinds and case.command.startswith(FITTING) and "--jobs" not in case.command:
+            cases -= 1
+            why = fuzzer.run(case)
             wrong += [f"{case}: {why}: {fuzzer.last['err'][-2000:]}"] if why else []
+    fuzzer.close()
     return wrong
 
 
