@@ -16,7 +16,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.area_crs import AreaFile, describe_miss, place_rings, read_area_file
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.geojson import load_polygons
-from wavebatch.files.las.geotiff_wkt import build_utm
+from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import build_wkt, read_header
 from wavebatch.tools.simulate import simulate_strip
 

@@ -15,8 +15,8 @@ from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.tools.return_stats import dead_zones, returns
-from wavebatch.tools.return_stats.returns import count_returns
+from wavebatch.tools import return_stats as returns
+from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, simulate_returns
 
 
@@ -205,8 +205,8 @@ def test_error_of_a_dead_zone_is_the_size_of_its_miss(rng, pairs, mean):
     misses = []
     for _ in range(300):
         distance = np.minimum(0.7 + rng.exponential(mean, pairs), 99.0)
-        bins = np.bincount((100 * distance).astype(int), minlength=dead_zones.BINS)
-        found = dead_zones.find_dead_zone(bins[: dead_zones.BINS])
+        bins = np.bincount((100 * distance).astype(int), minlength=returns.BINS)
+        found = returns.find_dead_zone(bins[: returns.BINS])
         misses.append((found.size - 0.7) / found.error)
     assert 0.4 < np.sqrt(np.mean(np.square(misses))) < 1.6
     assert np.min(misses) > -1.01

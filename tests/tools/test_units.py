@@ -14,7 +14,7 @@ from strips import add_record
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.las.crs import metres_per_unit, parse_wkt
-from wavebatch.files.las.geotiff_wkt import build_utm
+from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import build_wkt
 from wavebatch.files.strip.packet_vectors import DirectionTally, decide_direction
 from wavebatch.tools.html.cloud_pictures import picture_cloud

@@ -15,7 +15,7 @@ from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.compare.clouds import compare_clouds
 from wavebatch.tools.plots.histogram import count_values
-from wavebatch.tools.return_stats.returns import count_returns
+from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 TEXT = "number_of_returns >= 2 and echo_width < 5"

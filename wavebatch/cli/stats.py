@@ -24,9 +24,20 @@ from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.csv_table import format_csv
-from wavebatch.tools.return_stats.areas import RANKS, AreaGrid, AreaStats, PolygonSet, Separation, describe_pairs
-from wavebatch.tools.return_stats.dead_zones import BIN, BINS, LEAST_PAIRS, DeadZone
-from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
+from wavebatch.tools.return_stats import (
+    BIN,
+    BINS,
+    LEAST_PAIRS,
+    RANKS,
+    AreaGrid,
+    AreaStats,
+    DeadZone,
+    PolygonSet,
+    ReturnStats,
+    Separation,
+    count_returns,
+    describe_pairs,
+)
 
 EXIT_UNREADABLE = 1
 """A cloud could not be read; the others were counted."""

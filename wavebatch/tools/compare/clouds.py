@@ -21,7 +21,7 @@ from wavebatch.files.disk.buckets import count_buckets, spread_times
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
-from wavebatch.tools.return_stats.returns import pulses_told_apart
+from wavebatch.tools.return_stats import pulses_told_apart
 from wavebatch.tools.simulate.truth import TruthReader
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])

@@ -32,7 +32,7 @@ from wavebatch.files.las.header import (
 )
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.facts import StripFacts
-from wavebatch.files.wkt_repair import repair_records, repair_wkt
+from wavebatch.files.wkt import repair_records, repair_wkt
 from wavebatch.tools.voxels.grid import VoxelColumn
 
 SUFFIXES = (".npz", ".las", ".laz")

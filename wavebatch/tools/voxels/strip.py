@@ -35,8 +35,7 @@ from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
-from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
-from wavebatch.tools.voxels.floor import Floor
+from wavebatch.tools.voxels.floor import Ceiling, Floor, find_ceiling
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.tools.voxels.light import find_rule
 from wavebatch.tools.voxels.output import Piece, VoxelSpace, check_voxel_target, write_voxels

@@ -1,0 +1,644 @@
+"""Statistics of discrete returns: returns per pulse, distances between them, flags, areas, and the sensor's dead zone.
+
+`wavebatch stats` and the examples call `count_returns`. The points of a pulse may lie anywhere in a cloud: rows go to
+buckets on disk by pulse, so that memory is bounded. Whole clouds, cells of a grid and polygons are counted alike, by
+one AreaTally per division and cloud. A sensor that looks for its second and its third return in another way has
+another dead zone for each, so there is one per return number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import HALF_C
+from wavebatch.files.area_crs import describe_miss
+from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter
+from wavebatch.files.disk.buckets import count_buckets, spread_keys, tell_pulses_apart, time_keys
+from wavebatch.files.disk.spool import Spool
+from wavebatch.files.geojson import Polygon, find_inside
+from wavebatch.files.las.header import read_header
+
+MOST_AREAS = 50_000
+"""Most areas of all clouds together, so that memory is bounded."""
+
+MOST_NUMBER, MOST_COUNT = 15, 64
+"""Largest return number of LAS; pulses with at least so many returns are counted as one class."""
+
+_OUTSIDE = -1
+_HALF = 1 << 30
+
+_FARTHEST = 1e9
+"""Larger coordinates are damaged: no CRS of the Earth has them."""
+
+
+class Area(NamedTuple):
+    """Kind, name and corner of an area."""
+
+    kind: str
+    """`cell`, `polygon`, or `outside`: in no polygon, or without a valid position."""
+    name: str
+    x: float = math.nan
+    y: float = math.nan
+    """Lower left corner of a cell; NaN for others."""
+
+
+OUTSIDE = Area("outside", "outside")
+
+
+class Division(Protocol):
+    """A division of the plane into areas that do not overlap."""
+
+    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """The number of the area of each position (n,), i8; -1 outside of all areas."""
+
+    def describe(self, number: int) -> Area:
+        """The area with this number."""
+
+    def place(self, cloud: Path) -> Division:
+        """The division in the coordinates of a cloud."""
+        return self
+
+    def miss(self, cloud: Path) -> str:
+        """Says that no area lies in the cloud, once it is placed; empty where one does."""
+        return ""
+
+
+class AreaGrid(Division):
+    """Square cells whose borders are multiples of `size`, in the unit of the coordinates."""
+
+    def __init__(self, size: float) -> None:
+        if not (np.isfinite(size) and size > 0):
+            raise ConfigError(f"--area {size:g}: the side of a cell must be above 0")
+        self.size = float(size)
+
+    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """As Division.find; ConfigError if the cells are too small to be numbered at these coordinates."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            known = (np.abs([x, y]) < _FARTHEST).all(axis=0)
+            place = np.floor(np.stack([x, y]) / self.size)
+        if (np.abs(place[:, known]) >= _HALF).any():
+            raise ConfigError(f"--area {self.size:g}: the cells are too small for these coordinates; give a larger one")
+        column, row = np.where(known, place, 0.0).astype(np.int64) + _HALF
+        return np.where(known, (column << 31) | row, _OUTSIDE)
+
+    def describe(self, number: int) -> Area:
+        """As Division.describe."""
+        if number == _OUTSIDE:
+            return OUTSIDE
+        x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
+        return Area("cell", f"{x:.10g} {y:.10g}", x, y)
+
+
+class PolygonSet(Division):
+    """Polygons; where polygons overlap, a position belongs to the first one."""
+
+    def __init__(self, polygons: Sequence[Polygon]) -> None:
+        self.polygons = tuple(polygons)
+
+    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """As Division.find."""
+        found = np.full(len(x), _OUTSIDE, np.int64)
+        for number, polygon in enumerate(self.polygons):
+            free = np.flatnonzero(found == _OUTSIDE)
+            found[free[find_inside(polygon.rings, x[free], y[free])]] = number
+        return found
+
+    def describe(self, number: int) -> Area:
+        """As Division.describe."""
+        return OUTSIDE if number == _OUTSIDE else Area("polygon", self.polygons[number].name)
+
+    def place(self, cloud: Path) -> PolygonSet:
+        """As Division.place; raises as `Polygon.place`."""
+        header = read_header(cloud)
+        return PolygonSet([polygon.place(cloud, header) for polygon in self.polygons])
+
+    def miss(self, cloud: Path) -> str:
+        """As Division.miss."""
+        return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
+
+
+class Whole(Division):
+    """One area without borders, which counts also where it holds no pulse."""
+
+    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """As Division.find."""
+        return np.zeros(len(x), np.int64)
+
+    def describe(self, number: int) -> Area:
+        """As Division.describe."""
+        return Area("cloud", "")
+
+
+def name_ranks(number: int) -> tuple[str, ...]:
+    """Names of so many classes of pairs of consecutive returns.
+
+    They count by the number of the first return; the last class holds all higher numbers.
+    """
+    return (*(f"{k}-{k + 1}" for k in range(1, number)), f"{number}-")
+
+
+RANKS = name_ranks(4)
+"""Classes of pairs per area and of dead zones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Separation:
+    """Distances between two consecutive returns of a pulse [m]."""
+
+    pairs: int
+    mean: float
+    least: float
+    """NaN, as the mean, without a pair."""
+
+
+def describe_pairs(pairs: int, total: float, least: float) -> Separation:
+    """The distances of pairs from their number, sum and least distance."""
+    if not pairs:
+        return Separation(0, math.nan, math.nan)
+    return Separation(int(pairs), float(total) / int(pairs), float(least))
+
+
+@dataclass(frozen=True, slots=True)
+class AreaStats:
+    """Statistics of the returns of one area."""
+
+    kind: str
+    name: str
+    x: float
+    y: float
+    """As in Area."""
+    points: int
+    pulses: int
+    returns_per_pulse: float
+    by_number: dict[int, float]
+    """Share of the returns of the area with this return number."""
+    by_count: dict[int, float]
+    """Share of the pulses of the area with exactly this many returns."""
+    pairs: int
+    """Pairs of consecutive returns of a pulse."""
+    mean: float
+    least: float
+    """Mean and least distance of the pairs [m]; NaN without a pair."""
+    separations: dict[str, Separation]
+    """The same by return number: `1-2`, `2-3`, `3-4` and `4-`, as far as there are pairs."""
+    several: int
+    """Pulses with two or more returns."""
+    depth: float
+    """Mean height of the first above the last return of these pulses [m]: how deep they reach into the vegetation."""
+
+
+class AreaTally:
+    """Sums per area of one division; tallies of several clouds can be merged."""
+
+    def __init__(self, division: Division, ranks: tuple[str, ...] = RANKS) -> None:
+        self.division, self._ranks = division, ranks
+        n = int(isinstance(division, Whole))
+        self._areas = np.zeros(n, np.int64)
+        self._counts = np.zeros((n, MOST_NUMBER + 1 + MOST_COUNT + 1 + len(ranks) + 1), np.int64)
+        self._sums = np.zeros((n, len(ranks) + 1))
+        self._least = np.full((n, len(ranks)), np.inf)
+
+    def __len__(self) -> int:
+        return len(self._areas)
+
+    def add(
+        self, rows: np.ndarray, first: np.ndarray, pairs: tuple[np.ndarray, ...], depths: tuple[np.ndarray, ...]
+    ) -> None:
+        """Adds whole pulses: a pulse belongs, with all its returns, to the area of its first return.
+
+        rows: returns sorted by pulse, then number; first: row of the first return of each pulse; pairs: rows that form
+        a pair with the next row, and their distances [m]; depths: from `measure_depths`.
+        """
+        (before, distance), (pulses, depth), ranks = pairs, depths, len(self._ranks)
+        places = rows["xyz"][first]
+        areas, area = np.unique(self.division.find(places[:, 0], places[:, 1]), return_inverse=True)
+        n, number = len(areas), np.diff(np.append(first, len(rows)))
+        of_row = np.repeat(area, number)
+        by_number = np.bincount(of_row * (MOST_NUMBER + 1) + rows["number"], minlength=n * (MOST_NUMBER + 1))
+        classes = area * (MOST_COUNT + 1) + np.minimum(number, MOST_COUNT)
+        by_count = np.bincount(classes, minlength=n * (MOST_COUNT + 1))
+        rank = np.minimum(rows["number"][before].astype(np.int64), ranks) - 1
+        of_pair, cells = of_row[before] * ranks + rank, n * ranks
+        number_of_pairs = np.bincount(of_pair, minlength=cells).reshape(n, -1)
+        least = np.full(cells, np.inf)
+        np.minimum.at(least, of_pair, distance)
+        several = np.bincount(area[pulses], minlength=n)[:, None]
+        tables = (by_number.reshape(n, -1), by_count.reshape(n, -1), number_of_pairs, several)
+        apart = np.bincount(of_pair, distance, cells).reshape(n, -1)
+        sums = np.concatenate([apart, np.bincount(area[pulses], depth, n)[:, None]], axis=1)
+        self._join(areas, np.concatenate(tables, axis=1), sums, least.reshape(n, -1))
+
+    def merge(self, other: AreaTally) -> None:
+        """Adds the sums of another cloud."""
+        self._join(other._areas, other._counts, other._sums, other._least)
+
+    def _join(self, areas: np.ndarray, counts: np.ndarray, sums: np.ndarray, least: np.ndarray) -> None:
+        """Adds sums of areas, which are ascending and unique."""
+        known = np.union1d(self._areas, areas)
+        if len(known) > MOST_AREAS:
+            raise ConfigError(f"more than {MOST_AREAS} areas hold pulses; give a larger --area, or fewer clouds")
+        old, new = np.searchsorted(known, self._areas), np.searchsorted(known, areas)
+        if len(known) > len(self._areas):
+            kept = self._counts, self._sums, self._least
+            self._counts = np.zeros((len(known), counts.shape[1]), np.int64)
+            self._sums = np.zeros((len(known), sums.shape[1]))
+            self._least = np.full((len(known), least.shape[1]), np.inf)
+            self._counts[old], self._sums[old], self._least[old] = kept
+            self._areas = known
+        self._counts[new] += counts
+        self._sums[new] += sums
+        self._least[new] = np.minimum(self._least[new], least)
+
+    def finish(self) -> list[AreaStats]:
+        """The statistics: cells by column and row, polygons in the order of their file, `outside` last."""
+        order = np.argsort(np.where(self._areas == _OUTSIDE, np.iinfo(np.int64).max, self._areas), kind="stable")
+        return [self._describe(row) for row in order.tolist()]
+
+    def _describe(self, row: int) -> AreaStats:
+        edge = MOST_NUMBER + 2 + MOST_COUNT
+        by_number, by_count, pairs, several = np.split(self._counts[row], [MOST_NUMBER + 1, edge, -1])
+        points, pulses, number = int(by_number.sum()), int(by_count.sum()), int(several[0])
+        apart, depth = self._sums[row, :-1], float(self._sums[row, -1])
+        every = describe_pairs(pairs.sum(), apart.sum(), self._least[row].min())
+        ranks = zip(self._ranks, pairs, apart, self._least[row], strict=True)
+        return AreaStats(
+            *self.division.describe(int(self._areas[row])),
+            points=points,
+            pulses=pulses,
+            returns_per_pulse=points / pulses if pulses else math.nan,
+            by_number=_share_counts(by_number),
+            by_count=_share_counts(by_count),
+            pairs=every.pairs,
+            mean=every.mean,
+            least=every.least,
+            separations={name: describe_pairs(*values) for name, *values in ranks if values[0]},
+            several=number,
+            depth=depth / number if number else math.nan,
+        )
+
+
+def measure_depths(rows: np.ndarray, first: np.ndarray, up: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pulses with several returns, and the height of their first above their last return [m].
+
+    rows: returns sorted by pulse, then number; first: row of the first return of each pulse; up: metres of a step of 1
+    in height.
+    """
+    last = np.append(first[1:], len(rows)) - 1
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth = up * (rows["xyz"][first, 2] - rows["xyz"][last, 2])
+    pulses = np.flatnonzero((last > first) & np.isfinite(depth))
+    return pulses, depth[pulses]
+
+
+def _share_counts(counts: np.ndarray) -> dict[int, float]:
+    """Shares of the sum, without zeros."""
+    total = int(counts.sum())
+    return {int(n): int(counts[n]) / total for n in np.flatnonzero(counts)}
+
+
+BIN, BINS = 0.01, 10_000
+"""Width [m] and number of the bins of distances: to 1 cm, up to 100 m."""
+
+LEAST_PAIRS = 100
+"""Fewer pairs give no dead zone."""
+
+EDGE = 0.001
+"""Share of the distances that may lie within the dead zone, so that a few duplicate points do not hide it."""
+
+_NEXT = 10
+"""Pairs above the edge from which the distance of neighbouring pairs is measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeadZone:
+    """The shortest distance between a return and the next one."""
+
+    pairs: int
+    size: float
+    """Distance [m], to 1 cm, below which at most one pair in a thousand lies. NaN with fewer than LEAST_PAIRS, and
+    where it lies in the last bin, which holds all larger distances too (100 m)."""
+    error: float
+    """How much shorter the sensor's own distance may well be [m]: where pairs are rare, none is at the very edge. To
+    1 mm; NaN where the size is."""
+
+
+class Distances:
+    """Histograms of the distances between consecutive returns, one per class of RANKS."""
+
+    def __init__(self) -> None:
+        self.bins = np.zeros((len(RANKS), BINS), np.int64)
+
+    def add(self, number: np.ndarray, distance: np.ndarray) -> None:
+        """Adds pairs; number: return number of the first of each, from 1, (k,). distance: f8 (k,) [m]."""
+        rank = np.minimum(number.astype(np.int64), len(RANKS)) - 1
+        place = np.minimum(distance / BIN, BINS - 1).astype(np.int64)
+        np.add.at(self.bins, (rank, place), 1)
+
+    def merge(self, other: Distances) -> None:
+        """Adds the pairs of another cloud."""
+        self.bins += other.bins
+
+    def list_zones(self) -> dict[str, DeadZone]:
+        """The dead zone of `all` pairs, and of the classes of RANKS that have pairs."""
+        zones = {"all": find_dead_zone(self.bins.sum(axis=0))}
+        return zones | {name: find_dead_zone(bins) for name, bins in zip(RANKS, self.bins, strict=True) if bins.any()}
+
+    def count_hidden(self, size: float) -> int:
+        """Pairs that a dead zone would hold if they were as frequent there as up to twice its size."""
+        return int(self.bins[:, round(size / BIN) : round(2 * size / BIN)].sum())
+
+
+def find_dead_zone(bins: np.ndarray) -> DeadZone:
+    """The dead zone of the pairs of a histogram: the 0.1 % quantile of their distances."""
+    pairs = int(bins.sum())
+    if pairs < LEAST_PAIRS:
+        return DeadZone(pairs, math.nan, math.nan)
+    below = np.cumsum(bins)
+    edge = int(np.searchsorted(below, EDGE * pairs, side="right"))
+    if edge == BINS - 1:
+        return DeadZone(pairs, math.nan, math.nan)
+    # The pairs that were left out may be pairs of surfaces: then the edge is as many gaps between pairs below.
+    rank = int(EDGE * pairs) + 1
+    gap = (int(np.searchsorted(below, rank + _NEXT)) - edge) * BIN / _NEXT
+    return DeadZone(pairs, round(edge * BIN, 2), round(max(rank * gap, BIN), 3))
+
+
+_RANKS = name_ranks(15)
+"""Classes of pairs of whole clouds."""
+
+_NOT_A_TIME = np.uint64(0x7FF8 << 48)
+"""Bits of a NaN: above the key of every GPS time that is a number and at least 0."""
+
+_ROW = np.dtype([("key", "<u8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("echo", "?")])
+_SURE = 3.0
+"""A sensor limit is reported if pulses with the most returns outnumber those with one less by so many standard
+deviations; without a limit, counts fall with the number of returns."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnStats:
+    """Statistics of the returns of one cloud, or of several together."""
+
+    cloud: str
+    points: int
+    pulses: int
+    incomplete: int
+    """Pulses with another number of points than stored in them: cut by the border of a tile, thinned, or merged."""
+    pulses_by: str
+    """How pulses were found: `gps_time`, or `return_number` if times do not separate pulses."""
+    by_number: dict[int, float]
+    """Share of all returns with this return number."""
+    by_count: dict[int, float]
+    """Share of the pulses with exactly this many returns in the cloud."""
+    separations: dict[str, Separation]
+    """`all`, and `1-2`, `2-3` ... by return number, without points passed through without an echo."""
+    several: int
+    """Pulses with two or more returns."""
+    depth: float
+    """Mean height of the first above the last return of these pulses [m]; NaN without any."""
+    dead_zone: float
+    """Distance [m] below which only one pair in a thousand lies; NaN with fewer than a hundred pairs, and where nearly
+    all of them are farther apart than the histogram reaches, see `DeadZone`."""
+    dead_zones: dict[str, DeadZone]
+    """The same with its error, for `all` pairs and by return number: `1-2`, `2-3`, `3-4` and `4-` (all higher ones)."""
+    hidden: float
+    """Pairs per pulse that the dead zone would hold if they were as frequent there as up to twice its size."""
+    flags: dict[str, int] | None
+    """Points per flag of `echo_flags`; None if no cloud has the column."""
+    warnings: tuple[str, ...]
+    areas: tuple[AreaStats, ...] = ()
+    """Areas with a pulse, if divisions are given; together they hold all points and pulses."""
+    left_out: int = 0
+    """Points that do not meet the condition of --where; `points` are the others."""
+
+    @property
+    def returns_per_pulse(self) -> float:
+        """Mean number of returns; NaN without pulses."""
+        return self.points / self.pulses if self.pulses else float("nan")
+
+
+def count_returns(
+    clouds: Sequence[Path],
+    skip: Callable[[InputError], None] | None = None,
+    *,
+    divisions: Sequence[Division] = (),
+    chosen: PointFilter = EVERY,
+) -> tuple[list[ReturnStats], ReturnStats]:
+    """Statistics of each cloud and of all together, for points in any order.
+
+    A pulse is the points of equal GPS time in a cloud; if times do not separate pulses, a run of rising return numbers.
+    chosen: count only these points. divisions: count also by areas; a pulse belongs, with all its returns, to the
+    area of its first return. skip: called with the InputError of a cloud that cannot be read, which is then left out;
+    without it, the error is raised.
+    Memory does not grow with the clouds; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
+    """
+    each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0
+    for path in clouds:
+        try:
+            tally = _tally_cloud(Path(path), divisions, chosen)
+        except InputError as error:
+            if skip is None:
+                raise
+            skip(error)
+            continue
+        number += sum(map(len, tally.areas))
+        if number > MOST_AREAS:
+            raise ConfigError(f"{path}: more than {MOST_AREAS} areas with it; give a larger --area, or fewer clouds")
+        each.append(tally.finish(str(path)))
+        total.merge(tally)
+    return each, total.finish("total")
+
+
+def pulses_told_apart(reader: CloudReader) -> bool:
+    """Whether the GPS times of the first points separate pulses."""
+    if not reader.has_gps_time:
+        return False
+    rows = next(reader.read_pieces(), None)
+    return rows is None or tell_pulses_apart(rows["gps_time"])
+
+
+def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter) -> _Tally:
+    with CloudReader(path, RETURN_DTYPE) as reader:
+        by_time = pulses_told_apart(reader)  # by all points
+        reader.select(chosen)
+        placed = [division.place(path) for division in divisions]
+        tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=list(map(AreaTally, placed)))
+        tally.notes = [line for division in placed for line in [division.miss(path)] if line]
+        tally.metres = reader.metres
+        if math.isnan(reader.metres[0]):
+            tally.notes.append(f"coordinates are {reader.unit}: returns have no distances; project the cloud to metres")
+        elif reader.metres != (1.0, 1.0, 1.0):
+            tally.notes.append(f"coordinates are {reader.unit}: distances and depths are converted to metres")
+        if reader.has_flags:
+            tally.flags = np.zeros(16, np.int64)
+        number = count_buckets(reader.point_count)
+        with Spool(number, _ROW) as buckets:
+            keys = _Keys(by_time)
+            for rows in reader.read_pieces():
+                tally.add_points(rows)
+                shaped = _shape(rows, keys.of(rows))
+                buckets.append(spread_keys(shaped["key"], number), shaped)
+            for bucket in range(number):
+                tally.add_pulses(buckets.read(bucket))
+        if keys.untimed:
+            tally.notes.append(
+                f"points without GPS time (0 or NaN): {keys.untimed}; their pulses are found by return numbers"
+            )
+        tally.left_out = reader.left_out
+    return tally
+
+
+class _Keys:
+    """Numbers the pulses, piece by piece."""
+
+    def __init__(self, by_time: bool) -> None:
+        self._by_time, self._pulse, self._last = by_time, 0, 255
+        self.untimed = 0
+        """Points without a time, while others have one."""
+
+    def of(self, rows: np.ndarray) -> np.ndarray:
+        """Pulse number of each row, u8 (n,)."""
+        if not self._by_time:
+            return self._count_up(rows["number"])
+        keys = time_keys(rows["gps_time"])
+        # Hundreds of points without a time are no pulse of hundreds of returns.
+        missing = np.flatnonzero(np.isnan(rows["gps_time"]) | (rows["gps_time"] == 0))
+        keys[missing] = _NOT_A_TIME + self._count_up(rows["number"][missing])
+        self.untimed += len(missing)
+        return keys
+
+    def _count_up(self, numbers: np.ndarray) -> np.ndarray:
+        """Runs of rising return numbers, counted from 1, u8 (n,); goes on where the last piece ended."""
+        if not len(numbers):
+            return np.empty(0, np.uint64)
+        starts = numbers <= np.concatenate([[self._last], numbers[:-1]])
+        pulse = self._pulse + np.cumsum(starts)
+        self._pulse, self._last = int(pulse[-1]), int(numbers[-1])
+        return pulse.astype(np.uint64)
+
+
+def _shape(rows: np.ndarray, key: np.ndarray) -> np.ndarray:
+    shaped = np.zeros(len(rows), _ROW)
+    shaped["key"] = key
+    for name in ("xyz", "number", "total"):
+        shaped[name] = rows[name]
+    shaped["echo"] = (rows["flags"] & np.uint16(PASSED_THROUGH)) == 0
+    return shaped
+
+
+@dataclass(slots=True, eq=False)
+class _Tally:
+    """Sums of one cloud; tallies of several clouds can be merged."""
+
+    left_out: int = 0
+    incomplete: int = 0
+    depth: float = 0.0
+    methods: set[str] = field(default_factory=set)
+    distances: Distances = field(default_factory=Distances)
+    whole: AreaTally = field(default_factory=lambda: AreaTally(Whole(), _RANKS))
+    flags: np.ndarray | None = None
+    areas: list[AreaTally] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    """Lines about the areas and the unit of the coordinates."""
+    metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Of a step of 1 in x, y and z; NaN in degrees, which have no distances."""
+
+    def add_points(self, rows: np.ndarray) -> None:
+        """Adds the flags of some points."""
+        if self.flags is not None:
+            self.flags += [int(np.count_nonzero(rows["flags"] & np.uint16(flag))) for flag in EchoFlag]
+
+    def add_pulses(self, rows: np.ndarray) -> None:
+        """Adds counts and separations of whole pulses, in any order."""
+        if not len(rows):
+            return
+        rows = rows[np.lexsort((rows["number"], rows["key"]))]
+        first = np.flatnonzero(np.concatenate([[True], rows["key"][1:] != rows["key"][:-1]]))
+        counts = np.diff(np.append(first, len(rows)))
+        self.incomplete += int(np.count_nonzero(counts != rows["total"][first]))
+        depths = measure_depths(rows, first, self.metres[2])
+        self.depth += float(depths[1].sum())
+        pair = (rows["key"][1:] == rows["key"][:-1]) & rows["echo"][1:] & rows["echo"][:-1]
+        before = np.flatnonzero(pair & (rows["number"][1:] == rows["number"][:-1] + 1) & (rows["number"][:-1] > 0))
+        with np.errstate(over="ignore", invalid="ignore"):
+            distance = np.linalg.norm((rows["xyz"][before + 1] - rows["xyz"][before]) * self.metres, axis=1)
+        known = np.isfinite(distance)
+        before, distance = before[known], distance[known]
+        self.distances.add(rows["number"][before], distance)
+        for area in (self.whole, *self.areas):
+            area.add(rows, first, (before, distance), depths)
+
+    def merge(self, other: _Tally) -> None:
+        """Adds the sums of another cloud."""
+        self.methods |= other.methods
+        self.left_out += other.left_out
+        self.incomplete += other.incomplete
+        self.depth += other.depth
+        self.distances.merge(other.distances)
+        for area, more in zip((self.whole, *self.areas), (other.whole, *other.areas), strict=True):
+            area.merge(more)
+        if other.flags is not None:
+            self.flags = other.flags + (0 if self.flags is None else self.flags)
+
+    def finish(self, cloud: str) -> ReturnStats:
+        """The statistics."""
+        (whole,) = self.whole.finish()
+        zones = self.distances.list_zones()
+        zone = zones["all"].size
+        hidden = math.nan if math.isnan(zone) else self.distances.count_hidden(zone) / whole.pulses
+        names = [flag.name for flag in EchoFlag]
+        return ReturnStats(
+            cloud=cloud,
+            points=whole.points,
+            pulses=whole.pulses,
+            incomplete=self.incomplete,
+            pulses_by=" and ".join(sorted(self.methods)),
+            by_number=whole.by_number,
+            by_count=whole.by_count,
+            separations={"all": Separation(whole.pairs, whole.mean, whole.least), **whole.separations},
+            several=whole.several,
+            depth=self.depth / whole.several if whole.several else math.nan,
+            dead_zone=zone,
+            dead_zones=zones,
+            hidden=hidden,
+            flags=None if self.flags is None else dict(zip(names, self.flags.tolist(), strict=True)),
+            warnings=tuple(self._warn(zone, hidden, whole)),
+            areas=tuple(stats for area in self.areas for stats in area.finish()),
+            left_out=self.left_out,
+        )
+
+    def _warn(self, zone: float, hidden: float, whole: AreaStats) -> list[str]:
+        lines = list(self.notes)
+        if self.left_out:
+            lines.append(
+                f"--where: {self.left_out} of {whole.points + self.left_out} points are left out; pulses and distances "
+                "are those of the points that are left"
+            )
+        if zone >= 0.05 and hidden > 0.001:
+            lines.append(
+                f"dead zone: almost no returns of a pulse lie closer together than {zone:.2f} m ({zone / HALF_C:.1f} "
+                "ns); surfaces that are closer give one return. If returns were as frequent there as just above it, "
+                f"there would be {hidden:.3f} more returns per pulse"
+            )
+        most = max(whole.by_count, default=0)
+        last, before = (round(whole.pulses * whole.by_count.get(k, 0.0)) for k in (most, most - 1))
+        if most >= 3 and last - before > _SURE * math.sqrt(last + before):
+            lines.append(
+                f"limit: {whole.by_count[most]:.1%} of the pulses have {most} returns, more than have "
+                f"{most - 1}; the sensor records at most {most}, and later surfaces are missing"
+            )
+        if self.incomplete > 0.001 * whole.pulses:
+            lines.append(
+                f"incomplete: {self.incomplete} of {whole.pulses} pulses have another number of points than stored in "
+                "them; tiles and thinned clouds give fewer returns per pulse than the sensor recorded"
+            )
+        return lines
