@@ -97,7 +97,7 @@ class GeoKeys:
     def read_units(self) -> tuple[float | None, float | None]:
         """Return metres per unit of x and y, and of z; None where the keys do not say, NaN for an unknown unit.
 
-        If no key gives the unit, the EPSG code of the CRS does (`_PROJECTED`, `_VERTICAL`), then a citation that names feet.
+        If no key gives the unit, the EPSG code of the CRS does (`find_unit`), then a citation that names feet.
         """
         horizontal, vertical = self._read_unit(_LINEAR), self._read_unit(_VERTICAL)
         if horizontal is None and self.kind != "geographic":
@@ -137,7 +137,7 @@ def _guess_unit(text: str) -> float | None:
     return 0.3048 if re.search(r"\b(feet|foot|ft)\b", words) else None
 
 
-_PROJECTED = {
+_PROJECTED_UNITS = {
     1200 / 3937: (
         "2155 2194 2204 2225-2250 2254-2255 2257-2264 2267-2268 2271-2272 2274-2279 2283-2289 2870-2895 2899-2900 "
         "2902-2908 2911-2912 2915-2920 2924-2930 2964-2968 3089 3091 3102 3363 3365 3404 3417-3438 3441-3446 "
@@ -172,7 +172,7 @@ _PROJECTED = {
 }
 """Codes of projected CRSs by the size of their unit [m]; `a-b`: all from a to b, `a-b/2`: every second one."""
 
-_VERTICAL = {
+_VERTICAL_UNITS = {
     0.3048: "5614 6130-6132 8050-8051 8228 8897",
     1200 / 3937: "5702 6358-6360 8052-8053",
     0.3048007491: "5754",
@@ -187,7 +187,7 @@ def find_unit(code: int, *, vertical: bool = False) -> float | None:
 
 @functools.cache
 def _units(vertical: bool) -> dict[int, float]:
-    table = _VERTICAL if vertical else _PROJECTED
+    table = _VERTICAL_UNITS if vertical else _PROJECTED_UNITS
     return {code: unit for unit, codes in table.items() for text in codes.split() for code in _expand(text)}
 
 
