@@ -20,8 +20,7 @@ from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.cloud.cloud_reader import name_standard, read_field
-from wavebatch.files.cloud.column_names import resolve
+from wavebatch.files.cloud.column_names import name_standard, read_field, resolve
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter
 from wavebatch.files.las.point_formats import read_classes

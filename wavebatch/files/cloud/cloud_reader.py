@@ -12,14 +12,13 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
-from wavebatch.files.cloud.column_names import STYLES, resolve
+from wavebatch.files.cloud.column_names import STYLES, name_standard, read_field, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.closing import Closing
@@ -99,13 +98,6 @@ class ColumnFacts:
         """Name, meaning and unit for an axis."""
         title = f"{self.name}: {self.meaning}" if self.meaning else self.name
         return f"{title} [{self.unit}]"
-
-
-class Placing(Protocol):
-    """A header or a reader: what stored positions mean."""
-
-    scales: tuple[float, float, float]
-    offsets: tuple[float, float, float]
 
 
 class CloudReader(Closing):
@@ -332,33 +324,6 @@ class ColumnReader(CloudReader):
         for place, read in enumerate(self._values):
             rows["values"][:, place] = read(raw)
         return rows
-
-
-def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) -> np.ndarray:
-    """Return the values (n,) of a field of raw records, NaN for those that are not finite.
-
-    placing: scales and offsets of the positions.
-    """
-    if name in ("x", "y", "z"):
-        axis = "xyz".index(name)
-        return raw[name.upper()] * placing.scales[axis] + placing.offsets[axis]
-    if name.startswith("scan_angle"):
-        return read_angles(raw)
-    import laspy
-
-    values = widen_integers(np.asarray(laspy.PackedPointRecord(raw, laspy.PointFormat(point_format))[name]))
-    values[~np.isfinite(values)] = np.nan
-    return values
-
-
-def name_standard(point_format: int) -> dict[str, str]:
-    """Return the names of the fields of a point format, x, y and z for its integers, each with the field that it means.
-
-    The scan angle also has the name that other point formats give it.
-    """
-    names = ("x", "y", "z", *(name for name in list_dimensions(point_format) if name not in ("X", "Y", "Z")))
-    angle = next(name for name in names if name in ("scan_angle", "scan_angle_rank"))
-    return {**{name: name for name in names}, "scan_angle": angle, "scan_angle_rank": angle}
 
 
 def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> dict[str, str]:
