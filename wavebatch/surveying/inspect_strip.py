@@ -15,8 +15,8 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError, StripWarning
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.strip.describe import describe_samples
+from wavebatch.files.strip.header_check import audit_header
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
-from wavebatch.files.strip.scan_result import audit_header
 
 _MATCHED = 1024
 """Waveforms whose echoes are compared with the returns."""

@@ -1,22 +1,17 @@
-"""Result of the pass over the points of a strip, and the messages about what is wrong with it and with its header.
+"""Result of the pass over the points of a strip, and the messages about what is wrong with it.
 
-`scanner.scan_strip` makes it; reader, survey and reports use it. It is pickled for other processes. `wavebatch check`
-also compares the header's claims about the points (counts and bounds) with the points, all of which it reads;
-wavebatch uses none of these claims.
+`scanner.scan_strip` makes it; reader, survey and reports use it. It is pickled for other processes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
-from wavebatch.files.las.header import LasHeader, read_header
-from wavebatch.files.las.write_points import Statistics
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Reason
 from wavebatch.files.strip.packet_vectors import VectorDecision
@@ -105,30 +100,3 @@ def describe_oddities(reasons: dict[Reason, tuple[int, int]], short: int) -> Ite
         yield f"{count} points (first: point {first}) {REASON_TEXTS[reason]}; they are written unchanged{remedy}"
     if short:
         yield f"{short} points have packets with fewer samples than their descriptor gives; these samples are used"
-
-
-if TYPE_CHECKING:
-    from wavebatch.files.strip.reader import StripReader
-    from wavebatch.files.strip.scan_result import StripScan
-
-
-def audit_header(reader: StripReader, scan: StripScan) -> Iterator[str]:
-    """Yield a line for each count or bound of the header that the points contradict."""
-    facts = reader.facts
-    claimed = read_header(facts.path)
-    true = LasHeader(claimed.version, claimed.point_format, claimed.point_length, claimed.scales, claimed.offsets)
-    statistics = Statistics(facts.dtype, ())
-    for start, stop in zip(scan.borders[:-1].tolist(), scan.borders[1:].tolist(), strict=True):
-        statistics.add(reader.read_points(start, stop))
-    statistics.fill(true)
-    if not true.point_count:
-        return
-    known = 15 if claimed.version >= (1, 4) else 5
-    if claimed.by_return[:known] != true.by_return[:known]:
-        first, really = claimed.by_return[0], true.by_return[0]
-        yield f"counts by return in the header are wrong (first returns: {first}, counted: {really})"
-    slack = 1.5 * np.abs(claimed.scales)
-    outside = (np.array(true.mins) < np.array(claimed.mins) - slack) | (np.array(true.maxs) > claimed.maxs + slack)
-    if not np.all(~outside):
-        axes = ", ".join(np.array(list("xyz"))[outside].tolist())
-        yield f"points lie outside the bounds that the header claims ({axes})"

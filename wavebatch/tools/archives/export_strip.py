@@ -17,9 +17,9 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
 from wavebatch.files.las.header import STANDARD_TIME, Vlr, decode_text, has_record, is_projection
+from wavebatch.files.strip.header_check import audit_header
 from wavebatch.files.strip.packet_vectors import VECTORS, read_toward
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
-from wavebatch.files.strip.scan_result import audit_header
 from wavebatch.files.strip.writer import FullwaveWriter
 
 SUFFIXES = (".las", ".laz", ".npz")
