@@ -56,7 +56,7 @@ def alone(echoes, n):
     return echoes.take(echoes.count(n)[echoes.waveform] == 1)
 
 
-@pytest.mark.quick_cases("*-noise known", "10-gaussian-*", "100-adaptive-*")
+@pytest.mark.quick_cases("10-*-noise known", "100-*-noise known", "100-adaptive-*")
 @pytest.mark.parametrize("knowledge", ["noise known", "file to file"])
 @pytest.mark.parametrize("name", DECOMPOSERS)
 @pytest.mark.parametrize("snr", [10, 20, 100])
@@ -131,6 +131,7 @@ def test_pairs_with_two_maxima_stay_two(name, apart):
     assert (found[maxima == 2] == 2).mean() > 0.98
 
 
+@pytest.mark.quick_cases("noise known")
 @pytest.mark.parametrize("knowledge", ["noise known", "file to file"])
 def test_single_echoes_are_rarely_split(knowledge):
     n = 2500
@@ -145,6 +146,7 @@ def test_single_echoes_are_rarely_split(knowledge):
         assert (count == 0).mean() == 0, snr
 
 
+@pytest.mark.quick_cases("accurate-0.001")
 @pytest.mark.parametrize(("profile", "most"), [("fast", 0.005), ("balanced", 0.005), ("accurate", 0.001)])
 def test_noise_makes_no_echoes(profile, most):
     n = 10_000
@@ -153,6 +155,7 @@ def test_noise_makes_no_echoes(profile, most):
         assert (load_profile(profile).run(block, system).count(n) > 0).mean() <= most
 
 
+@pytest.mark.quick_cases("0.8")
 @pytest.mark.parametrize("rho", [0.5, 0.667, 0.8])
 def test_coloured_noise_neither_splits_nor_invents(rho):
     """T16: after the survey's remedy at most 0.5 % false splits and false echoes."""
@@ -208,7 +211,7 @@ def run_scene(scene, profile, n=8192):
     return score(found, truth, n, noise_std=find_scene(scene).recording.recorded_noise)
 
 
-@pytest.mark.quick_cases("mixed-*")
+@pytest.mark.quick_cases("mixed-accurate-*")
 @pytest.mark.parametrize(
     ("scene", "profile", "exact", "completeness", "correctness"),
     [

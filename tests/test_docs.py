@@ -132,6 +132,7 @@ def run_in(folder: Path, *words: str) -> subprocess.CompletedProcess:
     )
 
 
+@pytest.mark.slow
 def test_a_stage_and_a_column_of_another_package_are_used(extended):
     for line in blocks("extending.md")["commands"].splitlines():
         done = run_in(extended, "-m", *line.split())

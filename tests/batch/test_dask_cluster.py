@@ -308,6 +308,7 @@ def test_a_peer_that_is_no_scheduler_is_one_line_within_seconds(strips, tmp_path
     assert CONNECT + 0.5 <= 5
 
 
+@pytest.mark.slow
 def test_strips_that_a_worker_does_not_see_are_named_before_anything_starts(dask, strips, tmp_path):
     out = tmp_path / "out"
     with distributed.Client(dask.address, set_as_default=False) as client:

@@ -36,6 +36,7 @@ def test_a_plain_strip_has_none(tiny_strip, tmp_path):
     assert remarks(tiny_strip, tmp_path) == []
 
 
+@pytest.mark.slow
 def test_fits_that_fail_far_more_than_usual_are_said_with_quiet_too(leica, tiny_strip, tmp_path):
     """77 % of the fits of --profile fast did not converge, and nothing was said."""
     done = CliRunner().invoke(main, ["run", str(leica), "-o", str(tmp_path / "a"), "-q", "--profile", "fast"])
@@ -135,6 +136,7 @@ def test_echoes_in_doubt_warn_in_cron_too(tiny_strip, tmp_path):
     assert "20 % of the echoes in doubt: the system pulse is a guess" in lines[0] and "give --system" in lines[0]
 
 
+@pytest.mark.slow
 def test_a_known_pulse_is_no_guess_but_its_noise_may_be(tmp_path):
     neon, known = data_file("neon/neon_harv_a.las"), tmp_path / "known.toml"
     assert CliRunner().invoke(main, ["survey", str(neon), "-o", str(known)]).exit_code == 0

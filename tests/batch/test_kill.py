@@ -124,6 +124,7 @@ def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips,
     assert _contents(out) == undisturbed
 
 
+@pytest.mark.quick_cases("15")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path, number):
     out = tmp_path / "out"
@@ -135,6 +136,7 @@ def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path
         assert path.with_name(path.name.replace(".report.json", ".laz")).exists()
 
 
+@pytest.mark.quick_cases("True")
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
 @pytest.mark.parametrize("stopped", [False, True])
 def test_workers_die_with_their_parent(strips, tmp_path, stopped):

@@ -132,7 +132,7 @@ def test_a_summary_that_cannot_be_written_is_told_and_is_not_a_failure_of_the_st
     assert again.exit_code == 3 and again.stderr.count("error: ") == 2
 
 
-@pytest.mark.quick_cases("full-options0", "closed-options1")
+@pytest.mark.quick_cases("full-options0")
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
 @pytest.mark.parametrize("options", [["--report", "-"], ["--progress", "json"]])
 @pytest.mark.parametrize("target", ["full", "gone", "closed"])
@@ -189,6 +189,7 @@ print(outcome.status, outcome.error)
 """
 
 
+@pytest.mark.quick_cases("batch2")
 @pytest.mark.parametrize("batch", [{}, {"overwrite": True}, {"resume": True}])
 def test_two_runs_never_mix_their_outputs(place, batch):
     """The second run begins while the first has finished its cloud and not yet published it."""

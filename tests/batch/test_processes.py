@@ -86,6 +86,7 @@ def test_results_and_errors_come_back():
             futures[-1].result()
 
 
+@pytest.mark.quick_cases("True")
 @pytest.mark.parametrize("kept", [False, True])
 def test_a_process_that_dies_while_it_sends_its_result_loses_this_call_only(tmp_path, kept):
     keeper = tmp_path / "keeper" if kept else None
@@ -103,6 +104,7 @@ def test_a_process_that_dies_while_it_sends_its_result_loses_this_call_only(tmp_
         assert again.result() == 16
 
 
+@pytest.mark.quick_cases("stop")
 @pytest.mark.parametrize("function", [stop, stop_idle])
 def test_a_stopped_process_does_not_keep_this_one_from_ending(tmp_path, function):
     with Workers(2) as workers:
@@ -155,6 +157,7 @@ def _run_script(tmp_path, tiny_strip, text, **more):
     return subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_main_guard(tiny_strip, tmp_path):
     """Every process ran the user's script: 250 lines of traceback and no cloud."""
     done = _run_script(tmp_path, tiny_strip, _SCRIPT)

@@ -36,7 +36,7 @@ REAL = {
 }
 
 
-@pytest.mark.quick_cases("riegl-1")
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux" or os.uname().machine != "x86_64", reason="kinds of x86 processors")
 @pytest.mark.parametrize("others", [1, 4])
 @pytest.mark.parametrize("strip", [*REAL, "mixed"])

@@ -102,6 +102,7 @@ run.StripTask.start = count
 """
 
 
+@pytest.mark.quick_cases("1")
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_run_that_reaches_its_limit_of_processor_time_leaves_nothing(strip, tmp_path, jobs):
     """The parent process counts in vain until its limit; the limit holds for each process."""
@@ -127,6 +128,7 @@ main()
 """
 
 
+@pytest.mark.quick_cases("SIGTERM")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_signal_inside_the_compressor_is_not_taken_for_a_failed_write(strip, tmp_path, name):
     process = _start(["run", strip, "-o", tmp_path, "--profile", "fast"], code=_IN_COMPRESSOR.format(name=name))

@@ -176,6 +176,7 @@ def test_strips_without_points_pass_through_every_stage(place):
     assert "nan" not in shown and "completeness         no-data   correctness no-data" in shown
 
 
+@pytest.mark.quick_cases("check strip.las --json")
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device that is full")
 @pytest.mark.parametrize("words", ["info strip.las", "check strip.las --json", "stats strip.las", "stages"])
 def test_a_full_stdout_is_named(place, words):

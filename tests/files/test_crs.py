@@ -241,6 +241,7 @@ def in_feet(source, target):
     return target
 
 
+@pytest.mark.quick_cases("flat")
 @pytest.mark.parametrize("scene", ["urban", "flat"])
 def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
     simulate_strip(scene, tmp_path / "m.las", pulses=30_000, seed=3, flight=FlightLine(pulse_rate=50_000))

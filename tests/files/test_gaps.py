@@ -309,6 +309,7 @@ def test_tools_leave_gaps_out(whole, tmp_path):
     assert np.nanmedian(misfit / floor) == pytest.approx(np.nanmedian(full[0] / full[1]), rel=0.2)
 
 
+@pytest.mark.slow
 def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
     pytest.importorskip("matplotlib")
     from click.testing import CliRunner

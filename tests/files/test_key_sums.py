@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk import key_sums as module
 from wavebatch.files.disk.key_sums import KeyedSums
 
 
@@ -29,10 +28,9 @@ def draw_parts(seed, spread, number=40):
 @pytest.mark.parametrize("held", [3, 300, 2000, 100_000])
 @pytest.mark.parametrize("spread", [1, 30, 100_000])
 @pytest.mark.parametrize(("seed", "stride"), [(1, 256), (2, 4), (3, 1)])
-def test_sums_are_those_of_a_dictionary(held, spread, seed, stride, monkeypatch):
-    monkeypatch.setattr(module, "STRIDE", stride)
+def test_sums_are_those_of_a_dictionary(held, spread, seed, stride):
     parts = draw_parts(seed, spread, 40 if held > 3 else 6)
-    with KeyedSums(3, held=held) as sums:
+    with KeyedSums(3, held=held, stride=stride) as sums:
         for key, value in parts:
             sums.add(key, value)
         pieces = list(sums.pieces())
@@ -44,9 +42,8 @@ def test_sums_are_those_of_a_dictionary(held, spread, seed, stride, monkeypatch)
     assert values.tolist() == [expected[key] for key in keys.tolist()]
 
 
-def test_pieces_of_many_runs_are_small(monkeypatch):
-    monkeypatch.setattr(module, "STRIDE", 8)
-    with KeyedSums(3, held=400) as sums:
+def test_pieces_of_many_runs_are_small():
+    with KeyedSums(3, held=400, stride=8) as sums:
         for key, value in draw_parts(5, 2**23, 400):
             sums.add(key, value)
         runs = len(sums._runs)

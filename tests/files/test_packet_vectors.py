@@ -5,7 +5,6 @@ import pytest
 from strips import TOWARD, make_raw, read_all
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.strip import reader as reader_module
 from wavebatch.files.strip import shared_packets
 from wavebatch.files.strip.reader import StripReader
 
@@ -127,6 +126,5 @@ def test_returns_that_meet_only_far_apart_still_vote(tmp_path, monkeypatch):
         raw.points[name] = np.rint(xyz[:, axis] / 0.001)
         raw.points[("x_t", "y_t", "z_t")[axis]] = vector[:, axis]
     raw.points = raw.points[np.argsort(raw.points["bit_fields"], kind="stable")]
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     monkeypatch.setattr(shared_packets, "WINDOW", 64)
     assert scan_of(raw.write(tmp_path / "a.las")).vectors.direction == "toward"

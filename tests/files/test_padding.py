@@ -52,6 +52,7 @@ def pad(source, target, end):
     return np.append(ends, 0)[unit.packet_of_point]
 
 
+@pytest.mark.quick_cases("one length")
 @pytest.mark.parametrize("kind", ["one length", "many lengths"])
 def test_padded_strips_lose_nothing_of_what_was_recorded(tmp_path, kind):
     whole, padded = tmp_path / "whole.las", tmp_path / "padded.las"

@@ -231,6 +231,7 @@ def test_published_files_get_the_usual_permissions(tmp_path):
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o644
 
 
+@pytest.mark.quick_cases("run-3000")
 @pytest.mark.skipif(os.name == "nt", reason="limits of POSIX systems")
 @pytest.mark.parametrize(("command", "most"), [("run", 0), ("run", 3000), ("voxelize", 3000)])
 def test_a_full_disk_is_told_as_such_by_compressors_and_on_closing_too(tmp_path, tiny_strip, command, most):

@@ -8,7 +8,6 @@ import pytest
 from pulse_files import Pulse, PulseFile, Sampling, bell
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.pulsewaves import reader as module
 from wavebatch.files.pulsewaves.header import read_pulse_header
 from wavebatch.files.pulsewaves.reader import PulseReader
 
@@ -36,8 +35,8 @@ def _write(tmp_path, rng, number=40, **more):
     return file, file.write(tmp_path / "a.pls")
 
 
-def _read(path):
-    with PulseReader(read_pulse_header(path)) as reader:
+def _read(path, **sizes):
+    with PulseReader(read_pulse_header(path), **sizes) as reader:
         for piece in reader.pieces():
             yield from _list_segments(piece)
 
@@ -58,21 +57,19 @@ def _expected(file):
 
 
 @pytest.mark.parametrize("step", [1, 7, 50_000])
-def test_every_segment_comes_as_it_was_written(tmp_path, rng, monkeypatch, step):
-    monkeypatch.setattr(module, "PULSES", step)
+def test_every_segment_comes_as_it_was_written(tmp_path, rng, step):
     file, path = _write(tmp_path, rng)
-    assert list(_read(path)) == list(_expected(file))
+    assert list(_read(path, pulses=step)) == list(_expected(file))
 
 
-def test_pulses_need_not_lie_in_the_order_of_their_waves(tmp_path, rng, monkeypatch):
-    monkeypatch.setattr(module, "PIECE_BYTES", 200)
+def test_pulses_need_not_lie_in_the_order_of_their_waves(tmp_path, rng):
     file, path = _write(tmp_path, rng)
     data = bytearray(path.read_bytes())
     start = read_pulse_header(path).start
     records = [data[start + 48 * k : start + 48 * k + 48] for k in range(40)]
     data[start : start + 48 * 40] = b"".join(records[::-1])
     path.write_bytes(data)
-    turned = [(39 - pulse, *rest) for pulse, *rest in _read(path)]
+    turned = [(39 - pulse, *rest) for pulse, *rest in _read(path, size=200)]
     assert sorted(turned, key=lambda row: row[0]) == list(_expected(file))
 
 

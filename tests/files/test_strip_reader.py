@@ -14,7 +14,6 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import spool, temp_folders
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.las import laz_decode
-from wavebatch.files.strip import reader as reader_module
 from wavebatch.files.strip import scanner, shared_packets
 from wavebatch.files.strip.reader import LONG_SAMPLES, StripReader
 
@@ -74,11 +73,10 @@ def test_geometry_is_that_of_the_simulated_pulses(tmp_path):
 
 @pytest.mark.parametrize(("name", "packets"), [(RIEGL, 2375), (LEICA, 999)])
 @pytest.mark.parametrize("unit_points", [50_000, 100])
-def test_real_files_give_every_packet_once(monkeypatch, name, packets, unit_points):
+def test_real_files_give_every_packet_once(name, packets, unit_points):
     path = data_file(name)
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", unit_points)
     points = read_raw(path)
-    with StripReader(path) as reader:
+    with StripReader(path, unit_points=unit_points) as reader:
         facts = reader.facts
         kinds = {i: (d.bits, d.n_samples) for i, d in facts.digitizers.items()}
         data = facts.packets.file.read_bytes()[facts.packets.base :]
@@ -87,7 +85,7 @@ def test_real_files_give_every_packet_once(monkeypatch, name, packets, unit_poin
             assert scan.with_waveform == len(points)
             assert scan.vectors.direction == "toward"
             assert abs(scan.vectors.ratio - 0.9997) < 2e-4
-    assert_same(read_all(path, size=100), read_plainly(points, data, kinds))
+    assert_same(read_all(path, size=100, unit_points=unit_points), read_plainly(points, data, kinds))
 
 
 def _shuffled(tmp_path, points, order):
@@ -116,15 +114,14 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
     path = _shuffled(tmp_path, points, orders[order])
     kinds = {1: (16, 60), 2: (16, 120)}
     plain = read_plainly(points[orders[order]], path.with_suffix(".wdp").read_bytes(), kinds)
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 128)
     monkeypatch.setattr(shared_packets, "WINDOW", window)
     monkeypatch.setattr(shared_packets, "BINS", 64)
     monkeypatch.setattr(shared_packets, "_PER_BUCKET", 500)
     monkeypatch.setattr(spool, "MEMORY", 3000)
     monkeypatch.setattr(spool, "KEPT", 100)
-    assert_same(read_all(path, size=50), plain)
-    assert_same(read_all(path, size=50, owned_only=False), plain)
-    with StripReader(path) as reader, reader.scan() as scan:
+    assert_same(read_all(path, size=50, unit_points=128), plain)
+    assert_same(read_all(path, size=50, owned_only=False, unit_points=128), plain)
+    with StripReader(path, unit_points=128) as reader, reader.scan() as scan:
         assert (scan.packets, scan.with_waveform) == (2375, 2535)
         spans = [members[-1] - members[0] for _, members in plain.values()]
         assert scan.reach == max(spans)
@@ -134,12 +131,11 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
     assert not spooled.exists()
 
 
-def test_block_and_unit_sizes_change_nothing(monkeypatch):
+def test_block_and_unit_sizes_change_nothing():
     path = data_file(RIEGL)
     whole = read_all(path, size=4096)
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 77)
     for size in (1, 13):
-        parts = read_all(path, size=size)
+        parts = read_all(path, size=size, unit_points=77)
         assert list(parts.keys() - whole.keys()) == []
         for key, (samples, members, origin, direction) in whole.items():
             np.testing.assert_array_equal(parts[key][0], samples)
@@ -148,10 +144,9 @@ def test_block_and_unit_sizes_change_nothing(monkeypatch):
             assert parts[key][3].tobytes() == direction.tobytes()
 
 
-def test_units_take_every_point_once_and_cut_no_pulse(tmp_path, monkeypatch):
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
+def test_units_take_every_point_once_and_cut_no_pulse(tmp_path):
     raw = make_raw(400)
-    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+    with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
         units = [reader.read_unit(number, scan) for number in range(reader.unit_count())]
         assert np.concatenate([unit.points for unit in units]).tobytes() == raw.points.tobytes()
         assert [unit.start for unit in units] == scan.borders[:-1].tolist()
@@ -161,24 +156,22 @@ def test_units_take_every_point_once_and_cut_no_pulse(tmp_path, monkeypatch):
         assert sum(int(unit.packets.owned.sum()) for unit in units) == 400
 
 
-def test_a_border_cuts_runs_that_are_not_pulses(tmp_path, monkeypatch):
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
+def test_a_border_cuts_runs_that_are_not_pulses(tmp_path):
     raw = make_raw(100)
     raw.points["gps_time"] = 0
-    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+    with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
         assert scan.borders[:-1].tolist() == list(range(0, len(raw.points), 64))
-    assert len(read_all(tmp_path / "a.las")) == 100
+    assert len(read_all(tmp_path / "a.las", unit_points=64)) == 100
 
 
-def test_context_gives_returns_of_other_units(tmp_path, monkeypatch):
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
+def test_context_gives_returns_of_other_units(tmp_path):
     raw = make_raw(64, most_returns=1)
     points = np.concatenate([raw.points, raw.points])
     points["gps_time"] = np.arange(128)
     points["bit_fields"][64:] = 2
     points["return_point_wave_location"][64:] += 8000
     raw.points = points
-    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+    with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
         first, second = reader.read_unit(0, scan), reader.read_unit(1, scan)
         assert first.context_index.tolist() == list(range(64, 128))
         assert second.context_index.tolist() == list(range(64))
@@ -270,13 +263,12 @@ def test_equal_offsets_of_two_descriptors_are_two_packets(tmp_path):
 
 
 def test_too_many_points_on_one_packet_are_broken_wherever_they_are(tmp_path, monkeypatch):
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     for window in (16_384, 64):
         monkeypatch.setattr(shared_packets, "WINDOW", window)
         raw = make_raw(1000, most_returns=1)
         bad = np.arange(0, 1000, 25)
         raw.points["wavepacket_offset"][bad] = 60
-        with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
             assert (scan.broken, scan.with_waveform, scan.packets) == (40, 960, 960)
             flags = np.concatenate([reader.read_unit(n, scan).point_flags for n in range(reader.unit_count())])
             assert np.flatnonzero(flags).tolist() == bad.tolist()
@@ -317,9 +309,8 @@ def test_samples_are_read_only_and_blocks_hold_at_most_their_size(tmp_path):
         assert sizes == [33, 33, 33, 1]
 
 
-def test_sample_blocks_spread_over_the_strip_and_repeat(tmp_path, monkeypatch):
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
-    with StripReader(make_raw(1000).write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+def test_sample_blocks_spread_over_the_strip_and_repeat(tmp_path):
+    with StripReader(make_raw(1000).write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
         points = [block.point for block in reader.sample_blocks(scan, 100)]
         again = [block.point for block in reader.sample_blocks(scan, 100)]
         everything = np.concatenate(points)
@@ -345,11 +336,10 @@ def test_a_strip_without_points_and_one_without_waveforms(tmp_path):
 
 
 def test_facts_scans_and_units_travel_between_processes(tmp_path, monkeypatch):
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     monkeypatch.setattr(spool, "KEPT", 0)
     raw = make_raw(64, most_returns=1)
     raw.points = np.concatenate([raw.points, raw.points])
-    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+    with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
         facts, copy = pickle.loads(pickle.dumps((reader.facts, scan)))
         assert facts.digitizers == reader.facts.digitizers
         here, there = reader.read_unit(1, scan), reader.read_unit(1, copy)
@@ -369,7 +359,6 @@ def test_compressed_points_are_decoded_once(tmp_path, monkeypatch, case):
         calls.append(len(rows))
         decode(points, rows)
 
-    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     monkeypatch.setattr(spool, "KEPT", 0)
     if case == "beyond the limit":
         monkeypatch.setattr(scanner, "_KEPT_BYTES", 150 * 57)
@@ -377,7 +366,8 @@ def test_compressed_points_are_decoded_once(tmp_path, monkeypatch, case):
         monkeypatch.setattr(temp_folders.tempfile, "mkdtemp", refuse)
     raw = make_raw(200, most_returns=1)
     plain, path = raw.write(tmp_path / "a.las"), raw.write(tmp_path / "b.laz")
-    with StripReader(plain) as one, StripReader(path) as two, one.scan() as expected, two.scan() as scan:
+    readers = StripReader(plain, unit_points=64), StripReader(path, unit_points=64)
+    with readers[0] as one, readers[1] as two, one.scan() as expected, two.scan() as scan:
         monkeypatch.setattr(laz_decode.LazPoints, "_decode", decode)
         for number in range(one.unit_count()):
             units = one.read_unit(number, expected), two.read_unit(number, scan)
@@ -404,9 +394,8 @@ def test_extra_bytes_and_crs_are_told(tmp_path):
         assert reader.read_unit(0, scan).points["tail"].tolist() == list(range(len(wide)))
 
 
-def test_long_records_make_smaller_units(tmp_path, monkeypatch):
-    monkeypatch.setattr(reader_module, "UNIT_BYTES", 57 * 100)
-    with StripReader(make_raw(200).write(tmp_path / "a.las")) as reader:
+def test_long_records_make_smaller_units(tmp_path):
+    with StripReader(make_raw(200).write(tmp_path / "a.las"), unit_bytes=57 * 100) as reader:
         assert reader.unit_count() == -(-reader.facts.header.point_count // 100)
 
 

@@ -137,7 +137,7 @@ from wavebatch.files.disk import spool
 from wavebatch.files.strip import reader
 spool.KEPT, reader.UNIT_POINTS = 0, 500
 
-def kill(task, workers):
+def kill(task, *arguments):
     os.kill(os.getpid(), signal.SIGKILL)
 
 if "TEST_KILLS" in os.environ:
@@ -146,6 +146,7 @@ if "TEST_KILLS" in os.environ:
 """As sitecustomize: workers do not run the script of the user."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_the_next_run_clears_up_after_one_that_was_killed(tmp_path, edit_points, jobs):
     strips, temporary, out = tmp_path / "in", tmp_path / "tmp", tmp_path / "out"

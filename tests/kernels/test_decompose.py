@@ -128,6 +128,10 @@ def draw_crowd(rng):
     return np.stack([np.exp(rng.uniform(4, 9, 4)), 8 + np.cumsum(rng.uniform(3.0, 9.0, 4)), np.full(4, 2.0)])
 
 
+@pytest.mark.quick_cases(
+    "3.0-whitening2-draw_random-inf-learned", "0.0-whitening0-draw_stiff-200.0-gaussian",
+    "3.0-whitening1-draw_crowd-inf-gaussian", "3.0-whitening1-draw_random-200.0-learned",
+)  # fmt: skip
 @pytest.mark.parametrize("shape", [GAUSSIAN, LEARNED], ids=["gaussian", "learned"])
 @pytest.mark.parametrize(
     ("draw", "clip"),

@@ -81,6 +81,7 @@ def test_white_noise_has_no_correlation():
     assert np.abs(pooled.correlation).max() < 0.02
 
 
+@pytest.mark.quick_cases("0.667-1.39")
 @pytest.mark.parametrize(("rho", "factor"), [(0.5, 1.29), (0.667, 1.39), (0.8, 1.48)])
 def test_coloured_noise_shows_in_the_covariance(rho, factor):
     """H11: the remedy multiplies the noise by 1.29, 1.39, 1.48 after the [1 2 1] filter, and by more for a pulse."""

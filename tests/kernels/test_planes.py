@@ -6,7 +6,6 @@ import pytest
 from scipy.spatial import cKDTree
 
 from wavebatch.core.units import MAD_TO_STD
-from wavebatch.kernels.geometry import normals
 from wavebatch.kernels.geometry.normals import MOST_PER_CELL, Gap, Surroundings, find_edges, measure_normals, thin_out
 from wavebatch.kernels.geometry.plane_halves import DOUBTFUL, SURE, compare_halves, misfit_of_angles
 from wavebatch.kernels.geometry.planes import (
@@ -255,14 +254,13 @@ def test_no_points_and_one(count):
     assert len(angle) == count and (gap == Gap.FEW_NEIGHBOURS).all()
 
 
-def test_a_point_does_not_depend_on_what_is_asked_with_it(rng, monkeypatch):
+def test_a_point_does_not_depend_on_what_is_asked_with_it(rng):
     points = np.column_stack([rng.uniform(0, 30, (3000, 2)), rng.normal(0, 0.05, 3000)]).round(2)
     ray = rng.normal(0, 0.2, (3000, 3)) - [0, 0, 1]
     around = Surroundings(points)
     (angle, error), gap = measure_normals(points, ray, around, **SETTINGS)
-    monkeypatch.setattr(normals, "PAIRS", 1000)
     some = rng.permutation(3000)[:500]
-    (again, error_again), gap_again = measure_normals(points[some], ray[some], around, **SETTINGS)
+    (again, error_again), gap_again = measure_normals(points[some], ray[some], around, **SETTINGS, pairs=1000)
     np.testing.assert_array_equal(again, angle[some])
     np.testing.assert_array_equal(error_again, error[some])
     np.testing.assert_array_equal(gap_again, gap[some])

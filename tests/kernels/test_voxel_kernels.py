@@ -5,7 +5,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry import voxels
 from wavebatch.kernels.geometry.voxels import (
     KEY_BITS,
     VoxelSamples,
@@ -56,7 +55,7 @@ def test_crossings_are_those_of_a_slow_walk(size, seed):
     for row in range(40):
         expected = [one for one in walk(*(values[row] for values in rays), size) if one[2] > 2e-6]
         mine = np.flatnonzero((found.ray == row) & (found.inside > 2e-6))
-        assert [tuple(index) for index in found.index[mine].tolist()] == [one[0] for one in expected]
+        assert [tuple(index) for index in found.voxel[mine].tolist()] == [one[0] for one in expected]
         assert found.enter[mine] == pytest.approx([one[1] for one in expected], abs=1e-9)
         assert found.inside[mine] == pytest.approx([one[2] for one in expected], abs=1e-9)
 
@@ -66,7 +65,7 @@ def test_rays_along_faces_and_through_edges_lie_in_one_voxel_at_a_time():
     step = np.array([[0.0, 0.0, -1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     begin, end = np.array([0.0, 0.0, 0.0, 1.5]), np.array([3.0, 4.0, 2.0, 3.0])
     found = cross_voxels(start, step, begin, end, 1.0)
-    cells = [found.index[found.ray == row].tolist() for row in range(4)]
+    cells = [found.voxel[found.ray == row].tolist() for row in range(4)]
     assert cells[0] == [[1, 0, 4], [1, 0, 3], [1, 0, 2]]
     assert cells[1] == [[i, i, i] for i in range(4)]
     assert cells[2] == [[0, 0, 3]]
@@ -79,14 +78,13 @@ def test_rays_do_not_know_of_each_other():
     parts = [cross_voxels(*(values[row : row + 1] for values in rays), 0.3) for row in range(0, 500, 7)]
     for row, part in zip(range(0, 500, 7), parts, strict=True):
         mine = whole.ray == row
-        for name in ("enter", "inside", "index"):
+        for name in ("enter", "inside", "voxel"):
             assert np.array_equal(getattr(whole, name)[mine], getattr(part, name))
 
 
-def test_slices_of_rays_cover_all_and_stay_small(monkeypatch):
-    monkeypatch.setattr(voxels, "AT_A_TIME", 2000)
+def test_slices_of_rays_cover_all_and_stay_small():
     rays = draw_rays(np.random.default_rng(5), 300)
-    slices = split_rays(*rays, 0.2)
+    slices = split_rays(*rays, 0.2, crossings=2000)
     assert np.concatenate([np.arange(300)[part] for part in slices]).tolist() == list(range(300))
     for part in slices:
         found = cross_voxels(*(values[part] for values in rays), 0.2)

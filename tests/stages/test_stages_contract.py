@@ -70,7 +70,7 @@ def test_every_stage_keeps_the_contract_on_any_waveforms(s, system):
         np.testing.assert_array_equal(block.samples, before)
 
 
-@pytest.mark.quick_cases("1", "5", "40")
+@pytest.mark.quick_cases("1", "5")
 @pytest.mark.parametrize("s", [1, 2, 5, 40, 150])
 def test_every_chain_keeps_the_contract_after_its_own_survey(s):
     chains = [load_profile(profile) for profile in PROFILES]

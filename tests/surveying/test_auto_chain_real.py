@@ -81,6 +81,7 @@ def test_riegl(riegl):
     assert found.matched.mean() >= 0.99
 
 
+@pytest.mark.slow
 def test_leica(leica):
     """Measured: exactly one echo in 97.8 % of 999 waveforms, where a Gaussian fit that grows splits almost all."""
     found = _run(leica)
@@ -89,7 +90,7 @@ def test_leica(leica):
     assert found.matched.mean() >= 0.995
 
 
-@pytest.mark.quick_cases("leica")
+@pytest.mark.slow
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_the_chain_of_a_real_strip_is_the_same_every_time(strip, request):
     path = request.getfixturevalue(strip)

@@ -53,6 +53,7 @@ def write_log(path, strip, change):
     return path
 
 
+@pytest.mark.slow
 def test_a_weaker_laser_that_its_log_knows_is_right(tmp_path, flickering):
     found = load_calibration(flickering / "with.toml")
     assert found.energy_mean == pytest.approx(1.0, abs=0.005) and found.energy_source == "pulse_energy"
@@ -108,6 +109,7 @@ def test_logs_that_stand_still_or_drift_alone_are_named_and_in_the_error(tmp_pat
     assert np.mean(np.abs(off) < stated) > 0.6
 
 
+@pytest.mark.slow
 def test_two_lasers_that_take_turns_without_a_mark_are_named_and_in_the_error(tmp_path, flickering, monkeypatch):
     render = facet_strips._render
 

@@ -89,6 +89,7 @@ def run(folder, out, *arguments):
     return done.stderr
 
 
+@pytest.mark.slow
 def test_brightness_that_falls_across_the_swath_is_named_and_in_the_errors(tmp_path, dim_edges):
     found, said = calibrate(dim_edges)
     assert "brightness changes with the scan angle by" in said and "fit it with --scan-angle" in said
@@ -133,6 +134,7 @@ def one_side(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_light_that_falls_from_side_to_side_is_fitted_by_three_strips(tmp_path, one_side):
     found, said = calibrate(one_side, "--scan-angle", "--divergence", 0.4, strips=["a.las", "b.las", "c.las"])
     assert "falls from one side" not in said and "light to the left and -11" in said
@@ -143,6 +145,7 @@ def test_light_that_falls_from_side_to_side_is_fitted_by_three_strips(tmp_path, 
     assert parse_calibration(older, "older").swath == pytest.approx((*found.swath[:3], 0.0))
 
 
+@pytest.mark.quick_cases("ab")
 @pytest.mark.parametrize("strips", ["ab", "ac"])
 def test_light_that_falls_from_side_to_side_is_an_error_where_strips_leave_it_open(tmp_path, one_side, strips):
     found, said = calibrate(one_side, "--scan-angle", strips=[f"{name}.las" for name in strips])
@@ -192,6 +195,7 @@ def calibrated(tmp_path_factory):
 SENSOR = Sensor(**BASE, light=LIGHT)
 
 
+@pytest.mark.slow
 def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibrated):
     other = replace(SENSOR, start=(-30.0, 20.0), time=START + 600)
     write_strip(tmp_path / "b.las", GROUND, other, 6000, seed=2)
@@ -201,6 +205,7 @@ def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibra
     assert found.channels[0].noise_dn == pytest.approx(0.65, abs=0.1) and found.channels[0].brightest > 1e7
 
 
+@pytest.mark.quick_cases("change1-*")
 @pytest.mark.parametrize(
     ("change", "said", "growth"),
     [
@@ -218,6 +223,7 @@ def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_pat
     assert np.nanmedian(stated) == pytest.approx(growth, abs=0.1)
 
 
+@pytest.mark.quick_cases("0.8")
 @pytest.mark.parametrize("gain", [0.8, 1.25])
 def test_another_gain_over_a_like_scene_is_named_and_in_the_error(tmp_path, calibrated, gain):
     write_strip(tmp_path / "b.las", GROUND, replace(SENSOR, light=gain * LIGHT, time=START + 600), 10_000, seed=3)
@@ -228,6 +234,7 @@ def test_another_gain_over_a_like_scene_is_named_and_in_the_error(tmp_path, cali
     assert stated == pytest.approx(0.25, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, calibrated, monkeypatch):
     even = [Facet(lambda x, y: 0.1 + 0.5 * np.abs(np.sin(y)))]
     render = facet_strips._render
@@ -271,6 +278,7 @@ def disc(radius):
 SLOW = Sensor(speed=3.0, line_rate=20.0, half_angle=4.0, light=LIGHT, divergence=0.25e-3, start=(14.0, 0.0))
 
 
+@pytest.mark.quick_cases("1.2-0.53")
 @pytest.mark.parametrize(("radius", "off"), [(1.2, 0.53), (3.2, 0.03)])
 def test_a_target_that_is_declared_too_large_has_an_error_that_holds(tmp_path, radius, off):
     write_strip(tmp_path / "a.las", [Facet(0.6, inside=disc(radius)), Facet(0.28)], SLOW, 8000, seed=3)
@@ -281,6 +289,7 @@ def test_a_target_that_is_declared_too_large_has_an_error_that_holds(tmp_path, r
     assert abs(4 / (2 * LIGHT) / found.constant - 1) < 1.1 * off
 
 
+@pytest.mark.slow
 def test_a_target_that_is_clipped_is_refused(tmp_path):
     bright = replace(SLOW, bits=8, energy_spread=0.03, light=235 / 0.5 * 700**2 * 10 ** (2e-4 * 0.22 * 700))
     write_strip(tmp_path / "a.las", [Facet(0.5, inside=disc(4.0)), Facet(0.28)], bright, 8000, seed=3)
@@ -324,7 +333,7 @@ def test_a_trajectory_that_is_late_is_named_and_in_the_error(tmp_path, calibrate
     assert np.mean(off < cloud["range_error"]) > 0.5 and np.nanmedian(cloud["range_error"]) < (1.0 if late else 0.1)
 
 
-@pytest.mark.quick_cases("0.2")
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.2, -0.4])
 def test_vectors_that_are_turned_against_a_trajectory_are_in_the_errors_of_angles(tmp_path, monkeypatch, turn):
     """Packet vectors 0.2 deg off the points: one angle of eight was within its error."""
@@ -370,7 +379,7 @@ def test_other_air_on_the_day_of_the_calibration_is_named_and_in_the_error(tmp_p
     assert stated == pytest.approx(np.hypot(0.031, 4.6e-4 * 703 * (given - 0.22)), abs=0.004)
 
 
-@pytest.mark.quick_cases("2000-0-3200")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fall", "ground", "height"), [(2000, 0, 3200), (1200, 0, 3200), (2000, 2500, 1000), (1e9, 0, 2000)]
 )
@@ -456,6 +465,7 @@ def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, ca
             sensor.refuse_units(SimpleNamespace(facts=facts), scan)
 
 
+@pytest.mark.slow
 def test_feet_without_pairs_of_returns_are_said(tmp_path, calibrated):
     """Light 10.8 times too bright was put down to another gain or other surfaces."""
     write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 600), 8000, seed=81)
@@ -494,6 +504,7 @@ def test_strips_of_two_zones_are_not_tied(tmp_path, dim_edges):
     assert call("calibrate", tmp_path / "a.las", tmp_path / "c.las", *options).exit_code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scanners", [False, True])
 def test_lines_of_targets_have_the_constant_of_one_channel(tmp_path, scanners):
     two = replace(SENSOR, gains={1: 1.0, 2: 0.5}, scanners=scanners)

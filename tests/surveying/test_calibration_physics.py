@@ -155,6 +155,7 @@ def test_only_echoes_with_their_whole_footprint_on_the_target_count(tmp_path):
     assert found.targets[0].edge is None
 
 
+@pytest.mark.slow
 def test_a_target_as_small_as_the_footprint_is_refused_by_name(tmp_path):
     strip, corners = tarp_strip(tmp_path / "s.las", 2.4, 1.5e-3)
     with pytest.raises(InputError, match=r"t: too small for a footprint of 1\.05 m: \d of \d\d echoes"):
@@ -216,6 +217,7 @@ def test_a_file_gives_back_all_that_it_checks(channels):
     assert found.height == pytest.approx(701, abs=5) and found.divergence == 0.5
 
 
+@pytest.mark.slow
 def test_the_energy_from_shot_to_shot_is_measured(tmp_path):
     strip = write_strip(tmp_path / "s.las", [Facet(0.3)], Sensor(energy_spread=0.04), 6000)
     found = calibrate_strip(strip, [Target("t", 0.3, outline(40, -15, 70, 15))], CalibrationOptions(divergence=0.5))
@@ -283,6 +285,7 @@ def test_another_sensor_or_channel_is_refused_by_name(tmp_path, channels, change
     assert done.exit_code == 1 and message in done.stderr
 
 
+@pytest.mark.slow
 def test_descriptors_that_differ_in_length_only_share_a_constant(tmp_path, channels):
     strip = write_strip(tmp_path / "s.las", [Facet(0.3)], Sensor(gains={5: 1.0}, n_samples=96), 3000)
     done = run_with(tmp_path, strip, channels / "two.toml")
@@ -377,7 +380,7 @@ def test_a_vendors_column_of_reflectances_is_an_anchor(tmp_path, vendor):
     assert f"spread {100 * row.spread:.1f} %" in done.stderr and "incidence" not in done.stderr
 
 
-@pytest.mark.quick_cases("1.0")
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [0.0, 0.5, 1.0])
 def test_air_that_a_vendors_column_still_holds_is_taken_off(tmp_path, monkeypatch, held):
     """Constants by such a column were 7 to 15 % off, with an error of 3 %."""

@@ -19,6 +19,7 @@ def surveys():
     return block, [survey_block(part) for part in (block, block.rows(slice(0, half)))]
 
 
+@pytest.mark.slow
 def test_a_canopy_is_no_noise_and_no_pulse(surveys):
     for survey in surveys[1]:
         system = survey.system
@@ -36,6 +37,7 @@ def test_echoes_of_a_canopy_are_found_with_the_survey_of_any_tile(surveys):
     assert np.mean(counts[0] != counts[1]) < 0.05
 
 
+@pytest.mark.quick_cases("1")
 @pytest.mark.parametrize("seed", [1, 2])
 def test_leaves_that_are_too_weak_to_be_seen_are_no_noise(seed):
     """They stand below the limit in every seventh packet: the noise of a pulse was 24 and 32 % too large."""
@@ -59,6 +61,7 @@ def test_scatter_of_neighbours_is_no_tail_of_a_learned_pulse():
     assert len(choose_chain(survey).run(block, survey.system)) == pytest.approx(true, rel=0.04)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "density"), [(2, 0.3), (2, 0.8)])
 def test_neighbours_are_no_tail_of_the_pulse(seed, density):
     """2 and 3 Gaussians were learned; the other tile's survey gave a fifth of the packets another count."""
@@ -66,6 +69,7 @@ def test_neighbours_are_no_tail_of_the_pulse(seed, density):
     assert compare_pulses(system, SystemPulse(sigma_ref=CANOPY_SIGMA)) < 0.05 and system.misfit < 0.01
 
 
+@pytest.mark.slow
 def test_a_tail_stays_in_the_pulse_of_a_canopy():
     system = survey_block(grow_canopy(1, n=4000, tail=0.06)).system
     assert len(system.components) > 1

@@ -185,7 +185,7 @@ def ringing(tmp_path_factory):
     return folder
 
 
-@pytest.mark.quick_cases("True-options1")
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [["--profile", "fast"], ["--chain", EXAMPLES / "urban.toml"]])
 @pytest.mark.parametrize("saved", [False, True])
 def test_a_chain_that_does_not_fit_the_pulse_is_named_and_its_false_echoes_counted(ringing, tmp_path, options, saved):

@@ -85,6 +85,7 @@ def test_a_later_strip_of_the_sensor_belongs_to_them(strips, flight, name):
         assert hold_strip(reader, scan, kept) == ""
 
 
+@pytest.mark.slow
 def test_strangers_do_not_change_the_survey_of_the_others(strips, flight):
     names = ("wide", "flat", "level", "urban", "spacing", "forest")
     found = survey_flight(read_samples([strips[name] for name in names], waveforms=4800))

@@ -31,7 +31,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.quick_cases("forest")
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["forest", "mixed", "urban"])
 def test_errors_of_times_cover_hidden_neighbours(scene):
     """Over three strips, since each survey knows its strip's pairs to a fifth only."""

@@ -71,6 +71,7 @@ def test_what_is_shipped():
     assert FWHM_PER_SIGMA * KNOWN["riegl-q680i"].system.sigma_ref == pytest.approx(4.55, rel=0.05)
 
 
+@pytest.mark.quick_cases("*leica*")
 @pytest.mark.parametrize(("strip", "name"), [("riegl", "riegl-q680i"), ("leica", "leica-als")])
 def test_a_shipped_pulse_is_that_of_its_strip(strip, name, request):
     system = _survey(request.getfixturevalue(strip)).system
@@ -80,13 +81,14 @@ def test_a_shipped_pulse_is_that_of_its_strip(strip, name, request):
     assert KNOWN[name].sensor in likeness.describe()
 
 
+@pytest.mark.slow
 def test_pulses_that_change_from_shot_to_shot_have_at_least_their_known_misfit():
     """Outgoing pulses of LVIS miss their mean by 3 %; of that its echoes have nothing in common, and add no echo."""
     system = _survey(data_file("lvis/lvis1.las")).system
     assert find_source(system).name == "nasa-lvis" and system.misfit >= KNOWN["nasa-lvis"].system.misfit == 0.027
 
 
-@pytest.mark.quick_cases("11-0.03")
+@pytest.mark.slow
 @pytest.mark.parametrize(("points", "error"), [(11, 0.03), (54, 0.03), (100, 0.03)])
 def test_a_small_strip_has_the_echoes_of_the_whole_strip(riegl, tmp_path, points, error):
     """54 points are 53 packets. With a Gaussian they had 116 echoes, since each after-pulse became one."""
@@ -99,7 +101,7 @@ def test_a_small_strip_has_the_echoes_of_the_whole_strip(riegl, tmp_path, points
         assert reason.startswith("riegl-q680i: ")
 
 
-@pytest.mark.quick_cases("317")
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [317, 528])
 def test_a_small_strip_takes_the_known_pulse_that_its_own_looks_like(first):
     """Fifty packets learned a pulse with the noise of a few echoes, and found 2 and 6 % more."""
@@ -131,7 +133,7 @@ OTHERS = {
 }  # fmt: skip
 
 
-@pytest.mark.quick_cases("flat-wide", "urban-skewed", "flat-tail", "urban-ringing")
+@pytest.mark.quick_cases("flat-wide")
 @pytest.mark.parametrize("name", OTHERS)
 @pytest.mark.parametrize("scene", ["flat", "urban"])
 def test_a_small_strip_of_another_sensor_gets_no_known_pulse(name, scene):

@@ -62,6 +62,7 @@ def test_a_pulse_is_no_wider_than_the_narrowest_echoes(seed, sigma, tail, share)
     assert np.mean(choose_chain(survey).run(block, survey.system).count(NUMBER) == number) > 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strip", "name", "width"),
     [
@@ -78,7 +79,7 @@ def test_strangers_have_the_width_of_their_measured_pulses(strip, name, width):
     assert _half_width(survey.system) == pytest.approx(width, rel=0.06)
 
 
-@pytest.mark.quick_cases("1")
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [0, 1])
 def test_parts_of_a_stranger_have_one_width(part):
     """Halves of LVIS had 8.51 and 8.24 ns."""

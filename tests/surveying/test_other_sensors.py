@@ -84,7 +84,7 @@ def test_counts_that_hardly_scatter_do_not_spoil_the_pulse(noise):
     assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.quick_cases("5")
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 5])
 def test_noise_on_a_broad_top_is_no_echo(seed):
     block, time, _ = record(gaussian, seed, n=1500, s=300, width=10.0, wide=0.3)
@@ -93,7 +93,7 @@ def test_noise_on_a_broad_top_is_no_echo(seed):
     assert not (echoes.flags & int(EchoFlag.MERGED)).any()
 
 
-@pytest.mark.quick_cases("-1")
+@pytest.mark.slow
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_widened_echoes_of_skewed_pulses_stay_whole(mirror):
     """A target adds its own shape to a pulse; it does not stretch it."""
@@ -171,6 +171,7 @@ def test_digitizers_that_record_otherwise_get_a_pulse_and_noise_of_their_own():
     assert survey.waveforms == 2112 and survey.figures.single_share > 0.98
 
 
+@pytest.mark.slow
 def test_digitizers_that_record_alike_share_what_is_learned():
     """As scanners do that write one descriptor per length of a waveform."""
     blocks = [digitized(record(skewed, seed, n=900, s=s)[0], index) for index, seed, s in ((1, 1, 80), (2, 2, 64))]
@@ -195,6 +196,7 @@ def test_systems_of_digitizers_are_saved(tmp_path):
             parse_survey(text.replace("index = 9\n", new), "x.toml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "seed"), [(0.12, 11), (0.2, 12)])
 def test_after_pulses_of_every_echo_belong_to_the_pulse_however_high(share, seed):
     block, time, _ = record(lambda x: gaussian(x) + share * gaussian(x - 5.0), seed, amplitude=(15, 200))
@@ -213,6 +215,7 @@ def test_what_is_left_of_few_echoes_is_learned_too():
     assert np.mean([judge(*record(tailed, seed, n=300)[:2])[2] for seed in range(20, 26)]) > 0.993
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "most"), [(13, 0.985), (14, 0.94)])
 def test_echoes_that_the_receiver_compresses_stay_whole(seed, most):
     """R5: above two thirds of the range the pulse flattens, and fits like two. Few echoes are so high: their splits are
@@ -229,6 +232,7 @@ def test_echoes_that_the_receiver_compresses_stay_whole(seed, most):
     assert whole > most and (echoes.count(len(block)) == 1)[strong].mean() > (0.95 if most > 0.95 else 0.4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [15, 16])
 def test_pairs_of_strong_echoes_are_no_misfit(seed):
     """A quarter of all echoes are two targets, 1.5 to 2 widths apart: they are still two."""

@@ -157,6 +157,7 @@ def test_a_column_that_knows_few_pulses_is_not_used_unless_asked_for(tmp_path):
         _filled(path, "pulse_energy")
 
 
+@pytest.mark.slow
 def test_voxels_are_divided_by_the_energies(strip, tmp_path):
     path, energies = strip
     sums = {}

@@ -71,7 +71,7 @@ def town(tmp_path_factory):
     return fly(tmp_path_factory.mktemp("town"), planes, GREEN, 16_000)
 
 
-@pytest.mark.quick_cases("0", "4")
+@pytest.mark.slow
 @pytest.mark.parametrize("plane", range(5))
 def test_roofs_have_right_numbers_with_right_errors(town, plane):
     columns, true, _ = town
@@ -294,6 +294,7 @@ def test_footprints_that_reach_over_an_edge_to_what_no_packet_holds_have_no_refl
     assert (known & ~roof & ~true["pure"] & (off < -0.3)).sum() < 10
 
 
+@pytest.mark.slow
 def test_edges_that_packets_hold_are_not_taken_for_others(tmp_path):
     planes = [*(Plane(0.4, z0=6.0, inside=roof_strips(-90.0 + 18 * i)) for i in range(10)), Plane(0.25)]
     _, _, report = fly(tmp_path, planes, replace(GREEN, n_samples=200), 6000, seed=73)

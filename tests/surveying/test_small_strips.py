@@ -30,6 +30,7 @@ def _leave_out(monkeypatch, name):
     monkeypatch.setattr(module, "known_systems", lambda: rest)
 
 
+@pytest.mark.quick_cases("flat, after-pulse")
 @pytest.mark.parametrize(
     ("scene", "pulse", "first"),
     [("urban", TAIL, 0), ("flat", find_pulse("riegl"), 100), ("forest", TAIL, 0)],
@@ -53,6 +54,7 @@ def test_a_gaussian_stays_one_in_fifty_packets(scene):
     assert survey.figures.echoes_in_doubt < MOST_DOUBTED
 
 
+@pytest.mark.slow
 def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path, monkeypatch):
     """LVIS as a stranger: fifty packets had 1.17 to 2.2 times the echoes, its halves differ in a half, in silence."""
     whole = data_file("lvis/lvis1.las")
@@ -63,6 +65,7 @@ def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path,
     assert _survey(whole).figures.echoes_in_doubt > 0.05, "halves differ in a quarter: unknown echoes are left out"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("change", "doubted"), [(0.0, False), (0.05, True)])
 def test_samples_that_no_pulse_explains_leave_echoes_in_doubt(change, doubted, rng):
     """A long strip of clear echoes that swing out otherwise in each waveform, by 5 % at most."""
@@ -97,6 +100,7 @@ def test_echoes_that_repeat_stronger_ones_leave_fifty_packets_in_doubt(alike):
     assert survey.figures.echoes_in_doubt > MOST_DOUBTED or found == pytest.approx(50 if alike else 100, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [21, 63])
 def test_fifty_widened_echoes_make_no_odd_pulse_of_a_gaussian(seed):
     """They gave one with a negative part, and 1.12 and 1.19 times the echoes."""
@@ -115,6 +119,7 @@ def test_fifty_packets_of_level_ground_are_sure(strip, request, tmp_path):
     assert survey.figures.echoes_in_doubt < MOST_DOUBTED
 
 
+@pytest.mark.slow
 def test_a_known_pulse_keeps_its_misfit_in_a_small_strip():
     """Packets of a dense forest with eight quiet samples each."""
     survey = _survey(data_file("neon/neon_harv_a.las"))
@@ -122,6 +127,7 @@ def test_a_known_pulse_keeps_its_misfit_in_a_small_strip():
     assert survey.figures.echoes_in_doubt > MOST_DOUBTED_KNOWN
 
 
+@pytest.mark.slow
 def test_echoes_that_a_smaller_noise_would_find_are_in_doubt_too():
     """Every fifth packet of that forest: a larger noise loses 5 % of the echoes, a smaller one finds 15 % more."""
     with StripReader(data_file("neon/neon_harv_a.las")) as reader, reader.scan() as scan:
@@ -130,6 +136,7 @@ def test_echoes_that_a_smaller_noise_would_find_are_in_doubt_too():
     assert find_source(survey.system) and survey.figures.echoes_in_doubt > MOST_DOUBTED_KNOWN
 
 
+@pytest.mark.slow
 def test_quiet_samples_are_looked_for_again_with_a_narrower_pulse():
     """Half of that forest: its isolated echoes are so wide that no sample was quiet, and the noise 2.4 DN, not 6.8."""
     with StripReader(data_file("neon/neon_harv_a.las")) as reader, reader.scan() as scan:

@@ -94,6 +94,7 @@ def village(tmp_path_factory):
     return folder, *fly(folder, 1, 9000)
 
 
+@pytest.mark.slow
 def test_angles_of_the_village_hold(village):
     check_angles(*village[1:], coverage=0.05)
 

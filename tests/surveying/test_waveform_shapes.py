@@ -83,7 +83,7 @@ def test_tails_are_no_baseline(share, length):
     assert found > 0.995 and true > 0.985
 
 
-@pytest.mark.quick_cases("leica")
+@pytest.mark.slow
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_samples_before_the_pulse_agree_with_the_baseline(strip, request):
     with StripReader(request.getfixturevalue(strip)) as reader, reader.scan() as scan:
@@ -93,6 +93,7 @@ def test_samples_before_the_pulse_agree_with_the_baseline(strip, request):
     assert abs(error_before(block, system, load_profile("accurate").run(block, system))) < 0.2
 
 
+@pytest.mark.slow
 def test_ordinary_strips_keep_all_quiet_samples():
     signal, *_ = render(bell, 2, second=0.5)
     assert survey_block(digitize(signal, 2)).system.noise.recovery == 0
@@ -121,6 +122,7 @@ def test_clipped_echoes_stay_one(seed):
     assert (number[clipped] == 1).mean() > 0.95 and (number[~clipped] == 1).mean() > 0.97
 
 
+@pytest.mark.slow
 def test_close_pairs_are_found_where_many_echoes_are_clipped():
     """Second echoes near the strongest passed for misfit of the pulse: clipped pairs 3 to 4 widths apart became one."""
     rng = np.random.default_rng(26)
@@ -140,6 +142,7 @@ def scores(block, rows, time):
     return system, *compare(echoes, rows, time)[:2]
 
 
+@pytest.mark.slow
 def test_clipped_echoes_do_not_narrow_the_pulse():
     """What a model has above the clip level is no misfit: the pulse was taken 20 % too narrow, a third was false."""
     signal, rows, time, _ = render(
@@ -150,6 +153,7 @@ def test_clipped_echoes_do_not_narrow_the_pulse():
     assert found > 0.99 and true > 0.99
 
 
+@pytest.mark.slow
 def test_neighbours_among_clipped_echoes_are_no_misfit():
     """Three targets per waveform, some of them clipped: the misfit was 5.6 % of the amplitude."""
     rng = np.random.default_rng(8)
@@ -219,7 +223,7 @@ def test_sloping_baselines_hide_no_echo():
     assert found > 0.99 and true > 0.99
 
 
-@pytest.mark.quick_cases("20")
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [20, 21])
 def test_tails_of_both_signs_are_no_slopes(seed):
     """Tails of strong echoes seemed to be slopes: taken off, they lifted the end of each GeoLas packet by .8 DN."""
@@ -230,7 +234,7 @@ def test_tails_of_both_signs_are_no_slopes(seed):
     assert system.noise.recovery > 0 and system.defects.slope_spread == 0
 
 
-@pytest.mark.quick_cases("1.5")
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.4, 1.5])
 def test_errors_hold_where_few_samples_show_the_level(spread):
     """Baselines that are wrong by a part of the noise: errors of widths were 1.1 to 1.2 times too small."""
@@ -245,7 +249,7 @@ def test_errors_hold_where_few_samples_show_the_level(spread):
         assert 0.93 < np.std(ratio[np.abs(ratio) < 6]) < 1.07
 
 
-@pytest.mark.quick_cases("16-24")
+@pytest.mark.slow
 @pytest.mark.parametrize(("s", "seed"), [(16, 24), (20, 25)])
 def test_wandering_levels_that_echoes_hide_make_no_echoes(s, seed):
     """In 40 % of such packets no sample is quiet: by the strip's level 12 % of the echoes were false, widths .75."""
@@ -296,6 +300,7 @@ def test_echoes_across_recordings_that_lose_time_are_flagged():
     assert near.any() and (echoes.flags[near] & int(EchoFlag.NEAR_EDGE)).all()
 
 
+@pytest.mark.slow
 def test_strips_without_defects_keep_their_counts():
     for pulse, seed in ((bell, 9), (tailed(0.012, 30.0), 10)):
         block = digitize(render(pulse, seed, second=0.3)[0], seed)
@@ -323,7 +328,7 @@ def test_errors_hold_in_coloured_noise_that_grows_with_the_signal(rho, gain):
     assert true > 0.995
 
 
-@pytest.mark.quick_cases("0.3")
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.05, 0.3])
 def test_noise_that_grows_with_the_signal_makes_no_narrow_pulse(gain):
     """By errors of white noise the narrowest of scattered widths were the pulse: a fifth too narrow, g a fifth low."""
@@ -338,6 +343,7 @@ def test_noise_that_grows_with_the_signal_makes_no_narrow_pulse(gain):
     assert 0.9 < np.std((error / echoes.sigma_err[match.found])[strong]) < 1.1
 
 
+@pytest.mark.slow
 def test_coloured_noise_is_no_slope(riegl):
     """Its slopes scatter by twice what white noise does: every second waveform seemed to rise or fall by .025 DN/ns."""
     pool = read_pool(riegl)

@@ -183,7 +183,7 @@ class RunReport:
                 **{name: self.count(name) for name in COUNTS},
                 "passed_through": {name: self.passed_through.get(name, 0) for name in _PASSED},
                 "left_out": {name: self.left_out.get(name, 0) for name in LEFT_OUT},
-                "flags": {flag.name: self.flags.get(flag.name, 0) for flag in EchoFlag},
+                "flags": {name: self.flags.get(name, 0) for name in EchoFlag.__members__},
                 "no_data": {
                     column: {name: number for name, number in reasons.items() if number}
                     for column, reasons in self.no_data.items()
@@ -262,7 +262,7 @@ def list_sums(counts: Mapping[str, Any], points: str) -> dict[str, dict[str, int
 
 def count_flags(flags: np.ndarray) -> dict[str, int]:
     """Count the rows per flag in `flags`, u2 (m,); flags that no row has are left out."""
-    numbers = {flag.name: int(np.count_nonzero(flags & np.uint16(flag))) for flag in EchoFlag}
+    numbers = {name: int(np.count_nonzero(flags & np.uint16(flag))) for name, flag in EchoFlag.__members__.items()}
     return {name: number for name, number in numbers.items() if number}
 
 

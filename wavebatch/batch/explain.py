@@ -168,7 +168,7 @@ def _doubt_fits(prepared: Prepared, report: RunReport) -> Iterator[str]:
     """A line for each flag of failed fits that far more echoes have than usual."""
     written = report.count("points_out") - sum(report.passed_through.values())
     for flag in (EchoFlag.NOT_CONVERGED, EchoFlag.AT_BOUND):
-        number = report.flags.get(flag.name, 0)
+        number = report.flags.get(str(flag.name), 0)
         if written >= LEAST_JUDGED and number > MOST_FAILED * written:
             auto = prepared.job.request.describe(prepared.job.chain) is not None
             remedy = "draw some with `wavebatch plot waveform --flags`" if auto else "use --profile auto"

@@ -59,8 +59,8 @@ class StripJob:
         columns that are asked for.
         """
         saved = self.request.system
-        sources = (self.calibration, saved and saved.survey.system.radiometry)
-        divergence = any(source is not None and source.divergence is not None for source in sources)
+        known = [self.calibration and self.calibration.divergence, saved and saved.survey.system.radiometry.divergence]
+        divergence = any(value is not None for value in known)
         given = self.sensor != SensorRequest()
         chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
         return with_columns(chain, (*self.columns, *self.chosen.list_wanted()))

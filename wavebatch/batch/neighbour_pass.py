@@ -26,11 +26,13 @@ from wavebatch.batch.counts import RunReport
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, spread
 from wavebatch.batch.unit import Prepared, SolvedBlocks, solve_unit, unpack
 from wavebatch.core.echoes import COLUMNS, EchoTable
+from wavebatch.core.errors import StageError
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.core.process import Seconds
 from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.files.disk.row_file import RowStore
 from wavebatch.files.disk.spool import Spool
+from wavebatch.files.point_dtypes import field_names
 from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, find_edges, thin_out
 from wavebatch.kernels.geometry.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
 from wavebatch.stages.chain import Chain, Step
@@ -64,7 +66,7 @@ class TileTask:
     tiles: Tiles
     entries: Spool
     """Points by tile, including those of its buffer."""
-    scales: tuple[float, float, float]
+    scales: tuple[float, ...]
 
     def place(self, xyz: np.ndarray) -> np.ndarray:
         """Return positions [m] without the file's offset, f8 (n, 3), of stored coordinates, i4 (n, 3)."""
@@ -87,7 +89,7 @@ class SecondPass:
     """
 
     def __init__(
-        self, step: Step, scales: tuple[float, float, float], target: Path, *, tile_points: int | None = None
+        self, step: Step, scales: tuple[float, ...], target: Path, *, tile_points: int | None = None
     ) -> None:
         self._step, self._scales = step, scales
         self._tile_points = tile_points or TILE_POINTS
@@ -104,8 +106,8 @@ class SecondPass:
         """Keep entries and state of `begin_unit`, in the order of the units."""
         first = -self._rows.count % self._every
         self._sample.append(rows["xyz"][first :: self._every] * np.array(self._scales))
-        self._units.append(tuple(slice(store.count, store.count + len(new))
-                                 for store, new in ((self._rows, rows), (self._states, kept))))  # fmt: skip
+        entries, states = self._rows.count, self._states.count
+        self._units.append((slice(entries, entries + len(rows)), slice(states, states + len(kept))))
         self._rows.add(rows)
         self._states.add(kept)
         while sum(map(len, self._sample)) > SAMPLE:
@@ -135,8 +137,8 @@ class SecondPass:
             self._entries.append(tile, rows[able[index]])
             at += len(rows)
         self._blob = pickle.dumps(TileTask(self._step, tiles, self._entries.seal(), self._scales), PROTOCOL)
-        for tile, count in enumerate(counts.tolist()):
-            self._parts.extend((tile, part) for part in range(-(-count // PART_POINTS)))
+        for number, count in enumerate(counts.tolist()):
+            self._parts.extend((number, part) for part in range(-(-count // PART_POINTS)))
         self._tiles_left, self._units_left = len(self._parts), len(self._units)
         return RunReport(timing={"tiles": Seconds.now() - start})
 
@@ -157,7 +159,7 @@ class SecondPass:
         rows, state = self._units.popleft()
         return end_unit, (blob, self._states.read(state.start, state.stop), self._found.read(rows.start, rows.stop))
 
-    def take(self, result: Found | tuple[np.ndarray, RunReport]) -> tuple[np.ndarray | None, RunReport]:
+    def take(self, result: Any) -> tuple[np.ndarray | None, RunReport]:
         """Take the result of the oldest call: rows of the cloud, None for a tile; and its report."""
         if not self._tiles_left:
             self._units_left -= 1
@@ -217,8 +219,8 @@ def _mark_edges(prepared: Prepared, solved: SolvedBlocks) -> SolvedBlocks:
     # In the order of packets: blocks of several digitizers come in another one with blocks of another size.
     order = np.argsort(np.concatenate([index[block.echoes.waveform] for index, block in solved]), kind="stable")
     edge = np.empty(len(order), bool)
-    given = (np.concatenate(values)[order] for values in zip(*parts, strict=True))
-    edge[order] = find_edges(*given, INSET * beam * distance)
+    place, ray, time, before, after = (np.concatenate(values)[order] for values in zip(*parts, strict=True))
+    edge[order] = find_edges(place, ray, time, before, after, INSET * beam * distance)
     ends = np.cumsum([len(block.echoes) for _, block in solved])
     return [
         (index, block._replace(echoes=block.echoes.with_attributes(edge=part)))
@@ -246,11 +248,11 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndar
     _gather.cache_clear()  # tiles are done: their memory is needed for the unit
     prepared: Prepared = unpack(blob)
     timing: dict[str, Seconds] = {}
-    made, solved = pickle.loads(state)
+    made, solved = pickle.loads(state.data)
     has_echo = made.echo >= 0
     by_echo = np.zeros(len(made.counted), found.dtype)
     by_echo[made.echo[has_echo]] = found[has_echo]
-    first, *_ = names = found.dtype.names[:-1]
+    first, *_ = names = field_names(found.dtype)[:-1]
     known = by_echo["gap"] == Gap.KNOWN
     values = {name: np.where(known, by_echo[name], np.float32(np.nan)) for name in names}
     if f"{first}_err" in values:
@@ -319,13 +321,15 @@ def process_tile(blob: bytes, number: int, part: int) -> Found:
     start = Seconds.now()
     task: TileTask = unpack(blob)
     stage = task.step.stage
+    if stage.second_pass is None:
+        raise StageError(f"{stage.name} has no second pass; please report it as a bug")
     entries = _read_part(task.entries, number, part)
     place = task.place(entries["xyz"])
     own = np.flatnonzero(is_inside(task.tiles, number, place))
     around = _gather(blob, number)
     values, gap = stage.second_pass(place[own], entries["ray"][own], around, **task.step.effective())
     found = np.empty(len(own), _found_dtype(task.step))
-    for name, column in zip(found.dtype.names, (*values, gap), strict=True):
+    for name, column in zip(field_names(found.dtype), (*values, gap), strict=True):
         found[name] = column
     return entries["row"][own], found, RunReport(timing={f"{stage.name}, second pass": Seconds.now() - start})
 

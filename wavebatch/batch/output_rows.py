@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -134,6 +134,8 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
         near = table.attributes["point"].astype(np.int64)
         free = np.flatnonzero(near < 0)
         returns = block.returns
+        if returns is None:
+            raise _bug(unit, "a block has no returns")
         row = find_nearest(table.waveform[free], table.time[free], returns.waveform, returns.time)
         if np.any(row < 0):
             raise _bug(unit, "an echo lies in a packet of no point")
@@ -293,7 +295,7 @@ def _place_rows(
     owner = owner[np.concatenate([table.waveform, members.packet[passed]])]
     source = np.concatenate([members.find(point), passed])
     owner = np.where(owner < 0, source, owner)
-    order = find_order(owner, np.concatenate([table.time, _locations(members.source[passed])]))
+    order: Any = find_order(owner, np.concatenate([table.time, _locations(members.source[passed])]))
     order = slice(None) if order is None else order
     return _Rows(
         echo=np.concatenate([np.arange(len(table)), np.full(len(passed), -1)])[order],

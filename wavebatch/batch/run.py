@@ -170,8 +170,8 @@ def _survey_flight(
 ) -> SavedSurvey | None:
     """Survey all strips together and keep the result; None where no strip can be read: each fails in its turn."""
     first = jobs[0].options
-    reading = {"direction": first.direction, "headerless": first.headerless}
-    samples = read_samples([job.path for job in jobs], **reading, spread=workers.map)
+    paths = [job.path for job in jobs]
+    samples = read_samples(paths, direction=first.direction, headerless=first.headerless, spread=workers.map)
     if not samples:
         return None
     path = flight_path(options.folder)
@@ -264,12 +264,12 @@ class _Batch:
         with self._failing(strip):
             before = strip.written
             strip.take(self._workers)
-            done, units = strip.written, strip.prepared.units
+            done, units = strip.written, strip.ready.units
             if done > before:
                 self._tell({"event": "unit", "strip": str(strip.job.path), "done": done, "of": units})
             if strip.is_complete:
                 report = strip.finish()
-                survey = strip.prepared.choice.survey if strip.job.request.system is None else None
+                survey = strip.ready.choice.survey if strip.job.request.system is None else None
                 status = "incomplete" if report.is_incomplete else "written"
                 self._end(strip, Outcome(strip.job, status, report, survey=survey))
 

@@ -13,7 +13,7 @@ from collections import deque
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
@@ -24,13 +24,15 @@ from wavebatch.batch.options import RunOptions
 from wavebatch.batch.unit import Prepared, prepare_strip, process_unit
 from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import Workers
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import InputError, StageError
 from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.text_file import draft_text
+
+T = TypeVar("T")
 
 
 class StripTask:
@@ -44,11 +46,13 @@ class StripTask:
         Whether no other strip may be under way: it is tried again after a worker process died.
     """
 
+    facts: StripFacts
+    """From `start` on."""
+
     def __init__(self, job: StripJob, options: RunOptions, alone: bool) -> None:
         self.job = job
         self.alone = alone
         self.pending: deque[Future] = deque()
-        self.facts: StripFacts | None = None
         self.prepared: Prepared | None = None
         self.written = 0
         self._options = options
@@ -104,6 +108,11 @@ class StripTask:
             check_target(target(self.job, options.folder), overwrite=options.overwrite or options.resume)
 
     @property
+    def ready(self) -> Prepared:
+        """What the preparation found; it must have ended."""
+        return _given(self.prepared)
+
+    @property
     def has_more(self) -> bool:
         """Whether there is a call to submit now."""
         if self.prepared is None:
@@ -125,7 +134,7 @@ class StripTask:
             self.pending.append(workers.submit(prepare_strip, self.job.absolute() if workers.is_remote else self.job))
             return
         if self._submitted == self.prepared.units:
-            function, arguments = self._second.next_call(self._blob)
+            function, arguments = _given(self._second).next_call(self._blob)
             self.pending.append(workers.submit(function, *arguments))
             return
         arguments = self._blob, self._submitted, self._options.block_size
@@ -139,25 +148,25 @@ class StripTask:
         if self.prepared is None:
             self.prepared = result
             self._report += result.report
-            self._open(workers.jobs)
+            self._open(result, workers.jobs)
         elif self.written == self.prepared.units:
-            rows, report = self._second.take(result)
+            rows, report = _given(self._second).take(result)
             if rows is not None:
-                self._writer.write(rows)
+                _given(self._writer).write(rows)
             self._report += report
         else:
             rows, report = result
             if self._second is None:
-                self._writer.write(rows)
+                _given(self._writer).write(rows)
             else:
                 self._second.add(*rows)
             self.written += 1
             self._report += report + RunReport(timing={"write": Seconds.now() - start})
-        if self.written == self.prepared.units and self._second is not None:
+        if self.written == self.ready.units and self._second is not None:
             self._report += self._second.cut()
 
-    def _open(self, threads: int) -> None:
-        options, prepared = self._options, self.prepared
+    def _open(self, prepared: Prepared, threads: int) -> None:
+        options = self._options
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
         command = self.job.options.command(self.job.path.name)
         provenance = {**self._described, "command": command, **report_file.describe_chain(prepared)}
@@ -182,25 +191,25 @@ class StripTask:
         StageError
             Where counts do not add up.
         """
-        options, job = self._options, self.job
+        options, job, prepared, writer = self._options, self.job, self.ready, _given(self._writer)
         start = Seconds.now()
         self._report.check(job.options.points, str(job.path))
-        self._report += RunReport(remarks=(*_name_stranger(self.prepared), *find_remarks(self.prepared, self._report)))
+        self._report += RunReport(remarks=(*_name_stranger(prepared), *find_remarks(prepared, self._report)))
         if self._stat() != self._state:
             raise InputError(f"{job.path}: changed while it was read; run it again once it is complete")
         cloud = report_file.cloud_path(job, options.folder)
         report = report_file.report_path(job, options.folder)
         replaces = options.overwrite or options.resume
-        size = self._writer.complete()
+        size = writer.complete()
         self._report += RunReport(timing={"publish": Seconds.now() - start})
-        warnings = find_warnings(self.prepared, self._report, self._writer.dropped)
+        warnings = find_warnings(prepared, self._report, writer.dropped)
         self._report = replace(self._report, warnings=warnings)
-        document = report_file.build_document(self.prepared, self._described, self._report, cloud, size)
+        document = report_file.build_document(prepared, self._described, self._report, cloud, size)
         draft = draft_text(report, report_file.format_report(document), overwrite=replaces)
         try:
             if replaces:
                 report.unlink(missing_ok=True)  # before the new cloud: an old report must not vouch for it
-            self._writer.publish(draft)
+            writer.publish(draft)
         finally:
             draft.discard()
         self._close()
@@ -219,14 +228,22 @@ class StripTask:
 
     def _close(self) -> None:
         """Remove temporary files."""
-        for one in (self._second, self.prepared and self.prepared.scan):
-            if one is not None:
-                one.close()
+        if self._second is not None:
+            self._second.close()
+        if self.prepared is not None:
+            self.prepared.scan.close()
 
     def _stat(self) -> list[tuple[int, int]]:
         """Size and time of the input files, to see whether they change during the run."""
         stats = [os.stat(path) for path in self._files]
         return [(stat.st_size, stat.st_mtime_ns) for stat in stats]
+
+
+def _given(value: T | None) -> T:
+    """The value of a step that has been done."""
+    if value is None:
+        raise StageError("a step of the strip was called too early; please report it as a bug")
+    return value
 
 
 def _name_stranger(prepared: Prepared) -> tuple[str, ...]:

@@ -220,7 +220,9 @@ def _see_level(
     used = used.with_radiometry(divergence=divergence)
     seen = sample_reference(reader, scan, sensor, used, survey.figures.spacing_ns or 0.0)
     doubt = seen.doubt()
-    error = abs(seen.divergence / divergence - 1.0) if doubt else survey.system.radiometry.divergence_error
+    error = survey.system.radiometry.divergence_error
+    if doubt and seen.divergence and divergence:
+        error = abs(seen.divergence / divergence - 1.0)
     system = _take_reference(survey.system, seen.system).with_radiometry(divergence_error=error)
     return replace(choice, survey=replace(survey, system=system)), (doubt,) if doubt else ()
 

@@ -189,7 +189,8 @@ class _Parser:
     def _read_comparison(self) -> tuple:
         if (self._kind, self._value) == ("name", "flag") and self._text[self._at :].lstrip().startswith("("):
             return self._read_flag()
-        left, tree = self._read_operand(), None
+        tree: tuple | None = None
+        left = self._read_operand()
         if (self._kind, self._value) == ("name", "has") and isinstance(left, str):
             self._advance()
             return ("has", left, self._read_bits())
@@ -266,7 +267,7 @@ def _evaluate(tree: tuple, values: Mapping[str, np.ndarray], n: int) -> Truth:
 def _compare(tree: tuple, values: Mapping[str, np.ndarray], n: int) -> Truth:
     sign, *names = tree
     left, right = (
-        np.asarray(values[side], np.float64) if isinstance(side, str) else np.float64(side) for side in names
+        np.asarray(values[side] if isinstance(side, str) else side, np.float64) for side in names
     )
     if sign == "has":
         known = ~np.isnan(left)

@@ -144,7 +144,7 @@ def typed(name: str) -> str:
 
 def check_options(options: Any) -> None:
     """Raise ConfigError for an option that is none of its choices, or outside of its range."""
-    for name, one in declared_options(type(options)).items():
+    for name, one in declared_options(options.__class__).items():
         value, place = getattr(options, name), typed(one.words.name or name)
         if value is None and type(None) in one.kinds:
             continue

@@ -168,7 +168,7 @@ class WaveformBlock:
         if len(blocks) == 1:
             return blocks[0]
         names = ("samples", "point", "gps_time", "origin", "direction")
-        arrays = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
         arrays["samples"].flags.writeable = False
         return replace(blocks[0], **arrays, returns=_join_returns(blocks), sensor=None, scanner=None)
 
@@ -188,9 +188,14 @@ class WaveformBlock:
         names = ("point", "gps_time", "origin", "direction", "sensor", "scanner", "missing", "pulse_energy",
                  "pulse_energy_err")  # fmt: skip
         given = {name: getattr(self, name) for name in names}
-        parts = {name: values if values is None else values[index] for name, values in given.items()}
+        parts: dict[str, Any] = {name: values if values is None else values[index] for name, values in given.items()}
         first = int(self.point[index[0]]) if len(index) else self.first
         return replace(self, samples=samples, first=first, returns=returns, **parts)
+
+    @property
+    def gaps(self) -> np.ndarray:
+        """Samples that were not recorded, bool (n, samples): `missing`, or none."""
+        return np.zeros(self.samples.shape, bool) if self.missing is None else self.missing
 
     def without_samples(self) -> WaveformBlock:
         """The block with waveforms of no samples: their place, time and sensor are left."""
@@ -198,11 +203,12 @@ class WaveformBlock:
 
 
 def _join_returns(blocks: Sequence[WaveformBlock]) -> ReturnTable | None:
-    if any(block.returns is None for block in blocks):
+    tables = [block.returns for block in blocks if block.returns is not None]
+    if len(tables) < len(blocks):
         return None
     starts = np.cumsum([0, *(len(block) for block in blocks[:-1])])
-    waveform = [block.returns.waveform + start for block, start in zip(blocks, starts, strict=True)]
-    others = [np.concatenate([getattr(b.returns, name) for b in blocks]) for name in ("time", "point", "xyz")]
+    waveform = [table.waveform + start for table, start in zip(tables, starts, strict=True)]
+    others = [np.concatenate([getattr(table, name) for table in tables]) for name in ("time", "point", "xyz")]
     return ReturnTable(np.concatenate(waveform).astype(np.int32), *others)
 
 

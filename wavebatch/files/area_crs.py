@@ -123,7 +123,7 @@ def place_rings(
     """
     rings = [np.asarray(ring, np.float64) for ring in rings]
     source = None if file is None or not rings else _find_source(file, header)
-    if source is None:
+    if file is None or source is None:
         return rings
     definition = read_crs_definition(strip, header)
     if definition is None:

@@ -119,14 +119,15 @@ def _style(target: str, more: Mapping[str, Any] | None = None) -> Iterator[None]
     except ImportError as error:
         raise ConfigError(f"{target}: matplotlib cannot be imported; install it again: {error}") from error
     with matplotlib.rc_context(), warnings.catch_warnings():
-        dict.update(matplotlib.rcParams, _read_style())  # checked once: a page has many pictures
-        matplotlib.rcParams.update(more or {})
+        style: Any = matplotlib.rcParams
+        dict.update(style, _read_style())  # checked once: a page has many pictures
+        style.update(more or {})
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         yield
 
 
 @functools.cache
-def _read_style() -> Mapping[str, Any]:
+def _read_style() -> Any:
     """All settings that change the look of a figure."""
     import matplotlib
 

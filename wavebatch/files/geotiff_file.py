@@ -90,7 +90,7 @@ def _read_crs(text: str, where: str) -> Any:
         return found
 
 
-def _complain(where: str, what: str, error: Exception) -> ConfigError:
+def _complain(where: str, what: str, error: BaseException) -> ConfigError:
     why = " ".join(str(error).split())
     remedy = "write the code of a CRS, e.g. EPSG:32632" if where == "--crs" else "give it with --crs EPSG:n"
     return ConfigError(f"{where}: the CRS cannot be {what} ({why[:120]}); {remedy}")

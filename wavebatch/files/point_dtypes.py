@@ -41,10 +41,16 @@ _MARKS = ("synthetic", "key_point", "withheld")
 _NUMBERS = ("return_number", "number_of_returns")
 
 
+def field_names(dtype: np.dtype) -> tuple[str, ...]:
+    """Return the names of the fields of a record."""
+    return dtype.names or ()
+
+
 def list_dimensions(point_format: int) -> tuple[str, ...]:
     """Return the names of the standard dimensions of a point format: fields, and parts of fields, as laspy has them."""
+    parts: dict[str, tuple[str, ...]]
     parts = {"bit_fields": (*_NUMBERS, *_EDGES), "raw_classification": ("classification", *_MARKS)}
     if point_format > 5:
         flags = (*_MARKS, "overlap", "scanner_channel", *_EDGES)
         parts = {"bit_fields": _NUMBERS, "classification_flags": flags}
-    return tuple(part for name in STANDARD_DTYPES[point_format].names for part in parts.get(name, (name,)))
+    return tuple(part for name in field_names(STANDARD_DTYPES[point_format]) for part in parts.get(name, (name,)))

@@ -80,15 +80,21 @@ class PulseEnergy:
         """The mean over the reference."""
         return self.mean / (self.reference or self.mean)
 
+    def read_column(self, points: np.ndarray) -> np.ndarray:
+        """Return the extra byte of point records (n,), f8; raises ValueError for energies of a text file."""
+        if self.field is None or self.record is None:
+            raise ValueError(f"{self.source} is no extra byte")
+        return self.record.read(points[self.field])
+
     def read(self, points: np.ndarray) -> np.ndarray:
         """Return the energies of the pulses of point records (n,), f8, NaN where unknown, in the unit of the source."""
         if self.field is not None:
-            values = self.record.read(points[self.field])
+            values = self.read_column(points)
             return np.where(values > 0, values, np.nan)
-        time = points["gps_time"].astype(np.float64)
-        after = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
-        place = after - (time - self.time[after - 1] < self.time[after] - time)
-        return np.where(np.abs(self.time[place] - time) <= self.reach, self.energy[place], np.nan)
+        time, known = points["gps_time"].astype(np.float64), np.asarray(self.time)
+        after = np.clip(np.searchsorted(known, time), 1, len(known) - 1)
+        place = after - (time - known[after - 1] < known[after] - time)
+        return np.where(np.abs(known[place] - time) <= self.reach, np.asarray(self.energy)[place], np.nan)
 
     def fill(self, block: WaveformBlock, unit: Unit) -> WaveformBlock:
         """Return a block of the unit with the energies of its pulses over the reference."""
@@ -153,7 +159,7 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
     found = find_column(reader, request or COLUMN)
     if found is None and request is None:
         return None
-    found = found or _read_file(reader, request)
+    found = found or _read_file(reader, request or "")
     chosen = even_places(reader.unit_count(), SAMPLED_UNITS)
     # Points of one pulse follow each other: each pulse counts once.
     values = np.concatenate([np.empty(0), *(_once(found, reader.read_unit(int(number), scan)) for number in chosen)])

@@ -10,7 +10,7 @@ import os
 import stat
 import time
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import Draft, is_stream, open_stream, reporting
@@ -60,7 +60,7 @@ def _open(path: Path | str) -> BinaryIO:
         file.close()
         raise
     os.set_blocking(descriptor, True)
-    return _Pipe(file, begin)
+    return cast(BinaryIO, _Pipe(file, begin))
 
 
 def _read_first(descriptor: int) -> bytes:
@@ -84,7 +84,7 @@ class _Pipe(io.RawIOBase):
     def __init__(self, file: BinaryIO, begin: bytes) -> None:
         self._file, self._begin = file, begin
 
-    def read(self, size: int) -> bytes:
+    def read(self, size: int = -1, /) -> bytes:
         """Return at most so many bytes."""
         return self._begin + self._file.read(size - len(self._begin))
 

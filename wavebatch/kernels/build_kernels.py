@@ -19,6 +19,7 @@ import sys
 import sysconfig
 import tempfile
 from pathlib import Path
+from typing import Any
 
 SOURCES = Path(__file__).with_name("c")
 LIBRARY = Path(__file__).with_name("_kernels" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
@@ -89,7 +90,7 @@ def is_whole(library: Path) -> bool:
     return len(head) == 64 and library.stat().st_size >= place + size * number
 
 
-def _setuptools() -> object:
+def _setuptools() -> Any:
     from setuptools import build_meta
 
     return build_meta

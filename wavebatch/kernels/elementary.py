@@ -13,9 +13,9 @@ import numpy as np
 from wavebatch.kernels.library import call
 
 
-def exp(x: np.ndarray | float) -> np.ndarray:
+def exp(x: np.ndarray | np.floating | float) -> np.ndarray:
     """e^x of the shape and the type of x, error 2e-16 of the value (of float32: rounded from that)."""
-    return _apply("exponentials", x)
+    return _apply("exponentials", np.asarray(x))
 
 
 def log(x: np.ndarray | float) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -242,7 +242,7 @@ def _reason(error: Exception) -> str:
     return text.removeprefix(f"{LIBRARY}: ")
 
 
-def call(name: str, *arguments: ctypes.Structure | ctypes._SimpleCData | np.ndarray) -> int:
+def call(name: str, *arguments: Any) -> int:
     """Calls a function of the library: structures and arrays by reference.
 
     Raises

@@ -348,14 +348,15 @@ class Chain:
         Solved
         """
         cleaned, noise, system = self.estimate_noise(block, system, timing)
-        found = Solved(cleaned, noise, system, None)
+        found = Solved(cleaned, noise, system, EchoTable.empty())
         for step in self.steps[1:]:
             found = found._replace(echoes=self._call(step, self._data(found, step), timing))
         return found
 
     def keep_needed(self, solved: Solved) -> Solved:
         """Leave all out that stages after the second pass do not see: samples, returns, columns they do not need."""
-        needed = {name for step in self.after_second for name in step.needs} - set(self.second_step.stage.makes)
+        second = () if self.second_step is None else self.second_step.stage.makes
+        needed = {name for step in self.after_second for name in step.needs} - set(second)
         others = {name for step in self.steps[3:] for name in step.stage.makes} - needed
         kept = {name: values for name, values in solved.echoes.attributes.items()
                 if name.removesuffix(SUFFIX) not in others}  # fmt: skip

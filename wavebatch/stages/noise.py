@@ -78,7 +78,7 @@ def pooled(
         level = np.full(n, system.noise.baseline, np.float32)
         samples = Samples(block.samples, level, np.ones(n, np.float32), block.missing)
         mean, number = quiet_levels(samples, limit * np.hypot(SMOOTH_GAIN * std, spread), reach, recovery)
-        least = 0.0
+        least = np.zeros(1)
         if MOST_LEAST < floor_share(system.noise.baseline, quiet) <= MOST_CUT:
             offset, response, _ = floor_response(system.noise.baseline, quiet)
             mean = (mean - offset) / response
@@ -95,7 +95,7 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit
     The level of a recording is that of its quiet samples. Where echoes leave fewer than LEAST_QUIET, it is that of its
     lowest samples: a level that is too high loses the foot of an echo, one that is too low makes false echoes.
     """
-    row, start, end = find_stretches(~block.missing)
+    row, start, end = find_stretches(~block.gaps)
     number = np.bincount(row, minlength=len(block))[row]
     several = (number > 1) & (number <= MOST_RECORDINGS)
     row, start, end = row[several], start[several], end[several]
@@ -143,8 +143,8 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, R
         end = transpose_samples(block.samples[:, -samples:])
         baseline = np.median(end, axis=0)
         deviation = end - baseline
-        number = len(end)
-        std = np.sqrt(sum_samples(deviation * deviation) / max(number - 1, 1))
+        number = np.array(len(end))
+        std = np.sqrt(sum_samples(deviation * deviation) / max(len(end) - 1, 1))
     else:
         baseline, std, number = _tail_of_recorded(block, samples)
     std = np.maximum(std, max(system.noise.std, QUANTISATION_STD)).astype(np.float32)
@@ -154,8 +154,9 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, R
 
 def _tail_of_recorded(block: WaveformBlock, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Median, standard deviation and number (n,) of the last recorded samples of each waveform."""
-    behind = np.cumsum(~block.missing[:, ::-1], axis=1)[:, ::-1]
-    end = np.where(~block.missing & (behind <= samples), block.samples, np.float32(np.nan)).T.astype(np.float32)
+    recorded = ~block.gaps
+    behind = np.cumsum(recorded[:, ::-1], axis=1)[:, ::-1]
+    end = np.where(recorded & (behind <= samples), block.samples, np.float32(np.nan)).T.astype(np.float32)
     number = np.isfinite(end).sum(axis=0)
     end[:, number == 0] = block.samples[number == 0].T
     baseline = np.nanmedian(end, axis=0)

@@ -109,7 +109,8 @@ def fit_misfit(system: SystemPulse, spacing: float) -> float:
     z = np.arange(-np.ceil(6 * ref), np.ceil(6 * ref) + 1) / ref
     bell = exp(-0.5 * z * z)
     both = (8 * z**3 - 12 * z) * bell, (16 * z**4 - 48 * z**2 + 12) * bell
-    gains = [np.sum(np.convolve(one, noise_filter(system)[2]) ** 2) / np.sum(one * one) for one in both]
+    taps = whitening_filter(system.noise.whitening, system.noise.std / system.noise.quiet)[2]
+    gains = [np.sum(np.convolve(one, taps) ** 2) / np.sum(one * one) for one in both]
     return system.misfit * max(float(np.sqrt(max(gains))), 1.0)
 
 
@@ -330,7 +331,7 @@ def _factors_at(
     whole = main.copy()
     whole[1] += _find_delay(shape, limits.ref, np.full(1, width))[1] * main[2]
     if shape.components:
-        peak, by_peak = _change_with_width(pulse_measures(shape, limits), np.float64(width))
+        peak, by_peak = _change_with_width(pulse_measures(shape, limits), np.array(width))
         whole[0] += by_peak / peak * width * main[2]
     given = np.einsum("is,is->i", whole, whole)
     weights = np.einsum("if,sf->is", whole, bare)

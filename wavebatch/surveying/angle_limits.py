@@ -96,8 +96,8 @@ def predict_angles(
     bound = float(bound_time(max(amplitude, 1e-3), sigma, system.noise.std, spacing))
     width_err = float(np.hypot(bound, system.widths.scatter))
     variance_err = np.hypot(2.0 * np.hypot(sigma * width_err, own * own * REFERENCE_ERROR), system.widths.error or 0.0)
-    values = (np.array([value]) for value in (added * added, variance_err, distance))
-    error = float(np.degrees(angles_of_variance(*values, 1e-3 * divergence)[1][0]))
+    given, given_err, away = (np.array([value]) for value in (added * added, variance_err, distance))
+    error = float(np.degrees(angles_of_variance(given, given_err, away, 1e-3 * divergence)[1][0]))
     flat_err = float(np.hypot(bound_time(max(amplitude, 1e-3), own, system.noise.std, spacing), system.widths.scatter))
     least = np.sqrt(np.hypot(2.0 * np.hypot(own * flat_err, own * own * REFERENCE_ERROR), system.widths.error or 0.0))
     facing = float(np.degrees(angle_of_spread(least, distance, 1e-3 * divergence)))
@@ -156,7 +156,7 @@ def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergen
     """
     system = survey.system.with_radiometry(divergence=divergence)
     source = find_sensor(reader, scan, SensorRequest())
-    spacing, figures = survey.figures.spacing_ns, survey.figures
+    spacing, figures = survey.figures.spacing_ns or 0.0, survey.figures
     seen = None if source.distance is None else sample_reference(reader, scan, source, system, spacing)
     if seen is not None and seen.divergence is not None:
         error = seen.divergence * seen.divergence_error
@@ -167,7 +167,7 @@ def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergen
         outlook = AngleOutlook(np.inf, 0.0, "the sensor's position is unknown: give --trajectory to `wavebatch run`")
     else:
         system = seen.system
-        outlook = predict_angles(system, spacing, source.distance, divergence, figures.amplitude_50)
+        outlook = predict_angles(system, spacing, source.distance or 0.0, divergence, figures.amplitude_50 or 0.0)
         if seen.doubt():
             outlook = replace(outlook, reason=f"{seen.doubt()}; {outlook.reason}")
     others = (decision for decision in survey.decisions if decision.part != Part.ANGLE)

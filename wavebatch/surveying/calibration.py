@@ -241,10 +241,10 @@ class Calibration:
 
     def widened(self, growth: float) -> Calibration:
         """Return the calibration with a further relative error of all its constants."""
-        channels, strips = (
-            tuple(replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows)
-            for rows in (self.channels, self.strips)
+        channels = tuple(
+            replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in self.channels
         )
+        strips = tuple(replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in self.strips)
         whole = math.hypot(self.relative_error, growth)
         return replace(self, relative_error=whole, channels=channels, strips=strips)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import scipy  # parts of it load when they are first asked for
@@ -181,7 +181,14 @@ def _share_in_two_lines(xyz: np.ndarray, tree: scipy.spatial.cKDTree, some: np.n
     return float(np.mean(in_two_lines(offset[:, 0], offset[:, 1], group, len(some))))
 
 
-def sample_slopes(reader: StripReader, scan: StripScan, fill: object, n_waveforms: int) -> Iterator[Slopes]:
+class Fills(Protocol):
+    """A source of the sensor's positions."""
+
+    def fill(self, block: WaveformBlock) -> WaveformBlock:
+        """Return the block with them."""
+
+
+def sample_slopes(reader: StripReader, scan: StripScan, fill: Fills, n_waveforms: int) -> Iterator[Slopes]:
     """Yield waveforms spread over a strip with the slopes of the surfaces that they hit.
 
     Parameters
@@ -296,7 +303,7 @@ def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:
     echoes = echoes.take(np.flatnonzero(clean & ((echoes.flags & np.uint16(UNCLEAN)) == 0)))
     variance, error = added_variance(block, system, echoes, "system", 0.0)
     row = echoes.waveform
-    off = block.origin[row] + block.direction[row] * echoes.time[:, None] - block.sensor[row]
+    off = block.origin[row] + block.direction[row] * echoes.time[:, None] - np.asarray(block.sensor)[row]
     angle, angle_err = sample.incidence[row], sample.error[row]
     arm = 0.5 / C * np.sqrt((off * off).sum(axis=1))
     lever = (arm * np.tan(angle)) ** 2

@@ -271,11 +271,11 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: Survey) -> str:
     return _hold(sample, flight.system, whole, kinds).reason if sample.blocks else ""
 
 
-def _hold(sample: StripSample, system: SystemPulse, whole: Look, kinds: Mapping[int, Kind]) -> Held:
+def _hold(sample: StripSample, system: SystemPulse, whole: Look | None, kinds: Mapping[int, Kind]) -> Held:
     """A strip compared with what the flight records."""
     kind, look = _compare_kinds(sample.blocks, kinds), look_at(sample.blocks, system)
     # Counts of other bits or another gain say nothing; times do.
-    pulse = "" if look is None else (_compare_pulses if kind else compare_looks)(look, whole, system)
+    pulse = "" if look is None or whole is None else (_compare_pulses if kind else compare_looks)(look, whole, system)
     reason = "; ".join(filter(None, (pulse, kind)))
     return Held(sample.path, sample.fingerprint, sample.waveforms, None if kind else look, reason, sample.facts)
 
@@ -372,7 +372,7 @@ def _agree_on_kinds(samples: Sequence[StripSample]) -> dict[int, Kind]:
         for (index, kind), number in counts.items():
             votes.setdefault(index, {}).setdefault(kind, []).append(number)
     return {
-        index: max(kinds, key=lambda kind, kinds=kinds: (len(kinds[kind]), sum(kinds[kind]), kind))
+        index: max((len(numbers), sum(numbers), kind) for kind, numbers in kinds.items())[2]
         for index, kinds in sorted(votes.items())
     }
 
@@ -453,7 +453,7 @@ def _agree(a: Survey, b: Survey) -> bool:
     if (a.figures.spacing_ns, a.figures.bits) != (b.figures.spacing_ns, b.figures.bits):
         return False
     noise = min(a.system.noise.std, b.system.noise.std)
-    echoes = min(a.figures.isolated_echoes, b.figures.isolated_echoes)
+    echoes = min(a.figures.isolated_echoes or 0.0, b.figures.isolated_echoes or 0.0)
     return (
         max(a.system.noise.std, b.system.noise.std) < ALIKE_NOISE * noise
         and abs(a.system.noise.baseline - b.system.noise.baseline) < ALIKE_LEVEL * noise

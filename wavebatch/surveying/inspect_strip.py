@@ -129,7 +129,7 @@ def doubt_packets(facts: StripFacts, matched: int, returns: int) -> Iterator[str
     """Say that packets do not belong to the points, if too few returns in waveforms with echoes match an echo."""
     if returns >= LEAST_RETURNS and matched < LEAST_MATCHED * returns:
         packets = facts.packets
-        other = "" if packets.internal else f"{packets.file.name} belongs to another strip, or "
+        other = "" if packets.file is None or packets.internal else f"{packets.file.name} belongs to another strip, or "
         yield (
             f"only {matched} of {returns} returns lie where their packet has an echo: {other}the return locations "
             "(which should be picoseconds after the first sample) are wrong, and so are the positions of added echoes"
@@ -149,6 +149,6 @@ def _match_returns(reader: StripReader, scan: StripScan) -> tuple[int, int]:
     for block in blocks:
         echoes = chain.run(block, system)
         if block.returns is not None:
-            matched += np.count_nonzero(echoes.attributes["point"] >= 0)
-            returns += np.count_nonzero(np.isin(block.returns.waveform, echoes.waveform))
+            matched += int(np.count_nonzero(echoes.attributes["point"] >= 0))
+            returns += int(np.count_nonzero(np.isin(block.returns.waveform, echoes.waveform)))
     return matched, returns

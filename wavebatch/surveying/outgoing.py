@@ -173,8 +173,9 @@ def save_outgoing(
         outgoing_same_receiver=float(same_receiver),
         spacing_ns=spacing,
         bits=float(bits),
-        **{f"outgoing_{key}": value for key, value in scatter.items()},
     )
+    scatter_figures: dict[str, Any] = {f"outgoing_{key}": value for key, value in scatter.items()}
+    figures = replace(figures, **scatter_figures)
     reason = f"stacked from {shape.pulses} outgoing pulses: full width at half maximum {shape.fwhm:.3f} ns"
     survey = Survey(system, shape.pulses, figures, (Decision(PART, True, reason),))
     return SavedSurvey(survey, name, fingerprint)

@@ -18,11 +18,12 @@ from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.signal.noise import whitening_filter
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled
-from wavebatch.stages.pulse_tables import model_parameters, noise_filter, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 from wavebatch.stages.score import match_echoes
 
 WAVEFORMS = 2048
@@ -169,7 +170,7 @@ def _draw_noise(rng: np.random.Generator, n: int, s: int, system: SystemPulse) -
     """Noise that fits of this system see with a standard deviation of 1: coloured where they whiten it, f4 (n, s)."""
     noise = rng.standard_normal((n, s), dtype=np.float32)
     if system.noise.whitening:
-        rows = noise_filter(system).astype(np.float32)
+        rows = whitening_filter(system.noise.whitening, system.noise.std / system.noise.quiet).astype(np.float32)
         for i in range(s):
             before = min(i, 2)
             for j in range(1, before + 1):

@@ -120,7 +120,7 @@ def prepare(
         sent = take_energies(reader, scan, energy, calibration)
     if calibration is None:
         return Setup(choice, source, None, sent, (), stranger, forced)
-    system, level = choice.survey.system, sent.energy and sent.energy.level
+    system, level = choice.survey.system, None if sent.energy is None else sent.energy.level
     fitted, doubts = match_strip(calibration, reader, scan, system, source, choice.chain, air, level)
     return Setup(choice, source, sent.widen(fitted), sent, doubts, stranger, forced)
 

@@ -209,7 +209,9 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     for kind, rays in (("direction vectors", vectors), ("pairs of returns", pairs)):
         found = estimate_path(rays, kind)
         if found is not None:
-            turn = find_turn(pairs, found.trajectory) if rays is vectors else None
+            turn = None
+            if rays is vectors and found.trajectory is not None:
+                turn = find_turn(pairs, found.trajectory)
             return found if turn is None else replace(found, facts=(*found.facts, ("angle_to_pairs_deg", turn)))
     if request.height is not None:
         error = HEIGHT_ERROR * request.height
@@ -284,8 +286,9 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
 
 
 def _from_file(reader: StripReader, rays: RaySample, request: SensorRequest, several: bool) -> SensorSource:
+    path = Path(request.trajectory or "")
     crs = request.crs or read_crs_definition(reader.facts.path, reader.facts.header, heights=True)
-    known = read_trajectory(request.trajectory, crs=crs, lever_arm=request.lever_arm)
+    known = read_trajectory(path, crs=crs, lever_arm=request.lever_arm)
     times = rays.time[np.isfinite(rays.time) & (rays.time != 0)]
     if several and (not len(times) or times.min() == times.max()):
         raise InputError(
@@ -293,7 +296,7 @@ def _from_file(reader: StripReader, rays: RaySample, request: SensorRequest, sev
             "same; give --flight-height instead"
         )
     if not len(rays.time):
-        return SensorSource("trajectory", known, facts=(("file", request.trajectory.name),))
+        return SensorSource("trajectory", known, facts=(("file", path.name),))
     start, stop = float(rays.time[0]), float(rays.time[-1])
     try:
         offset, clocks = solve_offset(known, start, stop)
@@ -304,12 +307,12 @@ def _from_file(reader: StripReader, rays: RaySample, request: SensorRequest, sev
     except InputError as error:
         raise InputError(f"{request.trajectory}: {error}") from error
     share = known.share_known(start, stop)
-    path = estimate_path(rays, "direction vectors")
-    farther, error, vectors_error = _compare_ranges(distance, rays, path)
-    late, behind = (None, None) if path is None else _find_lag(known, path.trajectory)
+    seen = estimate_path(rays, "direction vectors")
+    farther, range_error_m, vectors_error = _compare_ranges(distance, rays, seen)
+    late, behind = (None, None) if seen is None or seen.trajectory is None else _find_lag(known, seen.trajectory)
     distance = distance[np.isfinite(distance)]
     facts = {
-        "file": request.trajectory.name,
+        "file": path.name,
         "clocks": clocks,
         "offset_s": offset,
         "share_covered": round(share, 6),
@@ -325,7 +328,7 @@ def _from_file(reader: StripReader, rays: RaySample, request: SensorRequest, sev
         "trajectory",
         known,
         distance=round(float(np.median(distance)), 2) if len(distance) else None,
-        error=error,
+        error=range_error_m,
         farther=farther,
         vectors_error=vectors_error,
         facts=tuple(facts.items()),
@@ -350,7 +353,7 @@ def _compare_ranges(
 ) -> tuple[float | None, float, float | None]:
     """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, root mean square, and
     the error of the latter; None, 0 and None where the vectors give no position."""
-    if path is None:
+    if path is None or path.trajectory is None:
         return None, 0.0, None
     longer = distance - np.sqrt(((rays.point - path.trajectory.at(rays.time)) ** 2).sum(axis=1))
     longer = longer[np.isfinite(longer)]

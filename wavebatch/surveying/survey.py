@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
@@ -308,6 +309,7 @@ def _add_digitizers(
         counts.append(len(block))
         scenes.append(_describe(block, own, decompose_sample(block, own), Figures()))
     names = ("empty_share", "single_share", "overlapped_share", "echoes_per_waveform", "saturated_share")
+    whole: dict[str, Any]
     whole = {name: float(np.average([getattr(scene, name) for scene in scenes], weights=counts)) for name in names}
     figures = replace(found.figures, **whole)
     system = replace(found.system, digitizers=systems)
@@ -333,7 +335,7 @@ def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock
 def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> SystemPulse:
     """The system of another digitizer; where its echoes are too few for a pulse, the main one's with its noise."""
     own = survey_block(block, learn=learn)
-    if not learn or own.figures.isolated_echoes >= FEW:
+    if not learn or (own.figures.isolated_echoes or 0.0) >= FEW:
         return own.system
     measured = measure_gaussian(block, system.sigma_ref / block.spacing)
     return replace(system, noise=measured.noise, saturation=measured.saturation)
@@ -366,7 +368,8 @@ def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlo
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
     """As survey_block, from noise and width by `measure_gaussian`; once more where noise grows with the signal."""
-    first, figures, candidates = system, Figures(), ()
+    first, figures = system, Figures()
+    candidates: tuple[Tried, ...] = ()
     if learn:
         clear = find_clear(block, system)
         main = find_isolated(block, system, clear)
@@ -461,8 +464,8 @@ def _decide(
 ) -> tuple[Decision, ...]:
     """The table of docs/algorithms.md 4.4: what this scene needs, and the reason for each part left out."""
     width = system.sigma_ref / spacing
-    share = figures.overlapped_share
-    strongest = figures.amplitude_99
+    share, strongest = figures.overlapped_share or 0.0, figures.amplitude_99 or 0.0
+    saturated, system_like = figures.saturated_share or 0.0, figures.system_width_share or 0.0
     learned = len(system.components)
     inverted = "the signal goes down from its baseline: counts are mirrored when they are read"
     return (
@@ -473,8 +476,8 @@ def _decide(
         Decision(Part.PRIOR, share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (limit 40 %)"),
         Decision(
             Part.CENSORED,
-            system.saturation is not None and figures.saturated_share > 0,
-            f"{100 * figures.saturated_share:.2f} % of the waveforms are saturated",
+            system.saturation is not None and saturated > 0,
+            f"{100 * saturated:.2f} % of the waveforms are saturated",
         ),
         Decision(
             Part.WEIGHTS,
@@ -489,8 +492,8 @@ def _decide(
         ),
         Decision(
             Part.ANGLE,
-            width >= LEAST_PULSE_WIDTH and figures.system_width_share < 0.95,
-            f"{100 * figures.system_width_share:.0f} % of the clear echoes have the width of the system pulse; a "
+            width >= LEAST_PULSE_WIDTH and system_like < 0.95,
+            f"{100 * system_like:.0f} % of the clear echoes have the width of the system pulse; a "
             "chain has angles only where the beam's divergence is given",
         ),
     )

@@ -595,7 +595,7 @@ class _Tally:
         zones = self.distances.list_zones()
         zone = zones["all"].size
         hidden = math.nan if math.isnan(zone) else self.distances.count_hidden(zone) / whole.pulses
-        names = [flag.name for flag in EchoFlag]
+        names = list(EchoFlag.__members__)
         return ReturnStats(
             cloud=cloud,
             points=whole.points,

@@ -242,7 +242,8 @@ class _Worker:
     def __init__(self, started: _Process, calls: queue.SimpleQueue[_Call | None], scratch: Path | None) -> None:
         self.process, self._pipe = started.process, started.pipe
         self._calls = calls
-        self.call: _Call | None = _Call(pickle.dumps((use_scratch, (scratch,))))
+        self._first = _Call(pickle.dumps((use_scratch, (scratch,))))
+        self.call: _Call | None = self._first
         """The call under way."""
         self.serves = True
         """Whether it takes calls."""
@@ -251,7 +252,7 @@ class _Worker:
 
     def _serve(self) -> None:
         try:
-            self._ask(self.call.pickled)
+            self._ask(self._first.pickled)
             self.call = None
             while (call := self._calls.get()) is not None:
                 if not call.future.set_running_or_notify_cancel():

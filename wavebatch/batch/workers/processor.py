@@ -58,7 +58,7 @@ def probe_arithmetic() -> str:
     digest = hashlib.sha256()
     for parameters, samples in _SIZES:
         for kind in (np.float64, np.float32):
-            rows = _make_rows(parameters, samples).astype(kind)
+            rows: np.ndarray = _make_rows(parameters, samples).astype(kind)
             gram = rows @ rows.T
             matrix = gram.astype(np.float64) + np.eye(parameters)
             results = [

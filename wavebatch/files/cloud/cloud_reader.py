@@ -28,7 +28,7 @@ from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.point_formats import ANGLE_UNIT, read_angles, read_classes, split_numbers
 from wavebatch.files.las.read_points import open_points
-from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
+from wavebatch.files.point_dtypes import STANDARD_DTYPES, field_names, list_dimensions
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
 """Columns that are read if the cloud has them."""
@@ -115,7 +115,8 @@ class CloudReader(Closing):
         self.dtype = dtype
         checked = read_checked_header(self.path, waveforms=False)
         self.point_count: int = checked.header.point_count
-        self.scales, self.offsets = checked.header.scales, checked.header.offsets
+        self.scales: tuple[float, ...] = checked.header.scales
+        self.offsets: tuple[float, ...] = checked.header.offsets
         self._header = checked.header
         units = read_crs(self.path, checked.header)[1]
         self.metres = metres_per_unit(units)
@@ -123,7 +124,7 @@ class CloudReader(Closing):
         self.unit = name_units(units)
         self.bounds = checked.header.mins, checked.header.maxs
         self.point_format: int = checked.header.point_format
-        fields = STANDARD_DTYPES[self.point_format].names
+        fields = field_names(STANDARD_DTYPES[self.point_format])
         self.has_gps_time = "gps_time" in fields
         self.has_packets = "wavepacket_index" in fields
         self.extra = {field: record for field, record in checked.extra.items() if not record.dtype.shape}
@@ -133,8 +134,8 @@ class CloudReader(Closing):
         self.written = {column: name for column, name in written.items() if _may_hold(self.extra[name], column)}
         """The file's name of each wavebatch column, by its provenance; empty without one. Columns that another
         program has stored as several numbers, or flags as signed ones, are none."""
-        self._sources = self._find_ours((*dtype.names, "echo_flags"))
-        self.columns = tuple(name for name in dtype.names if name in self._sources)
+        self._sources = self._find_ours((*field_names(dtype), "echo_flags"))
+        self.columns = tuple(name for name in field_names(dtype) if name in self._sources)
         """The wavebatch columns among the fields that the cloud has."""
         self.has_flags = "echo_flags" in self._sources
         self.records = np.empty(0)
@@ -155,9 +156,9 @@ class CloudReader(Closing):
         """Close the file."""
         self._points.close()
 
-    def read_pieces(self, size: int = _PIECE) -> Iterator[np.ndarray]:
-        """Yield the points of the file in order, at most `size` at a time."""
-        size = max(min(size, _PIECE_BYTES // self._point_length), 1)
+    def read_pieces(self, size: int = _PIECE, most: int = _PIECE_BYTES) -> Iterator[np.ndarray]:
+        """Yield the points of the file in order, at most `size`, and `most` bytes of records, at a time."""
+        size = max(min(size, most // self._point_length), 1)
         for start in range(0, self.point_count, size):
             raw = self._points.read(start, min(start + size, self.point_count))
             if self._filter is not None:
@@ -252,7 +253,7 @@ class CloudReader(Closing):
 
     def _describe_standard(self, name: str) -> ColumnFacts:
         fields = STANDARD_DTYPES[self.point_format]
-        step = 0.0 if name in fields.names and fields[name].kind == "f" else 1.0
+        step = 0.0 if name in field_names(fields) and fields[name].kind == "f" else 1.0
         if name in "xyz":
             step = abs(float(self.scales["xyz".index(name)]))
         elif name == "scan_angle":
@@ -260,10 +261,10 @@ class CloudReader(Closing):
         return ColumnFacts(name, _UNITS.get(name, "-"), "", step, is_standard=True)
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
-        if "ray" in self.dtype.names and self.has_packets:
+        if "ray" in field_names(self.dtype) and self.has_packets:
             raw = raw[raw["wavepacket_index"] != 0]
         rows = np.zeros(len(raw), self.dtype)
-        for name in self.dtype.names:
+        for name in field_names(self.dtype):
             values = self._read_named(raw, name)
             if values is not None:
                 rows[name] = values
@@ -334,7 +335,7 @@ def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> di
     counts only if it is stored as that style stores it: RIEGL's Amplitude, for example, is in dB.
     """
     wanted = set(columns)
-    names = [(column, column, None) for column in COLUMNS if column in wanted]
+    names: list[tuple[str, str, float | None]] = [(column, column, None) for column in COLUMNS if column in wanted]
     for style in STYLES.values():
         names += [(key, naming.name, naming.scale) for key, naming in style.items() if not naming.decibel]
     found: dict[str, str] = {}

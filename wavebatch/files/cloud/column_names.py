@@ -19,7 +19,7 @@ from wavebatch.core.suggest import nearest
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.point_formats import read_angles
-from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
+from wavebatch.files.point_dtypes import STANDARD_DTYPES, field_names, list_dimensions
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ _SHORT = {
 _STANDARD = frozenset(
     re.sub("[_ ]", "", name.casefold())
     for number in STANDARD_DTYPES
-    for name in (*list_dimensions(number), *STANDARD_DTYPES[number].names)
+    for name in (*list_dimensions(number), *field_names(STANDARD_DTYPES[number]))
 )
 """Normalised names of the standard LAS dimensions."""
 
@@ -173,8 +173,8 @@ def name_standard(point_format: int) -> dict[str, str]:
 class Placing(Protocol):
     """A header or a reader: what stored positions mean."""
 
-    scales: tuple[float, float, float]
-    offsets: tuple[float, float, float]
+    scales: tuple[float, ...]
+    offsets: tuple[float, ...]
 
 
 def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.las.geo_keys import convert_geotiff
@@ -54,7 +55,7 @@ def choose_version(path: Path, header: LasHeader, wanted: str, point_format: int
     if wanted == "1.3":
         return _as_1_3(path, header, target)
     evlrs, _ = find_evlrs(path, header)
-    records = [*header.vlrs, *evlrs]
+    records: list[Any] = [*header.vlrs, *evlrs]
     only_keys = has_record(records, PROJECTION, GEOTIFF_ID) and not has_record(records, PROJECTION, WKT_ID)
     repaired, notes = _repair(path, header, evlrs)
     if wanted == "1.4" and point_format is None and not keep:

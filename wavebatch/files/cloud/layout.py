@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from wavebatch.files.cloud.las_version import choose_version
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.point_formats import copy_standard
+from wavebatch.files.point_dtypes import field_names
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packets import PacketPlace
 
@@ -62,7 +64,8 @@ class OutputLayout:
     @property
     def extra_fields(self) -> tuple[str, ...]:
         """Names of the fields of `dtype` with extra dimensions, in order."""
-        return self.dtype.names[len(self.dtype.names) - len(self.carried) - len(self.written) :]
+        names = field_names(self.dtype)
+        return names[len(names) - len(self.carried) - len(self.written) :]
 
     def rows(
         self,
@@ -109,7 +112,7 @@ class OutputLayout:
         self._set_returns(rows, return_number, number_of_returns)
         self._carry(rows, source, matched)
         if self.packets is not None:
-            self._point_at_packets(rows, None if xyz is None else xyz[:, 0], time)
+            self._point_at_packets(self.packets, rows, None if xyz is None else xyz[:, 0], time)
         self.fill(rows, columns)
         for field, column in self._columns:
             if column.column not in columns:
@@ -156,18 +159,22 @@ class OutputLayout:
         names = self.extra_fields[: len(self.carried)]
         formats = [carried.record.dtype for carried in self.carried]
         places = [carried.source for carried in self.carried]
-        fields = {"names": list(names), "formats": formats, "offsets": places, "itemsize": source.dtype.itemsize}
+        fields: Any = {"names": list(names), "formats": formats, "offsets": places, "itemsize": source.dtype.itemsize}
         values = np.ascontiguousarray(source).view(np.dtype(fields))
         for carried, name in zip(self.carried, names, strict=True):
             rows[name] = values[name]
-            if not (self.whole or matched is None or carried.copied):
-                empty = carried.record.no_data
+            empty = carried.record.no_data
+            if not (self.whole or matched is None or carried.copied or empty is None):
                 rows[name][~np.asarray(matched)] = empty if len(empty) > 1 else empty[0]
 
-    def _point_at_packets(self, rows: np.ndarray, x: np.ndarray | None, time: np.ndarray | None) -> None:
-        if self.packets.shift:
+    @staticmethod
+    def _point_at_packets(
+        packets: PacketPlace, rows: np.ndarray, x: np.ndarray | None, time: np.ndarray | None
+    ) -> None:
+        if packets.shift:
             has_packet = rows["wavepacket_index"] > 0
-            rows["wavepacket_offset"][has_packet] += np.uint64(self.packets.shift)
+            offset = rows["wavepacket_offset"]
+            offset[has_packet] = offset[has_packet] + np.uint64(packets.shift)
         if time is not None and x is not None:
             new = np.isfinite(time) & np.isfinite(x)
             rows["return_point_wave_location"][new] = np.asarray(time)[new] * 1000.0
@@ -221,7 +228,8 @@ def plan_output(
     chosen = choose_version(path, checked.header, las_version, point_format, packets is not None)
     carried = plan_carried(checked, points == "returns")
     written = style_columns(columns, names, [entry.record.name for entry in carried], no_data)
-    dtype = build_dtype(chosen.point_format, [entry.record for entry in (*carried, *written)])
+    records = [*(entry.record for entry in carried), *(entry.record for entry in written)]
+    dtype = build_dtype(chosen.point_format, records)
     if dtype.itemsize > 65535:
         raise InputError(f"{path}: its extra bytes leave no room for the columns in a 65535-byte record; choose fewer")
     if packets is not None and packets.packets.file is None:

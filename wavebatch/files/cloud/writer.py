@@ -93,7 +93,7 @@ class CloudWriter(PointFile):
                     head = head[:20] + struct.pack("<Q", len(repaired)) + head[28:]
                     self.append_record(head, io.BytesIO(repaired), 0, len(repaired))
         packets = self._layout.packets
-        if packets is None:
+        if packets is None or packets.file is None:
             return
         head = waveform_head(packets.end - packets.start)
         with reporting(self.target), open(packets.file, "rb") as source:

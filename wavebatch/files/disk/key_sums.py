@@ -26,11 +26,12 @@ STRIDE = 256
 class KeyedSums(Closing):
     """Sums of `columns` integers per key: `add` any number of times, then `pieces`, then `close`.
 
-    held: rows in memory; more rows go to a temporary file. A context manager.
+    held: rows in memory; more rows go to a temporary file. stride: rows between two keys that mark places in it.
+    A context manager.
     """
 
-    def __init__(self, columns: int, *, held: int = HELD) -> None:
-        self._held = held
+    def __init__(self, columns: int, *, held: int = HELD, stride: int = STRIDE) -> None:
+        self._held, self._stride = held, stride
         self._dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []
         self._number = 0
@@ -67,7 +68,7 @@ class KeyedSums(Closing):
     def _cut_ranges(self) -> Iterator[tuple[int, int]]:
         """Ascending ranges of keys with about `held` rows each; none is empty."""
         marks = np.sort(np.concatenate([run.marks for run in self._runs]))
-        borders = np.unique(marks[:: max(self._held // STRIDE, 1)]).tolist()
+        borders = np.unique(marks[:: max(self._held // self._stride, 1)]).tolist()
         yield from zip(borders, [*borders[1:], 1 << 64], strict=True)
 
     def _shrink(self) -> None:
@@ -86,16 +87,18 @@ class KeyedSums(Closing):
                 rows["key"], rows["value"] = key, value
                 first = self._file.seek(0, 2) // self._dtype.itemsize
                 self._file.write(rows.data)
-                self._runs.append(_Run(first, len(key), key[::STRIDE].copy(), int(key[-1])))
+                self._runs.append(_Run(first, len(key), key[::self._stride].copy(), int(key[-1])))
         self._parts, self._number = [], 0
 
     def _read_range(self, run: _Run, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
         """Keys and values of the rows of a run with keys in [low, high)."""
-        begin = max(int(np.searchsorted(run.marks, np.uint64(low), side="right")) - 1, 0) * STRIDE
+        begin = max(int(np.searchsorted(run.marks, np.uint64(low), side="right")) - 1, 0) * self._stride
         end = run.number
         if high <= run.last:
-            end = min(int(np.searchsorted(run.marks, np.uint64(high))) * STRIDE, end)
+            end = min(int(np.searchsorted(run.marks, np.uint64(high))) * self._stride, end)
         size = self._dtype.itemsize
+        if self._file is None:
+            raise ValueError("the sums are closed")
         with reporting_scratch():
             self._file.seek((run.first + begin) * size)
             data = self._file.read((end - begin) * size)

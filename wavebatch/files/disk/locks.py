@@ -10,7 +10,9 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
+fcntl: Any
 try:
     import fcntl
 except ImportError:  # Windows has no fcntl: what killed processes left then stays until the user removes it

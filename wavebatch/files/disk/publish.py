@@ -16,8 +16,9 @@ import secrets
 import stat
 import time
 from collections.abc import Sequence
+from io import BufferedRandom
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
@@ -66,7 +67,7 @@ class Draft(contextlib.AbstractContextManager):
             remove_stale(self.target.parent)
         with uninterrupted(), reporting(self.target):
             self.path, descriptor = locks.make_locked(lambda: _create(self.target.parent))
-            self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
+            self.file = cast(BufferedRandom, os.fdopen(descriptor, "w+b", buffering=1 << 20))
             self.published = False
             _open.add(self)
 

@@ -57,7 +57,7 @@ def damaged(path: Path, what: str) -> InputError:
 
 def read_exactly(fd: int, target: np.ndarray, at: int) -> None:
     """Fill the bytes `target` (u1, contiguous) from byte `at` of the file; raises InputError if it ends before."""
-    view = memoryview(target)
+    view = target.data
     while view:
         got = os.preadv(fd, [view[: 1 << 30]], at) if hasattr(os, "preadv") else _seek_read(fd, view, at)
         if not got:

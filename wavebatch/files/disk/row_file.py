@@ -47,7 +47,7 @@ class RowStore:
         if not len(rows):
             return
         size = self.dtype.itemsize
-        content = memoryview(np.ascontiguousarray(rows).view(np.uint8))
+        content = np.ascontiguousarray(rows).view(np.uint8).data
         starts = np.flatnonzero(np.concatenate([[True], np.diff(index) != 1]))
         ends = np.append(starts[1:], len(index))
         with reporting(self._draft.target):
@@ -60,7 +60,7 @@ class RowStore:
         rows = np.empty(stop - start, self.dtype)
         with reporting(self._draft.target):
             self._draft.file.seek(start * self.dtype.itemsize)
-            if self._draft.file.readinto(rows.view(np.uint8)) != rows.nbytes:
+            if self._draft.file.readinto(rows.view(np.uint8).data) != rows.nbytes:
                 raise InputError(f"{self._draft.target}: its temporary file was cut by another program; run again")
         return rows
 

@@ -77,6 +77,8 @@ class Spool(Closing):
             if starts[bucket + 1] > starts[bucket]:
                 yield entries[starts[bucket] : starts[bucket + 1]]
             return
+        if self.path is None:
+            return
         with reporting_scratch(), open(self.path, "rb", buffering=0) as file:
             for at in self._segments:
                 edges = np.empty(2, np.int64)

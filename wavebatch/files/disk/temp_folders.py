@@ -90,6 +90,7 @@ class _Owned:
 
     def __init__(self, parent: Path, hidden: str) -> None:
         remove_orphans(parent)
+        self._lock: int | None
         self.folder, self._lock = locks.make_locked(lambda: _make_folder(parent, hidden))
 
     def close(self) -> None:

@@ -23,6 +23,7 @@ from wavebatch.files.las.header import (
     has_record,
     read_header,
 )
+from wavebatch.files.point_dtypes import field_names
 
 WAVEFORM_FORMATS = (4, 5, 9, 10)
 LEAST_SCALE, LARGEST_SCALE, LARGEST_OFFSET = 1e-12, 1e6, 1e12
@@ -52,7 +53,8 @@ class CheckedHeader:
     @property
     def extra(self) -> dict[str, ExtraRecord]:
         """The record of each extra dimension by its field of `dtype`, in order."""
-        return dict(zip(self.dtype.names[len(self.dtype.names) - len(self.records) :], self.records, strict=True))
+        names = field_names(self.dtype)
+        return dict(zip(names[len(names) - len(self.records) :], self.records, strict=True))
 
 
 def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:

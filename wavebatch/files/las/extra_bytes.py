@@ -14,6 +14,7 @@ import numpy as np
 
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.header import STANDARD_DTYPES
+from wavebatch.files.point_dtypes import field_names
 
 RECORD_SIZE = 192
 EXTRA_BYTES_RECORD_ID = 4
@@ -194,7 +195,7 @@ def tell_apart(records: Sequence[ExtraRecord], point_format: int) -> list[ExtraR
 
     A name that is taken, or empty, gets " 2", " 3" ... at its end, as in `build_dtype`.
     """
-    taken = set(STANDARD_DTYPES[point_format].names)
+    taken = set(field_names(STANDARD_DTYPES[point_format]))
     apart = []
     for record in records:
         name = _free_name(record.name, taken, TEXT_BYTES)
@@ -229,7 +230,7 @@ def build_dtype(point_format: int, records: Sequence[ExtraRecord]) -> np.dtype:
     A field has the name of its record; an empty or repeated name gets " 2", " 3" ... at its end.
     """
     standard = STANDARD_DTYPES[point_format]
-    fields = {name: standard[name] for name in standard.names}
+    fields = {name: standard[name] for name in field_names(standard)}
     for record in records:
         fields[_free_name(record.name, fields)] = record.dtype
     return np.dtype(list(fields.items()))

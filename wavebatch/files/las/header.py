@@ -86,8 +86,8 @@ class LasHeader:
     version: tuple[int, int]
     point_format: int
     point_length: int
-    scales: tuple[float, float, float]
-    offsets: tuple[float, float, float]
+    scales: tuple[float, ...]
+    offsets: tuple[float, ...]
     compressed: bool = False
     vlrs: list[Vlr] = field(default_factory=list)
     padding: bytes = b""
@@ -108,8 +108,8 @@ class LasHeader:
     file_size: int = 0
     """Bytes of the file that was read; 0 for a new header."""
     by_return: tuple[int, ...] = (0,) * 15
-    maxs: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    mins: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    maxs: tuple[float, ...] = (0.0, 0.0, 0.0)
+    mins: tuple[float, ...] = (0.0, 0.0, 0.0)
     waveform_start: int = 0
     evlr_start: int = 0
     evlr_count: int = 0

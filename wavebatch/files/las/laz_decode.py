@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import struct
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import lazrs
 import numpy as np
@@ -111,7 +111,8 @@ class LazPoints:
         except BaseException:
             self._file.close()
             raise
-        self._chunk, self._next, self._decoder = -1, 0, None
+        self._chunk, self._next = -1, 0
+        self._decoder: Any = None
 
     def read(self, start: int, stop: int) -> np.ndarray:
         rows = np.empty(stop - start, self._checked.dtype)
@@ -143,7 +144,7 @@ class LazPoints:
         read_exactly(self._file.fileno(), data[8:], start)
         self._check_layers(data[8:])
         count = int(self._first[chunk + 1] - self._first[chunk])
-        small = io.BytesIO(data)
+        small = io.BytesIO(data.data)
         small.seek(0, 2)
         lazrs.write_chunk_table(small, [(count, end - start)], lazrs.LazVlr(self._coding.payload))
         small.seek(0)

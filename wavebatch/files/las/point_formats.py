@@ -6,17 +6,19 @@ The output layout of a cloud uses it. A conversion is allowed only if it loses n
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.las.header import STANDARD_DTYPES, LasHeader
+from wavebatch.files.point_dtypes import field_names
 
 WITHOUT_WAVES = {4: 1, 5: 3, 9: 6, 10: 8}
 """For each waveform format the format with the same fields except the waveform fields."""
 MODERN = {0: 6, 1: 6, 2: 7, 3: 7}
 """For each format of LAS 1.0 to 1.3 the one of LAS 1.4 that holds its fields; those without GPS time get zero."""
-_WAVE_FIELDS = frozenset(STANDARD_DTYPES[4].names) - frozenset(STANDARD_DTYPES[1].names)
+_WAVE_FIELDS = frozenset(field_names(STANDARD_DTYPES[4])) - frozenset(field_names(STANDARD_DTYPES[1]))
 ANGLE_UNIT = 0.006
 """Degrees per count of `scan_angle` in formats 6-10; `scan_angle_rank` of formats 0-5 counts whole degrees."""
 _OVERLAP_CLASS = 12
@@ -37,18 +39,18 @@ def locate(points: np.ndarray, header: LasHeader) -> np.ndarray:
 def split_numbers(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the return numbers and numbers of returns of records (n,), u1 (n,) each."""
     bits = points["bit_fields"]
-    return (bits & 15, bits >> 4) if "classification_flags" in points.dtype.names else (bits & 7, bits >> 3 & 7)
+    return (bits & 15, bits >> 4) if "classification_flags" in field_names(points.dtype) else (bits & 7, bits >> 3 & 7)
 
 
 def read_classes(points: np.ndarray) -> np.ndarray:
     """Return the classes of records (n,), u1 (n,), without the flags that formats 0 to 5 keep in the same byte."""
-    modern = "classification_flags" in points.dtype.names
+    modern = "classification_flags" in field_names(points.dtype)
     return points["classification"] if modern else points["raw_classification"] & 31
 
 
 def read_angles(points: np.ndarray) -> np.ndarray:
     """Return the scan angles of records (n,) of any point format [deg], f8 (n,)."""
-    modern = "classification_flags" in points.dtype.names
+    modern = "classification_flags" in field_names(points.dtype)
     return points["scan_angle"] * ANGLE_UNIT if modern else points["scan_angle_rank"].astype(np.float64)
 
 
@@ -73,10 +75,16 @@ def _can_hold(old: int, new: int) -> bool:
     """Whether format `new` has all fields of `old` except the waveform fields; never from 6-10 back to 0-5."""
     if old >= 6 > new:
         return False
-    have = set(STANDARD_DTYPES[old].names) - _WAVE_FIELDS
+    have = set(field_names(STANDARD_DTYPES[old])) - _WAVE_FIELDS
     if new >= 6:
         have -= {"raw_classification", "scan_angle_rank"}
-    return have <= set(STANDARD_DTYPES[new].names)
+    return have <= set(field_names(STANDARD_DTYPES[new]))
+
+
+def _whole(size: int, length: int) -> np.dtype:
+    """The first bytes of records of some length, as one field."""
+    record: Any = {"names": ["record"], "formats": [f"V{size}"], "offsets": [0], "itemsize": length}
+    return np.dtype(record)
 
 
 def copy_standard(source: np.ndarray, rows: np.ndarray, old: int, new: int) -> None:
@@ -88,12 +96,11 @@ def copy_standard(source: np.ndarray, rows: np.ndarray, old: int, new: int) -> N
     if base_old == base_new:
         wave = old in WITHOUT_WAVES and new in WITHOUT_WAVES
         size = STANDARD_DTYPES[new if wave else base_new].itemsize
-        piece = {"names": ["record"], "formats": [f"V{size}"], "offsets": [0]}
-        target = rows.view(np.dtype({**piece, "itemsize": rows.dtype.itemsize}))
-        target["record"] = source.view(np.dtype({**piece, "itemsize": source.dtype.itemsize}))["record"]
+        target, given = (records.view(_whole(size, records.dtype.itemsize)) for records in (rows, source))
+        target["record"] = given["record"]
         return
-    for name in STANDARD_DTYPES[new].names:
-        if name in STANDARD_DTYPES[old].names:
+    for name in field_names(STANDARD_DTYPES[new]):
+        if name in field_names(STANDARD_DTYPES[old]):
             rows[name] = source[name]
     if old < 6 <= new:
         _promote_bits(source, rows)

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from wavebatch.files.disk.publish import Draft, publish_together, refuse_existin
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord
 from wavebatch.files.las.header import WAVEFORM_RECORD_ID, LasHeader, Vlr, encode_evlr_header, has_record
 from wavebatch.files.las.laz_encode import open_encoder
+from wavebatch.files.point_dtypes import field_names
 
 _COPY_SIZE = 1 << 22
 _EXTRA_BYTES = ("LASF_Spec", EXTRA_BYTES_RECORD_ID)
@@ -168,12 +169,13 @@ class Statistics:
 
     def __init__(self, dtype: np.dtype, records: Sequence[ExtraRecord]) -> None:
         self.count = 0
-        fields = dtype.names[len(dtype.names) - len(records) :]
+        names = field_names(dtype)
+        fields = names[len(names) - len(records) :]
         self._records = dict(zip(fields, records, strict=True))
         self._bits = np.zeros(256, np.int64)
-        self._format_bits = 4 if "classification_flags" in dtype.names else 3
-        self._axes = [name for name in ("X", "Y", "Z", "gps_time") if name in dtype.names]
-        self._extremes: dict[tuple[str, int], tuple[np.generic, np.generic]] = {}
+        self._format_bits = 4 if "classification_flags" in names else 3
+        self._axes = [name for name in ("X", "Y", "Z", "gps_time") if name in names]
+        self._extremes: dict[tuple[str, int], tuple[Any, Any]] = {}
 
     def add(self, rows: np.ndarray) -> None:
         """Count the rows (m,) and widen the extremes."""
@@ -208,9 +210,9 @@ class Statistics:
         bounds = []
         for axis, name in enumerate("XYZ"):
             scale, offset = header.scales[axis], header.offsets[axis]
-            least, largest = self._extremes.get((name, 0), (None, None))
-            bounds.append((0.0, 0.0) if least is None else sorted((least * scale + offset, largest * scale + offset)))
-        header.mins, header.maxs = tuple(b[0] for b in bounds), tuple(b[1] for b in bounds)
+            ends = self._extremes.get((name, 0))
+            bounds.append([0.0, 0.0] if ends is None else sorted(end * scale + offset for end in ends))
+        header.mins, header.maxs = (tuple(ends[side] for ends in bounds) for side in (0, 1))
         if header.version >= (1, 5):
             least, largest = self._extremes.get(("gps_time", 0), (0.0, 0.0))
             header.gps_range = (float(largest), float(least))

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -153,7 +153,7 @@ def _read(file: BinaryIO, path: Path, front: bytes) -> PulseHeader:
     _check_scales(path, scales, offsets, time_scale, time_offset)
     found = [*_list_records(file, path, header_size, start, records)]
     found += _list_appended(file, size, start + count * length, appended)
-    descriptors = {}
+    descriptors: dict[int, Any] = {}
     for user, number, payload in found:
         if user == _SPEC and 200_000 < number <= 200_255:
             descriptors.setdefault(number - 200_000, _read_descriptor(path, number - 200_000, payload))
@@ -177,7 +177,7 @@ def _build_dtype(attributes: int, length: int) -> np.dtype:
     """The pulse record; the attributes that 0.3 defines are sources of points of 2 and of 4 bytes."""
     fields, at = list(PULSE), 48
     for bit, kind in _POINT_SOURCE.items():
-        if attributes & bit and at + int(kind[2]) <= length and "point_source" not in dict(f[:2] for f in fields):
+        if attributes & bit and at + int(kind[2]) <= length and "point_source" not in [field[0] for field in fields]:
             fields.append(("point_source", kind))
             at += int(kind[2])
     return np.dtype([*fields, ("rest", f"V{length - at}")] if length > at else fields)

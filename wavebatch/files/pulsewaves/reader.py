@@ -117,10 +117,13 @@ class Waves:
 
 
 class PulseReader(Closing):
-    """Reads the pulses of a PulseWaves file in order, piece by piece. A context manager."""
+    """Reads the pulses of a PulseWaves file in order, piece by piece. A context manager.
 
-    def __init__(self, header: PulseHeader) -> None:
-        self.header = header
+    pulses, size: most pulses (None: PULSES), and about the most bytes of waves, of a piece.
+    """
+
+    def __init__(self, header: PulseHeader, *, pulses: int | None = None, size: int = PIECE_BYTES) -> None:
+        self.header, self._size = header, size
         self._pulses = open_regular(header.path)
         try:
             self._waves = open_regular(header.waves)
@@ -128,7 +131,7 @@ class PulseReader(Closing):
             self._pulses.close()
             raise
         each = max(header.waves_size // max(header.count, 1), 1)
-        self._step = int(np.clip(PIECE_BYTES // each, 1, PULSES))
+        self._step = int(np.clip(size // each, 1, pulses or PULSES))
 
     def close(self) -> None:
         """Close both files."""
@@ -153,7 +156,7 @@ class PulseReader(Closing):
         while begin < len(offsets):
             part = offsets[begin:]
             span = np.maximum.accumulate(part) - np.minimum.accumulate(part)
-            many = int(np.searchsorted(span, 2 * PIECE_BYTES, side="right"))
+            many = int(np.searchsorted(span, 2 * self._size, side="right"))
             yield begin, begin + max(many, 1)
             begin += max(many, 1)
 

@@ -62,13 +62,14 @@ def describe_samples(reader: StripReader, scan: StripScan) -> dict[str, Any]:
         extremes = int(block.samples.min()), int(block.samples.max())
         gaps = 0 if block.missing is None else int(block.missing.any(axis=1).sum())
         rows.append((len(block), *extremes, int(np.count_nonzero(at_limit)), gaps, block.samples.shape[1]))
-    numbers, least, largest, limited, gaps, lengths = zip(*rows, strict=True) if rows else ((),) * 6
+    columns: Any = zip(*rows, strict=True) if rows else ((),) * 6
+    numbers, least, largest, limited, with_gaps, lengths = columns
     return {
         "waveforms_read": sum(numbers),
         "least": min(least, default=None),
         "largest": max(largest, default=None),
         "waveforms_at_limit": sum(limited),
-        "waveforms_with_gaps": sum(gaps),
+        "waveforms_with_gaps": sum(with_gaps),
         "lengths": sorted(set(lengths)),
     }
 

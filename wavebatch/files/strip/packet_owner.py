@@ -91,6 +91,8 @@ def compare_returns(blocks: Iterable[tuple[WaveformBlock, np.ndarray]]) -> np.nd
     groups: dict[int, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
     for block, strength in blocks:
         returns = block.returns
+        if returns is None:
+            continue
         order = np.lexsort((-strength, returns.waveform))
         strongest = order[np.unique(returns.waveform[order], return_index=True)[1]]
         part = block.samples, returns.time[strongest] / block.spacing, strength[strongest]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
+from io import FileIO
 from pathlib import Path
 
 import numpy as np
@@ -198,11 +199,17 @@ def settle_headerless(place: PacketPlace, points: np.ndarray) -> PacketPlace:
 
 
 class PacketFile:
-    """Reads the samples of many packets at once; compressed: indices of descriptors with compressed packets."""
+    """Reads the samples of many packets at once.
 
-    def __init__(self, place: PacketPlace, compressed: Collection[int] = ()) -> None:
-        self._place, self._compressed = place, compressed
-        self._file = None
+    compressed: indices of descriptors with compressed packets. span: bytes up to which all between the packets is read
+    in one piece; gap: bytes between two packets that are read over.
+    """
+
+    def __init__(
+        self, place: PacketPlace, compressed: Collection[int] = (), *, span: int = _SPAN, gap: int = _GAP
+    ) -> None:
+        self._place, self._compressed, self._span, self._gap = place, compressed, span, gap
+        self._file: FileIO | None = None
         self._buffer = np.empty(0, np.uint8)
         if place.file is not None:
             with reporting_reads(place.file):
@@ -239,7 +246,7 @@ class PacketFile:
     def read_bytes(self, offsets: np.ndarray, width: int) -> np.ndarray:
         """Return the first `width` bytes of packets that were checked before, u1 (n, width)."""
         starts = (offsets + np.uint64(self._place.base % 2**64)).astype(np.int64)
-        with reporting_reads(self._place.file, "packets ", "; check the disk"):
+        with reporting_reads(self._place.file or Path(), "packets ", "; check the disk"):
             return self._gather(starts, width)
 
     def decode(
@@ -255,11 +262,11 @@ class PacketFile:
         order = np.argsort(starts, kind="stable")
         ends = np.minimum(starts + sizes, self._place.end)[order]
         samples, good = np.zeros((len(starts), n_samples), f"<u{bits // 8}"), np.zeros(len(starts), bool)
-        with reporting_reads(self._place.file, "packets ", "; check the disk"):
-            for a, z in _find_runs(starts[order], int(sizes.max(initial=0)), BLOCK_BYTES):
+        with reporting_reads(self._place.file or Path(), "packets ", "; check the disk"):
+            for a, z in _find_runs(starts[order], int(sizes.max(initial=0)), self._gap, BLOCK_BYTES):
                 first, last = int(starts[order[a]]), int(ends[a:z].max())
                 buffer = self._take_buffer(last - first)
-                read_exactly(self._file.fileno(), buffer, first)
+                self._fill(buffer, first)
                 here = starts[order[a:z]] - first
                 rows = order[a:z]
                 samples[rows], good[rows] = decode_packets(buffer, here, ends[a:z] - first, n_samples, bits // 8)
@@ -272,27 +279,32 @@ class PacketFile:
         first, last = int(starts.min()), int(starts.max())
         if last - first == (n - 1) * width and (n == 1 or np.all(np.diff(starts) == width)):
             rows = np.empty((n, width), np.uint8)
-            read_exactly(self._file.fileno(), rows.reshape(-1), first)
+            self._fill(rows.reshape(-1), first)
             return rows
         span = last - first + width
-        if span <= max(_SPARSE * n * width, _SPAN):
+        if span <= max(_SPARSE * n * width, self._span):
             buffer = self._take_buffer(span)
-            read_exactly(self._file.fileno(), buffer, first)
+            self._fill(buffer, first)
             return _pick(buffer, starts - first, width)
         return self._gather_sparse(starts, width)
 
     def _gather_sparse(self, starts: np.ndarray, width: int) -> np.ndarray:
         order = np.argsort(starts, kind="stable")
         ordered = starts[order]
-        runs = [(a, z, int(ordered[a]), int(ordered[z - 1]) + width) for a, z in _find_runs(ordered, width)]
+        runs = [(a, z, int(ordered[a]), int(ordered[z - 1]) + width) for a, z in _find_runs(ordered, width, self._gap)]
         buffer = self._take_buffer(sum(end - begin for _, _, begin, end in runs))
         place = np.empty(len(starts), np.int64)
         at = 0
         for a, z, begin, end in runs:
-            read_exactly(self._file.fileno(), buffer[at : at + end - begin], begin)
+            self._fill(buffer[at : at + end - begin], begin)
             place[order[a:z]] = ordered[a:z] - begin + at
             at += end - begin
         return _pick(buffer, place, width)
+
+    def _fill(self, target: np.ndarray, at: int) -> None:
+        if self._file is None:
+            raise InputError("the strip has no packets")
+        read_exactly(self._file.fileno(), target, at)
 
     def _take_buffer(self, size: int) -> np.ndarray:
         if len(self._buffer) < size:
@@ -300,9 +312,9 @@ class PacketFile:
         return self._buffer[:size]
 
 
-def _find_runs(ordered: np.ndarray, width: int, most: int = 2**62) -> Iterator[tuple[int, int]]:
+def _find_runs(ordered: np.ndarray, width: int, gap: int, most: int = 2**62) -> Iterator[tuple[int, int]]:
     """Slices of sorted starts with only small gaps, and at most about so many bytes long."""
-    cut = np.diff(ordered) > width + _GAP
+    cut = np.diff(ordered) > width + gap
     cut |= np.diff((ordered - ordered[:1]) // most) > 0
     cuts = np.flatnonzero(cut) + 1
     edges = [0, *cuts.tolist(), len(ordered)]

@@ -20,6 +20,7 @@ from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import reading, take_whole_records, widen_integers
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
+from wavebatch.files.point_dtypes import field_names
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
 from wavebatch.files.strip.packet_owner import compare_returns, is_strange, size_of_sample
@@ -104,6 +105,8 @@ class StripReader(Closing):
         Where packet vectors point; "auto" decides from the points.
     headerless : bool
         Accept a .wdp without its 60-byte header.
+    unit_points, unit_bytes : int or None
+        Most points of a unit, and bytes of their records; None: UNIT_POINTS, UNIT_BYTES.
 
     Raises
     ------
@@ -111,7 +114,10 @@ class StripReader(Closing):
         If the strip cannot be read as what it claims to be.
     """
 
-    def __init__(self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False) -> None:
+    def __init__(
+        self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False,
+        unit_points: int | None = None, unit_bytes: int | None = None,
+    ) -> None:  # fmt: skip
         if direction not in OPTIONS:
             raise ConfigError(f"direction {direction!r}: must be one of {', '.join(OPTIONS)}")
         if isinstance(path, StripFacts):
@@ -120,6 +126,8 @@ class StripReader(Closing):
             with reading(Path(path)):
                 facts = find_facts(Path(path), direction, headerless)
         self.facts = facts
+        most = (unit_bytes or UNIT_BYTES) // facts.header.point_length
+        self._unit_points = max(1, min(unit_points or UNIT_POINTS, most))
         self._points = open_points(facts)
         try:
             self._judge = Judge(facts)
@@ -139,7 +147,7 @@ class StripReader(Closing):
         tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
         packets of another strip.
         """
-        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points())
+        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points)
         if not scan.problems and (stranger := self._find_stranger(scan)):
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
             scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
@@ -150,7 +158,8 @@ class StripReader(Closing):
 
     def _find_stranger(self, scan: StripScan) -> str:
         """Why the packets of the .wdp are certainly those of another strip; empty where they may be its own."""
-        if not scan.with_waveform or self.facts.packets.internal:
+        file = self.facts.packets.file
+        if not scan.with_waveform or self.facts.packets.internal or file is None:
             return ""
         used = scan.by_descriptor.keys() & self.facts.digitizers
         longest = max(self.facts.digitizers[index].n_samples for index in used)
@@ -158,7 +167,7 @@ class StripReader(Closing):
         if not is_strange(table):
             return ""
         return (
-            f"{self.facts.packets.file.name} belongs to another strip: in a sample of {len(table)} packets, returns "
+            f"{file.name} belongs to another strip: in a sample of {len(table)} packets, returns "
             "lie on echoes no more often than by chance, and are not as strong as these"
         )
 
@@ -166,16 +175,15 @@ class StripReader(Closing):
         """Yield about `n_waveforms` waveforms, each block with the intensities of its returns."""
         for unit, rows in self.sample_units(scan, n_waveforms):
             for block, _ in self.read_rows(unit, rows, n_waveforms):
+                if block.returns is None:
+                    continue
                 # The few returns that stand in another unit get the intensity of a point of this one.
                 near = np.clip(block.returns.point - unit.start, 0, len(unit.points) - 1)
                 yield block, unit.points["intensity"][near].astype(float)
 
     def unit_count(self) -> int:
         """Return the number of units."""
-        return -(-self.facts.header.point_count // self._unit_points())
-
-    def _unit_points(self) -> int:
-        return max(1, min(UNIT_POINTS, UNIT_BYTES // self.facts.header.point_length))
+        return -(-self.facts.header.point_count // self._unit_points)
 
     def read_points(self, start: int, stop: int) -> np.ndarray:
         """Return records [start, stop) of the file."""
@@ -375,7 +383,7 @@ class _Geometry:
 
 def read_scanner(records: np.ndarray) -> np.ndarray | None:
     """Scanner channels of records (n,), u1 (n,); None for point formats 4 and 5."""
-    if "classification_flags" not in records.dtype.names:
+    if "classification_flags" not in field_names(records.dtype):
         return None
     return (records["classification_flags"] >> 4) & 3
 

@@ -100,13 +100,13 @@ class _Scanner:
                 self._add_unit(start, points)
             suspects = self._near.suspects()
             packets, reach = self._near.count_packets(suspects), self._near.reach
-            overfull = [np.empty(0, np.uint64), *self._near.overfull]
+            found = [np.empty(0, np.uint64), *self._near.overfull]
             if suspects.any():
                 more, far_reach, far_overfull = self._go_far(suspects)
                 packets, reach = packets + more, max(reach, far_reach)
-                overfull.append(far_overfull)
+                found.append(far_overfull)
             self._context.seal()
-            overfull = np.unique(np.concatenate(overfull))
+            overfull = np.unique(np.concatenate(found))
             if suspects.any():
                 self._vote_far()
             if len(overfull):

@@ -148,8 +148,8 @@ class FullwaveWriter(PointFile):
 
 
 def _check_version(target: Path, version: str, point_format: int) -> tuple[int, int]:
-    numbers = tuple(int(part) for part in version.split(".") if part.isdigit())
-    if point_format not in _FORMATS.get(numbers, ()):
+    numbers = next((known for known in _FORMATS if version == ".".join(map(str, known))), None)
+    if numbers is None or point_format not in _FORMATS[numbers]:
         raise ConfigError(
             f"{target}: LAS {version} has no waveforms in point format {point_format}; choose format 4 or 5 for 1.3; "
             "4, 5, 9 or 10 for 1.4; 9 or 10 for 1.5"

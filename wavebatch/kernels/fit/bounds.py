@@ -11,7 +11,9 @@ import numpy as np
 from wavebatch.core.units import SQRT_PI
 
 
-def bound_time(amplitude: np.ndarray, sigma: np.ndarray, noise_std: np.ndarray | float, spacing: float) -> np.ndarray:
+def bound_time(
+    amplitude: np.ndarray | float, sigma: np.ndarray | float, noise_std: np.ndarray | float, spacing: float
+) -> np.ndarray:
     """Smallest standard deviation of the time of isolated Gaussian echoes; that of sigma is the same.
 
     Parameters

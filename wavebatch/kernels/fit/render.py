@@ -22,7 +22,8 @@ VANISHED = 15.0
 
 
 def render_echoes(
-    shape: PulseShape, n: int, s: int, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
+    shape: PulseShape, n: int, s: int, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray,
+    rows: int = ROWS,
 ) -> np.ndarray:
     """The sum of all pulses of each waveform.
 
@@ -36,6 +37,8 @@ def render_echoes(
         Row of each echo, ascending.
     time, amplitude, width : float (m,), samples, count, samples
         Parameters of each echo.
+    rows : int
+        Echoes at a time, about; changes nothing but memory.
 
     Returns
     -------
@@ -45,13 +48,14 @@ def render_echoes(
     signal = np.zeros((n, s), np.float32)
     x = np.arange(s, dtype=np.float32)
     # Parts end with a waveform, so that the order in which its echoes are added does not depend on the others.
-    borders = np.append(np.unique(np.searchsorted(waveform, waveform[::ROWS])), len(waveform))
+    borders = np.append(np.unique(np.searchsorted(waveform, waveform[::rows])), len(waveform))
     for begin, end in zip(borders[:-1], borders[1:], strict=True):
         part = slice(begin, end)
         t, w, height = (values[part].astype(np.float32) for values in (time, width, amplitude))
         owner, reach = waveform[part], _reach(shape, w)
         for first in range(0, s, COLUMNS):
-            columns, near = slice(first, first + COLUMNS), slice(None)
+            columns = slice(first, first + COLUMNS)
+            near: slice | np.ndarray = slice(None)
             if s > COLUMNS:
                 near = np.flatnonzero((t > first - reach) & (t < first + COLUMNS + reach))
             _add(signal[:, columns], shape, x[columns], owner[near], t[near], w[near], height[near])

@@ -181,7 +181,7 @@ class _Image:
         while True:
             run, used = self._follow(rows, start)
             other = None if run is None or self.pulse is None else self._other_side(run)
-            if other is None:
+            if run is None or self.pulse is None or other is None:
                 return run, used
             # Whole pulses: pixels of half a pulse would turn the line.
             rows = rows[~np.isin(self.pulse[rows], other)]
@@ -190,7 +190,8 @@ class _Image:
 
     def _other_side(self, run: _Run) -> np.ndarray | None:
         """Pulses on the weaker side of a run's bend; None where it has no bend."""
-        apart, light, pulse = self.points[run.rows] - run.middle, self.weight[run.rows], self.pulse[run.rows]
+        apart, light = self.points[run.rows] - run.middle, self.weight[run.rows]
+        pulse = np.asarray(self.pulse)[run.rows]
         sums = np.bincount(pulse, light)
         seen = np.flatnonzero(sums)
         axes = (run.along, _across(run.along))

@@ -128,7 +128,8 @@ class Surroundings:
 
 
 def measure_normals(
-    points: np.ndarray, ray: np.ndarray, around: Surroundings, *, radius: float, min_points: int, max_error: float
+    points: np.ndarray, ray: np.ndarray, around: Surroundings, *, radius: float, min_points: int, max_error: float,
+    pairs: int = PAIRS,
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Angle between ray and surface normal at each point.
 
@@ -148,6 +149,8 @@ def measure_normals(
         Smallest number of neighbours.
     max_error : float, deg
         Angles that are less certain are not given.
+    pairs : int
+        Pairs of neighbours at a time, about; bounds memory.
 
     Returns
     -------
@@ -172,7 +175,7 @@ def measure_normals(
         point, offset = around.find(points[rows], radius)
         angles, errors, gap[rows] = _judge(offset, point, unit[rows], min_points, np.radians(max_error))
         angle[rows], error[rows] = np.degrees(angles), np.degrees(errors)
-        size = int(np.clip(PAIRS * len(rows) // max(len(point), 1), 64, _LARGEST_CHUNK))
+        size = int(np.clip(pairs * len(rows) // max(len(point), 1), 64, _LARGEST_CHUNK))
     return (angle, error), gap
 
 
@@ -279,8 +282,8 @@ def find_edges(
     spacing = float(np.median(tree.query(few, k=[min(RING, len(able))])[0]))
     # The footprint reaches over the edge, and so does that of the pulses behind it that still see this surface.
     most = 2.0 * reach + spacing
-    given = (values[able] for values in (level, points[:, 2], ray, time, before, after))
-    rows = able[_may_lie_apart(*given, most)]
+    given = [values[able] for values in (level, points[:, 2], ray, time, before, after)]
+    rows = able[_may_lie_apart(most, *given)]
     number = int(np.clip(np.ceil(1.5 * np.pi * (most / max(spacing, 1e-6)) ** 2), RING, MOST_NEIGHBOURS))
     for start in range(0, len(rows), _LARGEST_CHUNK):
         own = rows[start : start + _LARGEST_CHUNK]
@@ -295,8 +298,8 @@ def find_edges(
 
 
 def _may_lie_apart(
-    level: np.ndarray, z: np.ndarray, ray: np.ndarray, time: np.ndarray, before: np.ndarray, after: np.ndarray,
     most: float,
+    level: np.ndarray, z: np.ndarray, ray: np.ndarray, time: np.ndarray, before: np.ndarray, after: np.ndarray,
 ) -> np.ndarray:
     """Whether the cell of an echo, or one of those around it, has heights that lie outside of its packet, bool (m,)."""
     cell = np.floor((level - level.min(axis=0)) / most)

@@ -171,7 +171,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _sum_moments(x: np.ndarray, group: np.ndarray, n: int) -> list[np.ndarray]:
     """Number, sums (three) and sums of products (six) of each set, float64 (n,) each."""
-    sums = [np.bincount(group, minlength=n).astype(np.float64)]
+    sums: list[np.ndarray] = [np.bincount(group, minlength=n).astype(np.float64)]
     sums += [np.bincount(group, x[axis], minlength=n) for axis in range(3)]
     return sums + [np.bincount(group, x[a] * x[b], minlength=n) for a, b in _PRODUCTS]
 

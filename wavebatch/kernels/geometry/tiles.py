@@ -45,7 +45,9 @@ def cut_tiles(sample: np.ndarray, most: int, least_side: float) -> Tiles:
     -------
     Tiles
     """
-    axis, at, child, low, high = [-1], [0.0], [0], [], []
+    low: list[np.ndarray] = []
+    high: list[np.ndarray] = []
+    axis, at, child = [-1], [0.0], [0]
     waiting = [(0, sample, np.full(3, -np.inf), np.full(3, np.inf))]
     while waiting:
         node, points, lower, upper = waiting.pop()

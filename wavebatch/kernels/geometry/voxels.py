@@ -32,7 +32,7 @@ class Crossings(NamedTuple):
     """Time at which the ray enters the voxel, float64 (m,), ns."""
     inside: np.ndarray
     """Time for which it is inside, float64 (m,), ns."""
-    index: np.ndarray
+    voxel: np.ndarray
     """The voxel, int64 (m, 3)."""
 
 
@@ -115,13 +115,17 @@ def cross_voxels(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np
     return Crossings(ray, enter, inside, index)
 
 
-def split_rays(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float) -> list[slice]:
+def split_rays(
+    start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float, crossings: int | None = None
+) -> list[slice]:
     """Slices of the rays that `cross_voxels` can handle at a time in bounded memory.
 
     Parameters
     ----------
     start, step, begin, end, size
         As for `cross_voxels`.
+    crossings : int or None
+        Most of a slice of several rays; None: AT_A_TIME.
 
     Returns
     -------
@@ -134,7 +138,7 @@ def split_rays(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.n
         if at:
             most = np.maximum.accumulate(number[at:])
         cost = most * np.arange(1, len(most) + 1)
-        taken = max(int(np.searchsorted(cost, AT_A_TIME, side="right")), 1)
+        taken = max(int(np.searchsorted(cost, crossings or AT_A_TIME, side="right")), 1)
         slices.append(slice(at, at + taken))
         at += taken
     return slices

@@ -78,10 +78,13 @@ def estimate_canopy_ratio(canopy: np.ndarray, ground: np.ndarray) -> CanopyRatio
     if found is None:
         return None
     part, near = np.arange(len(canopy)) * PARTS // len(canopy), found + np.linspace(-_NEAR, _NEAR, 5)
-    others = [_find_ratio(canopy[part != number], ground[part != number], near) for number in range(PARTS)]
-    if any(other is None for other in others):
-        return None
-    error = float(np.sqrt((PARTS - 1) * np.mean((np.array(others) - np.mean(others)) ** 2)))
+    others = []
+    for number in range(PARTS):
+        other = _find_ratio(canopy[part != number], ground[part != number], near)
+        if other is None:
+            return None
+        others.append(other)
+    error = float(np.sqrt((PARTS - 1) * np.var(others)))
     scatter, unlike = _measure_scatter(canopy, ground, np.exp(found))
     error = float(np.sqrt(error**2 + MODEL_ERROR**2 + scatter**4 + unlike**2))
     return CanopyRatio(float(np.exp(found)), float(np.exp(found) * error)) if error < LARGEST_ERROR else None

@@ -28,7 +28,7 @@ _PHASES = (0.0, 0.25, 0.5, 0.75)
 """Places of the first sample, in samples, over which a table is averaged."""
 
 
-def spread_of_angle(angle: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
+def spread_of_angle(angle: np.ndarray, distance: np.ndarray | float, divergence: float) -> np.ndarray:
     """Spread of the pulse by a plane.
 
     Parameters
@@ -48,7 +48,7 @@ def spread_of_angle(angle: np.ndarray, distance: np.ndarray, divergence: float) 
     return 0.5 * divergence / C * np.asarray(distance, np.float64) * np.tan(angle)
 
 
-def angle_of_spread(spread: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
+def angle_of_spread(spread: np.ndarray, distance: np.ndarray | float, divergence: float) -> np.ndarray:
     """Angle of the plane that spreads the pulse; the inverse of `spread_of_angle`.
 
     Parameters

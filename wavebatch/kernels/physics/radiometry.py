@@ -104,7 +104,11 @@ def mean_haze(low: float, high: float) -> float:
 
 
 def backscatter(
-    constant: np.ndarray | float, distance: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray, attenuation: float
+    constant: np.ndarray | float,
+    distance: np.ndarray,
+    amplitude: np.ndarray,
+    sigma: np.ndarray | float,
+    attenuation: float,
 ) -> np.ndarray:
     """Backscatter coefficient gamma: cross section per illuminated area, 4 rho cos(alpha) for a Lambertian target.
 

@@ -83,7 +83,7 @@ HIGH, SKEWED = 2.0, 1.15
 """Standard deviations above the level from which quiet samples may be an echo, and how much larger than by samples
 below the level the variance of noise may be: it may be skewed."""
 
-DITHER = np.float32([0.75487767, 0.56984029])
+DITHER = np.array([0.75487767, 0.56984029], np.float32)
 """Steps along samples and waveforms, modulo 1, that fill the unit interval evenly: powers of the plastic number."""
 
 ROUNDED, ENOUGH = 0.5, 500
@@ -249,13 +249,13 @@ def quiet_edges(signal: np.ndarray, missing: np.ndarray | None = None) -> tuple[
     lower = edges[1][0] < edges[0][0]
     level, power = (np.where(lower, edges[1][i], edges[0][i]) for i in (0, 1))
     least = QUANTISATION_STD**2
-    mean = max(float(np.quantile(power, QUIET_EDGES)), least)
+    common: float = max(float(np.quantile(power, QUIET_EDGES)), least)
     for _ in range(8):
-        quiet = power <= ALIKE * mean
-        last_mean, mean = mean, max(float(np.mean(power[quiet], dtype=np.float64)), least)
-        if mean == last_mean:
+        quiet = power <= ALIKE * common
+        last, common = common, max(float(np.mean(power[quiet], dtype=np.float64)), least)
+        if common == last:
             break
-    return np.where(quiet, level, np.float32(np.nan)), float(np.sqrt(mean))
+    return np.where(quiet, level, np.float32(np.nan)), float(np.sqrt(common))
 
 
 def find_ends(above: np.ndarray, width: float, reach: int, recovery: int = 0) -> np.ndarray:
@@ -312,7 +312,7 @@ def _common_level(own: np.ndarray, number: np.ndarray, covariance: np.ndarray) -
 def _may_be_lopsided(signal: np.ndarray, quiet: np.ndarray, covariance: np.ndarray) -> bool:
     """Whether noise is not as often above its level as below it, rounded off or cut off; or too few samples show it."""
     cut = np.count_nonzero(quiet) < ENOUGH or float(np.mean(signal[quiet] == signal.min())) > MOST_LEAST
-    return cut or covariance[0] < ROUNDED**2
+    return bool(cut or covariance[0] < ROUNDED**2)
 
 
 def _leave_signal_out(
@@ -335,7 +335,7 @@ def _leave_signal_out(
     calm = ~(quiet & (np.abs(smoothed) > limit)).any(axis=0) & (number > 0)
     if calm.any():
         smoothed -= np.float32(np.median((sum_samples(above) / np.maximum(number, 1))[calm]))
-    beyond = tuple(widen(quiet & (side > limit), reach) for side in (smoothed, -smoothed))
+    beyond = widen(quiet & (smoothed > limit), reach), widen(quiet & (-smoothed > limit), reach)
     mirrored = measure_covariance(signal, quiet, lags, beyond)
     if mirrored is None:
         return plain
@@ -343,7 +343,8 @@ def _leave_signal_out(
     if most <= SKEWED * least:
         return plain
     share, size = (SKEWED - 1) * least / (most - least), max(len(plain), len(mirrored))
-    return sum(w * np.pad(one, (0, size - len(one))) for w, one in ((share, plain), (1 - share, mirrored)))
+    longer = [np.pad(one, (0, size - len(one))) for one in (plain, mirrored)]
+    return share * longer[0] + (1 - share) * longer[1]
 
 
 def _pulse_variance(covariance: np.ndarray, lags: int) -> float:
@@ -378,8 +379,11 @@ def measure_covariance(
         k <= 1 + MOST_LAGS. None where fewer than LEAST_QUIET_PAIRS neighbours are quiet.
     """
     signal, quiet = np.ascontiguousarray(signal, np.float32), np.ascontiguousarray(quiet)
-    masks = [None, None] if mirrored is None else [np.ascontiguousarray(mask) for mask in mirrored]
-    half, pairs = [], []
+    masks: list[np.ndarray | None] = [None, None]
+    if mirrored is not None:
+        masks = [np.ascontiguousarray(mask) for mask in mirrored]
+    half: list[float] = []
+    pairs: list[float] = []
     # In fewer waveforms than `measure_recovery` needs a tail of echoes looks like slow noise.
     most = MOST_LAGS if signal.shape[1] >= 2 * LEAST_WAVEFORMS else lags
     for lag in range(1, min(most, len(signal) - 1) + 1):
@@ -398,8 +402,8 @@ def measure_covariance(
     rest = sill - np.array(half)
     chance = CHANCE * sill / np.sqrt(pairs)
     if len(half) >= RISE and pairs[-1] >= LEAST_PAIRS:
-        most = float(np.var(signal[quiet], dtype=np.float64))
-        slow = _extend(np.array(half), np.array(pairs), max(lags, len(half)), most)
+        variance = float(np.var(signal[quiet], dtype=np.float64))
+        slow = _extend(np.array(half), np.array(pairs), max(lags, len(half)), variance)
         if slow is not None and slow[0] > (1 + SETTLED) * sill:
             return slow
     return np.r_[sill, np.where(np.abs(rest) > chance, rest, 0.0)]
@@ -722,7 +726,7 @@ MOST_PREDICTED = 0.999
 """Correlation of noise from which on it is as good as constant: nothing is left that is new in a sample."""
 
 
-def whitening_filter(whitening: tuple[float, float], gain: float = 1.0) -> np.ndarray:
+def whitening_filter(whitening: tuple[float, ...], gain: float = 1.0) -> np.ndarray:
     """Return the filter that makes coloured noise white.
 
     Parameters

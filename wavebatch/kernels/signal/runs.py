@@ -118,7 +118,9 @@ def lobe_edges(x: np.ndarray, curve: np.ndarray, level: float) -> tuple[float, f
     return cross(left + 1, left), cross(right - 1, right)
 
 
-def walk_down(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray, level: np.ndarray, step: int) -> np.ndarray:
+def walk_down(
+    signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray, level: np.ndarray, step: int
+) -> np.ndarray:
     """Place at which the signal falls to a level when one walks from a peak in one direction.
 
     Parameters

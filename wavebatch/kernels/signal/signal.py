@@ -309,7 +309,9 @@ def widen_after(mask: np.ndarray, reach: int) -> np.ndarray:
     return wide
 
 
-def find_quiet(signal: np.ndarray, limit: np.ndarray | float, reach: int, recovery: int = 0) -> np.ndarray:
+def find_quiet(
+    signal: np.ndarray, limit: np.ndarray | np.floating | float, reach: int, recovery: int = 0
+) -> np.ndarray:
     """Samples far from any signal.
 
     Parameters

@@ -6,7 +6,7 @@ Path of a block: candidates in ns, clusters in samples (`group`), fits (kernels)
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -73,7 +73,7 @@ def closed_form(
 
 @stage("decompose", fits=fit_gaussian, shares=FIT)
 def gaussian(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: float
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: Any
 ) -> EchoTable:
     """Sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
 
@@ -93,7 +93,7 @@ _GAUSS_NEWTON = FitOptions(max_iterations=20, tolerance=0.01)
 
 @stage("decompose", fits=fit_gaussian, shares=_GAUSS_NEWTON)
 def gauss_newton(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: float
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: Any
 ) -> EchoTable:
     """Sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
 
@@ -116,7 +116,7 @@ def adaptive(
     gate_residual: Annotated[float, Range(0.0, 1e6)] = 4.2,
     gate_hermite: Annotated[float, Range(0.0, 1e6)] = 8.5,
     width_prior: Annotated[float, Range(0.0, 100.0)] = 0.1,
-    **options: float,
+    **options: Any,
 ) -> EchoTable:  # fmt: skip
     """As many echoes as the waveform needs: a fit grows only where a test of its residual asks for it.
 

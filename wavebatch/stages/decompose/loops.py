@@ -91,8 +91,8 @@ def residual_loop(
     ----------
     Wang, Wang and Tseng; docs/algorithms.md 1.2.
     """
-    model = loop_model(system, model)
-    shape = pulse_shape(_fit_loop(system, {"model": model}), block.spacing)
+    fitted = loop_model(system, model)
+    shape = pulse_shape(_fit_loop(system, {"model": fitted}), block.spacing)
     options = {"max_iterations": max_iterations, "tolerance": 0.1, **limits}
     limit = _residual_limit(block, noise, t_diff, t_unit)
     rows = np.arange(len(block))
@@ -100,7 +100,7 @@ def residual_loop(
     varies = find_varying(block.samples)
     parts: list[EchoTable] = []
     while len(rows) or not parts:
-        found = _LOOP_FITS[model](block, noise, system, echoes, **options)
+        found = _LOOP_FITS[fitted](block, noise, system, echoes, **options)
         residual = _residual(block, noise, system, shape, found)
         height = residual.max(axis=1, initial=0)
         number = found.count(len(rows))

@@ -46,7 +46,7 @@ def reference(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     model: Literal["broadened", "stretched", "given"] = "broadened",
     pulse: str = "",
-    **options: float,
+    **options: Any,
 ) -> EchoTable:  # fmt: skip
     """Sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
 
@@ -87,7 +87,7 @@ def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> 
 
 @stage("decompose", fits=fit_gaussian, shares=FIT)
 def generalized_gaussian(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: float
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: Any
 ) -> EchoTable:
     """Sum of generalized Gaussians exp(-|z|^p / 2); the exponent is chosen for each cluster of echoes.
 

@@ -147,5 +147,5 @@ def _by_power(echoes: EchoTable) -> Iterator[tuple[float, np.ndarray]]:
     """Exponents, and the echoes that have them."""
     for power in np.unique(echoes.attributes["power"]):
         # As it was tried: a column holds it in single precision.
-        exact = min(POWERS, key=lambda value, power=power: abs(value - power))
+        exact = POWERS[int(np.argmin(np.abs(np.array(POWERS) - power)))]
         yield exact, np.flatnonzero(echoes.attributes["power"] == power)

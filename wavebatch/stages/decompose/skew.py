@@ -75,7 +75,7 @@ def skew_system(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPul
 def skewed(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     kappa: Annotated[float, Range(-0.9, 0.9)] | Literal["free"] = 0.0,
-    **options: float,
+    **options: Any,
 ) -> EchoTable:  # fmt: skip
     """Sum of skewed pulses: the log-normal of Wang et al. in its stable form, with one skew for the strip or per echo.
 
@@ -148,7 +148,7 @@ def _fit_skews(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPuls
 def log_normal(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     origin: Literal["segment", "waveform"] = "segment",
-    **options: float,
+    **options: Any,
 ) -> EchoTable:  # fmt: skip
     """Sum of log-normals as the paper prints them, a exp(-(ln x - mu)^2 / (2 sigma^2)): three parameters per echo.
 

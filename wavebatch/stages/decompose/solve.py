@@ -236,7 +236,8 @@ def _fit_again(
     old, waveform = solution.take(rows), clusters.waveform[rows]
     amplitude, time, width, _ = old.parameters.T
     place = np.arange(len(rows))
-    some = Samples(*(None if column is None else column[waveform] for column in samples))
+    columns: Any = (None if column is None else column[waveform] for column in samples)
+    some = Samples(*columns)
     some = some._replace(std=(some.std * factor).astype(np.float32))
     windows = Clusters(place, clusters.low[rows], clusters.high[rows], np.cumsum(old.number) - old.number, old.number)
     new = decompose_clusters(some, Candidates(place[old.cluster], time, amplitude, width), windows, settings)

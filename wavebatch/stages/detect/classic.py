@@ -123,7 +123,7 @@ def constant_fraction(
     waveform, sample = find_peaks(smoothed, np.float32(level * SMOOTH_GAIN) * noise.std)
     amplitude, width, height = _smoothed_height(smoothed, sample, waveform, ref)
     level = np.minimum(fraction * height, 0.999 * smoothed[sample, waveform])
-    edge = walk_down(smoothed, waveform, sample, level, -1)
+    edge = walk_down(smoothed, waveform, sample, np.full(len(sample), level), -1)
     time = edge + _time_to_peak(edge, np.full(len(edge), 1 / fraction), ref)
     return candidate_table(block, system, waveform, time, amplitude, width)
 

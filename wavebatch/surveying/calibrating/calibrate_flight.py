@@ -77,12 +77,12 @@ def calibrate_flight(
         # All energies count relative to those of the first strip: the mean of each would hide what lasers lose.
         before = Calibration(1.0, 0.0, **strips[0].sent.describe()) if strips else None
         strips.append(read_strip(path, i, boxes, targets, replace(options, before=before)))
-    good = [strip for strip in strips if strip.found is not None]
+    good = [strip.found for strip in strips if strip.found is not None]
     if not good:
         raise InputError(strips[0].refused if len(strips) == 1 else "; ".join(strip.refused for strip in strips))
     sources = [Source(strip, row) for strip in strips for row in strip.channels]
     if len(sources) == 1 and not options.scan_angle:
-        return FlightCalibration(good[0].found)
+        return FlightCalibration(good[0])
     rights = np.array([source.strip.right for source in sources])
     ties = _tie(sources, rights)
     anchors, seen = _list_given(sources, options)
@@ -168,8 +168,9 @@ def _list_given(sources: Sequence[Source], options: CalibrationOptions) -> tuple
     value, error = np.full((2, len(sources)), np.nan)
     seen = np.full(len(sources), np.nan, VIEW)
     for number, source in enumerate(sources):
-        if (given := source.given) is not None:
-            rest = given.relative_error**2 - _reflectance_error([source.strip.found], options) ** 2
+        given, found = source.given, source.strip.found
+        if given is not None and found is not None:
+            rest = given.relative_error**2 - _reflectance_error([found], options) ** 2
             value[number], error[number] = math.log(given.constant), math.sqrt(max(rest, 1e-6))
             seen[number] = source.strip.seen[source.channel]
     return Anchors(value, error), seen
@@ -190,10 +191,12 @@ def _assemble(
     shared = _reflectance_error(good, options)
     of = np.array([source.channel for source in sources])
     known = np.isfinite(adjusted.value)
-    channels, rows, scatter = [], [], _drift_scatter(of[known], adjusted.value[known])
+    channels: list[ChannelConstant] = []
+    rows: list[StripConstant] = []
+    scatter = _drift_scatter(of[known], adjusted.value[known])
     for channel in np.unique(of[known]):
         mine = np.flatnonzero(known & (of == channel))
-        some = [sources[k] for k in mine]
+        some = [sources[k] for k in mine.tolist()]
         mean, trials = float(adjusted.value[mine].mean()), adjusted.trials[:, mine]
         # A channel of one strip says nothing of its drift: it is credited with that of the others.
         apart = float(np.std(adjusted.value[mine], ddof=1)) if len(mine) > 1 else scatter

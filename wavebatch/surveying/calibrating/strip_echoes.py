@@ -122,11 +122,13 @@ class EchoSource:
         """
         for unit in self.reader.read_units(self.scan):
             for block, _ in self.reader.read_blocks(unit, _BLOCK, owned_only=True):
+                if block.returns is None:
+                    continue
                 near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
                 if len(near):
                     part = block.rows(near)
                     records = take_records(part, unit)
-                    given = None if self.column is None else self.column.record.read(records[self.column.field])
+                    given = None if self.column is None else self.column.read_column(records)
                     part = self.sensor.fill(part if self.sent.energy is None else self.sent.energy.fill(part, unit))
                     yield take_clean(part, self.chain.run(part, self.system), given)
 
@@ -189,7 +191,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None
     clipped = (echoes.flags & np.uint16(EchoFlag.SATURATED)) != 0
     rows = np.zeros(len(echoes), ECHO)
     rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
-    away = rows["xyz"] - block.sensor[echoes.waveform]
+    away = rows["xyz"] - np.asarray(block.sensor)[echoes.waveform]
     rows["distance"] = np.sqrt((away * away).sum(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
         rows["ray"] = away / rows["distance"][:, None]

@@ -130,7 +130,7 @@ def measure_target(
         edge=edge,
         strange=strange,
     )
-    inner = MEDIAN_ERROR * result.spread / np.sqrt(result.echoes - 1)
+    inner = MEDIAN_ERROR * (result.spread or 0.0) / np.sqrt(result.echoes - 1)
     hot_err = 0.5 * target.hot_spot / (1.0 + target.hot_spot)
     error = float(np.sqrt(reflectance_error**2 + hot_err**2 + facing_err**2 + inner**2 + edge_err**2 + strange_err**2))
     return replace(result, relative_error=error), rows[used], constant
@@ -176,8 +176,8 @@ def measure_column(
     # By both: classes of one alone differ where that one is noisy.
     order = np.argsort(facing * rows["light"], kind="stable")
     classes = np.array_split(constant[order], min(CLASSES, len(rows) // LEAST_ECHOES))
-    apart = float(np.std([np.median(some) for some in classes])) / result.constant
-    inner = MEDIAN_ERROR * result.spread / np.sqrt(len(rows) - 1)
+    apart = float(np.std([np.median(some) for some in classes])) / (result.constant or 1.0)
+    inner = MEDIAN_ERROR * (result.spread or 0.0) / np.sqrt(len(rows) - 1)
     error = float(np.sqrt(reflectance_error**2 + apart**2 + inner**2 + air_err**2))
     return replace(result, relative_error=error), rows, constant
 
@@ -262,7 +262,7 @@ def combine_targets(results: Sequence[TargetResult], light_err: np.ndarray, chan
         return None
     constants = np.array([result.constant for result in good])
     constant = float(np.median(constants))
-    stated = float(np.sqrt(sum(result.relative_error**2 for result in good))) / len(good)
+    stated = float(np.sqrt(sum((result.relative_error or 0.0) ** 2 for result in good))) / len(good)
     between = float(np.std(constants, ddof=1) / constant / np.sqrt(len(good))) if len(good) > 1 else 0.0
     spread = float(np.median([result.spread for result in good]))
     fits = float(np.median(light_err)) if len(light_err) else 0.0

@@ -137,8 +137,9 @@ def _measure_channels(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndar
             if mine.sum() >= LEAST_ECHOES:
                 results.append(summarise(result, constant[mine]))
                 parts.append(rows[mine])
-        if results:
-            found.append(combine_targets(results, _fit_errors(parts), channel))
+        combined = combine_targets(results, _fit_errors(parts), channel) if results else None
+        if combined is not None:
+            found.append(combined)
     return found
 
 
@@ -181,9 +182,10 @@ def _list_doubts(
         if options.column and result.air is None and source.air:
             yield (
                 f"{result.name}: its ranges are too alike to show whether it still holds the air: the error of the "
-                f"constant, {100 * result.relative_error:.1f} %, holds all of that; ask the vendor, or take targets"
+                f"constant, {100 * (result.relative_error or 0.0):.1f} %, holds all of that; ask the vendor, or take "
+                "targets"
             )
-        elif options.column and result.air > 0.5:
+        elif options.column and result.air is not None and result.air > 0.5:
             yield f"{result.name}: it falls with the range as if it still held {result.air:.0%} of the air: taken off"
         if result.edge is not None:
             yield (
@@ -195,10 +197,10 @@ def _list_doubts(
                 f"{result.name}: {100 * result.strange:.0f} % of its echoes are darker or brighter than the target by "
                 "far: check its outline and the coordinates; the error holds it"
             )
-    good = [result for result in results if result.constant is not None]
-    limits = [abs(np.log(a.constant / b.constant)) / (3 * np.hypot(a.relative_error, b.relative_error))
-              for i, a in enumerate(good) for b in good[:i]]  # fmt: skip
-    ratio = max(result.constant for result in good) / min(result.constant for result in good)
+    good = [(one.constant, one.relative_error or 0.0) for one in results if one.constant is not None]
+    limits = [abs(np.log(a / b)) / (3 * np.hypot(a_err, b_err))
+              for i, (a, a_err) in enumerate(good) for b, b_err in good[:i]]  # fmt: skip
+    ratio = max(good)[0] / min(good)[0]
     # Channels may have different constants, so that targets that they see unequally may differ too.
     if limits and max(limits) > 1 and len(channels) < 2:
         yield f"constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates"

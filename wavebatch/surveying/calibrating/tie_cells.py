@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class Ties:
     """Centre of the cell, f8 (k, 2) [m]."""
     size: float
     """Edge of a cell [m]."""
-    view: np.ndarray | None = None
+    view: np.ndarray = field(default_factory=lambda: np.empty(0, VIEW))
     """Array of VIEW (k,): by the middle echo in time of each row."""
 
 

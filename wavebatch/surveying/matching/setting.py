@@ -213,7 +213,7 @@ def see_channels(reader: StripReader, scan: StripScan) -> dict[tuple[int, int], 
     for block in reader.sample_blocks(scan, _CHANNEL_SAMPLE):
         scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
         counts[block.digitizer.index] = counts.get(block.digitizer.index, 0) + np.bincount(scanner, minlength=SCANNERS)
-    shares = {}
+    shares: dict[tuple[int, int], float] = {}
     for index, number in sorted(scan.by_descriptor.items()):
         of = counts.get(index, np.eye(SCANNERS)[0])
         shares |= {(index, scanner): number / total * of[scanner] / of.sum() for scanner in np.flatnonzero(of).tolist()}

@@ -53,11 +53,16 @@ def doubt_calibration(calibration: Calibration) -> Iterator[str]:
             "calibration: the file does not say which sensor it was measured with (an earlier version wrote it), so "
             "it cannot be compared with this strip; measure it again with `wavebatch calibrate`"
         )
-    if not min(row.relative_error for row in (calibration, *calibration.channels)):
+    if not _least_error(calibration):
         yield (
             f"calibration: its relative_error is 0, but no constant is known exactly: {UNSTATED:.0%} is taken; put the "
             "error of the targets into the file"
         )
+
+
+def _least_error(calibration: Calibration) -> float:
+    """The least relative error of its constants."""
+    return min([calibration.relative_error, *(row.relative_error for row in calibration.channels)])
 
 
 def find_growth(
@@ -68,8 +73,7 @@ def find_growth(
     attenuation: of the strip's air [dB/km], where it is given. Air that is not given is known to AIR_DOUBT: over the
     whole way on another day than that of the calibration, over what the ways differ on the same.
     """
-    rows = (calibration, *calibration.channels)
-    parts, lines = [UNSTATED if not min(row.relative_error for row in rows) else 0.0], []
+    parts, lines = [UNSTATED if not _least_error(calibration) else 0.0], []
     day = read_day(reader)
     slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
     haze = sensor.haze / calibration.haze if calibration.haze and attenuation is None else 1.0
@@ -84,7 +88,7 @@ def find_growth(
         )
     elif calibration.distance and sensor.distance:
         more, less = haze * sensor.distance - calibration.distance, 0.0
-        if haze != 1.0:
+        if haze != 1.0 and calibration.haze:
             # What heights above sea take off the air is known to a half as well.
             less = (sensor.distance - calibration.distance) / calibration.haze - more
         parts.append(slope * math.hypot(more, less))

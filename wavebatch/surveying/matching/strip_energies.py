@@ -182,7 +182,8 @@ def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy
     """Time, light, energy (1 where nothing is known) and channel of waveforms in the order of time, f8 (4, n)."""
     parts = [np.empty((4, 0))]
     for block, _ in reader.read_rows(unit, rows, NEIGHBOURS):
-        sent = np.ones(len(block)) if energy is None else energy.fill(block, unit).pulse_energy
+        given = None if energy is None else energy.fill(block, unit).pulse_energy
+        sent = np.ones(len(block)) if given is None else given
         channel = np.full(len(block), SCANNERS * block.digitizer.index)
         channel += 0 if block.scanner is None else block.scanner
         parts.append(np.stack([block.gps_time, sum_light(block), sent, channel]))

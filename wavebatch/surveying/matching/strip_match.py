@@ -109,15 +109,16 @@ def match_strip(
         )
     warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
-    rows, reasons = [], {}
+    rows: list[ChannelConstant] = []
+    missing: dict[int, str] = {}
     pulses = _find_pulses(calibration, reader, scan, system, sensor)
     for index in sorted(scan.by_descriptor):
         pulse = pulses.get(index, pulses[0])
-        found, reasons[index] = _match_digitizer(calibration, reader.facts.digitizers[index], pulse, warnings)
+        found, missing[index] = _match_digitizer(calibration, reader.facts.digitizers[index], pulse, warnings)
         rows += found
     have, seen = {(row.digitizer, row.scanner) for row in rows}, see_channels(reader, scan)
     problems = {
-        f"{reasons[index] or f'scanner channel {scanner} of digitizer {index} was not calibrated'}": share
+        f"{missing[index] or f'scanner channel {scanner} of digitizer {index} was not calibrated'}": share
         for (index, scanner), share in seen.items()
         if (index, scanner) not in have
     }
@@ -239,7 +240,7 @@ def _compare_decomposers(
     """By how much energies of the strip's chain differ from those of the calibration's, relative; 0 for one chain."""
     own = None if chain is None else chain.steps[2].stage.name
     other = STAGES.get(calibration.decomposer)
-    if own is None or other is None or own == calibration.decomposer:
+    if chain is None or other is None or own == calibration.decomposer:
         return 0.0
     steps = chain.steps[:3] + (Step(STAGES["attribute.energy"]),)
     pair = (Chain(steps), Chain((*steps[:2], Step(other), steps[3])))

@@ -201,7 +201,8 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     borne = _bear(system, change)
     explained = explain(block, borne, least_width=STRICT, width_prior=0.0)
     gaussians = max(len(system.components), 1)
-    written = 0.0 if known else 3 * gaussians * 0.5 * log(max(np.count_nonzero(explained.sums.used), 1)) / len(block)
+    used = max(int(np.count_nonzero(explained.sums.used)), 1)
+    written = 0.0 if known else 3 * gaussians * 0.5 * log(used) / len(block)
     length = describe_waveforms(block, borne, explained, change) + written
     return Candidate(
         name, system, change, length, len(explained.echoes), known, 2 if known else gaussians,

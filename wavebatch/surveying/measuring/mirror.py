@@ -56,9 +56,9 @@ def look_in_mirror(block: WaveformBlock, system: SystemPulse) -> Mirror:
     mirrored = (block.samples - 2 * explained.sums.left).astype(np.float32)
     echoes, other = explained.echoes, explain(replace(block, samples=mirrored), system).echoes
     width = system.sigma_ref * FWHM_PER_SIGMA
-    rest = np.ones(len(other), bool)
-    rest[match_echoes(other, echoes, SAME * width).found] = False
-    rest = other.take(np.flatnonzero(rest))
+    alone = np.ones(len(other), bool)
+    alone[match_echoes(other, echoes, SAME * width).found] = False
+    rest = other.take(np.flatnonzero(alone))
     top = np.zeros(len(block), np.float32)
     np.maximum.at(top, echoes.waveform, echoes.amplitude)
     strong = (echoes.amplitude == top[echoes.waveform]) & (echoes.amplitude > STRONG * system.noise.std)

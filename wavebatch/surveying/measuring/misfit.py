@@ -115,7 +115,8 @@ def _add_beside(
     block, ref = block.rows(strong.waveform), system.sigma_ref
     n, s = block.samples.shape
     lag = rng.choice([-1, 1], n) * rng.uniform(NOT_ABSORBED - 1, BESIDE + 1, n)
-    height = system.noise.std * exp(rng.uniform(*log(np.array(HEIGHTS)), n))
+    low, high = log(np.array(HEIGHTS)).tolist()
+    height = system.noise.std * exp(rng.uniform(low, high, n))
     added = EchoTable.build(np.arange(n), strong.time + lag * ref, height, np.full(n, ref))
     owner = np.full(int(max(echoes.waveform.max(), strong.waveform.max())) + 1, -1)
     owner[strong.waveform] = np.arange(n)

@@ -148,7 +148,7 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     if len(alone) < ENOUGH_TO_LEARN:
         return system
     time, width = alone.time / block.spacing, alone.sigma / block.spacing
-    rows = np.arange(len(alone))
+    rows = np.arange(len(alone), dtype=np.int32)
     part = block.rows(alone.waveform)
     model = render_own(block, system, alone, rows, len(alone))
     residual = subtract_echoes(part, system, replace(alone, waveform=rows.astype(np.int32)))
@@ -352,7 +352,7 @@ def _noise_gain(
     # one strip would fall on either side.
     share = 1 / (1 + exp(np.clip(0.5 * (chi2[1] - chi2[2]), -50, 50)))
     gain = share * fits[1][0][1] + (1 - share) * fits[3][0][1]
-    sigma = np.sqrt(max(share * (chi2[0] - chi2[1]) + (1 - share) * (chi2[2] - chi2[3]), 0.0))
+    sigma = np.sqrt(max(float(share * (chi2[0] - chi2[1]) + (1 - share) * (chi2[2] - chi2[3])), 0.0))
     # Of coloured noise the fit takes away more, at all levels alike, and `std` is what it does to a pulse: the growth
     # relative to the noise without signal holds for both.
     rest = share * fits[1][0][0] + (1 - share) * fits[3][0][0]

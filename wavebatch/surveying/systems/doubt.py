@@ -85,5 +85,5 @@ def share_repeated(echoes: EchoTable, width: float) -> float:
         if np.count_nonzero(here) >= FEW:
             alike = np.abs(ratios - np.median(ratios[here])) < SAME_RATIO
             chance = max(np.mean(alike[~here]), 0.1) if np.count_nonzero(~here) >= FEW else CHANCE_RATIO
-            most = max(most, np.count_nonzero(alike & here) - chance * np.count_nonzero(here))
+            most = max(most, float(np.count_nonzero(alike & here) - chance * np.count_nonzero(here)))
     return 2 * most / max(len(echoes), 1)

@@ -106,4 +106,4 @@ def fit_single(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     clusters = Clusters(row, low, high, row, np.ones_like(row))
     fit = decompose_clusters(samples_of(part, pooled(part, system)), starts, clusters, settings)
     known = fit.converged & ~fit.at_bound
-    return tuple(np.where(known, values[:, 3], np.nan) for values in (fit.parameters, fit.errors))
+    return np.where(known, fit.parameters[:, 3], np.nan), np.where(known, fit.errors[:, 3], np.nan)

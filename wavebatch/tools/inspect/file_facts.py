@@ -24,6 +24,7 @@ from wavebatch.files.las.crs import name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
 from wavebatch.files.las.point_formats import WITHOUT_WAVES, locate, read_angles, read_classes, split_numbers
+from wavebatch.files.point_dtypes import field_names
 from wavebatch.files.strip.describe import describe_strip
 
 _GPS_EPOCH = datetime(1980, 1, 6)
@@ -43,7 +44,7 @@ def describe_file(path: Path, *, direction: str = "auto", headerless: bool = Fal
     """
     checked = read_checked_header(path, waveforms=False)
     header = checked.header
-    facts = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
+    facts: dict[str, Any] = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
     if header.point_format in WITHOUT_WAVES and header.version >= (1, 3):
         facts |= _describe_waveforms(path, direction, headerless)
     facts |= _describe_header(path, checked)
@@ -148,7 +149,7 @@ class _Totals:
             self.widen(name, values)
         self.widen("scan_angle_deg", read_angles(raw))
         self.widen("intensity", raw["intensity"])
-        if "gps_time" in raw.dtype.names:
+        if "gps_time" in field_names(raw.dtype):
             self.widen("gps_time", raw["gps_time"])
         number, total = split_numbers(raw)
         self.returns += np.bincount(number, minlength=16)
@@ -157,7 +158,8 @@ class _Totals:
         _count(self.classes, kinds)
         _count(self.sources, raw["point_source_id"])
         if flags is not None:
-            self.flags.update({one.name: int(np.count_nonzero(flags & np.uint16(one))) for one in EchoFlag})
+            found = {name: int(np.count_nonzero(flags & np.uint16(one))) for name, one in EchoFlag.__members__.items()}
+            self.flags.update(found)
             self.passed += int(np.count_nonzero(flags & np.uint16(PASSED_THROUGH)))
 
 

@@ -170,7 +170,7 @@ def draw_numbers(rng: np.random.Generator, n: int, probabilities: tuple[float, .
 
 
 def widen_on_slope(
-    sigma: np.ndarray, amplitude: np.ndarray, incidence: np.ndarray, beam_radius: float
+    sigma: np.ndarray, amplitude: np.ndarray, incidence: np.ndarray, beam_radius: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
     """sigma [ns] and amplitude of echoes of a tilted plane: s_alpha = w tan(alpha)/c (docs/algorithms.md 1.4).
 

@@ -20,6 +20,7 @@ from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.las.header import is_projection, read_header
+from wavebatch.files.point_dtypes import field_names
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.files.wkt import repair_records
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
@@ -163,7 +164,8 @@ def synthesize_strip(
 
 def _read_pulses(reader: CloudReader) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Rows and raw records in pieces that cut no pulse."""
-    rows, records = None, None
+    rows: np.ndarray | None = None
+    records: np.ndarray | None = None
     for piece in reader.read_pieces(_PIECE):
         rows = piece if rows is None else np.concatenate([rows, piece])
         records = reader.records if records is None else np.concatenate([records, reader.records])
@@ -171,7 +173,7 @@ def _read_pulses(reader: CloudReader) -> Iterator[tuple[np.ndarray, np.ndarray]]
         if len(starts) > 1:
             yield rows[: starts[-1]], records[: starts[-1]]
             rows, records = rows[starts[-1] :], records[starts[-1] :]
-    if rows is not None and len(rows):
+    if rows is not None and records is not None and len(rows):
         yield rows, records
 
 
@@ -261,7 +263,7 @@ def _fill_points(
 ) -> np.ndarray:
     """Output points: fields of the input, and where their packets are."""
     points = np.zeros(len(records), dtype)
-    for name in set(dtype.names) & set(records.dtype.names) - set(_PACKET_FIELDS):
+    for name in set(field_names(dtype)) & set(field_names(records.dtype)) - set(_PACKET_FIELDS):
         points[name] = records[name]
     kind = pulses.kind[pulses.pulse]
     index = np.where(kind < len(_LENGTHS), kind + 1, 0)

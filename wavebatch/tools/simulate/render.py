@@ -171,7 +171,8 @@ def record_counts(
     dtype = {8: np.uint8, 16: np.uint16, 32: np.uint32}[recording.bits]
     counts = np.empty((n, s), dtype)
     # Adding half a count makes the cast round to nearest, which is faster than np.rint.
-    level = (recording.baseline + 0.5 + recording.baseline_spread * rng.standard_normal(n)).astype(np.float32)
+    level = recording.baseline_spread * np.asarray(rng.standard_normal(n))
+    level = (recording.baseline + 0.5 + level).astype(np.float32)
     top = recording.clip + 0.5
     for a in range(0, n, _ROWS):
         part = signal[a : a + _ROWS]

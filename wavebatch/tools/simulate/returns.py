@@ -94,9 +94,9 @@ class DiscreteReceiver:
             rows.append(hit)
             numbers.append(np.full(len(hit), number))
             at = reach[hit[reach[hit] < end[hit]]]
-        row, number = np.concatenate(rows), np.concatenate(numbers)
+        row = np.concatenate(rows)
         order = np.argsort(row, kind="stable")
-        return row[order], number[order], energy[row[order]]
+        return row[order], np.concatenate(numbers)[order], energy[row[order]]
 
 
 def _end_of_dead_zone(distance: np.ndarray, limit: np.ndarray, end: np.ndarray) -> np.ndarray:

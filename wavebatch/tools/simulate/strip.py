@@ -23,6 +23,7 @@ from wavebatch.files.las.extra_bytes import build_dtype
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.point_formats import WITHOUT_WAVES
 from wavebatch.files.las.write_points import PointFile
+from wavebatch.files.point_dtypes import field_names
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated_echoes
 from wavebatch.tools.simulate.blocks import Simulated, seed_block, simulate_seed_block
@@ -252,11 +253,11 @@ def _fill_points(dtype: np.dtype, simulated: Simulated, returns: Returns, scale:
     points["gps_time"] = block.gps_time[pulse]
     points["point_source_id"] = 1
     for number, name in enumerate(("red", "green", "blue", "nir")):
-        if name in dtype.names:
+        if name in field_names(dtype):
             points[name] = 20_000 + 9_000 * number + 20 * (pulse % 256)
     ground_or_plants = np.where(returns.number == returns.total, 2, 5)
     scan_angle = simulated.rays.scan_angle[pulse]
-    if "classification_flags" in dtype.names:
+    if "classification_flags" in field_names(dtype):
         points["bit_fields"] = returns.number | returns.total << 4
         points["classification"] = ground_or_plants
         points["classification_flags"] = 0x40

@@ -49,7 +49,7 @@ class CubeBuilder:
 
         Raises InputError without a line, and where lines differ in their spacing.
         """
-        arrays = build_cube(self._lines, str(self._target))
+        arrays: dict[str, Any] = build_cube(self._lines, str(self._target))
         arrays |= {"crs": np.array(crs or ""), "meta": np.array(json.dumps(meta, sort_keys=True))}
         with Draft(self._target, overwrite=overwrite) as draft:
             with reporting(self._target):

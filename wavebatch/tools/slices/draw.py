@@ -63,8 +63,8 @@ def draw_segments(
         space.set_box_aspect(sides, zoom=0.85 + 0.35 * (1.0 - np.sort(sides)[1] / sides.max()))
         for axis, side in zip("xyz", sides / sides.max(), strict=True):
             _place_ticks(getattr(space, f"{axis}axis"), 5.0 * side)
-        for axis, side in zip((plan.xaxis, plan.yaxis), extent[:2] / extent.max(), strict=True):
-            _place_ticks(axis, 7.0 * side)
+        for flat, side in zip((plan.xaxis, plan.yaxis), extent[:2] / extent.max(), strict=True):
+            _place_ticks(flat, 7.0 * side)
         factor = tall / extent[2]
         scales = "equal scales" if factor < 1.01 else f"heights {factor:.2g} times exaggerated"
         space.set_title(f"{scales}; z above {base[2]:.10g} m", fontsize=9)

@@ -76,7 +76,8 @@ class Slice:
             after = end[0] * self.pixel - self.start
             lines = self.line.origin + after[:, None] * self.line.direction
             place = np.array([np.interp(end[1], rows, lines[:, axis]) for axis in range(3)])
-        return tuple(float(value) for value in place)
+        x, y, z = place.tolist()
+        return x, y, z
 
     def scale(self, end: tuple[float, float]) -> tuple[float, float]:
         """A point of the slice in the units of its axes: [m] and height [m], or time [ns] and pulse."""

@@ -140,12 +140,12 @@ class VoxelGrid(Closing):
             found = cross_voxels(local[part], step[part], begin[part], end[part], self.size)
             values = self._list_values(found, rays.take(part), rule)
             kept = slice(None) if self._everything else values[:, _ENERGY] > 0
-            index = found.index[kept]
+            index = found.voxel[kept]
             if len(index):
                 self._low = np.minimum(self._low, index.min(axis=0))
                 self._high = np.maximum(self._high, index.max(axis=0))
             self._energy += int(values[:, _ENERGY].sum())
-            self._sums.add(pack_index(found.index), values)
+            self._sums.add(pack_index(found.voxel), values)
 
     def _list_values(self, found: Crossings, rays: Rays, rule: LightRule) -> np.ndarray:
         """Values that every crossing adds to its voxel, i8 (m, columns); over a ray they add up to its total."""
