@@ -20,6 +20,7 @@ from wavebatch.kernels.physics.pulse_energies import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
+from wavebatch.surveying.matching.setting import _find_fading, compare_scenes
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -234,6 +235,47 @@ def test_another_gain_over_a_like_scene_is_named_and_in_the_error(tmp_path, cali
     assert stated == pytest.approx(0.25, abs=0.05)
 
 
+def test_what_scenes_do_not_show_of_another_gain_or_energy_is_in_the_error():
+    """Scenes whose quantiles scatter by 0.2 passed factors of 0.7 to 1.4 with an error of 3 %."""
+    scene = np.linspace(15.0, 17.0, 10)
+    other = scene + 0.2 * np.where(np.arange(10) % 2, 1.0, -1.0)
+    alike, unlike = compare_scenes(scene, scene + 0.02, 0.0), compare_scenes(scene, other, 0.0)
+    assert alike.chance < 0.1 and alike.error < 0.02
+    assert unlike.chance < 0.25 and 0.08 < unlike.error < 0.13
+    for factor in (0.7, 0.8, 1.25, 1.4):
+        change = np.log(factor)
+        assert compare_scenes(scene + change, scene, 0.0).chance > 0.8
+        assert compare_scenes(scene + change, scene, 0.0).error == pytest.approx(abs(change), rel=0.15)
+        # Over another landscape an energy passes, with a larger error; a gain shows in the noise.
+        assert compare_scenes(other + change, scene, 0.0).error > 0.08
+        if abs(change) > 0.3:
+            assert compare_scenes(other + change, scene, change).chance > 0.7
+    assert compare_scenes(scene + 0.3, scene).error > 0.25
+
+
+@pytest.mark.slow
+def test_noise_that_grows_with_the_light_names_a_gain_over_another_landscape(tmp_path, calibrated):
+    bright = [Facet(lambda x, y: 0.2 + 0.3 * np.abs(np.sin(0.3 * x)) ** 0.3)]
+    said = {}
+    for gain in (1.0, 0.7):
+        changed = replace(SENSOR, light=gain * LIGHT, noise=gain * SENSOR.noise, time=START + 600)
+        write_strip(tmp_path / "b.las", bright, changed, 6000, seed=3)
+        said[gain] = run(calibrated, tmp_path / f"out{gain}", tmp_path / "b.las")
+    assert "and noise with them" in said[0.7] and "another gain or energy" not in said[1.0]
+
+
+@pytest.mark.parametrize("fade", [0.0, -0.35, 0.5])
+def test_light_that_changes_evenly_along_a_strip_is_told_from_its_fields(rng, fade):
+    time = np.sort(rng.uniform(0.0, 1.0, 2048))
+    fields = np.exp(rng.normal(0.0, 0.5, (1000, 6)))
+    light = fields[(1000 * time).astype(int), rng.integers(0, 6, 2048)] * (1.0 + fade * time)
+    found = _find_fading(time, light)
+    assert (found.chance > 0.5) == bool(fade)
+    assert found.shift == pytest.approx(0.5 * np.log1p(fade), abs=0.06)
+    forest = np.where(np.abs(time - 0.4) < 0.2, 0.5 * light, light)
+    assert fade or _find_fading(time, forest).chance < 0.5
+
+
 @pytest.mark.slow
 def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, calibrated, monkeypatch):
     even = [Facet(lambda x, y: 0.1 + 0.5 * np.abs(np.sin(y)))]
@@ -253,22 +295,64 @@ def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, ca
     assert 0.17 < stated < 0.4
 
 
+FAST = Sensor(light=LIGHT, rate=250_000.0, line_rate=800.0, half_angle=20.0, height=911.0)
+ZONE = 1e9 * facet_strips.C_AIR / FAST.rate
+HILLY = [replace(facet, slope=(0.1, -0.05)) for facet in GROUND]
+
+
+def write_off(monkeypatch, path, off, sensor=FAST, ground=HILLY, pulses=8000):
+    """A strip whose ranges are off by whole zones; off: of each pulse, by its number and the angle of its ray."""
+    write = facet_strips._write
+
+    def moved(path, sensor, origin, ray, seconds, channel, samples, first, hit, *more):
+        lower = ZONE * off(np.arange(len(hit)) / len(hit), np.degrees(np.arccos(-ray[:, 2])))
+        first = first - lower / facet_strips.C_AIR
+        write(path, sensor, origin, ray, seconds, channel, samples, first, hit - lower, *more)
+
+    monkeypatch.setattr(facet_strips, "_write", moved)
+    write_strip(path, ground, sensor, pulses, seed=1)
+    monkeypatch.undo()
+
+
 @pytest.mark.parametrize(("off", "said"), [(1, "m too short, 1 x the 600 m"), (-1, "too long"), (0, "")])
 def test_a_wrong_pulse_zone_is_refused(tmp_path, monkeypatch, off, said):
-    fast = Sensor(light=LIGHT, rate=250_000.0, line_rate=800.0, half_angle=20.0, height=911.0)
-    write, zone = facet_strips._write, 1e9 * facet_strips.C_AIR / fast.rate
-
-    def write_off(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy, facing):
-        first, hit = first - off * zone / facet_strips.C_AIR, hit - off * zone
-        write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy, facing)
-
-    monkeypatch.setattr(facet_strips, "_write", write_off)
-    ground = [replace(facet, slope=(0.1, -0.05)) for facet in GROUND]
-    write_strip(tmp_path / "s.las", ground, fast, 8000)
+    write_off(monkeypatch, tmp_path / "s.las", lambda share, angle: off)
     done = call("calibrate", tmp_path / "s.las", "--targets", write_targets(tmp_path / "t.csv"),
                 "-o", tmp_path / "cal.toml")  # fmt: skip
     assert done.exit_code == (1 if off else 0) and said in done.stderr
     assert ("its ground is bent across the flight" in done.stderr) == bool(off)
+
+
+@pytest.mark.quick_cases("late")
+@pytest.mark.parametrize(
+    "off",
+    [
+        pytest.param(lambda share, angle: share > 0.4, id="late"),
+        pytest.param(lambda share, angle: -1.0 * (share < 0.15), id="early"),
+        pytest.param(lambda share, angle: angle > 18.5, id="edges"),
+    ],
+)
+def test_a_pulse_zone_that_is_wrong_in_a_part_of_the_strip_is_refused(tmp_path, monkeypatch, off):
+    write_off(monkeypatch, tmp_path / "s.las", off)
+    done = call("calibrate", tmp_path / "s.las", "--targets", write_targets(tmp_path / "t.csv"),
+                "-o", tmp_path / "cal.toml")  # fmt: skip
+    assert done.exit_code == 1 and "pulses jump by a whole number of the 600 m between two pulses" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_wrong_pulse_zone_under_a_narrow_swath_is_refused_by_its_light(tmp_path, monkeypatch):
+    """A valley hides the bend of the ground; gamma was 89 % too small, with an error of 4 %."""
+    narrow = replace(FAST, half_angle=4.0, height=800.0)
+    valley = [replace(HILLY[1], slope=(0.0, side * 0.4), inside=half) for side, half in (
+        (1.0, lambda x, y: y >= 0), (-1.0, lambda x, y: y < 0))]  # fmt: skip
+    write_strip(tmp_path / "a.las", GROUND, replace(narrow, start=(8.0, 10.0)), 8000, seed=2)
+    write_targets(tmp_path / "t.csv")
+    calibrate(tmp_path, strips=["a.las"])
+    for off, code in ((1.0, 4), (0.0, 0)):
+        write_off(monkeypatch, tmp_path / "b.las", lambda share, angle, off=off: off, narrow, valley)
+        done = call("run", tmp_path / "b.las", "-o", tmp_path / f"out{code}", "--calibration", tmp_path / "cal.toml")
+        assert done.exit_code == code, done.output
+        assert ("as if all ranges were 600 m too short, 1 x the way between two pulses" in done.stderr) == bool(off)
 
 
 def disc(radius):
@@ -404,7 +488,8 @@ def test_air_that_is_not_given_thins_with_the_height_above_sea(tmp_path, monkeyp
     inside = (np.abs(x % 20 - 10) < 8) & (np.abs(y % 20 - 10) < 8) & (x > 60)
     off = np.nanmedian((cloud["level_reflectance"] / fields(x, y))[inside]) - 1
     stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
-    assert abs(off) < stated < 0.1 and (abs(off) < 0.03 or fall != 2000)
+    # Fields seen along other lines leave a change of the energy of some 10 % open.
+    assert abs(off) < stated < 0.12 and (abs(off) < 0.03 or fall != 2000)
 
 
 def test_an_attenuation_per_metre_is_refused(tmp_path, calibrated):

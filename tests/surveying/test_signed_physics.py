@@ -35,6 +35,7 @@ def write_calibration(path, flight, *, divergence=None, shot_energy=0.0):
 
 def fly(folder, planes, flight, pulses=12_000, *options, seed=1, calibration=None):
     """Columns of the cloud, NaN where no-data, the truth of each of its points, and its report."""
+    folder.mkdir(exist_ok=True)
     truth = write_strip(folder / "strip.las", planes, flight, pulses, seed)
     calibration = calibration or write_calibration(folder / "cal.toml", flight)
     call("run", folder / "strip.las", "-o", folder / "out", "--calibration", calibration, "-q", *options)
@@ -292,6 +293,13 @@ def test_footprints_that_reach_over_an_edge_to_what_no_packet_holds_have_no_refl
     edge = roof & ~true["pure"] & known
     assert np.quantile(off[edge], 0.1) > -0.06 and edge.sum() > 0.5 * (roof & ~true["pure"]).sum()
     assert (known & ~roof & ~true["pure"] & (off < -0.3)).sum() < 10
+    level = columns["level_reflectance"] / true["reflectance"] - 1
+    assert report["counts"]["no_data"]["level_reflectance"]["EDGE"] > 200
+    assert np.nanquantile(level[roof & ~true["pure"]], 0.1) > -0.06
+    alone, _, said = fly(tmp_path / "alone", planes, replace(GREEN, n_samples=samples), 12_000,
+                         "--columns", "level_reflectance", seed=seed)  # fmt: skip
+    np.testing.assert_array_equal(alone["level_reflectance"], columns["level_reflectance"])
+    assert said["counts"]["no_data"]["level_reflectance"] == report["counts"]["no_data"]["level_reflectance"]
 
 
 @pytest.mark.slow

@@ -29,11 +29,10 @@ from wavebatch.core.echoes import COLUMNS, EchoTable
 from wavebatch.core.errors import StageError
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.core.process import Seconds
-from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.files.disk.row_file import RowStore
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.point_dtypes import field_names
-from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, find_edges, thin_out
+from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, thin_out
 from wavebatch.kernels.geometry.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
 from wavebatch.stages.chain import Chain, Step
 
@@ -196,36 +195,8 @@ def begin_unit(blob: bytes, number: int, block_size: int | None) -> tuple[tuple[
     needed = {name: made.columns[name] for name in ("echo_flags", *prepared.needed)}
     chain = prepared.job.chain
     kept = [(index, chain.keep_needed(block)) for index, block in solved] if chain.after_second else []
-    kept = _mark_edges(prepared, kept)
     state = np.frombuffer(pickle.dumps((made._replace(columns=needed), kept), PROTOCOL), np.uint8)
     return (_list_entries(echoes, made), state), RunReport(timing=timing)
-
-
-def _mark_edges(prepared: Prepared, solved: SolvedBlocks) -> SolvedBlocks:
-    """The blocks whose echoes have the attribute `edge`, bool: beside them lies a surface outside of their packets."""
-    distance = prepared.sensor.distance
-    if not solved or distance is None:
-        return solved
-    parts = []
-    for block, _, system, echoes in (solution for _, solution in solved):
-        way = block.direction[echoes.waveform]
-        speed = np.sqrt((way * way).sum(axis=1))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ray = way / speed[:, None]
-        place = np.stack([echoes.attributes[axis] for axis in "xyz"], axis=1)
-        rest = block.digitizer.n_samples * block.spacing - echoes.time - 2.0 * system.sigma_ref
-        parts.append((place, ray, block.gps_time[echoes.waveform], echoes.time * speed, rest * speed))
-    beam = 0.5e-3 * (prepared.system.radiometry.divergence or ASSUMED_DIVERGENCE)
-    # In the order of packets: blocks of several digitizers come in another one with blocks of another size.
-    order = np.argsort(np.concatenate([index[block.echoes.waveform] for index, block in solved]), kind="stable")
-    edge = np.empty(len(order), bool)
-    place, ray, time, before, after = (np.concatenate(values)[order] for values in zip(*parts, strict=True))
-    edge[order] = find_edges(place, ray, time, before, after, INSET * beam * distance)
-    ends = np.cumsum([len(block.echoes) for _, block in solved])
-    return [
-        (index, block._replace(echoes=block.echoes.with_attributes(edge=part)))
-        for (index, block), part in zip(solved, np.split(edge, ends[:-1]), strict=True)
-    ]
 
 
 def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, RunReport]:

@@ -19,12 +19,15 @@ from wavebatch.batch.job import StripJob, UnitRows, plan_filter, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.process import Seconds
+from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
 from wavebatch.files.las.point_formats import split_numbers
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
+from wavebatch.kernels.geometry.normals import find_edges
+from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
 from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
@@ -289,6 +292,7 @@ def solve_unit(
         blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)
         solved = list(_run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
     start = Seconds.now()
+    solved = _mark_edges(prepared, solved)
     echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
     layout, needed = prepared.layout, prepared.needed
     if echoes_mode:
@@ -297,6 +301,34 @@ def solve_unit(
         made = assemble_returns(unit, echoes, layout, needed)
     timing["assemble"] = Seconds.now() - start
     return solved, echoes, made
+
+
+def _mark_edges(prepared: Prepared, solved: SolvedBlocks) -> SolvedBlocks:
+    """The blocks whose echoes have the attribute `edge`, bool: beside them lies a surface outside of their packets; and
+    no level reflectance there. Other reflectances see it after the second pass."""
+    distance = prepared.sensor.distance
+    if not solved or distance is None or set(REFLECTANCES).isdisjoint(prepared.job.chain.makes):
+        return solved
+    parts = []
+    for block, _, system, echoes in (solution for _, solution in solved):
+        way = block.direction[echoes.waveform]
+        speed = np.sqrt((way * way).sum(axis=1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ray = way / speed[:, None]
+        place = np.stack([echoes.attributes[axis] for axis in "xyz"], axis=1)
+        rest = block.digitizer.n_samples * block.spacing - echoes.time - 2.0 * system.sigma_ref
+        parts.append((place, ray, block.gps_time[echoes.waveform], echoes.time * speed, rest * speed))
+    beam = 0.5e-3 * (prepared.system.radiometry.divergence or ASSUMED_DIVERGENCE)
+    # In the order of packets: blocks of several digitizers come in another one with blocks of another size.
+    order = np.argsort(np.concatenate([index[block.echoes.waveform] for index, block in solved]), kind="stable")
+    edge = np.empty(len(order), bool)
+    place, ray, time, before, after = (np.concatenate(values)[order] for values in zip(*parts, strict=True))
+    edge[order] = find_edges(place, ray, time, before, after, INSET * beam * distance)
+    ends = np.cumsum([len(block.echoes) for _, block in solved])
+    return [
+        (index, block._replace(echoes=hide_edges(block.echoes.with_attributes(edge=part))))
+        for (index, block), part in zip(solved, np.split(edge, ends[:-1]), strict=True)
+    ]
 
 
 @functools.lru_cache(maxsize=4)

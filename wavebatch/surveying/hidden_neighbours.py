@@ -27,6 +27,10 @@ lie in a step of distance as nearer. Pairs are simulated up to FAR."""
 CLEAR = 10.0
 """Least amplitude over noise of echoes whose widths are counted."""
 
+LEVEL, AROUND = 64, 24.0
+"""Samples, and widths of the pulse, of a simulated waveform: what a level comes from, and FAR with ten widths around
+it; longer ones show the same."""
+
 MOST_LOST = 0.7
 """Share of groups of three and more that may hold another hidden echo: beyond, nothing tells how many there are."""
 
@@ -108,12 +112,14 @@ def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) ->
     rng = np.random.default_rng(SEED)
     block = block.rows(slice(0, PAIRS))
     n, ref = len(block), system.sigma_ref
+    length = min(block.samples.shape[1], LEVEL + int(np.ceil(AROUND * ref / block.spacing)))
     half, chosen = 0.5 * FAR * ref * rng.random(n), rng.integers(0, len(echoes), 2 * n)
-    middle = block.spacing * (0.5 * block.samples.shape[1] + rng.random(n))
+    middle = block.spacing * (0.5 * length + rng.random(n))
     time = np.stack([middle - half, middle + half], axis=1)
     pairs = EchoTable.build(np.repeat(np.arange(n), 2), time.ravel(), echoes.amplitude[chosen], echoes.sigma[chosen])
-    found = decompose_sample(*simulate_again(block, system, pairs, rng))
+    found = decompose_sample(*simulate_again(block, system, pairs, rng, length))
     one = found.alone(n) & (found.amplitude > CLEAR * system.noise.std)
     found = found.take(np.flatnonzero(one))
     shift = np.abs(time[found.waveform] - found.time[:, None]).min(axis=1)
     return excess_variance(found, system), shift / ref
+

@@ -129,7 +129,7 @@ def leave_out_false(predictions: Sequence[Prediction]) -> list[Prediction]:
 
 
 def simulate_again(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rng: np.random.Generator
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rng: np.random.Generator, length: int | None = None
 ) -> tuple[WaveformBlock, SystemPulse]:
     """Simulate waveforms that hold given echoes, with the strip's pulse, new baselines and new noise.
 
@@ -141,6 +141,8 @@ def simulate_again(
     echoes : EchoTable
         Their rows refer to `block`.
     rng : numpy.random.Generator
+    length : int, optional
+        Samples of a waveform; by default as many as in the block.
 
     Returns
     -------
@@ -148,7 +150,7 @@ def simulate_again(
     system : SystemPulse
         Without the defects of the strip's waveforms: simulated ones have none.
     """
-    n, s = block.samples.shape
+    n, s = len(block), length or block.samples.shape[1]
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
     start = [echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing]
     amplitude, time, width = model_parameters(shape, limits, np.stack(start, axis=1).astype(np.float64)).T
@@ -163,7 +165,7 @@ def simulate_again(
     counts = np.clip(np.rint(signal.astype(np.float64)), 0, top).astype(np.min_scalar_type(block.digitizer.max_count))
     trial = WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
     plain = replace(system, defects=Defects())
-    return replace(trial, digitizer=block.digitizer), plain
+    return replace(trial, digitizer=replace(block.digitizer, n_samples=s)), plain
 
 
 def _draw_noise(rng: np.random.Generator, n: int, s: int, system: SystemPulse) -> np.ndarray:

@@ -311,38 +311,51 @@ INLINE lane_bits read_flags(const uint8_t *a, const uint8_t *b, size_t count, in
     return __builtin_convertvector(any ? first | second : first & second, lane_bits) != 0;
 }
 
+enum { PAIR_KINDS = 4, PAIRS_TOGETHER = 256 }; /* vectors whose squares are added in single precision: 1e-6 of their sum */
+
+typedef struct { lane_bits number[PAIR_KINDS]; lanes square[PAIR_KINDS]; } PairSums;
+
 /* The next `count` pairs, at most LANES. */
-INLINE void add_pairs(const float *a, int64_t ahead, const uint8_t *quiet, const uint8_t *high, const uint8_t *low, size_t count, wide *sums) {
+INLINE void add_pairs(const float *a, int64_t ahead, const uint8_t *quiet, const uint8_t *high, const uint8_t *low, size_t count,
+                      int64_t kinds, PairSums *sums) {
     lanes first = ALL(0), second = ALL(0);
     memcpy(&first, a, count * sizeof(float));
     memcpy(&second, a + ahead, count * sizeof(float));
-    lane_bits kinds[4] = {read_flags(quiet, quiet + ahead, count, 0)};
-    if (high) {
-        kinds[1] = kinds[0] & read_flags(high, high + ahead, count, 1);
-        kinds[2] = kinds[0] & read_flags(low, low + ahead, count, 1);
-        kinds[3] = kinds[1] & kinds[2];
+    lane_bits is[PAIR_KINDS] = {read_flags(quiet, quiet + ahead, count, 0)};
+    if (kinds > 1) {
+        is[1] = is[0] & read_flags(high, high + ahead, count, 1);
+        is[2] = is[0] & read_flags(low, low + ahead, count, 1);
+        is[3] = is[1] & is[2];
     }
     const lanes step = second - first, square = step * step;
-    for (int64_t k = 0; k < (high ? 4 : 1); k++) {
-        sums[2 * k] += __builtin_convertvector(-kinds[k], wide);
-        sums[2 * k + 1] += __builtin_convertvector(pick(kinds[k], square, ALL(0)), wide);
+    for (int64_t k = 0; k < kinds; k++) {
+        sums->number[k] -= is[k];
+        sums->square[k] += (lanes)(is[k] & (lane_bits)square);
+    }
+}
+
+INLINE void add_all_pairs(int64_t end, const float *signal, int64_t ahead, const uint8_t *quiet, const uint8_t *high,
+                          const uint8_t *low, int64_t kinds, double *out) {
+    for (int64_t i = 0; i < end;) {
+        PairSums sums = {0};
+        int64_t most = i + PAIRS_TOGETHER * LANES, last = most < end ? most : end;
+        for (; i + LANES <= last; i += LANES) add_pairs(signal + i, ahead, quiet + i, high + i, low + i, LANES, kinds, &sums);
+        if (i < last) add_pairs(signal + i, ahead, quiet + i, high + i, low + i, last - i, kinds, &sums);
+        i = last;
+        for (int64_t k = 0; k < kinds; k++)
+            for (int64_t lane = 0; lane < LANES; lane++) {
+                out[2 * k] += sums.number[k][lane];
+                out[2 * k + 1] += sums.square[k][lane];
+            }
     }
 }
 
 /* Pairs of quiet samples `lag` apart of waveforms in columns, signal (s, n): number, and sum of squared differences, of
-   all pairs, of those with a sample of `high`, of `low`, and of both: out (4, 2). Without masks only the first. */
+   all pairs, of those with a sample of `high`, of `low`, and of both: out (4, 2), zeros. Without masks only the first. */
 EXPORT int64_t pair_differences(int64_t s, int64_t n, const float *signal, const uint8_t *quiet, const uint8_t *high,
                                 const uint8_t *low, int64_t lag, double *out) {
-    wide sums[8] = {0};
     const int64_t ahead = lag * n, end = (s - lag) * n;
-    int64_t i = 0;
-    if (high) {
-        for (; i + LANES <= end; i += LANES) add_pairs(signal + i, ahead, quiet + i, high + i, low + i, LANES, sums);
-        if (i < end) add_pairs(signal + i, ahead, quiet + i, high + i, low + i, end - i, sums);
-    } else {
-        for (; i + LANES <= end; i += LANES) add_pairs(signal + i, ahead, quiet + i, NULL, NULL, LANES, sums);
-        if (i < end) add_pairs(signal + i, ahead, quiet + i, NULL, NULL, end - i, sums);
-    }
-    for (int64_t k = 0; k < 8; k++) out[k] = sums[k][0] + sums[k][1] + sums[k][2] + sums[k][3];
+    if (high) add_all_pairs(end, signal, ahead, quiet, high, low, PAIR_KINDS, out);
+    else add_all_pairs(end, signal, ahead, quiet, quiet, quiet, 1, out);
     return 0;
 }

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.no_data import NoData
+from wavebatch.core.no_data import SUFFIX, NoData
 from wavebatch.core.system import angle_to_vertical
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
@@ -164,6 +164,9 @@ def relative_cross_section(block: WaveformBlock, noise: Noise, system: SystemPul
     return add_column(echoes, "relative_cross_section", section, light.relative_error, *light.cases)
 
 
+REFLECTANCES = ("level_reflectance", "reflectance", "relative_reflectance")
+"""Columns that footprints over an edge do not have."""
+
 _ANGLE = {"normals": "incidence_angle_normals", "echo": "incidence_angle"}
 """Column of the angle, by the parameter `surface`."""
 
@@ -240,6 +243,17 @@ def level_reflectance(
     light, angle = measure_light(block, system, echoes, 2), angle_to_vertical(block.direction)[echoes.waveform]
     relative = np.hypot(light.relative_error, radiometry.slope_error(angle, np.radians(slope)))
     return _divide(block, echoes, "level_reflectance", light, angle, relative)
+
+
+def hide_edges(echoes: EchoTable) -> EchoTable:
+    """Leave out the level reflectance of echoes with the attribute `edge`: it is computed before edges are known."""
+    name, edge = "level_reflectance", echoes.attributes["edge"]
+    if name not in echoes.attributes:
+        return echoes
+    hidden = edge & np.isfinite(echoes.attributes[name])
+    changed = {key: np.where(hidden, np.float32(np.nan), echoes.attributes[key]) for key in (name, f"{name}_err")}
+    changed[f"{name}{SUFFIX}"] = np.where(hidden, np.uint8(NoData.EDGE), echoes.attributes[f"{name}{SUFFIX}"])
+    return echoes.with_attributes(**changed)
 
 
 def _reflectance(block: WaveformBlock, echoes: EchoTable, name: str, light: Light, surface: str) -> EchoTable:

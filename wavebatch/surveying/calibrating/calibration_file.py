@@ -27,7 +27,7 @@ _DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
 _SECTION = "section_constant"
 _MEANING = "C_cal: cross section = C_cal R^4 amplitude sigma / transmission"
-_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0), "odd": (-10.0, 10.0, 0.0)}
+_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0), "odd": (-10.0, 10.0)}
 """Keys of [scan_angle] with their limits: the constant grows by exp(square u^2 + fourth u^4 + odd u), u = angle to the
 right of the flight / most_deg."""
 _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
@@ -70,7 +70,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     Returns
     -------
     Calibration
-        Without `targets` and `fingerprint`, which nothing uses after the measurement.
+        Without `targets`, which nothing uses after the measurement.
 
     Raises
     ------
@@ -81,8 +81,9 @@ def parse_calibration(text: str, name: str) -> Calibration:
     table.check_kind("calibration")
     table.check_schema(CALIBRATION_SCHEMA)
     swath = _read_swath(table.table("scan_angle")) if "scan_angle" in table.values else ()
+    fingerprint = dict(table.table("fingerprint", {}).values)
     others = ("schema", "version", _SECTION, "scan_angle", "target", "fingerprint")
-    found = replace(read_record(Calibration, table, also=others), swath=swath)
+    found = replace(read_record(Calibration, table, also=others), swath=swath, fingerprint=fingerprint)
     if found.flight:
         flight = found.flight
         with contextlib.suppress(ValueError):
@@ -104,7 +105,9 @@ def parse_calibration(text: str, name: str) -> Calibration:
 
 def _read_swath(table: TomlTable) -> tuple[float, ...]:
     table.check_keys(_SWATH)
-    most, *terms = (table.number(key, *limits) for key, limits in _SWATH.items())
+    even = {key: limits for key, limits in _SWATH.items() if key != "odd"}
+    most, *terms = (table.number(key, low, high) for key, (low, high) in even.items())
+    terms.append(table.number("odd", *_SWATH["odd"], default=0.0))  # older files have none
     return (math.radians(most), *terms)
 
 

@@ -6,7 +6,7 @@ makes another sensor of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
@@ -29,23 +29,48 @@ SAMPLE = 2048
 QUANTILES = np.linspace(0.05, 0.95, 10)
 """Of the light of waveforms, by which scenes are compared."""
 
-UNLIKE = 4.0
-"""Scenes of one setting differ in brightness by up to so many times the scatter of the ratios of their quantiles:
-quarters of strips over villages, fields and forest by up to 3.8 times."""
+UNLIKE, LEAST_UNLIKE = 2.0, 0.04
+"""Scenes of one setting differ in brightness by so many times the scatter of the ratios of their quantiles, and by the
+second where these are equal (standard deviations of the logarithm): quarters of five real strips differ by 1.2 times
+what these two make together."""
+
+USUAL_CHANGE = 0.35
+"""By how much another gain or energy changes light (standard deviation of the logarithm): factors of 0.7 to 1.4."""
+
+SUNLIGHT = 0.1
+"""By how much sunlight changes the noise of one gain (standard deviation of the logarithm)."""
+
+PRIORS = ((0.7, (0.0, 0.0)), (0.15, (1.0, 0.0)), (0.15, (1.0, 1.0)))
+"""How likely nothing, the energy and the gain are another one before light and noise are seen, and whether light and
+noise change with each. The chance of a change is assumed: it is high, since errors must hold for those who have one."""
 
 ZONE_PARTS = 8
 """Parts of a strip whose bend is measured: their scatter tells ground from a wrong pulse zone."""
 
-LEAST_BEND, MOST_BEND = 0.002, 0.1
-"""Least standard deviation of the cosine of the rays' angles that bends level ground by a metre or more; and by how
+LEAST_OF_ZONE = 100
+"""Waveforms of each of them."""
+
+LEAST_BEND, MOST_BEND = 0.0005, 0.1
+"""Least standard deviation of the cosine of the rays' angles that bends level ground by a third of a metre; and by how
 much of a zone the ranges may seem to be off a whole number of them, and uncertain: terrain that follows the flight line
 for the whole strip seldom does so."""
 
-LEAST_SCENE = 200
-"""Waveforms of a scene."""
+MOST_ZONES = 3
+"""Zones by which ranges may be wrong: valleys bend the ground as more of them would."""
 
-LEAST_CHANGE = 0.1
-"""Smaller changes of the brightness (logarithm) say nothing: quarters of a strip over a village differ by 0.09."""
+NEAR_PULSES, NEAR_TIME, LONE_STEP = 64, 2.0, 8.0
+"""Pulses that follow each other in the sample; the longest time [s] from such a group to the next, in which the ground
+does not change by a zone; and how much larger than other steps a jump is, since mountains have many."""
+
+LEAST_OFF, MOST_BETWEEN = 0.02, 0.1
+"""Share of the pulses a whole number of zones off their neighbours from which zones are mixed, and that of this share
+which may lie half-way: slopes and cliffs lie there."""
+
+FADING_PARTS, LEAST_OF_PART = 16, 50
+"""Parts of a strip that show whether it fades, and waveforms of each."""
+
+FEW_PARTS = 1.3
+"""Factor of an error that so few parts tell, for surfaces that lie in no order."""
 
 BRIGHT = 0.95
 """Quantile of the light of waveforms: above it lie few metal roofs and signs."""
@@ -59,6 +84,10 @@ LEAST_IN_ORDER = 0.8
 SCANNERS = 4
 """Scanner channels of LAS points (0 to 3). A channel number here is SCANNERS x digitizer + scanner channel."""
 
+OTHER_PULSE = (
+    "echoes were taken for those of another pulse; resolve the pulse zones again with the sensor's software"
+)
+
 _CHANNEL_SAMPLE = 4096
 """Waveforms that show which scanner channels a strip has."""
 
@@ -66,6 +95,31 @@ _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 _ADJUSTED = 1e9
 """Seconds that LAS takes off standard GPS time."""
 _WEEK = 604_800.0
+
+
+class Change(NamedTuple):
+    """By how much light is brighter, and what another gain or energy may have to do with it."""
+
+    shift: float
+    """Logarithm of the ratio."""
+    chance: float
+    """Of another gain or energy, from 0 to 1."""
+    error: float
+    """Root mean square of the logarithm of that change, as far as the light shows it."""
+
+
+NO_CHANGE = Change(0.0, 0.0, 0.0)
+
+
+class Zone(NamedTuple):
+    """What the ground says of ranges that are a whole number of pulse intervals off."""
+
+    size: float
+    """Way of light between two pulses, one way [m]."""
+    off: float
+    """By how much ranges seem too short, as the ground is bent across the flight [m]."""
+    error: float
+    """Of `off` [m]; infinite where the swath is too narrow."""
 
 
 class Setting(NamedTuple):
@@ -80,18 +134,52 @@ class Setting(NamedTuple):
     """Logarithms of the QUANTILES of that light, for each digitizer."""
     right: tuple[float, float]
     """Unit vector to the right of the flight."""
-    fades: float
-    """By how much this light falls from the first half of the strip to the second, as of one scene (logarithm)."""
+    fades: Change
+    """How this light grows from the first half of the strip to the second."""
+    zone: Zone | None
+    """None where there is no rate."""
 
 
-def compare_scenes(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return by how much one scene is brighter than another that is like it (logarithm); 0 where scenes explain it.
+def weigh_change(shift: float, spread: float, noise: float | None = None) -> Change:
+    """Weigh whether light differs by its surfaces, or by another energy or gain.
+
+    Parameters
+    ----------
+    shift : float
+        By how much it is brighter (logarithm).
+    spread : float
+        How much surfaces change that (standard deviation).
+    noise : float, optional
+        Logarithm of the ratio of the noise: a gain changes it as it changes light, an energy does not.
+
+    Returns
+    -------
+    Change
+
+    Notes
+    -----
+    Bayes' rule with PRIORS and normal distributions. docs/algorithms.md 5.2.
+    """
+    seen = np.array([shift, noise or 0.0])
+    known = np.diag([spread**2, 1e6 if noise is None else SUNLIGHT**2])
+    chances, squares = [], []
+    for prior, moves in PRIORS:
+        covariance = known + USUAL_CHANGE**2 * np.outer(moves, moves)
+        inner = np.linalg.solve(covariance, np.stack([seen, moves], axis=1)).T @ np.stack([seen, moves], axis=1)
+        chances.append(prior * np.exp(-0.5 * inner[0, 0]) / np.sqrt(np.linalg.det(covariance)))
+        mean = USUAL_CHANGE**2 * inner[0, 1]
+        squares.append((mean**2 + USUAL_CHANGE**2 * (1.0 - USUAL_CHANGE**2 * inner[1, 1])) * any(moves))
+    share = np.array(chances) / max(sum(chances), 1e-300)
+    return Change(shift, float(1.0 - share[0]), float(np.sqrt(share @ squares)))
+
+
+def compare_scenes(one: Sequence[float], other: Sequence[float], noise: float | None = None) -> Change:
+    """Weigh by how much one scene is brighter than another; noise: as `weigh_change`.
 
     Another energy or gain shifts the logarithms of all quantiles alike; other surfaces shift each in its own way.
     """
     off = np.subtract(one, other)
-    shift = float(np.median(off))
-    return shift if abs(shift) > max(LEAST_CHANGE, UNLIKE * float(np.std(off))) else 0.0
+    return weigh_change(float(np.median(off)), float(np.hypot(UNLIKE * np.std(off), LEAST_UNLIKE)), noise)
 
 
 def measure_setting(
@@ -113,54 +201,91 @@ def measure_setting(
     joined = {index: np.concatenate(some, axis=1) for index, some in parts.items()}
     known = {index: rows for index, rows in joined.items() if rows.size}
     rate = _measure_rate(reader)
-    if known and rate:
-        _refuse_zone(reader, np.concatenate([*known.values()], axis=1), 1e9 * HALF_C / rate)
+    every = np.concatenate([np.empty((8, 0)), *known.values()], axis=1)
+    zone = _find_zone(reader, every, 1e9 * HALF_C / rate) if known and rate else None
     brightest = {index: float(np.quantile(rows[1], BRIGHT)) for index, rows in known.items()}
     scenes = {index: _describe_scene(rows[1]) for index, rows in known.items()}
-    fades = [_find_fading(*rows[:2]) for rows in known.values()]
-    return Setting(rate, brightest, scenes, _find_right(known), max(fades, key=abs, default=0.0))
+    fades = max((_find_fading(*rows[:2]) for rows in known.values()), key=lambda one: one.error, default=NO_CHANGE)
+    return Setting(rate, brightest, scenes, _find_right(every), fades, zone)
 
 
-def _find_right(known: Mapping[int, np.ndarray]) -> tuple[float, float]:
+def _find_right(rows: np.ndarray) -> tuple[float, float]:
     """Unit vector to the right of the mean motion of the sensor; 0 where it does not move."""
-    rows = np.concatenate([np.empty((8, 0)), *known.values()], axis=1)
     time, *place = rows[[0, 6, 7]] - rows[[0, 6, 7]].mean(axis=1, keepdims=True)
     ahead = np.nan_to_num(np.stack(place) @ time)
     return tuple((np.array([ahead[1], -ahead[0]]) / max(float(np.hypot(*ahead)), 1e-30)).tolist())
 
 
-def _refuse_zone(reader: StripReader, rows: np.ndarray, zone: float) -> None:
-    """Raise InputError where the ground is bent across the flight as by ranges that are off by whole pulse intervals.
+def _find_zone(reader: StripReader, rows: np.ndarray, size: float) -> Zone:
+    """Measure how the ground is bent across the flight; InputError where that, or jumps, show a wrong pulse zone.
 
-    rows: f8 (8, n), of which 2 to 5 are x, y, z and the cosine of the ray's angle to the vertical; zone: way of light
-    between two pulses, one way [m]. Ranges that are too short by s lift the ground by s times that cosine.
+    rows: f8 (8, n), of which 0 is the time, and 2 to 5 are x, y, z and the cosine of the ray's angle to the vertical;
+    size: way of light between two pulses, one way [m]. Ranges that are too short by s lift the ground by s times that
+    cosine.
     """
-    found = []
-    for part in np.array_split(rows[2:6, np.argsort(rows[0], kind="stable")], ZONE_PARTS, axis=1):
+    rows, found = rows[:, np.argsort(rows[0], kind="stable")], []
+    if _jumps(rows, size):
+        raise InputError(
+            f"{reader.facts.path}: heights of neighbouring pulses jump by a whole number of the {size:.0f} m between "
+            f"two pulses: {OTHER_PULSE}"
+        )
+    for part in np.array_split(rows[2:6], ZONE_PARTS, axis=1):
         x, y, z, down = part - part.mean(axis=1, keepdims=True)
-        if part.shape[1] < LEAST_SCENE // 2 or np.std(down) < LEAST_BEND:
-            return
+        if part.shape[1] < LEAST_OF_ZONE or np.std(down) < LEAST_BEND:
+            return Zone(size, 0.0, np.inf)
         found.append(np.linalg.lstsq(np.stack([x, y, down], axis=1), z, rcond=None)[0][2])
     off, error = float(np.median(found)), robust_std(np.array(found)) / ZONE_PARTS**0.5
-    number = round(off / zone)
-    if number and abs(off - number * zone) < MOST_BEND * zone > error:
+    number = round(off / size)
+    if 0 < abs(number) <= MOST_ZONES and abs(off - number * size) < MOST_BEND * size > error:
         raise InputError(
             f"{reader.facts.path}: its ground is bent across the flight as if all ranges were {abs(off):.0f} m too "
-            f"{'short' if off > 0 else 'long'}, {abs(number)} x the {zone:.0f} m between two pulses: echoes were taken "
-            "for those of another pulse; resolve the pulse zones again with the sensor's software"
+            f"{'short' if off > 0 else 'long'}, {abs(number)} x the {size:.0f} m between two pulses: {OTHER_PULSE}"
         )
+    return Zone(size, off, error)
+
+
+def _jumps(rows: np.ndarray, size: float) -> bool:
+    """Whether pulses lie whole zones off their neighbours, or groups of them off the next; rows as `_find_zone`."""
+    groups = np.array_split(rows, max(rows.shape[1] // NEAR_PULSES, 1), axis=1)
+    height = np.array([np.median(group[4]) for group in groups])
+    off = np.concatenate([(group[4] - at) / group[5] for group, at in zip(groups, height, strict=True)]) / size
+    whole = _is_whole(off)
+    steps = np.diff(height)[np.diff([np.median(group[0]) for group in groups]) < NEAR_TIME] / size
+    between = np.mean(np.abs(off - np.rint(off)) > 0.25)
+    mixed = np.mean(whole) > LEAST_OFF and between < MOST_BETWEEN * np.mean(whole)
+    lone = np.abs(steps) > LONE_STEP * np.median(np.abs(steps)) if len(steps) else False
+    return bool(mixed or (_is_whole(steps) & lone).any())
+
+
+def _is_whole(zones: np.ndarray) -> np.ndarray:
+    number = np.rint(zones)
+    return (number != 0) & (np.abs(number) <= MOST_ZONES) & (np.abs(zones - number) < MOST_BEND)
 
 
 def _describe_scene(light: np.ndarray) -> tuple[float, ...]:
     return tuple(np.log(np.quantile(light, QUANTILES)).tolist())
 
 
-def _find_fading(time: np.ndarray, light: np.ndarray) -> float:
-    """Logarithm by which the light of the second half of a strip is darker, where both halves are like one scene."""
-    late = time > np.median(time)
-    if min(late.sum(), (~late).sum()) < LEAST_SCENE:
-        return 0.0
-    return compare_scenes(_describe_scene(light[~late]), _describe_scene(light[late]))
+def _find_fading(time: np.ndarray, light: np.ndarray) -> Change:
+    """How light grows from the first half of a strip to the second, by a line through the scenes of its parts.
+
+    What parts scatter about the line is their surfaces' doing. Fields, forests and towns reach over several parts: such
+    neighbours scatter alike, and raise the error by what they share.
+    """
+    parts = np.array_split(np.argsort(time, kind="stable"), FADING_PARTS)
+    if len(time) < FADING_PARTS * LEAST_OF_PART or time.min() == time.max():
+        return NO_CHANGE
+    place = np.array([time[part].mean() for part in parts])
+    place -= place.mean()
+    scenes = np.array([_describe_scene(light[part]) for part in parts])
+    half = 2.0 * np.abs(place).mean() / (place @ place)
+    slopes, middle = half * (place @ scenes), np.median(scenes, axis=1)
+    rest = middle - middle.mean() - place * (place @ middle) / (place @ place)
+    alike = np.correlate(rest, rest, "full")[FADING_PARTS - 1 :] / max(float(rest @ rest), 1e-30)
+    shared = 1.0 + 2.0 * float(alike[1 : int(np.argmax(alike <= 0.0))].sum())
+    error = FEW_PARTS * shared * half * float(np.sqrt(rest @ rest / (FADING_PARTS - 2) * (place @ place)))
+    spread = np.sqrt(LEAST_UNLIKE**2 + np.var(slopes) + error**2)
+    return weigh_change(float(np.median(slopes)), float(spread))
 
 
 def sum_light(block: WaveformBlock) -> np.ndarray:

@@ -5,18 +5,29 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from datetime import date
+from pathlib import Path
 
 import numpy as np
 
+from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.light import AIR_DOUBT
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.matching.setting import Setting, compare_scenes, read_day, read_sensor_name
+from wavebatch.surveying.matching.setting import (
+    MOST_ZONES,
+    OTHER_PULSE,
+    SUNLIGHT,
+    Setting,
+    compare_scenes,
+    read_day,
+    read_sensor_name,
+)
 from wavebatch.surveying.sensor import FOOT, SensorSource
 
 SAME_DIVERGENCE = 0.03
@@ -38,8 +49,14 @@ FAR = 1.3
 SAME_RATE = 1.02
 """Ratio up to which pulse rates are equal."""
 
+OTHER_RANGE, LIKE_RANGE = 1.5, 0.35
+"""Logarithm of the light from which surfaces do not explain it, and by how much they change what ranges explain."""
+
 LIKE_FEET = 0.35
 """Logarithm by which light may differ from what feet taken for metres make of it: other surfaces, and more air."""
+
+LIKELY = 0.5
+"""Chance from which another gain or energy is named."""
 
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
@@ -110,6 +127,26 @@ def find_growth(
     return float(np.sqrt(np.sum(np.square(parts)))), lines
 
 
+def refuse_zone(calibration: Calibration, found: Setting, distance: float | None, path: Path) -> None:
+    """Raise InputError where light is as much darker or brighter than the calibration's as in a wrong pulse zone, and
+    the ground's bend does not speak against it: narrow swaths and hills do not show the zone alone."""
+    zone = found.zone
+    if zone is None or not distance or abs(zone.off) + 2.0 * zone.error < 0.5 * zone.size:
+        return
+    for row, number in itertools.product(calibration.channels, range(-MOST_ZONES, MOST_ZONES + 1)):
+        scene, off = found.scenes.get(row.digitizer, ()), number * zone.size
+        if not number or distance + off <= 0.0 or not scene or len(row.scene) != len(scene):
+            continue
+        light = -2.0 * math.log1p(off / distance) - 2.0e-4 * math.log(10.0) * calibration.attenuation * off
+        seen = float(np.median(np.subtract(scene, row.scene)))
+        if abs(light) > OTHER_RANGE and abs(seen - light) < LIKE_RANGE:
+            raise InputError(
+                f"{path}: --calibration: its light is {math.exp(seen):.2g} times that of the calibration, as if all "
+                f"ranges were {abs(off):.0f} m too {'short' if off > 0 else 'long'}, {abs(number)} x the way between "
+                f"two pulses: {OTHER_PULSE}, or calibrate this strip if its gain is another"
+            )
+
+
 def compare_setting(calibration: Calibration, found: Setting, system: SystemPulse) -> tuple[float, list[str]]:
     """Error that another pulse rate or gain adds to the constant, relative, and the warnings."""
     growth, lines = 0.0, []
@@ -132,12 +169,16 @@ def compare_setting(calibration: Calibration, found: Setting, system: SystemPuls
             surfaces += ", or coordinates in feet (which make it 10.8 times as bright)"
         compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or {surfaces}: light {which} is")
         scene = found.scenes.get(row.digitizer)
-        off = compare_scenes(scene, row.scene) if scene and len(row.scene) == len(scene) else 0.0
-        if off:
-            growth = max(growth, math.expm1(abs(off)))
+        if not scene or len(row.scene) != len(scene):
+            continue
+        louder = math.log(noise / row.noise_dn) if noise and row.noise_dn else None
+        change = compare_scenes(scene, row.scene, louder)
+        growth = max(growth, math.expm1(abs(change.shift) if change.chance > LIKELY else change.error))
+        if change.chance > LIKELY:
             lines.append(
                 f"calibration: another gain or energy under the same header: all echoes {which} are brighter by a "
-                f"factor of {math.exp(off):.2f}, though scenes are alike"
+                f"factor of {math.exp(change.shift):.2f}, "
+                + ("and noise with them" if abs(louder or 0.0) > SUNLIGHT else "though scenes are alike")
             )
     return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines]
 

@@ -24,11 +24,13 @@ from wavebatch.surveying.angle_limits import sample_reference
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.matching.setting import measure_setting, see_channels
 from wavebatch.surveying.matching.strip_conditions import (
+    LIKELY,
     compare_air,
     compare_divergence,
     compare_setting,
     doubt_calibration,
     find_growth,
+    refuse_zone,
 )
 from wavebatch.surveying.sensor import SensorSource
 
@@ -97,15 +99,18 @@ def match_strip(
         calibration = replace(calibration, attenuation=calibration.attenuation / calibration.haze * sensor.haze)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
     setting = measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0)
-    if all(row.sha256 != own_strip for row in calibration.strips):
+    refuse_zone(calibration, setting, sensor.distance, reader.facts.path)
+    measured = {calibration.fingerprint.get("sha256_sampled"), *(row.sha256 for row in calibration.strips)}
+    if own_strip not in measured:
         more, lines = compare_setting(calibration, setting, system)
         growth, reasons = math.hypot(growth, more), [*reasons, *lines]
-    if setting.fades and energy is None:
-        growth = math.hypot(growth, math.expm1(abs(setting.fades)))
+    fades = setting.fades
+    if fades.chance > LIKELY and energy is None:
+        growth = math.hypot(growth, math.expm1(abs(fades.shift)))
         reasons.append(
-            f"calibration: the second half of the strip is {100 * math.expm1(-setting.fades):+.0f} % brighter, though "
+            f"calibration: the second half of the strip is {100 * math.expm1(fades.shift):+.0f} % brighter, though "
             "both are like one scene: a laser that fades, or haze? The error of the constant grows by "
-            f"{100 * math.expm1(abs(setting.fades)):.0f} %; calibrate shorter strips"
+            f"{100 * math.expm1(abs(fades.shift)):.0f} %; calibrate shorter strips"
         )
     warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))

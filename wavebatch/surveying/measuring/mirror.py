@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
@@ -45,11 +46,26 @@ class Mirror:
         return self.echoes - (self.beside + self.quiet) / WORTH
 
 
-def look_in_mirror(block: WaveformBlock, system: SystemPulse) -> Mirror:
+def look_in_mirror(
+    block: WaveformBlock, system: SystemPulse, levels: Sequence[float] = (0.0,)
+) -> Iterator[tuple[float, Mirror]]:
     """Decompose samples less twice their residual, and count the echoes that match none of the waveforms' own.
 
     Noise makes as many echoes up as down; so does a pulse that misses its echoes. Close targets are in the mirror too.
     Waveforms with clipped samples are left out: what is beyond the limit has no residual.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+    levels : sequence of float
+        Least energies of an echo that are tried [standard deviations].
+
+    Yields
+    ------
+    level : float
+    mirror : Mirror
+        Of the echoes that have this energy.
     """
     block = block.rows(np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1)))
     explained = explain(block, system)
@@ -63,8 +79,17 @@ def look_in_mirror(block: WaveformBlock, system: SystemPulse) -> Mirror:
     np.maximum.at(top, echoes.waveform, echoes.amplitude)
     strong = (echoes.amplitude == top[echoes.waveform]) & (echoes.amplitude > STRONG * system.noise.std)
     mains = echoes.take(np.flatnonzero(strong))
-    beside = _count_near(rest, mains, ZONE * width)
-    return Mirror(len(mains), beside, len(echoes), len(rest) - _count_near(rest, echoes, ZONE * width))
+    for level in levels:
+        found = np.count_nonzero(_measure_energy(echoes, system, block.spacing) >= level)
+        false = rest.take(np.flatnonzero(_measure_energy(rest, system, block.spacing) >= level))
+        beside = _count_near(false, mains, ZONE * width)
+        quiet = len(false) - _count_near(false, echoes, ZONE * width)
+        yield level, Mirror(len(mains), beside, int(found), quiet)
+
+
+def _measure_energy(echoes: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:
+    """Energy of echoes, over that of noise [standard deviations], as a decomposition asks for it."""
+    return echoes.amplitude * np.sqrt(echoes.sigma / spacing * SQRT_PI) / system.noise.std
 
 
 def _count_near(rest: EchoTable, echoes: EchoTable, reach: float) -> int:

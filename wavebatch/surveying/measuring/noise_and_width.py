@@ -16,7 +16,7 @@ from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
-from wavebatch.kernels.signal.noise import estimate_noise, keep_longest
+from wavebatch.kernels.signal.noise import PooledNoise, estimate_noise, keep_longest
 from wavebatch.kernels.signal.signal import transpose_samples
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import noise_factors
@@ -31,8 +31,8 @@ FAR_OFF = 0.1
 SETTLED = 0.01
 """Change of the width, as a share of it, below which it stays."""
 
-FIRST_LOOK, NOISE_LOOK, RESIDUAL_LOOK, LEAST_LOOK = 80_000, 240_000, 480_000, 256
-"""Samples from which noise and width to begin with are found, from which noise is found then (to 1 %), and whose
+FIRST_LOOK, NOISE_LOOK, RESIDUAL_LOOK, LEAST_LOOK = 40_000, 120_000, 480_000, 256
+"""Samples from which noise and width to begin with are found, from which noise is found then (to 1.5 %), and whose
 residuals are looked at; and waveforms that each has at least."""
 
 FEW = 20
@@ -71,12 +71,16 @@ def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known:
     saturation = find_saturation(block.samples, block.digitizer.max_count)
     few = thin_samples(block, FIRST_LOOK)
     width, last = first, first if known else 0.0
+    noises: dict[int, PooledNoise] = {}
     for _ in range(MOST_ROUNDS):
         if abs(width - last) <= SETTLED * width:
             break
-        system, last = _gaussian_system(few, width, saturation), width
-        width = _isolated_width(few, system)
-    system = _gaussian_system(thin_samples(block, NOISE_LOOK), width, saturation)
+        reach = _reach(width)
+        if reach not in noises:
+            noises[reach] = _find_noise(few, width)
+        last = width
+        width = _isolated_width(few, _gaussian_system(noises[reach], few.spacing, width, saturation))
+    system = _gaussian_system(_find_noise(thin_samples(block, NOISE_LOOK), width), block.spacing, width, saturation)
     last, width = width, _isolated_width(block, system)
     if known and abs(width / last - 1) > FAR_OFF:
         return measure_gaussian(block, width)
@@ -95,7 +99,7 @@ def list_widths(block: WaveformBlock) -> list[float]:
 def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
     """A Gaussian of a width that is known [samples], and the noise outside of the echoes."""
     saturation = find_saturation(block.samples, block.digitizer.max_count)
-    return _gaussian_system(thin_samples(block, NOISE_LOOK), width, saturation)
+    return _gaussian_system(_find_noise(thin_samples(block, NOISE_LOOK), width), block.spacing, width, saturation)
 
 
 def measure_again(block: WaveformBlock, system: SystemPulse, gain: float) -> SystemPulse:
@@ -118,20 +122,29 @@ def thin_samples(block: WaveformBlock, number: int) -> WaveformBlock:
     return block.rows(slice(None, None, -(-len(block) // most)))
 
 
-def _gaussian_system(block: WaveformBlock, width: float, saturation: float | None) -> SystemPulse:
-    """A Gaussian of this width [samples], and the noise that is left outside of its echoes."""
+def _reach(width: float) -> int:
+    """Samples next to an echo of this width [samples] that are not quiet."""
+    return int(np.ceil(3 * width))
+
+
+def _find_noise(block: WaveformBlock, width: float) -> PooledNoise:
+    """Noise outside of echoes of this width [samples]."""
     missing = None if block.missing is None else keep_longest(block.missing.T)
-    noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing)
+    return estimate_noise(transpose_samples(block.samples), _reach(width), missing=missing)
+
+
+def _gaussian_system(noise: PooledNoise, spacing: float, width: float, saturation: float | None) -> SystemPulse:
+    """A Gaussian of this width [samples] with this noise; spacing of the samples [ns]."""
     correlation = tuple(noise.correlation.tolist())
     seen = float(noise.std * noise_factors(GAUSSIAN, width, correlation)[0])
     known = noise.std if noise.share > 0 else 0.0
     hidden = DITHERED if noise.std < UNDITHERED else QUANTISATION_STD
     return SystemPulse(
-        sigma_ref=width * block.spacing,
+        sigma_ref=width * spacing,
         noise=ReceiverNoise(
             baseline=noise.level,
             baseline_spread=noise.spread,
-            recovery=float(noise.recovery * block.spacing),
+            recovery=float(noise.recovery * spacing),
             std=max(seen, noise.std, hidden),
             by_kind={"quiet": known, "quiet_pulse": seen},
             correlation=correlation,

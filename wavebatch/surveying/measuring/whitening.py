@@ -10,8 +10,7 @@ from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
 from wavebatch.surveying.measuring.judge import SURE, count_errors, describe_waveforms, explain
-from wavebatch.surveying.measuring.noise_and_width import FEW
-from wavebatch.surveying.measuring.residuals import decompose_sample
+from wavebatch.surveying.measuring.noise_and_width import FEW, thin_samples
 
 LEAST_NOISE = 0.5
 """Noise of a sample below which rounding makes what a filter of neighbours sees [count]."""
@@ -19,6 +18,10 @@ LEAST_NOISE = 0.5
 LEAST_PREDICTED = 0.1
 """Share of the noise's variance that two samples must predict of the next one: below it, the errors of close echoes
 fall by less than 5 %, which the time of the fits is not worth."""
+
+LOOK = 120_000
+"""Samples on which the two ways are compared: some hundreds of waveforms, whose mean lengths differ by standard errors
+of a twentieth of a nat."""
 
 STRONG = 20.0
 """Amplitude over noise from which lone echoes tell whether the filter makes what their fits leave white."""
@@ -49,15 +52,18 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
     whitening = predict_noise(system.noise.correlation)
     if whitening is None or system.noise.quiet < LEAST_NOISE or _predicted(whitening) < LEAST_PREDICTED:
         return plain
+    block = thin_samples(block, LOOK)
     whitened = replace(system, noise=replace(system.noise, whitening=whitening))
-    echoes = decompose_sample(block, whitened)
+    explained = explain(block, whitened)
+    echoes = explained.echoes
     strong = echoes.alone(len(block)) & (echoes.amplitude > STRONG * system.noise.std)
     left = echoes.residual[strong & ((echoes.flags & np.uint16(UNCLEAN)) == 0)].astype(np.float64) ** 2
     if len(left) < FEW or np.median(left) > MOST_LEFT:
         return plain
     # Whitened fits take small changes of the pulse for echoes: the description, which knows both, is then longer.
-    lengths = [describe_waveforms(block, way, explain(block, way), change) for way in (whitened, plain)]
-    return whitened if count_errors(lengths[0] - lengths[1]) <= SURE else plain
+    length = describe_waveforms(block, whitened, explained, change)
+    other = describe_waveforms(block, plain, explain(block, plain), change)
+    return whitened if count_errors(length - other) <= SURE else plain
 
 
 def _predicted(whitening: tuple[float, float]) -> float:
