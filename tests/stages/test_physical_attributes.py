@@ -20,7 +20,7 @@ from wavebatch.kernels.physics.radar import receive_power
 from wavebatch.stages.attribute.light import echo_light
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import load_profile, parse_chain
-from wavebatch.stages.pulse_tables import describe_echoes, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.angle_limits import SLOPE, predict_angles
 from wavebatch.surveying.calibration import with_physics
@@ -42,7 +42,7 @@ KNOWN = set(COLUMNS) - {"range_error"}
 
 def whole_pulse(shape, limits, main):
     """Amplitude, time and sigma of the whole pulse (m, 3) from those of its main component."""
-    return describe_echoes(shape, limits, main, np.ones_like(main), np.zeros((len(main), 2)))[0]
+    return describe_fitted(shape, limits, main, np.ones_like(main), np.zeros((len(main), 2)))[0]
 
 
 def run(block, echoes, system, *names, **parameters):

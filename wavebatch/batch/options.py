@@ -30,13 +30,14 @@ HEADINGS = (CHAIN, READING, SENSOR, AIR, WHICH, OUTPUT, SPEED, RUNNING)
 EXCLUSIVE = (
     ("chain", "profile", "tolerance"), ("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"),
     ("scheduler", "memory"), ("attenuation", "visibility"),
-    ("attenuation", "wavelength"), ("trajectory", "flight_height"),
+    ("attenuation", "wavelength"), ("trajectory", "flight_height"), ("forest", "statistic"),
 )  # fmt: skip
 """Options that exclude each other. One in wavebatch.toml replaces those that come from a weaker source."""
 
 NEEDS = {
     "lever_arm": ("trajectory",), "crs": ("trajectory",), "wavelength": ("visibility",),
     "attenuation_error": ("attenuation", "visibility"), "seed": ("random",),
+    "leaf_projection": ("forest",), "layer": ("forest",),
 }  # fmt: skip
 """Options that are of no use without one of others."""
 

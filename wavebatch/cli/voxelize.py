@@ -41,7 +41,7 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @click.option("--profiles", type=shared.OutputPath(path_type=Path), metavar="FILE.npz",
               help="Also write the deconvolved signal of every pulse: energy and, with --calibration, cross section by "
               "time.")
-@shared.options_of(VoxelOptions, "all_crossed")
+@shared.options_of(VoxelOptions, "all_crossed", "forest")
 @shared.system_option
 @shared.declared("calibration")
 @shared.declared("energy")

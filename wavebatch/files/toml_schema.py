@@ -47,7 +47,7 @@ class Entry(NamedTuple):
 
 
 @functools.cache
-def list_entries(kind: type) -> tuple[Entry, ...]:
+def list_entries(kind: Any) -> tuple[Entry, ...]:
     """List the fields of a dataclass that have a Key."""
     hints, found = get_type_hints(kind, include_extras=True), []
     for one in dataclasses.fields(kind):
@@ -109,7 +109,9 @@ def describe_record(value: Any) -> dict[str, Any]:
     None and infinite numbers are None, which a file leaves out; a mapping of numbers becomes sorted pairs; empty lists
     are left out where their Key does not ask for them.
     """
-    values, tables, lists = {}, {}, {}  # type: dict[str, Any], dict[str, Any], dict[str, Any]
+    values: dict[str, Any] = {}
+    tables: dict[str, Any] = {}
+    lists: dict[str, Any] = {}
     for one in list_entries(type(value)):
         part, key = getattr(value, one.field), one.key.name
         if one.shape == "record":

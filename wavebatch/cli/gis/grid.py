@@ -15,6 +15,8 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, count, talk, tell
 from wavebatch.cli.plot.clouds import choose_points, find_clouds
 from wavebatch.cli.program.completion import complete_columns
+from wavebatch.core.errors import ConfigError
+from wavebatch.tools.rasters.forest import ForestOptions
 from wavebatch.tools.rasters.grid import GridOptions, GridResult, write_grid
 
 FEW_CELLS = 1_000_000
@@ -27,6 +29,9 @@ FEW_CELLS = 1_000_000
 @click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete_columns,
               help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
 @shared.options_of(GridOptions, "statistic", "size")
+@click.option("--forest", is_flag=True, help="Metrics of voxels that voxelize --forest made, in place of columns: "
+              "cover, heights of light, leaf area index and density, with errors.")
+@shared.options_of(ForestOptions)
 @shared.output_option("Raster to write: .tif.", "X.tif")
 @shared.bbox_option("Write")
 @shared.selection_options
@@ -39,13 +44,21 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     compressed and has the CRS of the clouds, a no-data value, and name and unit of every band; it has at most 10^11
     cells. Memory does not grow; large clouds need room in TMPDIR. Needs rasterio: pip install rasterio.
 
+    With --forest the bands are cover (the part of the light that plants catch), light_height_25, 50, 75 and 95 (the
+    height below which plants caught 25 % of their light, ...), leaf_area_index, and leaf_area_density of each layer;
+    cover_err and the like are standard deviations. Leaves and wood count alike. The last band, no_data_reason, says why
+    a cell has no data: 1 fewer than 10 rays, 2 no light on the ground.
+
     Exit code: 0 done, 1 a cloud cannot be read or the raster cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.files.geotiff_file import check_raster
 
+    if options["forest"] and columns:
+        raise ConfigError("--forest and --column exclude each other; give one of them")
     paths = find_clouds(clouds, options)
     check_raster(output, overwrite=options["overwrite"])
-    how = shared.from_options(GridOptions, options, columns=columns, chosen=choose_points(options))
+    forest = shared.from_options(ForestOptions, options) if options["forest"] else None
+    how = shared.from_options(GridOptions, options, columns=columns, chosen=choose_points(options), forest=forest)
     found = write_grid(paths, output, how, overwrite=options["overwrite"])
     layout = found.layout
     if layout.crs is None:
@@ -65,6 +78,12 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
 def _summarise(found: GridResult, columns: Sequence[str]) -> str:
     layout = found.layout
     used = found.points - found.left_out - found.outside
+    if found.reasons:
+        known, few, dark = found.reasons
+        return (
+            f"{count(found.points, 'voxel')}, {layout.columns} x {layout.rows} cells of {layout.size:g} {layout.unit}, "
+            f"{known} with metrics; {few} without data: fewer than 10 rays; {dark}: no light on the ground"
+        )
     parts = [f"{name or 'points'} {values} values, {used - values} without data"
              for name, values in zip(columns or ("",), found.values, strict=True)]  # fmt: skip
     return (
@@ -77,7 +96,9 @@ def _summarise(found: GridResult, columns: Sequence[str]) -> str:
 def _describe(found: GridResult, columns: Sequence[str]) -> dict[str, Any]:
     """The raster and the counts as plain values."""
     layout = found.layout
-    used = found.points - found.left_out - found.outside
+    used = sum(found.reasons) or found.points - found.left_out - found.outside
+    if found.reasons:
+        columns = [""] * len(found.bands)
     bands = [{"column": name or None, "description": band.description, "unit": band.unit, "values": values,
               "no_data": used - values}
              for name, band, values in zip(columns or ("",), found.bands, found.values, strict=True)]  # fmt: skip

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD
+from wavebatch.kernels.elementary import log
 
 LEAST_PULSES = 100
 """Smallest number of pulses."""
@@ -42,6 +43,13 @@ _NEAR = np.log(2.0)
 
 _CLIP = 4.0
 """Pulses whose light is further off than this many robust standard deviations do not count."""
+
+LEAST_RAYS = 2.0
+"""Independent rays below which attenuation is no-data: the unbiased rate (hits - 1) / path of rays that all end in the
+voxel has no finite mean for one ray."""
+
+_LEAST_SHARE = 1e-9
+"""Shares are kept so far from 0 and 1, where the bias is a limit; below the unit in which light is summed."""
 
 
 class CanopyRatio(NamedTuple):
@@ -135,3 +143,34 @@ def _slope(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> float:
         off = np.abs(light - level - slope * share)
         used = off <= _CLIP * max(MAD_TO_STD * float(np.median(off)), 1e-9)
     return slope
+
+
+def measure_attenuation(share: np.ndarray, rays: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Part of the light that plants catch per metre, and its standard deviation.
+
+    Parameters
+    ----------
+    share : float64 (n,)
+        Share of the light that plants caught in a voxel, 0 to 1.
+    rays : float64 (n,)
+        Independent rays in it.
+    free : float64 (n,), m
+        Mean path of the light up to where it is caught or leaves the voxel.
+
+    Returns
+    -------
+    attenuation, error : float64 (n,), 1/m
+        NaN for fewer than LEAST_RAYS rays, or none.
+
+    Notes
+    -----
+    Hits over free path, the estimate of largest likelihood, less its bias for few rays (Pimont et al. 2018): the part
+    of the path that belongs to rays that were caught, over the hits. That part is taken for leaves that are even in
+    the voxel. The error is that of a count of hits; half a hit is added, because no hit would state no error.
+    """
+    known = (rays >= LEAST_RAYS) & (free > 0)
+    share, exposure = np.clip(share, _LEAST_SHARE, 1.0 - _LEAST_SHARE), np.where(known, rays * free, 1.0)
+    hits = share * rays
+    bias = 1.0 + (1.0 - share) * log(1.0 - share) / share
+    found, error = np.maximum(hits - bias, 0.0) / exposure, np.sqrt(hits + 0.5) / exposure
+    return np.where(known, found, np.nan), np.where(known, error, np.nan)

@@ -27,7 +27,7 @@ from wavebatch.stages.pulse_tables import (
     MOST_WIDTH,
     ShapeLimits,
     clip_level,
-    describe_echoes,
+    describe_fitted,
     error_factors,
     matched_gaussian,
     noise_filter,
@@ -307,7 +307,7 @@ def describe_solution(
     level_err = None if noise.baseline_err is None else (noise.baseline_err / noise.std)[waveform]
     factors = error_factors(fitted, block.spacing, parameters[:, 2], level_err)
     energy_err = relative_energy_errors(parameters, errors, shared) * factors[:, 3]
-    parameters, errors = describe_echoes(settings.shape, limits, parameters, errors, shared)
+    parameters, errors = describe_fitted(settings.shape, limits, parameters, errors, shared)
     errors *= factors[:, :3]
     amplitude, time, width = parameters.T
     energy = amplitude * amplitude * width * SQRT_PI

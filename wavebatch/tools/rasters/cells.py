@@ -134,17 +134,22 @@ class Placed:
     """Points with a value, per band."""
 
 
+Statistic = str | Callable[[np.ndarray, np.ndarray, int], np.ndarray]
+"""One of STATISTICS; or a function from the cell of each point i8 (n,), the values of all columns f8 (n, k) and the
+number of cells to bands f8 (m, cells)."""
+
+
 def compute_tiles(
-    clouds: Clouds, statistic: str, grid: Grid, points: int, result: Placed, bounds: Box | None = None
+    clouds: Clouds, statistic: Statistic, grid: Grid, points: int, result: Placed, bounds: Box | None = None
 ) -> Iterator[tuple[int, int, np.ndarray]]:
     """Row from the north, column and values f8 (bands, TILE, TILE) of every tile with a point; NaN without a value.
 
-    There is a band for each column of the clouds. points: of all clouds, about. result: gets the counts before the
-    first tile comes. bounds: only points within them count.
+    There is a band for each column of the clouds, or those that the statistic computes. points: of all clouds, about.
+    result: gets the counts before the first tile comes. bounds: only points within them count.
     """
     number = int(np.clip(-(-points // (HELD // 2)), 1, MOST_BUCKETS))
-    bands = 1 + len(clouds.other_facts)
-    entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (bands,))]))
+    columns = 1 + len(clouds.other_facts)
+    entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (columns,))]))
     try:
         _fill(clouds, bounds, grid, entries, result)
         entries.seal()
@@ -189,7 +194,7 @@ def _fill(clouds: Clouds, bounds: Box | None, grid: Grid, entries: Spool, result
 
 
 def _compute_bucket(
-    entries: Spool, bucket: int, statistic: str, area: float
+    entries: Spool, bucket: int, statistic: Statistic, area: float
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Number and values (bands, TILE, TILE) of every tile of a bucket."""
     total = sum(len(piece) for piece in entries.pieces(bucket))
@@ -207,22 +212,23 @@ def _compute_bucket(
         yield tile, _compute_dense(entries, bucket, tile, statistic, area)
 
 
-def _compute_dense(entries: Spool, bucket: int, tile: int, statistic: str, area: float) -> np.ndarray:
+def _compute_dense(entries: Spool, bucket: int, tile: int, statistic: Statistic, area: float) -> np.ndarray:
     """A tile of a bucket that does not fit in memory: groups of cells, each of about HELD points, one by one."""
     count = np.zeros(TILE * TILE, np.int64)
     for piece in entries.pieces(bucket):
         count += np.bincount(piece["cell"][piece["tile"] == tile], minlength=len(count))
     group = np.cumsum(count) // HELD
-    values = np.full((entries.dtype["values"].shape[0], len(count)), np.nan)
+    values = np.full((TILE, TILE), np.nan)
     for number in np.unique(group[count > 0]).tolist():
         wanted = group == number
         parts = [piece[(piece["tile"] == tile) & wanted[piece["cell"]]] for piece in entries.pieces(bucket)]
-        part = _compute(np.concatenate(parts), statistic, area).reshape(len(values), -1)
-        values[:, wanted] = part[:, wanted]
-    return values.reshape(-1, TILE, TILE)
+        values = np.fmax(values, _compute(np.concatenate(parts), statistic, area))  # NaN in the other cells
+    return values
 
 
-def _compute(rows: np.ndarray, statistic: str, area: float) -> np.ndarray:
+def _compute(rows: np.ndarray, statistic: Statistic, area: float) -> np.ndarray:
     cell = rows["cell"].astype(np.int64)
+    if not isinstance(statistic, str):
+        return statistic(cell, rows["values"], TILE * TILE).reshape(-1, TILE, TILE)
     bands = [compute_cells(statistic, cell, values, TILE * TILE, area) for values in rows["values"].T]
     return np.stack(bands).reshape(-1, TILE, TILE)

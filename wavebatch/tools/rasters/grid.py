@@ -22,6 +22,7 @@ from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.tools.plots.values import Clouds, check_statistic
+from wavebatch.tools.rasters import forest
 from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, Placed, check_cells, compute_tiles, is_in_bounds
 
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
@@ -53,6 +54,8 @@ class GridOptions:
         None, "CRS of the clouds, e.g. EPSG:32632.", form="CRS", unset="that of their headers"
     )
     no_data: float = option(-9999.0, "Value of cells without data; nan is possible.", form="VALUE")
+    forest: forest.ForestOptions | None = None
+    """Metrics of voxels, in place of columns and a statistic."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -66,6 +69,8 @@ class GridResult(Placed):
     """Cells that have a value in a band at least."""
     bands: tuple[Band, ...] = ()
     """Name and unit of each band."""
+    reasons: tuple[int, ...] = ()
+    """Of a forest: cells with metrics, with too few rays, and without light on the ground."""
 
 
 def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False) -> GridResult:
@@ -73,6 +78,10 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
 
     Raises ConfigError for wrong options, InputError for clouds that cannot be read or have no point to write.
     """
+    metrics = None
+    if options.forest is not None:
+        metrics = forest.Forest(paths, options.size, options.forest)
+        options = replace(options, columns=tuple(forest.COLUMNS))
     _check(options)
     options = replace(options, bbox=_grow(options.bbox, options.size))
     crs, unit, unnamed = _find_crs(paths, options.crs)
@@ -86,17 +95,23 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
                           "the clouds; --size 1e-05 gives cells of about 1 m")  # fmt: skip
     grid = _lay_out(str(paths[0]), box, options)
     west, _, _, north = grid.extent
-    layout = RasterLayout(
-        west, north, grid.size, grid.rows, grid.columns, _choose_dtype(facts, largest), options.no_data, crs, unit
-    )
-    bands = [_describe(one, options.statistic, unit) for one in facts]
+    dtype = _choose_dtype(facts, largest) if metrics is None else "float32"
+    layout = RasterLayout(west, north, grid.size, grid.rows, grid.columns, dtype, options.no_data, crs, unit)
+    if metrics is None:
+        bands, statistic = [_describe(one, options.statistic, unit) for one in facts], options.statistic
+    else:
+        bands, statistic = metrics.list_bands(largest[forest.COLUMNS.index("height")]), metrics.compute
     result = GridResult(layout=layout, bands=tuple(bands), unnamed=unnamed)
-    tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}", "STATISTIC": options.statistic}
+    tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}"}
+    tags |= {"STATISTIC": options.statistic} if metrics is None else metrics.describe()
     with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
-        for row, column, values in compute_tiles(clouds, options.statistic, grid, points, result, options.bbox):
+        for row, column, values in compute_tiles(clouds, statistic, grid, points, result, options.bbox):
             result.filled += int(np.isfinite(values).any(axis=0).sum())
             writer.write_tile(row, column, values)
         writer.publish()
+    if metrics is not None:
+        result.reasons = tuple(metrics.reasons.tolist())
+        result.values = (*[result.reasons[forest.KNOWN]] * (len(bands) - 1), result.filled)
     return result
 
 

@@ -25,6 +25,8 @@ from wavebatch.kernels.geometry.voxels import (
     sum_before,
     unpack_index,
 )
+from wavebatch.kernels.physics.gap_probability import measure_attenuation
+from wavebatch.tools.voxels.floor import Floor
 from wavebatch.tools.voxels.light import LightRule
 from wavebatch.tools.voxels.rays import Rays, measure_lengths
 
@@ -38,6 +40,7 @@ SECTION_UNIT = 2.0**-40
 """Unit in which cross sections are summed [m2]."""
 
 _RAYS, _LIGHT, _CAUGHT, _PATH, _ENERGY, _SQUARES, _CAUGHT_BY_RATIO, _LIGHT_BY_RATIO, _SECTION, _UNKNOWN = range(10)
+_GROUND, _FREE = 10, 11
 
 _NEXT_Y = np.uint64(1 << KEY_BITS[2])
 """From the key of a voxel to that of its neighbour along y."""
@@ -47,7 +50,6 @@ _CLASSES = 40
 
 _LEAST_PAIRS = 10.0
 """Pairs of neighbours that weigh as much as the spread of all classes."""
-
 
 @dataclass(frozen=True, slots=True)
 class VoxelColumn:
@@ -73,6 +75,16 @@ COLUMNS = (
 )
 """Values of every voxel; cross_section only with a calibration."""
 
+FOREST_COLUMNS = (
+    VoxelColumn("height", "f4", "m", "centre above the ground", -9999.0),
+    VoxelColumn("ground", "f4", "-", "share returned by ground", -9999.0),
+    VoxelColumn("free_path", "f4", "m", "light times its path"),
+    VoxelColumn("attenuation", "f4", "1/m", "caught by plants", -9999.0),
+    VoxelColumn("attenuation_error", "f4", "1/m", "std of attenuation", -9999.0),
+)
+"""Further values that forest metrics need. free_path: light times the way that it goes in the voxel until it is caught.
+attenuation: the part of the light that plants catch per metre."""
+
 
 def energy_unit(bits: int) -> float:
     """Unit in which energies are summed [DN ns]: fine, but with room for the sum of all samples in 63 bits."""
@@ -84,16 +96,27 @@ class VoxelGrid(Closing):
 
     size: of the voxels [m]; faces lie at multiples of it. anchor: index of a voxel in the middle of the strip, counted
     from the origin of the coordinates, i8 (3,). unit: of energies [DN ns]. sections: whether rays have cross sections.
-    everything: also keeps voxels that rays crossed without any signal. held: see KeyedSums.
+    everything: also keeps voxels that rays crossed without any signal. floor: the ground, for FOREST_COLUMNS; None:
+    without them. held: see KeyedSums.
     """
 
     def __init__(
-        self, size: float, anchor: np.ndarray, unit: float, *, sections: bool, everything: bool, held: int = HELD
+        self,
+        size: float,
+        anchor: np.ndarray,
+        unit: float,
+        *,
+        sections: bool,
+        everything: bool,
+        floor: Floor | None = None,
+        held: int = HELD,
     ) -> None:
         self.size, self.anchor = size, anchor
         self.columns = tuple(column for column in COLUMNS if sections or column.name != "cross_section")
-        self._unit, self._sections, self._everything = unit, sections, everything
-        self._sums = KeyedSums(10 if sections else 8, held=held)
+        self.columns += () if floor is None else FOREST_COLUMNS
+        self._unit, self._sections, self._everything, self._floor = unit, sections, everything, floor
+        self._width = 8 if floor is None and not sections else 10 if floor is None else 12
+        self._sums = KeyedSums(self._width, held=held)
         self._low = np.full(3, np.iinfo(np.int64).max)
         self._high = np.full(3, np.iinfo(np.int64).min)
         self._energy = 0
@@ -153,6 +176,7 @@ class VoxelGrid(Closing):
         first = np.append(True, ray[1:] != ray[:-1])[: len(ray)]
         caught, ground = (_count(part, LIGHT_UNIT) for part in rule.weigh(rays))
         summed = [caught, ground, _count(samples["energy"], self._unit), _count(samples["section"], SECTION_UNIT)]
+        summed += [] if self._floor is None else [np.rint(caught * samples["time"]).astype(np.int64)]
         summed = VoxelSamples(samples["time"], samples["spacing"], np.stack(summed, axis=1))
         each = np.arange(len(table))
         last = sum_before(summed, table["first"], table["count"], each, np.full(len(table), np.inf))
@@ -164,7 +188,7 @@ class VoxelGrid(Closing):
         inside = np.clip(table["known"][ray] - found.enter, 0.0, found.inside)
         light = np.where(known, np.maximum(_count(1.0, LIGHT_UNIT) - before[:, 0], 0), 0)
         share = last[ray, 1] * LIGHT_UNIT
-        values = np.zeros((len(ray), 10 if self._sections else 8), np.int64)
+        values = np.zeros((len(ray), self._width), np.int64)
         values[:, _RAYS], values[:, _LIGHT], values[:, _CAUGHT] = known, light, part[:, 0]
         values[:, _PATH] = _count(inside * measure_lengths(table["step"])[ray], PATH_UNIT)
         values[:, _ENERGY] = part[:, 2]
@@ -176,6 +200,12 @@ class VoxelGrid(Closing):
         if self._sections:
             values[:, _SECTION] = part[:, 3]
             values[:, _UNKNOWN] = table["unknown"][ray] & (part[:, 2] > 0)
+        if self._floor is not None:
+            values[:, _GROUND] = np.where(known, part[:, 1], 0)
+            # The light times the way it goes here: all of it to the far side, less what is caught before.
+            stopped = (found.enter + inside) * part[:, 0] - part[:, 4]
+            free = np.clip(inside * light - stopped, 0.0, inside * light) * LIGHT_UNIT
+            values[:, _FREE] = np.where(known, _count(free * measure_lengths(table["step"])[ray], PATH_UNIT), 0)
         return values
 
     def measure_spread(self) -> None:
@@ -215,9 +245,10 @@ class VoxelGrid(Closing):
             if not self._everything:
                 some = np.flatnonzero(sums[:, _ENERGY] > 0)
                 key, sums = key[some], sums[some]
-            yield unpack_index(key) - self._low, self._finish(sums, log_error)
+            index = unpack_index(key)
+            yield index - self._low, self._finish(index, sums, log_error)
 
-    def _finish(self, sums: np.ndarray, log_error: float) -> dict[str, np.ndarray]:
+    def _finish(self, index: np.ndarray, sums: np.ndarray, log_error: float) -> dict[str, np.ndarray]:
         lit = sums[:, _LIGHT] > 0
         share, rays, light = _list_shares(sums).T
         rays = rays / self.spread[_classify(rays)]
@@ -235,6 +266,15 @@ class VoxelGrid(Closing):
         }
         if self._sections:
             columns["cross_section"] = np.where(sums[:, _UNKNOWN] > 0, np.nan, sums[:, _SECTION] * SECTION_UNIT)
+        if self._floor is not None:
+            height = self._floor.measure_height((index + self.anchor + 0.5) * self.size)
+            columns["height"] = np.where(np.isfinite(height), height, np.nan)
+            ground = sums[:, _GROUND] * LIGHT_UNIT / light
+            columns["ground"] = np.where(lit, ground, np.nan)
+            columns["free_path"] = sums[:, _FREE] * PATH_UNIT
+            free = np.where(lit, columns["free_path"] / light, 0.0)
+            found = measure_attenuation(np.clip(share - ground, 0.0, 1.0), rays, free)
+            columns["attenuation"], columns["attenuation_error"] = found
         return {column.name: columns[column.name].astype(column.dtype) for column in self.columns}
 
 

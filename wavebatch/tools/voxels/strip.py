@@ -36,7 +36,7 @@ from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.floor import Ceiling, Floor, find_ceiling
-from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
+from wavebatch.tools.voxels.grid import VoxelGrid, energy_unit
 from wavebatch.tools.voxels.light import find_rule
 from wavebatch.tools.voxels.output import Piece, VoxelSpace, check_voxel_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
@@ -72,6 +72,8 @@ class VoxelOptions:
         unset="from the highest return near it",
     )  # fmt: skip
     all_crossed: bool = option(False, "Also write voxels that rays crossed without any signal.")
+    forest: bool = option(False, "Also write what `grid --forest` needs: all voxels that rays crossed, with height, "
+                          "ground and attenuation.")  # fmt: skip
     ground_height: Annotated[float, Range(0.0, 100.0)] = option(
         0.5, "Height above the lowest returns up to which signal counts as ground [m].", form="M"
     )
@@ -195,7 +197,7 @@ def voxelize_strip(
         tracer = _Tracer(reader, source, pulse, options, floor.finish(), ceiling, energy, calibration is not None)
         rule = find_rule(map(tracer.trace, _sample_batches(reader, scan)), options.reflectance_ratio)
         with (
-            _open_grid(reader, middle, options, calibration is not None, held) as grid,
+            _open_grid(reader, middle, options, calibration is not None, tracer.floor, held) as grid,
             (
                 ProfileWriter(Path(profiles), strip, sections=calibration is not None, overwrite=overwrite)
                 if profiles is not None
@@ -218,7 +220,7 @@ def voxelize_strip(
                     progress(sum(len(rows) for _, rows, *_ in batch.parts), scan.packets)
             grid.measure_spread()
             counts["left_out"] = 0 if keep is None else scan.packets - counts["waveforms"]
-            meta = _describe(strip, options, pulse, calibration) | {
+            meta = _describe(strip, options, grid, pulse, calibration) | {
                 "reflectance_ratio": {"ratio": rule.ratio, "error": rule.error, "source": rule.source},
                 "hidden_light": rule.hidden_light,
             }
@@ -293,14 +295,17 @@ def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) ->
     return middle
 
 
-def _open_grid(reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, held: int) -> VoxelGrid:
+def _open_grid(
+    reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, floor: Floor, held: int
+) -> VoxelGrid:
     digitizers = reader.facts.digitizers.values()
     return VoxelGrid(
         options.size,
         np.floor(middle / options.size).astype(np.int64),
         energy_unit(max(digitizer.bits for digitizer in digitizers if digitizer.n_samples)),
         sections=sections,
-        everything=options.all_crossed,
+        everything=options.all_crossed or options.forest,
+        floor=floor if options.forest else None,
         held=held,
     )
 
@@ -358,7 +363,7 @@ class _Tracer:
 
 
 def _describe(
-    strip: Path, options: VoxelOptions, pulse: SystemPulse, calibration: Calibration | None
+    strip: Path, options: VoxelOptions, grid: VoxelGrid, pulse: SystemPulse, calibration: Calibration | None
 ) -> dict[str, Any]:
     """How the voxels were made; goes into the file, so it holds no time of day."""
     deconvolution = options.deconvolution
@@ -367,11 +372,12 @@ def _describe(
         "strip": strip.name,
         "size_m": options.size,
         "headroom_m": options.headroom,
-        "all_crossed": options.all_crossed,
+        "all_crossed": options.all_crossed or options.forest,
+        "forest": options.forest,
         "ground_height_m": options.ground_height,
         "where": None if options.chosen.where is None else options.chosen.where.text,
         "deconvolution": asdict(deconvolution) | {"iterations": deconvolution.steps},
         "system": describe_system(pulse),
         "calibration": None if calibration is None else calibration.describe(),
-        "columns": {column.name: {"unit": column.unit, "meaning": column.meaning} for column in COLUMNS},
+        "columns": {column.name: {"unit": column.unit, "meaning": column.meaning} for column in grid.columns},
     }

@@ -1,0 +1,170 @@
+"""Forest metrics of cells from voxels, against forests of discs whose leaf area is known."""
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from forest_scenes import fly, grow
+
+from wavebatch.cli import main
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.system import ReceiverNoise
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.kernels.physics.gap_probability import measure_attenuation
+from wavebatch.surveying import Survey
+from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.tools.rasters import cells
+from wavebatch.tools.rasters.forest import COLUMNS, Forest, ForestOptions
+from wavebatch.tools.rasters.grid import GridOptions, write_grid
+from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
+
+SAVED = SavedSurvey(Survey(SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.1, std=0.58)), 1000))
+SIDE, CELL = 20.0, 10.0
+
+
+def voxelize(strip, target, size=1.0, ratio=None):
+    options = VoxelOptions(size, forest=True, reflectance_ratio=ratio)
+    voxelize_strip(strip, target, options, system=SAVED, force=True, overwrite=True)
+    return target
+
+
+def measure(voxels, folder, size=CELL, box=(0.0, 0.0, SIDE, SIDE), **options):
+    """The result, and each band by its name, rows from the north."""
+    rasterio = pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
+    paths = voxels if isinstance(voxels, list) else [voxels]
+    how = GridOptions(size=size, bbox=box, no_data=np.nan, forest=ForestOptions(**options))
+    result = write_grid(paths, folder / "f.tif", how, overwrite=True)
+    with rasterio.open(folder / "f.tif") as file:
+        assert set(file.dtypes) == {"float32"} and file.tags()["LEAF_PROJECTION"] == f"{how.forest.leaf_projection:g}"
+        return result, dict(zip(file.descriptions, file.read().astype(float), strict=True))
+
+
+@pytest.fixture(scope="module")
+def even(tmp_path_factory):
+    """Leaves, and voxels of a strip over a layer of them from 4 to 14 m."""
+    folder, rng = tmp_path_factory.mktemp("even"), np.random.default_rng(1)
+    leaves = grow(rng, SIDE, crowns=None, density=0.3)
+    fly(folder / "s.las", rng, leaves, SIDE)
+    return leaves, voxelize(folder / "s.las", folder / "v.laz")
+
+
+def test_an_even_layer_of_leaves_is_measured_within_its_error(even, tmp_path):
+    leaves, voxels = even
+    result, found = measure(voxels, tmp_path)
+    true = np.array([[leaves.area_index(x, y, CELL) for x in (0, 10)] for y in (10, 0)])
+    index, error = found["leaf_area_index"], found["leaf_area_index_err"]
+    assert (np.abs(index - true) < 2 * error).all() and (error < 0.06 * true).all()
+    # The light of an even layer falls off as exp(-G times the leaf area above): half of 1 - exp(-1.5) is caught below.
+    assert np.abs(found["cover"] - (1 - np.exp(-0.5 * true))).max() < 2 * found["cover_err"].max() < 0.06
+    for part in (25, 50, 75, 95):
+        gone = (1 - 0.01 * part) * (1 - np.exp(-0.5 * true))
+        height = 14.0 + np.log(1 - gone) / (0.5 * 0.3)
+        assert np.abs(found[f"light_height_{part}"] - height).max() < 0.5  # half a voxel
+    density = [found[f"leaf_area_density {low}-{low + 5} m"].mean() for low in (0, 5, 10, 15)]
+    np.testing.assert_allclose(density, [0.06, 0.3, 0.24, 0.0], atol=0.04)
+    assert result.reasons == (4, 0, 0) and (found["no_data_reason"] == 0).all()
+
+
+@pytest.mark.quick_cases("hillside")
+@pytest.mark.parametrize("how", ["hillside", "packets"])
+def test_crowns_on_hillsides_and_in_several_packets_are_within_the_error(tmp_path, how):
+    """Trees leave gaps that voxels do not resolve, and hide leaves: the error says what that may hide."""
+    rng = np.random.default_rng(2)
+    leaves = grow(rng, SIDE, crowns=0.04, density=0.7, slope=0.4 if how == "hillside" else 0.0)
+    fly(tmp_path / "s.las", rng, leaves, SIDE, angle=12.0, split=how == "packets")
+    _, found = measure(voxelize(tmp_path / "s.las", tmp_path / "v.laz"), tmp_path)
+    true = np.array([[leaves.area_index(x, y, CELL) for x in (0, 10)] for y in (10, 0)])
+    off = np.abs(found["leaf_area_index"] - true)
+    assert (off < 2 * found["leaf_area_index_err"]).all() and (found["leaf_area_index_err"] < 0.35 * true + 0.1).all()
+    assert np.abs(off / true).mean() < 0.2
+
+
+def test_leaves_that_show_more_of_themselves_are_fewer(even, tmp_path):
+    _, spherical = measure(even[1], tmp_path)
+    _, level = measure(even[1], tmp_path, leaf_projection=1.0, layer=10.0)
+    np.testing.assert_allclose(level["leaf_area_index"], 0.5 * spherical["leaf_area_index"], rtol=1e-5)
+    whole = 10 * sum(band for name, band in level.items() if name.startswith("leaf_area_density "))
+    np.testing.assert_allclose(whole, level["leaf_area_index"], rtol=1e-5)
+
+
+def test_cells_do_not_depend_on_memory_and_twice_the_same_voxels_are_the_same(even, tmp_path, monkeypatch):
+    _, once = measure(even[1], tmp_path)
+    _, twice = measure([even[1], even[1]], tmp_path)
+    monkeypatch.setattr(cells, "HELD", 3000)
+    _, parts = measure(even[1], tmp_path)
+    for name, band in once.items():
+        np.testing.assert_array_equal(parts[name], band)
+        if "err" not in name:
+            np.testing.assert_allclose(twice[name], band, rtol=0.02, atol=0.02)
+
+
+def test_cells_that_show_too_little_have_no_data_and_a_reason(tmp_path):
+    rng = np.random.default_rng(3)
+    leaves = grow(rng, 8.0, crowns=None, density=1.0)
+    fly(tmp_path / "s.las", rng, leaves, 8.0, pulses=2.0, rays=10)
+    voxels = voxelize(tmp_path / "s.las", tmp_path / "v.laz", ratio=2.0)
+    result, found = measure(voxels, tmp_path, size=4.0, box=(0.0, 0.0, 8.0, 8.0))
+    assert (found["no_data_reason"] == 2).all() and result.reasons == (0, 0, 4)
+    assert all(np.isnan(band).all() for name, band in found.items() if name != "no_data_reason")
+    few = fly(tmp_path / "few.las", rng, grow(rng, SIDE, crowns=None, density=0.1), SIDE, pulses=0.15)
+    result, found = measure(voxelize(few, tmp_path / "w.laz"), tmp_path, size=5.0)
+    assert result.reasons[1] > 8 and np.nanmax(found["no_data_reason"]) >= 1
+
+
+def test_attenuation_of_few_rays_has_no_bias_and_its_error_is_right():
+    """Rays through leaves at random, until they hit or leave a voxel of 1 m: hits over path alone are 12 % too many."""
+    rng = np.random.default_rng(4)
+    for rays, rate in ((4, 0.7), (10, 0.3), (10, 1.5)):
+        way = rng.exponential(1.0 / rate, (40_000, rays))
+        hit, free = (way < 1.0).mean(axis=1), np.minimum(way, 1.0).mean(axis=1)
+        found, error = measure_attenuation(hit, np.full(len(hit), float(rays)), free)
+        assert abs(found.mean() / rate - 1) < 0.03 < (hit / free).mean() / rate - 1
+        assert np.sqrt((error**2).mean()) == pytest.approx(found.std(), rel=0.35)
+    none = measure_attenuation(np.array([0.5, 0.5]), np.array([1.9, 5.0]), np.array([0.5, 0.0]))
+    assert np.isnan(none).all()
+
+
+def test_voxels_have_what_forests_need(even, tmp_path):
+    voxels = laspy.read(even[1])
+    names = list(voxels.point_format.extra_dimension_names)
+    assert names[-5:] == ["height", "ground", "free_path", "attenuation", "attenuation_error"]
+    assert set(COLUMNS[2:]) <= set(names)
+    inside = (voxels["height"] > 5) & (voxels["height"] < 13) & (voxels["attenuation"] >= 0)
+    assert np.mean(voxels["attenuation"][inside]) == pytest.approx(0.15, rel=0.1)
+    np.testing.assert_allclose(voxels["height"], voxels.z - 100.0, atol=0.1)
+    assert (voxels["free_path"] <= voxels["path"] * (1 + 1e-6)).all()
+
+
+def test_other_clouds_sizes_and_cells_are_refused(even, tmp_path, forest_strip):
+    plain = tmp_path / "plain.laz"
+    voxelize_strip(forest_strip, plain, VoxelOptions(1.0), system=SAVED, force=True)
+    with pytest.raises(ConfigError, match="--forest needs voxels: wavebatch voxelize"):
+        Forest([plain], 10.0, ForestOptions())
+    other = voxelize(forest_strip, tmp_path / "other.laz", size=2.0)
+    with pytest.raises(ConfigError, match="has other voxels"):
+        Forest([even[1], other], 10.0, ForestOptions())
+    with pytest.raises(ConfigError, match="cells need 4 voxels along a side; give 4 or more"):
+        Forest([even[1]], 3.0, ForestOptions())
+    for wrong in ({"leaf_projection": 0.0}, {"layer": 0.0}, {"layer": np.nan}):
+        with pytest.raises(ConfigError):
+            ForestOptions(**wrong)
+
+
+@pytest.fixture
+def forest_strip(tmp_path):
+    rng = np.random.default_rng(5)
+    return fly(tmp_path / "p.las", rng, grow(rng, 4.0, crowns=None, density=0.1), 4.0, pulses=1.0)
+
+
+def test_the_command_says_what_it_wrote(even, tmp_path):
+    pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
+    arguments = ["grid", even[1], "--forest", "--size", 10, "--bbox", "0,0,20,20", "-o", tmp_path / "f.tif"]
+    result = CliRunner().invoke(main, list(map(str, arguments)))
+    assert result.exit_code == 0 and "2 x 2 cells of 10 m, 4 with metrics; 0 without data" in result.output
+    for more, words in (
+        (["--forest", "--column", "share"], "--forest and --column exclude each other"),
+        (["--forest", "--statistic", "max"], "exclude each other"),
+        (["--layer", "2", "--column", "share"], "--layer is of no use without --forest"),
+    ):
+        result = CliRunner().invoke(main, ["grid", str(even[1]), *more, "-o", str(tmp_path / "g.tif")])
+        assert result.exit_code == 2 and words in result.output
