@@ -112,7 +112,8 @@ def describe_record(value: Any) -> dict[str, Any]:
     values: dict[str, Any] = {}
     tables: dict[str, Any] = {}
     lists: dict[str, Any] = {}
-    for one in list_entries(type(value)):
+    kind: Any = type(value)
+    for one in list_entries(kind):
         part, key = getattr(value, one.field), one.key.name
         if one.shape == "record":
             for name, item in ({} if part is None else describe_record(part)).items():
