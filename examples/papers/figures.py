@@ -22,7 +22,7 @@ from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.detect.wavelet import transform, wavelet
 from wavebatch.tools.simulate.from_returns import synthesize_strip
-from wavebatch.tools.simulate.return_light import SynthesisOptions
+from wavebatch.tools.simulate.returns import SynthesisOptions
 
 SCALES = (1.0, 2.0, 3.0)
 DEGREES = np.arange(0.0, 76.0, 1.0)

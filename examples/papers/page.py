@@ -23,8 +23,8 @@ from pathlib import Path
 from table import HEADS
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.tools.html import markup
-from wavebatch.tools.html.page import check_page, write_page
+from wavebatch.tools.sheets.page import check_page, render, section, text, write_page
+from wavebatch.tools.sheets.sheet import Cell, Code, Note, Part, Table
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -223,14 +223,14 @@ def measure(script: str, number: int | None, seed: int, folder: Path) -> tuple[l
 def format_table(table: dict) -> str:
     """A table as HTML; text of a script as it is."""
     if "text" in table:
-        return markup.code(table["text"])
-    head = f'<th scope="col">{markup.text(table["title"])}</th>'
-    head += "".join(f'<th scope="col" class="n">{markup.text(name)}</th>' for name in HEADS[1:])
+        return render(Code(table["text"]))
+    head = f'<th scope="col">{text(table["title"])}</th>'
+    head += "".join(f'<th scope="col" class="n">{text(name)}</th>' for name in HEADS[1:])
     rows = []
     for name, *cells in table["rows"]:
-        texts = [f'<span class="mark">{cell}</span>' if cell == "FAIL" else markup.text(cell) for cell in cells]
+        texts = [f'<span class="mark">{cell}</span>' if cell == "FAIL" else text(cell) for cell in cells]
         values = "".join(f'<td class="n">{one}</td>' for one in texts)
-        rows.append(f"<tr><td>{markup.text(name)}</td>{values}</tr>")
+        rows.append(f"<tr><td>{text(name)}</td>{values}</tr>")
     body = "\n".join(rows)
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>'
 
@@ -243,17 +243,17 @@ def fold(table: dict) -> str:
     missed = sum(row[-1] == "FAIL" for row in rows)
     title = f"{table['title']}: {len(rows)} figures" + (f", {missed} not accepted" if missed else "")
     opened = " open" if missed else ""
-    return f"<details{opened}><summary>{markup.text(title)}</summary>\n{shown}\n</details>"
+    return f"<details{opened}><summary>{text(title)}</summary>\n{shown}\n</details>"
 
 
 def format_picture(picture: Picture, image: bytes | None, error: str) -> str:
     """A picture with its caption and its command."""
     ours = f"wavebatch {picture.command} {picture.option} picture.png"
-    command = markup.text(ours if picture.option else f"{picture.command} in examples/papers/figures.py")
-    caption = markup.text(picture.caption)
+    command = text(ours if picture.option else f"{picture.command} in examples/papers/figures.py")
+    caption = text(picture.caption)
     below = f"<figcaption>{caption}<br><code>{command}</code></figcaption>"
     if image is None:
-        return f'<figure class="wide">{markup.paragraph(f"not drawn: {error}", "warning")}{below}</figure>'
+        return f'<figure class="wide">{render(Note(f"not drawn: {error}", "warning"))}{below}</figure>'
     data = base64.b64encode(image).decode()
     shown = f'<img class="picture" alt="{caption}" src="data:image/png;base64,{data}">'
     return f'<figure class="wide">{shown}{below}</figure>'
@@ -263,8 +263,8 @@ def read_notes() -> dict[str, list[str]]:
     """The paragraphs of README.md about each script, without its table."""
     parts = re.split(r"(?m)^## `python examples/papers/(\w+)\.py`$", (FOLDER / "README.md").read_text("utf-8"))
     notes = {}
-    for script, text in zip(parts[1::2], parts[2::2], strict=True):
-        paragraphs = [" ".join(one.split()) for one in text.split("\n\n") if not one.lstrip().startswith("|")]
+    for script, words in zip(parts[1::2], parts[2::2], strict=True):
+        paragraphs = [" ".join(one.split()) for one in words.split("\n\n") if not one.lstrip().startswith("|")]
         # The first one begins with the authors, who stand in the heading.
         first, *rest = [one.replace("`", "") for one in paragraphs if one]
         lead = first.split(": ", 1)[-1]
@@ -278,7 +278,7 @@ def count_accepted(tables: Sequence[dict]) -> tuple[int, int]:
     return verdicts.count("ok") + verdicts.count("FAIL"), verdicts.count("ok")
 
 
-def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
+def build(number: int | None, pulses: int, seed: int) -> tuple[list[Part | str], bool]:
     """The parts of the page, and whether all went well."""
     drawing = importlib.util.find_spec("matplotlib") is not None
     parts, rows, notes, fine = [], [], read_notes(), True
@@ -293,17 +293,17 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
             fine &= accepted and bool(tables) and not failed
             banded, inside = count_accepted(tables)
             mark = paper.script
-            link = markup.Cell(f'<a href="#{mark}">{markup.text(paper.title)}</a>')
+            link = Cell(paper.title, link=mark)
             rows.append([link, banded, inside, len(drawn) - failed])
             inner = []
             if drawn:
-                inner.append(markup.paragraph(f"In place of the paper's figures {paper.figures}, on simulated strips:"))
+                inner.append(render(Note(f"In place of the paper's figures {paper.figures}, on simulated strips:")))
             inner += [format_picture(*one) for one in drawn]
-            inner += [markup.paragraph(one) for one in notes.get(paper.script, ())]
+            inner += [render(Note(one)) for one in notes.get(paper.script, ())]
             inner += [fold(table) for table in tables]
             if not tables:
-                inner.append(markup.paragraph(f"{paper.script}.py printed no table; run it to see why", "warning"))
-            parts.append(markup.section(paper.title, *inner, mark=mark))
+                inner.append(render(Note(f"{paper.script}.py printed no table; run it to see why", "warning")))
+            parts.append(section(paper.title, *inner, mark=mark))
     if not drawing:
         errors = ["no pictures: matplotlib is not installed (pip install matplotlib)"]
     intro = (
@@ -311,8 +311,8 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
         f"ours, and the band that is accepted; a dash where there is none. Seed {seed}. The papers' data and pictures "
         "are not used: a figure can agree by chance."
     )
-    head = ["paper", "figures with a band", "of these accepted", "pictures"]
-    front = [markup.paragraph(intro), markup.bullets(errors, "warning"), markup.table(head, rows)]
+    head = ("paper", "figures with a band", "of these accepted", "pictures")
+    front = [Note(intro), *(Note(error, "warning") for error in errors), Table(head, rows)]
     return [*front, *parts], fine and not (drawing and errors)
 
 

@@ -15,10 +15,8 @@ from click.testing import CliRunner
 import wavebatch as wb
 from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
-from wavebatch.cli.program import log_file
-from wavebatch.cli.program.about import roff
-from wavebatch.cli.program.command import ProgramCommand, group_options
-from wavebatch.cli.program.examples import EXAMPLES, GROUPS
+from wavebatch.cli.messages import log_is_open
+from wavebatch.cli.program.command import EXAMPLES, GROUPS, ProgramCommand, group_options, roff
 from wavebatch.cli.program.settings import HARMLESS, NO_VARIABLE, OLD_NAMES
 from wavebatch.core.errors import ConfigError
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions
@@ -339,7 +337,7 @@ def test_a_log_has_what_quiet_hides_and_is_appended(folder, tmp_path):
     assert any("INFO" in line and "tiny.las" in line and "waveforms" in line for line in lines)
     assert any("ERROR" in line and "broken.las" in line for line in lines)
     assert invoke(*arguments, "--resume", "--log-level", "error").exit_code == 3
-    assert log.read_text().count("broken.las") == 2 and not log_file.is_open()
+    assert log.read_text().count("broken.las") == 2 and not log_is_open()
     loud = invoke(*task, "--overwrite").stderr.splitlines()
     said = [line.partition(": ")[2] for line in loud if "tiny.las: " in line]
     assert len(said) > 1 and all(any(text in line for line in lines) for text in said), "also remarks and warnings"

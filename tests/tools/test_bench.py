@@ -32,10 +32,9 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
 from wavebatch.tools.bench import command, report
 from wavebatch.tools.bench.accuracy import AccuracyTally, Group, make_group, make_groups
-from wavebatch.tools.bench.command import BenchOptions, run_bench
+from wavebatch.tools.bench.command import BenchOptions, run_bench, shape_scene
 from wavebatch.tools.bench.report import format_document
-from wavebatch.tools.bench.scenes import shape_scene
-from wavebatch.tools.bench.worker import BenchWorkerDied, Worker, peak_memory
+from wavebatch.tools.bench.speed import BenchWorkerDied, Worker, peak_memory
 from wavebatch.tools.simulate import Recording, find_scene, simulate_block, simulate_blocks, simulate_strip
 
 SMALL = BenchOptions(
@@ -102,7 +101,7 @@ def test_document_is_plain_json_and_its_tables_show_all(document):
     text = format_release(document)
     assert text.startswith(format_document(document)) and "isolated, time error / bound" in text
     for row in document["scenes"][0]["rows"]:
-        assert f"\n{row['name']}" in text
+        assert f"\n  {row['name']}" in text
     assert "constant 0, 12 or 255" in text and "cheapest chain with an error of 50 cm" in text
     assert f"{100 * find_row(document, 'fast')['figures']['exact_count']['value']:.2f} +-" in text
 
@@ -138,6 +137,7 @@ def test_nothing_to_measure():
         list_cases(["H14"])
 
 
+@pytest.mark.slow
 def test_command_writes_what_it_prints(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "has_matplotlib", lambda: False)
     options = "--scene flat --waveforms 800 --pulses 0 --repeat 1 --json"
@@ -207,6 +207,7 @@ def test_strip_too_short_to_resample(tmp_path):
         shape_scene(tmp_path / "short.las", load_profile("fast"))
 
 
+@pytest.mark.slow
 def test_groups_differ_and_are_surveyed():
     groups = make_groups(find_scene("flat"), 1600, 3)
     assert [len(group.block) for group in groups] == [200] * 8

@@ -168,7 +168,8 @@ def test_text_has_every_figure(tmp_path):
     path = write_cloud(tmp_path / "c.las", **SMALL, flags=[EchoFlag.WEAK] * 7)
     result = CliRunner().invoke(stats, [str(path)])
     assert result.exit_code == 0
-    for text in ("pulses         4", "57.14%", "1-2", "1.900", "0.800", "WEAK", "warning        incomplete: 1 of 4"):
+    wanted = ("pulses            4", "57.14%", "1-2", "1.900", "0.800", "WEAK", "warning           incomplete: 1 of 4")
+    for text in wanted:
         assert text in result.stdout
     other = write_cloud(tmp_path / "d.las", **SMALL)
     assert "total" in CliRunner().invoke(stats, [str(path), str(other)]).stdout
