@@ -241,7 +241,7 @@ def plan_filter(job: StripJob, layout: OutputLayout) -> PlannedFilter:
     def find(name: str) -> RowColumn:
         found = resolve(name, *kinds)
         if found is not None:
-            return RowColumn(*found, layout)
+            return RowColumn(found[0], found[1], layout)
         makers = [stage.name for stage in STAGES.values() if name in stage.makes and name in COLUMNS]
         remedy = nearest(name, [one for known in kinds for one in known])
         if makers:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.batch.counts import LEFT_OUT, RunReport, count_flags
-from wavebatch.batch.job import StripJob, UnitRows, plan_filter, plan_layout
+from wavebatch.batch.job import RowColumn, StripJob, UnitRows, plan_filter, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.process import Seconds
@@ -91,7 +91,8 @@ class Prepared:
     @property
     def needed(self) -> tuple[str, ...]:
         """The computed columns that decide which rows are written."""
-        return tuple(one.name for one in self.chosen.columns.values() if one.kind == "computed")
+        columns = [one for one in self.chosen.columns.values() if isinstance(one, RowColumn)]
+        return tuple(one.name for one in columns if one.kind == "computed")
 
     def choose_rows(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, RunReport]:
         """Choose the rows that are written.

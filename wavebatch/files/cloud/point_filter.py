@@ -118,12 +118,7 @@ class PointFilter:
         ConfigError
             For a column that there is not; with its place in the text of --where.
         """
-        columns = {}
-        for column in () if self.where is None else self.where.columns:
-            try:
-                columns[column] = find(column)
-            except ConfigError as error:
-                raise self.where.complain(column, str(error)) from error
+        columns = {} if self.where is None else _find_columns(self.where, find)
         if (self.flags or self.drop_flags) and "echo_flags" not in standard:
             raise ConfigError(f"{name}: has no column echo_flags to select points by")
         return PlannedFilter(self, standard, columns)
@@ -196,6 +191,17 @@ class PlannedFilter:
                 yield "polygon", np.logical_or.reduce(inside)
         if chosen.where is not None:
             yield "where", chosen.where.choose({name: column(rows) for name, column in self.columns.items()})
+
+
+def _find_columns(where: Condition, find: Callable[[str], ReadColumn]) -> dict[str, ReadColumn]:
+    """The columns of a condition by their names there."""
+    columns = {}
+    for column in where.columns:
+        try:
+            columns[column] = find(column)
+        except ConfigError as error:
+            raise where.complain(column, str(error)) from error
+    return columns
 
 
 def _describe_polygons(path: str, polygons: Sequence[Polygon]) -> dict[str, Any]:

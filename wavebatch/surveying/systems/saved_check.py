@@ -130,7 +130,7 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     forms = {(float(block.digitizer.bits), float(block.spacing)) for block in blocks}
     if figures.look is not None:
         whole, kinds = read_flight(survey)
-        known = {kind[:2] for kind in kinds.values()}
+        known = {(kind.bits, kind.spacing_ns) for kind in kinds.values()}
     else:
         known = {(figures.bits, figures.spacing_ns)} if figures.bits and figures.spacing_ns else forms
     if not forms & known:
