@@ -69,9 +69,11 @@ PAPERS = (
         Picture("Echoes of the forest from the side.", "plot section out/forest.laz --column amplitude --aspect 3"),
     )),
     Paper("s1_wang", "Wang, Wang, Tseng", "1b, 4, 5", (
-        Picture("Figures 1b and 5: the five cases without noise (dashed: their echoes), and the echoes that the B3 "
+        Picture("Figure 5: the five cases without noise (dashed: their echoes), and the echoes that the B3 "
                 "wavelet finds at three scales.", "draw_cases", ""),
-        Picture("Figure 4: the coefficients at these scales, of case e in noise 1.", "draw_coefficients", ""),
+        Picture("Figure 1b: the coefficients at these scales, of case e in noise 1.", "draw_coefficients", ""),
+        Picture("Figure 4: noise of the last samples of 60 waveforms, and the threshold of three standard deviations.",
+                "draw_noise", ""),
         Picture("A skewed pulse (kappa 0.1) and its fit by `decompose.skewed`: the model follows the falling edge.",
                 "plot waveform skewed.laz --packet 40:42 --times all --echoes --chain skewed.toml"),
     )),
@@ -86,29 +88,32 @@ PAPERS = (
         Picture("Length of the segments per height: the ground at 120 m, flat roofs at 124 m, slopes above.",
                 "plot profile segments.csv --column length --log"),
     )),
-    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024)", "2A, 3, 4, 5, 6", (
+    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024)", "2A, 3, 4, 5, 6A, 6B", (
         Picture("Figures 2A and 3: the pulse h as printed and Carlsson's, and the width of the echo by angle, with "
                 "widths that were fitted to planes of 400,000 rays (bars: their spread at A/sn 100).",
                 "draw_widths", ""),
-        Picture("Figures 4 and 6B: angles from widths by angles from the normals of surfaces, and the histogram of "
+        Picture("Figure 6B: angles from widths by angles from the normals of surfaces, and the histogram of "
                 "their differences.", "draw_angles", ""),
         Picture("Echo widths in plan: roofs of 0 to 60 degrees on level ground.",
                 "plot map out/village.laz --column echo_width --statistic median --size 2"),
-        Picture("Angles of incidence from these widths.",
+        Picture("Figure 4: angles of incidence from the normals of surfaces, in plan.",
+                "plot map out/village.laz --column incidence_angle_normals --statistic median --size 2"),
+        Picture("Figure 5: angles of incidence from these widths.",
                 "plot map out/village.laz --column incidence_angle --statistic median --size 2"),
         Picture("Echo widths from the side, across a row of roofs.",
                 "plot section out/village.laz --column echo_width --line 500006,5399890,500006,5400110 --width 3"),
         Picture("Which width means which angle, and how sure that is.",
                 "survey village.laz --divergence 1.1", "--angles"),
-        Picture("Angles on the roofs from widths, with their mean.",
+        Picture("Figure 6A: angles on the roofs from widths, with their mean.",
                 "plot histogram out/village.laz --column incidence_angle --where 'z > 123.5'"),
-        Picture("The same from the normals of surfaces; roofs of 60 degrees give few.",
+        Picture("Figure 6A: the same from the normals of surfaces; roofs of 60 degrees give few.",
                 "plot histogram out/village.laz --column incidence_angle_normals --where 'z > 123.5'"),
     )),
-    Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2, 4, 6, 7", (
-        Picture("Figures 1 and 2: a pulse with four returns, and the waveform that `synthesize` models from them.",
+    Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2a, 2b, 4, 7a, 7b", (
+        Picture("Figures 1, 2a, 2b, 7a and 7b: pulses with four returns over trees of 6 m and with three over corn, "
+                "and the waveforms that `synthesize` models from them.",
                 "draw_record", ""),
-        Picture("Figures 4, 6 and 7: the same trees of 20 m by a receiver with a dead zone of 0.65 m and by one of 2 "
+        Picture("Figure 4: the same trees of 20 m by a receiver with a dead zone of 0.65 m and by one of 2 "
                 "m, and their returns by height.", "draw_canopy", ""),
         Picture("Amplitudes by the number of returns of the pulse.",
                 "plot histogram out/forest.laz --column amplitude --by number_of_returns"),
