@@ -592,7 +592,7 @@ def test_a_group_of_two_values_does_not_press_the_others_down(tmp_path):
     for few in (2, 0):
         group = np.repeat([1, 2], [5000 - few, few]).astype("u1")
         path = write_cloud(tmp_path / f"{few}.las", n=5000, group=(group, None, None, "-"))
-        found = count_values([path], Selection("z"), by="group")
+        found = count_values([path], "z", by="group")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Figure, "savefig", lambda figure, *args, **more: tops.append(figure.axes[0].get_ylim()[1])
                           or args[0].write(b"x"))  # fmt: skip
