@@ -56,11 +56,12 @@ def _list_facts(found: Calibration) -> Iterator[Fact]:
 
 def _list_tables(flight: FlightCalibration) -> Iterator[Table]:
     found = flight.calibration
+    tilted = any(one.incidence_deg is not None for one in found.targets)  # a column of reflectances has no angle
     rows = [(one.label, one.reflectance, one.echoes, _constant(one.constant, one.relative_error or one.spread),
-             one.spread, _incidence(one), "used" if one.constant is not None else one.refused or "refused")
-            for one in found.targets]  # fmt: skip
-    head = ("target", "reflectance", "echoes", "constant", "spread", "incidence deg", "")
-    yield Table(head, rows, ("", ".4g", "", "", ".1%", "", ""), sortable=True)
+             one.spread, *[_incidence(one)] * tilted,
+             "used" if one.constant is not None else one.refused or "refused") for one in found.targets]  # fmt: skip
+    head = ("target", "reflectance", "echoes", "constant", "spread", *["incidence deg"] * tilted, "")
+    yield Table(head, rows, ("", ".4g", "", "", ".1%", *[""] * tilted, ""), sortable=True)
     rows = [(f"digitizer {one.digitizer}, scanner channel {one.scanner}", one.echoes or "by overlap",
              _constant(one.constant, one.relative_error), one.relative_error,
              *((one.spread, one.shot_energy) if one.echoes else (None, None))) for one in found.channels]  # fmt: skip
