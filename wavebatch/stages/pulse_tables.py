@@ -379,7 +379,7 @@ def describe_fitted(
 
 
 def whole_pulse(shape: PulseShape, limits: ShapeLimits, widths: np.ndarray) -> WholePulse:
-    """Return what `describe_echoes` takes whole echoes from.
+    """Return what `describe_fitted` takes whole echoes from.
 
     Parameters
     ----------
