@@ -381,3 +381,13 @@ def test_python_is_refused_what_the_command_line_is():
     ):  # fmt: skip
         with pytest.raises(ConfigError, match="^--[a-z-]+ [^:]+: (must lie (from|above)|choose) "):
             options(**words)
+
+
+def test_no_command_loads_linear_algebra_before_it_runs():
+    """To explain a variable that no command reads, all commands load; SciPy's BLAS may wait for memory for ever."""
+    script = (
+        "import sys, click; from wavebatch.cli import main; from wavebatch.cli.program.settings import _load_all; "
+        "assert len(dict(_load_all(click.Context(main)))) > 15; print('scipy.linalg' in sys.modules)"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert shown.stdout == "False\n", shown.stderr

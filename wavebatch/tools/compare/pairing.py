@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
@@ -344,8 +344,8 @@ class Pairing:
         """
         left = right = np.empty(0, np.int64)
         if len(a) and len(b):
-            to_b, nearest_b = cKDTree(b["xyz"]).query(a["xyz"], distance_upper_bound=self.tolerance)
-            _, nearest_a = cKDTree(a["xyz"]).query(b["xyz"], distance_upper_bound=self.tolerance)
+            to_b, nearest_b = scipy.spatial.cKDTree(b["xyz"]).query(a["xyz"], distance_upper_bound=self.tolerance)
+            _, nearest_a = scipy.spatial.cKDTree(a["xyz"]).query(b["xyz"], distance_upper_bound=self.tolerance)
             left = np.flatnonzero(np.isfinite(to_b))
             right = nearest_b[left]
             mutual = nearest_a[right] == left
@@ -431,7 +431,7 @@ def _list_crowded(
     rows_a, rows_b = (np.flatnonzero(crowd[pulse]) for pulse in (pulse_a, pulse_b))
     if not len(rows_a) or not len(rows_b):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    trees = cKDTree(xyz_a[rows_a]), cKDTree(xyz_b[rows_b])
+    trees = scipy.spatial.cKDTree(xyz_a[rows_a]), scipy.spatial.cKDTree(xyz_b[rows_b])
     if trees[0].count_neighbors(trees[1], reach) > MOST_PAIRS:
         raise InputError(
             f"{len(rows_a)} and {len(rows_b)} points share their GPS times with more than {MOST_PER_PULSE} others and "

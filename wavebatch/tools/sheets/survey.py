@@ -77,6 +77,9 @@ def _list_pulse(survey: Survey, document: Mapping[str, Any]) -> Iterator[Part]:
     width = f"s_ref {system.sigma_ref:.4f} ns, full width at half maximum {system.sigma_ref * FWHM_PER_SIGMA:.3f} ns"
     yield Fact("system pulse", f"{name_model(system)}; {width}")
     yield Table(("Gaussians: weight", "delay ns", "sigma ns"), system.components, (".4f", ".3f", ".3f"))
+    if figures.sent_fwhm_ns is not None:
+        width = f"full width at half maximum {figures.sent_fwhm_ns:.3f} ns, as import found it"
+        yield Fact("outgoing pulses", width)
     like = document.get("looks_like")
     if like is not None:
         taken = f"{like['sensor']}: its shipped pulse is used"
