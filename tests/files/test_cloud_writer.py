@@ -25,9 +25,8 @@ from writer_tools import (
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.cloud.cloud_reader import CloudReader, ColumnReader
 from wavebatch.files.cloud.column_names import STYLES
-from wavebatch.files.cloud.column_reader import ColumnReader
-from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.publish import remove_stale
 from wavebatch.files.las.extra_bytes import ExtraRecord

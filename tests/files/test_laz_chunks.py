@@ -17,7 +17,7 @@ from numpy.lib import recfunctions
 from writer_tools import BACKENDS, read_raw
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.cloud.echo_reader import CloudReader
+from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.disk import raw_bytes
 from wavebatch.files.disk.raw_bytes import hiding_panics
 from wavebatch.files.las import laz_decode

@@ -192,7 +192,7 @@ def begin_unit(blob: bytes, number: int, block_size: int | None) -> tuple[tuple[
     prepared: Prepared = unpack(blob)
     timing: dict[str, Seconds] = {}
     solved, echoes, made = solve_unit(prepared, number, block_size, timing)
-    needed = {name: made.columns[name] for name in ("echo_flags", *prepared.selector.needed)}
+    needed = {name: made.columns[name] for name in ("echo_flags", *prepared.needed)}
     chain = prepared.job.chain
     kept = [(index, chain.keep_needed(block)) for index, block in solved] if chain.after_second else []
     state = np.frombuffer(pickle.dumps((made._replace(columns=needed), kept), PROTOCOL), np.uint8)

@@ -14,24 +14,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wavebatch.batch.counts import RunReport
-from wavebatch.batch.job import StripJob, plan_layout
+from wavebatch.batch.counts import LEFT_OUT, RunReport, count_flags
+from wavebatch.batch.job import RowColumn, StripJob, UnitRows, plan_filter, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.packing import pack_rows
-from wavebatch.batch.selection import RowSelector
 from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.process import Seconds
 from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
 from wavebatch.files.disk.row_parcel import RowParcel
 from wavebatch.files.las.laz_encode import Chunk
+from wavebatch.files.las.point_formats import split_numbers
 from wavebatch.files.las.write_points import Statistics
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.kernels.geometry.normals import find_edges
-from wavebatch.stages.attribute.reflectance import REFLECTANCES, hide_edges
+from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
 from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
@@ -67,6 +68,8 @@ class Prepared:
     units: int
     choice: ChainChoice
     layout: OutputLayout
+    chosen: PlannedFilter
+    """Chooses the rows that are written, from UnitRows."""
     report: RunReport
     """Timing of the preparation, and how many points have lost their packets."""
     sensor: SensorSource = UNKNOWN
@@ -88,12 +91,42 @@ class Prepared:
         """The step whose columns need a second pass over the strip's points; None where nothing wanted needs them."""
         chain, step = self.job.chain, self.job.chain.second_step
         made = {name for one in (step, *chain.after_second) if one is not None for name in one.stage.makes}
-        return None if made.isdisjoint([*self.job.columns, *self.selector.needed]) else step
+        return None if made.isdisjoint([*self.job.columns, *self.needed]) else step
 
     @property
-    def selector(self) -> RowSelector:
-        """Chooses the rows that are written."""
-        return RowSelector.plan(self.job.selection, self.job.chain, self.layout)
+    def needed(self) -> tuple[str, ...]:
+        """The computed columns that decide which rows are written."""
+        columns = [one for one in self.chosen.columns.values() if isinstance(one, RowColumn)]
+        return tuple(one.name for one in columns if one.kind == "computed")
+
+    def choose_rows(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, RunReport]:
+        """Choose the rows that are written.
+
+        Parameters
+        ----------
+        rows : structured array (m,)
+            In the cloud's layout.
+        columns : mapping of str to array (m,)
+            Those `needed` and echo_flags as they were computed, whatever the cloud's names and units.
+
+        Returns
+        -------
+        rows : structured array (k,)
+            Those that are written.
+        report : RunReport
+            Points and flags that are written, and points left out by reason.
+        """
+        left = self.chosen.test(UnitRows(rows, columns), len(rows))
+        kept = left == 0
+        numbers = dict(zip(("", *REASONS), np.bincount(left, minlength=len(REASONS) + 1).tolist(), strict=True))
+        number, total = split_numbers(rows[left == len(REASONS)])
+        report = RunReport(
+            counts={"points_out": numbers[""]},
+            last_left_out=int(np.count_nonzero(number == total)),
+            left_out={name: numbers[name] for name in LEFT_OUT if numbers[name]},
+            flags=count_flags(columns["echo_flags"][kept]),
+        )
+        return rows if kept.all() else rows[kept], report
 
 
 class UnitResult(NamedTuple):
@@ -140,8 +173,7 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
     start = Seconds.now()
     with job.open() as reader:
         facts = reader.facts
-        job = replace(job, selection=job.selection.place(facts))
-        RowSelector.plan(job.selection, job.chain, plan_layout(job, facts))
+        plan_filter(job, plan_layout(job, facts))
         scan = reader.scan(force=job.request.force, parts=parts)
         try:
             scanned = Seconds.now()
@@ -166,14 +198,14 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
             if job.calibration is not None:
                 doubts += StripWarning.of("energy", setup.sent.notes)
             layout = plan_layout(job, facts)
-            RowSelector.plan(job.selection, job.chain, layout)
+            chosen = plan_filter(job, layout)
             units = reader.unit_count()
         except BaseException:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": Seconds.now() - surveyed}
     report = RunReport(counts={"points_cut": scan.cut}, timing=timing)
-    found = choice, layout, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
+    found = choice, layout, chosen, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
     return Prepared(job, facts, scan, units, *found)
 
 
@@ -280,7 +312,7 @@ def finish_rows(
     UnitResult
     """
     start = Seconds.now()
-    rows, left = prepared.selector.select(rows, columns)
+    rows, left = prepared.choose_rows(rows, columns)
     statistics = Statistics(rows.dtype, prepared.layout.extra_records)
     statistics.add(rows)
     timing["assemble"] = timing.get("assemble", Seconds()) + (Seconds.now() - start)
@@ -311,7 +343,7 @@ def solve_unit(
     echoes : UnitEchoes
         The same echoes, by packet.
     made : Assembled
-        With the columns that the selection needs.
+        With the columns that decide which rows are written.
     """
     start = Seconds.now()
     echoes_mode = prepared.job.options.points == "echoes"
@@ -323,9 +355,9 @@ def solve_unit(
     start = Seconds.now()
     solved = _mark_edges(prepared, solved)
     echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
-    layout, needed = prepared.layout, prepared.selector.needed
+    layout, needed = prepared.layout, prepared.needed
     if echoes_mode:
-        made = assemble_echoes(unit, echoes, layout, needed, prepared.job.selection.drop_flags)
+        made = assemble_echoes(unit, echoes, layout, needed, prepared.job.chosen.drop_flags)
     else:
         made = assemble_returns(unit, echoes, layout, needed)
     timing["assemble"] = Seconds.now() - start

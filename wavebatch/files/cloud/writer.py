@@ -44,7 +44,7 @@ from wavebatch.files.las.header import (
     has_record,
 )
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
-from wavebatch.files.wkt_repair import repair_evlr
+from wavebatch.files.wkt import repair_evlr
 
 _DESCRIPTORS = range(100, 356)
 MOST_PAYLOAD = 65535
