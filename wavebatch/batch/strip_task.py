@@ -24,7 +24,7 @@ from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.packing import Packing, pack_chunk
-from wavebatch.batch.unit import Prepared, UnitResult, prepare_strip, process_unit, scan_units
+from wavebatch.batch.unit import Prepared, UnitResult, prepare_strip, process_unit, scan_run
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError, StageError
 from wavebatch.core.process import Seconds
@@ -152,7 +152,7 @@ class StripTask:
         if self.prepared is None:
             job = self.job.absolute() if workers.is_remote else self.job
             if self._runs:
-                self._call(workers, self._take_scanned, scan_units, job, *self._runs.popleft())
+                self._call(workers, self._take_scanned, scan_run, job, *self._runs.popleft())
             else:
                 self._call(workers, self._take_prepared, prepare_strip, job, self._scanned)
         elif self._packing.has_chunk(last=self._has_all_rows):

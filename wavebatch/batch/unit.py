@@ -141,7 +141,7 @@ class UnitResult(NamedTuple):
     """Of LAZ: the only unit of a strip is compressed at once."""
 
 
-def scan_units(job: StripJob, first: int, last: int) -> tuple[ScanPart, Seconds]:
+def scan_run(job: StripJob, first: int, last: int) -> tuple[ScanPart, Seconds]:
     """Scan some units of a strip; what was found, and the time that it took. Raises InputError as the scan."""
     start = Seconds.now()
     with job.open() as reader:
@@ -156,7 +156,7 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
     ----------
     job : StripJob
     parts : sequence of ScanPart
-        From `scan_units`, all units in order; none where this process scans them.
+        From `scan_run`, all units in order; none where this process scans them.
 
     Returns
     -------
