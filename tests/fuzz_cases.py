@@ -32,7 +32,7 @@ def test_what_failed_once_does_not_fail_again(fuzzer, case):
     assert fuzzer.run(case) == ""
 
 
-@pytest.mark.quick_cases("strip.las", "cloud.laz", "*.[!lw]*")
+@pytest.mark.quick_cases("cloud.laz", "*.toml", "*.txt", "*son", "c*.npz", "t*.npz")
 @pytest.mark.parametrize("kind", sorted(COMMANDS))
 def test_sound_inputs_do_not_fail(fuzzer, kind):
     """Else the fuzzer would only see how commands refuse."""

@@ -25,7 +25,7 @@ def _all_hold(folder: Path, plan: Plan, commands: list[str]) -> None:
         assert not done.wrong and done.memory < MEMORY, (plan, done)
 
 
-@pytest.mark.quick_cases("spikes")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(HOSTILE))
 def test_long_and_dense_waveforms_stay_within_memory_and_time(tmp_path, name):
     done = attack(tmp_path, HOSTILE[name], COMMANDS[:1])

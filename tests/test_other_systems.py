@@ -76,6 +76,7 @@ def test_the_parts_are_hidden(elsewhere):
     assert done.stdout.split() == ["False", "False"] and "fcntl: not on this system" in done.stderr
 
 
+@pytest.mark.quick_cases("2")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_run_without_posix_gives_the_same_cloud(elsewhere, tiny_strip, cloud, tmp_path, jobs):
     command = ["run", tiny_strip, "-o", tmp_path, "--jobs", jobs, "-q", "--block-size", 100]
@@ -87,6 +88,7 @@ def test_a_run_without_posix_gives_the_same_cloud(elsewhere, tiny_strip, cloud, 
     assert _wavebatch(elsewhere, *command, "--resume").returncode == 0
 
 
+@pytest.mark.slow
 def test_lists_of_windows_and_a_console_of_an_old_code_page(elsewhere, tiny_strip, tmp_path):
     strip = tmp_path / "Überflug 1.las"
     strip.write_bytes(tiny_strip.read_bytes())

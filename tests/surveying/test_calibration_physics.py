@@ -380,7 +380,7 @@ def test_a_vendors_column_of_reflectances_is_an_anchor(tmp_path, vendor):
     assert f"spread {100 * row.spread:.1f} %" in done.stderr and "incidence" not in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.quick_cases("1.0")
 @pytest.mark.parametrize("held", [0.0, 0.5, 1.0])
 def test_air_that_a_vendors_column_still_holds_is_taken_off(tmp_path, monkeypatch, held):
     """Constants by such a column were 7 to 15 % off, with an error of 3 %."""

@@ -138,6 +138,7 @@ def test_nothing_to_measure():
         list_cases(["H14"])
 
 
+@pytest.mark.slow
 def test_command_writes_what_it_prints(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "has_matplotlib", lambda: False)
     options = "--scene flat --waveforms 800 --pulses 0 --repeat 1 --json"
@@ -207,6 +208,7 @@ def test_strip_too_short_to_resample(tmp_path):
         shape_scene(tmp_path / "short.las", load_profile("fast"))
 
 
+@pytest.mark.slow
 def test_groups_differ_and_are_surveyed():
     groups = make_groups(find_scene("flat"), 1600, 3)
     assert [len(group.block) for group in groups] == [200] * 8

@@ -1,7 +1,9 @@
+
 """`bench --all-methods`: one row for every detector and decomposer."""
 
 import json
 
+import pytest
 from bench.cases import list_cases
 from bench.stability import FAILURES, measure_stability
 from bench.stability_tables import format_stability
@@ -24,6 +26,7 @@ def test_every_method_has_a_chain():
         assert stages[1] == (name if name.startswith("detect") else before)
 
 
+@pytest.mark.slow
 def test_all_methods_stand_in_one_table(timed_here):
     options = "--scene flat --waveforms 600 --pulses 0 --repeat 1 --all-methods --json"
     result = CliRunner().invoke(main, ["bench", *options.split()])
@@ -34,6 +37,7 @@ def test_all_methods_stand_in_one_table(timed_here):
         assert rows[name]["figures"]["completeness"]["value"] > 0.98, name
 
 
+@pytest.mark.slow
 def test_every_method_goes_through_the_stiff_cases(monkeypatch):
     monkeypatch.setattr("bench.stability.GROUPS", 1)
     few = ("detect.asdf", "detect.wavelet", "decompose.residual_loop", "decompose.reference")

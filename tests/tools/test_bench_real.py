@@ -69,6 +69,7 @@ def test_strong_echoes_are_found_and_weak_ones_are_not(report):
     assert report.split.extra < 0.02 * report.split.injected
 
 
+@pytest.mark.slow
 def test_reported_errors_are_right_where_the_noise_is_white(report):
     whole = [row for row in report.calibration if (row.where, row.high) == ("quiet", np.inf)][-1]
     assert whole.low == 8.0 and whole.echoes > 2000 and whole.gross < 0.01
@@ -184,6 +185,7 @@ def test_clipped_echoes_are_injected_where_the_strip_has_some(strip, report, tmp
     assert found.clipped.extra < 0.05 * found.clipped.injected
 
 
+@pytest.mark.slow
 def test_surveys_of_parts_and_in_any_order_agree(strip, report):
     assert [row.parts for row in report.agreement[:2]] == ["even/odd", "first/last"]
     whole = read_pool(strip)
@@ -196,6 +198,7 @@ def test_surveys_of_parts_and_in_any_order_agree(strip, report):
     assert "even/odd" in format_report(report)
 
 
+@pytest.mark.slow
 def test_models_that_were_not_chosen_are_compared(strip):
     whole = read_pool(strip, 500)
     chosen = Solver.of_blocks(whole.blocks)
@@ -224,6 +227,7 @@ def test_a_stranger_has_no_shipped_pulse(strip, report):
     assert "as an unknown sensor: without nasa-lvis" in format_report(replace(report, left_out="nasa-lvis"))
 
 
+@pytest.mark.slow
 def test_a_strip_without_clear_echoes_has_the_other_figures(strip, monkeypatch):
     monkeypatch.setattr(templates, "LEAST_SNR", 1e6)
     (found,) = measure_real(strip, waveforms=300)
@@ -255,6 +259,7 @@ def test_a_strip_of_five_packets_gives_one_line(tmp_path):
         measure_real(small)
 
 
+@pytest.mark.slow
 def test_command_measures_strips_and_goes_on_after_one_that_fails(strip, tmp_path, capsys):
     small = make_raw(5, n_samples=60).write(tmp_path / "five.las")
     assert main([str(small), str(strip), "-o", str(tmp_path / "out")]) == 1
