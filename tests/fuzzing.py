@@ -497,9 +497,10 @@ def _begin() -> int:
     parser.add_argument("--no-keep", action="store_true", help="print failures only")
     options = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
-    until, known, start = time.monotonic() + 60 * options.minutes, set(), 1000 * options.seed
+    known, start = set(), 1000 * options.seed
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(KeyboardInterrupt):
         fuzzer = Fuzzer(Path(folder))
+        until = time.monotonic() + 60 * options.minutes
         with contextlib.closing(fuzzer):
             while time.monotonic() < until:
                 found, start = fuzz(fuzzer, 500, start, known, until), start + 1

@@ -4,7 +4,9 @@ import naive
 import numpy as np
 from scipy.optimize import brentq
 
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.kernels.fit.learn_pulse import fit_bounded
+from wavebatch.kernels.fit.whole_pulse import AS_FITTED, STRETCHED
 
 GAIN_121 = np.sqrt(6.0) / 4.0
 
@@ -275,3 +277,58 @@ def measure(shape, width):
         for side in (grid[grid < top][::-1], grid[grid > top])
     )
     return float(value(top)), right - left
+
+
+def relative_energy_errors(parameters, errors, shared):
+    """Relative errors of amplitude times width of echoes (m, 3), with the covariance of both (m, 2)."""
+    found = []
+    for (amplitude, _, width), (amplitude_err, _, width_err), (both, _) in zip(parameters, errors, shared, strict=True):
+        variance = (amplitude_err / amplitude) ** 2 + (width_err / width) ** 2 + 2 * both / (amplitude * width)
+        found.append(np.sqrt(np.maximum(variance, 0)))
+    return np.array(found)
+
+
+def describe_whole(whole, fitted, error, shared):
+    """Amplitude, time and width of one whole echo, and their errors."""
+    value, value_error = np.array(fitted), np.array(error)
+    if whole.kind == AS_FITTED:
+        return value, value_error
+    amplitude, _, width = fitted
+    delay, by_width = whole.datum, 0.0
+    if whole.kind == STRETCHED:
+        ratio = max(width / whole.ref, whole.least)
+        delay = whole.datum * whole.ref * (ratio + 1 / (ratio * ratio) - 1)
+        by_width = whole.datum * (1 - 2 / (ratio * ratio * ratio))
+    value[1] += delay
+    variance = error[1] * error[1] + (by_width * error[2]) * (by_width * error[2]) + 2 * by_width * shared[1]
+    value_error[1] = np.sqrt(np.maximum(variance, 0))
+    if whole.kind == STRETCHED:
+        return value, value_error
+    table = whole.wide if width > whole.near[-1, 0] else whole.near
+    peak, slope, sigma, steep = (float(np.interp(width, table[:, 0], table[:, i])) for i in range(1, 5))
+    by_width = amplitude * slope
+    own, other = peak * error[0], by_width * error[2]
+    value[::2] = amplitude * peak, sigma
+    variance = own * own + other * other + 2 * peak * by_width * shared[0]
+    value_error[::2] = np.sqrt(np.maximum(variance, 0)), error[2] * abs(steep)
+    return value, value_error
+
+
+def keep(clusters, solution, whole, factors, std, spacing, length, significance):
+    """Rows of the echoes that are kept, as tuples in the order of the columns of a table of echoes."""
+    rows, energies = [], relative_energy_errors(solution.parameters[:, :3], solution.errors[:, :3], solution.shared)
+    for i, c in enumerate(np.repeat(np.arange(len(solution.number)), solution.number)):
+        fit = solution.parameters[i, :3], solution.errors[i, :3], solution.shared[i]
+        (amplitude, time, width), errors = describe_whole(whole, *fit)
+        errors = errors * factors[i, :3]
+        noise = np.float32(significance) * std[clusters.waveform[c]]
+        strong = amplitude * amplitude * width * np.sqrt(np.pi) >= noise * noise
+        if not (strong and -0.5 * width <= time <= length - 1 + 0.5 * width and np.isfinite(errors).all()):
+            continue
+        flags = EchoFlag(0)
+        flags |= EchoFlag.NOT_CONVERGED if not solution.converged[c] else EchoFlag(0)
+        flags |= EchoFlag.AT_BOUND if solution.at_bound[i] else EchoFlag(0)
+        flags |= EchoFlag.OVERLAPPED if solution.number[c] > 1 else EchoFlag(0)
+        rows.append((clusters.waveform[c], time * spacing, amplitude, width * spacing, errors[1] * spacing, errors[0],
+                     errors[2] * spacing, energies[i] * factors[i, 3], solution.misfit[c], int(flags), i))  # fmt: skip
+    return rows

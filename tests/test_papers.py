@@ -213,7 +213,7 @@ def test_long_tables_are_folded_unless_a_figure_is_not_accepted(load):
     assert wrong.startswith("<details open><summary>t: 20 figures, 1 not accepted<")
 
 
-@pytest.mark.parametrize("name", ["draw_cases", "draw_coefficients", "draw_record"])
+@pytest.mark.parametrize("name", ["draw_cases", "draw_coefficients", "draw_noise", "draw_record"])
 def test_figures_are_drawn(name, load, tmp_path):
     pytest.importorskip("matplotlib")
     target = tmp_path / "p.png"

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from wavebatch.batch.options import RunOptions
-from wavebatch.tools.api.run_keywords import RunKeywords
+from wavebatch.tools.api.run import RunKeywords
 
 ROOT = Path(__file__).resolve().parent.parent
 CHECKERS = {

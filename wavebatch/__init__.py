@@ -26,10 +26,9 @@ if TYPE_CHECKING:
     from wavebatch.core.waveforms import Digitizer, Noise, ReturnTable, SystemPulse, WaveformBlock
     from wavebatch.stages.chain import Chain, Range, Step, stage
     from wavebatch.surveying.survey import Decision, Survey
-    from wavebatch.tools.api.chain import auto_chain, load_chain
     from wavebatch.tools.api.cloud import read_cloud
     from wavebatch.tools.api.run import run
-    from wavebatch.tools.api.strip import Strip, open_strip, survey
+    from wavebatch.tools.api.strip import Strip, auto_chain, load_chain, open_strip, survey
 
 __version__ = "0.1.0"
 
@@ -41,10 +40,9 @@ _MODULES = {
     "stages.chain": ("Chain", "Range", "Step", "stage"),
     "batch.options": ("RunOptions",),
     "surveying.survey": ("Decision", "Survey"),
-    "tools.api.chain": ("auto_chain", "load_chain"),
     "tools.api.cloud": ("read_cloud",),
     "tools.api.run": ("run",),
-    "tools.api.strip": ("Strip", "open_strip", "survey"),
+    "tools.api.strip": ("Strip", "auto_chain", "load_chain", "open_strip", "survey"),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -22,7 +22,7 @@ from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.detect.wavelet import transform, wavelet
 from wavebatch.tools.simulate.from_returns import synthesize_strip
-from wavebatch.tools.simulate.return_light import SynthesisOptions
+from wavebatch.tools.simulate.returns import SynthesisOptions
 
 SCALES = (1.0, 2.0, 3.0)
 DEGREES = np.arange(0.0, 76.0, 1.0)
@@ -47,7 +47,7 @@ def draw_voxels(folder: Path, seed: int, target: Path) -> None:
 
 
 def draw_cases(folder: Path, seed: int, target: Path) -> None:
-    """Wang et al., figures 1b and 5: the five cases, and the echoes that the wavelet finds at three scales."""
+    """Wang et al., figure 5: the five cases, and the echoes that the wavelet finds at three scales."""
     rng = np.random.default_rng(seed)
     with open_picture(target, (13.0, 4.6), overwrite=True) as figure:
         every = figure.subplots(1, 5, sharey=True)
@@ -74,7 +74,7 @@ def draw_cases(folder: Path, seed: int, target: Path) -> None:
 
 
 def draw_coefficients(folder: Path, seed: int, target: Path) -> None:
-    """Wang et al., figure 4: coefficients of the B3 wavelet at three scales, case e in noise 1."""
+    """Wang et al., figure 1b: coefficients of the B3 wavelet at three scales, here of case e in noise 1."""
     block, truth, recording = simulate_wang("e", 1.0, 1, np.random.default_rng(seed))
     noise, system = known_noise(recording, 1), known_system(recording)
     signal = (block.samples - noise.baseline[:, None]).T.astype(np.float32)
@@ -92,6 +92,26 @@ def draw_coefficients(folder: Path, seed: int, target: Path) -> None:
             for centre in truth.time:
                 axes.axvline(centre, color="tab:gray", linewidth=0.6)
         every[-1].set_xlabel("time [ns]   red: three standard deviations of noise, gray: true echoes")
+
+
+def draw_noise(folder: Path, seed: int, target: Path) -> None:
+    """Wang et al., figure 4: a waveform, and 60 of them with the noise of their last samples and the threshold."""
+    block, _, recording = simulate_wang("e", 1.0, 60, np.random.default_rng(seed))
+    signal = block.samples / FINE
+    time = np.arange(signal.shape[1]) * block.spacing
+    quiet = time > 0.78 * time[-1]
+    mean, std = float(signal[:, quiet].mean()), float(signal[:, quiet].std())
+    with open_picture(target, (12.0, 4.4), overwrite=True) as figure:
+        every = figure.subplots(1, 2, sharey=True)
+        every[0].plot(time, signal[0], color="black", linewidth=1.0)
+        every[1].plot(time, signal.T, color="tab:gray", linewidth=0.4)
+        every[1].axvspan(time[quiet][0], time[-1], color="tab:blue", alpha=0.15)
+        every[1].axhline(mean + 3 * std, color="tab:red", linewidth=1.0, label=f"{mean:.1f} + 3 x {std:.2f}")
+        every[1].legend(fontsize=8)
+        for axes, name in zip(every, ("a waveform", "60 waveforms, free of signal at the end"), strict=True):
+            axes.set_title(name, loc="left", fontsize=10)
+            axes.set_xlabel("time [ns]")
+        every[0].set_ylabel("signal [paper's unit]")
 
 
 def draw_widths(folder: Path, seed: int, target: Path) -> None:
@@ -133,7 +153,7 @@ def _measure_width(degrees: float, rng: np.random.Generator) -> tuple[float, flo
 
 
 def draw_angles(folder: Path, seed: int, target: Path) -> None:
-    """Rhomberg-Kauert et al., figures 4 and 6B: angles from widths by those from normals, and their differences."""
+    """Rhomberg-Kauert et al., figure 6B: angles from widths by those from normals, and their differences."""
     names = ["incidence_angle", "incidence_angle_normals"]
     cloud = wb.read_cloud(folder / "out" / "village.laz", names)
     width, normal = (np.asarray(cloud[name], np.float64) for name in names)
@@ -160,33 +180,37 @@ def _plain(value: float, place: int) -> str:
 
 
 def draw_record(folder: Path, seed: int, target: Path) -> None:
-    """Ussyshkin and Theriault, figures 1, 2: a pulse with four returns, and the waveform modelled from them."""
-    cloud, strip = folder / "orion.las", folder / "modelled.las"
-    fly_cloud("orion-20", cloud, 0.65, 2000, seed)
-    synthesize_strip(cloud, strip, SynthesisOptions(bits=16, baseline=0.0), overwrite=True)
-    with wb.open_strip(strip) as opened:
-        block, row = next(
-            (block, row) for block in opened.blocks()
-            for row in np.flatnonzero(np.bincount(block.returns.waveform, minlength=len(block)) == 4)
-        )  # fmt: skip
-        time = np.arange(block.samples.shape[1]) * block.spacing
-        mine = np.flatnonzero(block.returns.waveform == row)
-        height = np.interp(block.returns.time[mine], time, block.samples[row])
-        metres = HALF_C * (block.returns.time[mine] - block.returns.time[mine][0])
-    with open_picture(target, (9.0, 4.6), overwrite=True) as figure:
-        axes = figure.subplots()
-        axes.plot(time, block.samples[row], color="black", label="modelled waveform")
-        axes.vlines(block.returns.time[mine], 0, height, color="tab:red", label="returns")
-        for number, (at, top, deep) in enumerate(zip(block.returns.time[mine], height, metres, strict=True), 1):
-            axes.annotate(f"{number}: {deep:.2f} m", (at, top), xytext=(4, 4), textcoords="offset points", fontsize=8)
-        axes.set_ylim(0, 1.15 * float(block.samples[row].max()))
-        axes.set_xlabel("time [ns]")
-        axes.set_ylabel("signal [DN]")
-        axes.legend(fontsize=8)
+    """Ussyshkin and Theriault, figures 1, 2 and 7: pulses with four returns over trees of 6 m and with three over corn,
+    and the waveforms modelled from them."""
+    with open_picture(target, (13.0, 4.6), overwrite=True) as figure:
+        every = figure.subplots(1, 2)
+        for axes, (stand, returns) in zip(every, (("orion-6", 4), ("corn", 3)), strict=True):
+            cloud, strip = folder / f"record-{stand}.las", folder / f"modelled-{stand}.las"
+            fly_cloud(stand, cloud, 0.65, 2000, seed)
+            synthesize_strip(cloud, strip, SynthesisOptions(bits=16, baseline=0.0), overwrite=True)
+            with wb.open_strip(strip) as opened:
+                block, row = next(
+                    (block, row) for block in opened.blocks()
+                    for row in np.flatnonzero(np.bincount(block.returns.waveform, minlength=len(block)) == returns)
+                )  # fmt: skip
+                time = np.arange(block.samples.shape[1]) * block.spacing
+                mine = np.flatnonzero(block.returns.waveform == row)
+                height = np.interp(block.returns.time[mine], time, block.samples[row])
+                metres = HALF_C * (block.returns.time[mine] - block.returns.time[mine][0])
+            axes.plot(time, block.samples[row], color="black", label="modelled waveform")
+            axes.vlines(block.returns.time[mine], 0, height, color="tab:red", label="returns")
+            for number, (at, top, deep) in enumerate(zip(block.returns.time[mine], height, metres, strict=True), 1):
+                text = f"{number}: {deep:.2f} m"
+                axes.annotate(text, (at, top), xytext=(4, 4), textcoords="offset points", fontsize=8)
+            axes.set_ylim(0, 1.15 * float(block.samples[row].max()))
+            axes.set_title(f"{returns} returns, {stand}", loc="left", fontsize=10)
+            axes.set_xlabel("time [ns]")
+        every[0].set_ylabel("signal [DN]")
+        every[0].legend(fontsize=8)
 
 
 def draw_canopy(folder: Path, seed: int, target: Path) -> None:
-    """Ussyshkin and Theriault, figures 4, 6, 7: the same trees by two sensors, side by side, and returns by height."""
+    """Ussyshkin and Theriault, figure 4: the same trees by two sensors, side by side, and returns by height."""
     sensors = {"dead zone 0.65 m": 0.65, "dead zone 2 m": 2.0}
     colours = ("tab:green", "tab:orange", "tab:red", "tab:purple")
     with open_picture(target, (13.0, 4.8), overwrite=True) as figure:

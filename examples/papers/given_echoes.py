@@ -13,8 +13,7 @@ from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.tools.simulate.blocks import flag_truth
 from wavebatch.tools.simulate.draws import tabulate_echoes
-from wavebatch.tools.simulate.pulses import PulseModel
-from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
+from wavebatch.tools.simulate.render import PulseModel, Recording, paint_echoes, record_counts
 
 FINE = 100.0
 """Counts per unit of amplitude of `fine_recording`."""

@@ -23,8 +23,8 @@ from pathlib import Path
 from table import HEADS
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.tools.html import markup
-from wavebatch.tools.html.page import check_page, write_page
+from wavebatch.tools.sheets.page import check_page, render, section, text, write_page
+from wavebatch.tools.sheets.sheet import Cell, Code, Note, Part, Table
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -69,9 +69,11 @@ PAPERS = (
         Picture("Echoes of the forest from the side.", "plot section out/forest.laz --column amplitude --aspect 3"),
     )),
     Paper("s1_wang", "Wang, Wang, Tseng", "1b, 4, 5", (
-        Picture("Figures 1b and 5: the five cases without noise (dashed: their echoes), and the echoes that the B3 "
+        Picture("Figure 5: the five cases without noise (dashed: their echoes), and the echoes that the B3 "
                 "wavelet finds at three scales.", "draw_cases", ""),
-        Picture("Figure 4: the coefficients at these scales, of case e in noise 1.", "draw_coefficients", ""),
+        Picture("Figure 1b: the coefficients at these scales, of case e in noise 1.", "draw_coefficients", ""),
+        Picture("Figure 4: noise of the last samples of 60 waveforms, and the threshold of three standard deviations.",
+                "draw_noise", ""),
         Picture("A skewed pulse (kappa 0.1) and its fit by `decompose.skewed`: the model follows the falling edge.",
                 "plot waveform skewed.laz --packet 40:42 --times all --echoes --chain skewed.toml"),
     )),
@@ -86,29 +88,32 @@ PAPERS = (
         Picture("Length of the segments per height: the ground at 120 m, flat roofs at 124 m, slopes above.",
                 "plot profile segments.csv --column length --log"),
     )),
-    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024)", "2A, 3, 4, 5, 6", (
+    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024)", "2A, 3, 4, 5, 6A, 6B", (
         Picture("Figures 2A and 3: the pulse h as printed and Carlsson's, and the width of the echo by angle, with "
                 "widths that were fitted to planes of 400,000 rays (bars: their spread at A/sn 100).",
                 "draw_widths", ""),
-        Picture("Figures 4 and 6B: angles from widths by angles from the normals of surfaces, and the histogram of "
+        Picture("Figure 6B: angles from widths by angles from the normals of surfaces, and the histogram of "
                 "their differences.", "draw_angles", ""),
         Picture("Echo widths in plan: roofs of 0 to 60 degrees on level ground.",
                 "plot map out/village.laz --column echo_width --statistic median --size 2"),
-        Picture("Angles of incidence from these widths.",
+        Picture("Figure 4: angles of incidence from the normals of surfaces, in plan.",
+                "plot map out/village.laz --column incidence_angle_normals --statistic median --size 2"),
+        Picture("Figure 5: angles of incidence from these widths.",
                 "plot map out/village.laz --column incidence_angle --statistic median --size 2"),
         Picture("Echo widths from the side, across a row of roofs.",
                 "plot section out/village.laz --column echo_width --line 500006,5399890,500006,5400110 --width 3"),
         Picture("Which width means which angle, and how sure that is.",
                 "survey village.laz --divergence 1.1", "--angles"),
-        Picture("Angles on the roofs from widths, with their mean.",
+        Picture("Figure 6A: angles on the roofs from widths, with their mean.",
                 "plot histogram out/village.laz --column incidence_angle --where 'z > 123.5'"),
-        Picture("The same from the normals of surfaces; roofs of 60 degrees give few.",
+        Picture("Figure 6A: the same from the normals of surfaces; roofs of 60 degrees give few.",
                 "plot histogram out/village.laz --column incidence_angle_normals --where 'z > 123.5'"),
     )),
-    Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2, 4, 6, 7", (
-        Picture("Figures 1 and 2: a pulse with four returns, and the waveform that `synthesize` models from them.",
+    Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2a, 2b, 4, 7a, 7b", (
+        Picture("Figures 1, 2a, 2b, 7a and 7b: pulses with four returns over trees of 6 m and with three over corn, "
+                "and the waveforms that `synthesize` models from them.",
                 "draw_record", ""),
-        Picture("Figures 4, 6 and 7: the same trees of 20 m by a receiver with a dead zone of 0.65 m and by one of 2 "
+        Picture("Figure 4: the same trees of 20 m by a receiver with a dead zone of 0.65 m and by one of 2 "
                 "m, and their returns by height.", "draw_canopy", ""),
         Picture("Amplitudes by the number of returns of the pulse.",
                 "plot histogram out/forest.laz --column amplitude --by number_of_returns"),
@@ -223,14 +228,14 @@ def measure(script: str, number: int | None, seed: int, folder: Path) -> tuple[l
 def format_table(table: dict) -> str:
     """A table as HTML; text of a script as it is."""
     if "text" in table:
-        return markup.code(table["text"])
-    head = f'<th scope="col">{markup.text(table["title"])}</th>'
-    head += "".join(f'<th scope="col" class="n">{markup.text(name)}</th>' for name in HEADS[1:])
+        return render(Code(table["text"]))
+    head = f'<th scope="col">{text(table["title"])}</th>'
+    head += "".join(f'<th scope="col" class="n">{text(name)}</th>' for name in HEADS[1:])
     rows = []
     for name, *cells in table["rows"]:
-        texts = [f'<span class="mark">{cell}</span>' if cell == "FAIL" else markup.text(cell) for cell in cells]
+        texts = [f'<span class="mark">{cell}</span>' if cell == "FAIL" else text(cell) for cell in cells]
         values = "".join(f'<td class="n">{one}</td>' for one in texts)
-        rows.append(f"<tr><td>{markup.text(name)}</td>{values}</tr>")
+        rows.append(f"<tr><td>{text(name)}</td>{values}</tr>")
     body = "\n".join(rows)
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>'
 
@@ -243,17 +248,17 @@ def fold(table: dict) -> str:
     missed = sum(row[-1] == "FAIL" for row in rows)
     title = f"{table['title']}: {len(rows)} figures" + (f", {missed} not accepted" if missed else "")
     opened = " open" if missed else ""
-    return f"<details{opened}><summary>{markup.text(title)}</summary>\n{shown}\n</details>"
+    return f"<details{opened}><summary>{text(title)}</summary>\n{shown}\n</details>"
 
 
 def format_picture(picture: Picture, image: bytes | None, error: str) -> str:
     """A picture with its caption and its command."""
     ours = f"wavebatch {picture.command} {picture.option} picture.png"
-    command = markup.text(ours if picture.option else f"{picture.command} in examples/papers/figures.py")
-    caption = markup.text(picture.caption)
+    command = text(ours if picture.option else f"{picture.command} in examples/papers/figures.py")
+    caption = text(picture.caption)
     below = f"<figcaption>{caption}<br><code>{command}</code></figcaption>"
     if image is None:
-        return f'<figure class="wide">{markup.paragraph(f"not drawn: {error}", "warning")}{below}</figure>'
+        return f'<figure class="wide">{render(Note(f"not drawn: {error}", "warning"))}{below}</figure>'
     data = base64.b64encode(image).decode()
     shown = f'<img class="picture" alt="{caption}" src="data:image/png;base64,{data}">'
     return f'<figure class="wide">{shown}{below}</figure>'
@@ -263,8 +268,8 @@ def read_notes() -> dict[str, list[str]]:
     """The paragraphs of README.md about each script, without its table."""
     parts = re.split(r"(?m)^## `python examples/papers/(\w+)\.py`$", (FOLDER / "README.md").read_text("utf-8"))
     notes = {}
-    for script, text in zip(parts[1::2], parts[2::2], strict=True):
-        paragraphs = [" ".join(one.split()) for one in text.split("\n\n") if not one.lstrip().startswith("|")]
+    for script, words in zip(parts[1::2], parts[2::2], strict=True):
+        paragraphs = [" ".join(one.split()) for one in words.split("\n\n") if not one.lstrip().startswith("|")]
         # The first one begins with the authors, who stand in the heading.
         first, *rest = [one.replace("`", "") for one in paragraphs if one]
         lead = first.split(": ", 1)[-1]
@@ -278,7 +283,7 @@ def count_accepted(tables: Sequence[dict]) -> tuple[int, int]:
     return verdicts.count("ok") + verdicts.count("FAIL"), verdicts.count("ok")
 
 
-def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
+def build(number: int | None, pulses: int, seed: int) -> tuple[list[Part | str], bool]:
     """The parts of the page, and whether all went well."""
     drawing = importlib.util.find_spec("matplotlib") is not None
     parts, rows, notes, fine = [], [], read_notes(), True
@@ -293,17 +298,17 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
             fine &= accepted and bool(tables) and not failed
             banded, inside = count_accepted(tables)
             mark = paper.script
-            link = markup.Cell(f'<a href="#{mark}">{markup.text(paper.title)}</a>')
+            link = Cell(paper.title, link=mark)
             rows.append([link, banded, inside, len(drawn) - failed])
             inner = []
             if drawn:
-                inner.append(markup.paragraph(f"In place of the paper's figures {paper.figures}, on simulated strips:"))
+                inner.append(render(Note(f"In place of the paper's figures {paper.figures}, on simulated strips:")))
             inner += [format_picture(*one) for one in drawn]
-            inner += [markup.paragraph(one) for one in notes.get(paper.script, ())]
+            inner += [render(Note(one)) for one in notes.get(paper.script, ())]
             inner += [fold(table) for table in tables]
             if not tables:
-                inner.append(markup.paragraph(f"{paper.script}.py printed no table; run it to see why", "warning"))
-            parts.append(markup.section(paper.title, *inner, mark=mark))
+                inner.append(render(Note(f"{paper.script}.py printed no table; run it to see why", "warning")))
+            parts.append(section(paper.title, *inner, mark=mark))
     if not drawing:
         errors = ["no pictures: matplotlib is not installed (pip install matplotlib)"]
     intro = (
@@ -311,8 +316,8 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
         f"ours, and the band that is accepted; a dash where there is none. Seed {seed}. The papers' data and pictures "
         "are not used: a figure can agree by chance."
     )
-    head = ["paper", "figures with a band", "of these accepted", "pictures"]
-    front = [markup.paragraph(intro), markup.bullets(errors, "warning"), markup.table(head, rows)]
+    head = ("paper", "figures with a band", "of these accepted", "pictures")
+    front = [Note(intro), *(Note(error, "warning") for error in errors), Table(head, rows)]
     return [*front, *parts], fine and not (drawing and errors)
 
 

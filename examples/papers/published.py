@@ -14,8 +14,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.tools.simulate.draws import FoldedWidth, LogNormal, WithinDepth
-from wavebatch.tools.simulate.pulses import PulseModel
-from wavebatch.tools.simulate.render import Recording
+from wavebatch.tools.simulate.render import PulseModel, Recording
 from wavebatch.tools.simulate.scenes import Scene
 
 WAGNER = Scene(

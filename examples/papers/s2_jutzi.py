@@ -29,8 +29,7 @@ from wavebatch.stages.detect.classic import sustained_threshold
 from wavebatch.stages.detect.maximum import matched_filter
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import GROUND
-from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
-from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
+from wavebatch.tools.slices.segments import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
 
 RATIOS = (2, 3, 4, 5, 6, 7, 8, 10)
 DETECTORS = {

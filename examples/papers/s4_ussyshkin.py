@@ -28,7 +28,7 @@ from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, simulate_returns
 from wavebatch.tools.simulate.from_returns import synthesize_strip
 from wavebatch.tools.simulate.render import paint_echoes
-from wavebatch.tools.simulate.return_light import Radar, SynthesisOptions
+from wavebatch.tools.simulate.returns import Radar, SynthesisOptions
 
 FULL = 20_000
 """Pulses that the bands hold for."""

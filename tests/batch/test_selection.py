@@ -288,7 +288,7 @@ def test_the_workers_of_a_cluster_need_not_see_the_polygons(tiny_strip, tmp_path
         raise ConfigError("stop")
 
     seen = []
-    monkeypatch.setattr("wavebatch.batch.run.Cluster", refuse)
+    monkeypatch.setattr("wavebatch.batch.workers.dask_cluster.Cluster", refuse)
     path, energy = tmp_path / "path.txt", tmp_path / "energy.txt"
     path.write_text("time x y z\n0 0 0 900\n1 9 9 900\n")
     energy.write_text("time energy\n0 1\n1 1\n")

@@ -1,6 +1,6 @@
 """The stiff cases: the hazards H1 to H16 of docs/algorithms.md 3 that can be simulated, each at fixed values.
 
-`stability` runs every chain on them. tools.simulate.hazards draws at random values instead, for the scene `stiff`.
+`stability` runs every chain on them. tools.simulate.scenes draws at random values instead, for the scene `stiff`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.tools.simulate import PulseModel, Recording, Scene
 from wavebatch.tools.simulate.draws import Drawn, tabulate_echoes
-from wavebatch.tools.simulate.hazards import Draw, draw_broad, draw_constant, draw_contrast, draw_crowd, draw_huge
+from wavebatch.tools.simulate.scenes import Draw, draw_broad, draw_constant, draw_contrast, draw_crowd, draw_huge
 
 SIGMA = 2.0
 """Width of the system pulse in all cases [ns]."""

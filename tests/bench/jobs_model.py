@@ -32,7 +32,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import UNIT_POINTS
 from wavebatch.tools.api.run import plan_run
 from wavebatch.tools.bench.report import write_texts
-from wavebatch.tools.bench.worker import Worker
+from wavebatch.tools.bench.speed import Worker
 
 JOBS = (1, 2, 4, 16, 64)
 """Numbers of jobs of the table."""

@@ -25,8 +25,7 @@ from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled
 from wavebatch.tools.bench.accuracy import AccuracyTally, Group
 from wavebatch.tools.bench.command import make_row
-from wavebatch.tools.bench.speed import Laps
-from wavebatch.tools.bench.worker import BenchWorkerDied, Worker
+from wavebatch.tools.bench.speed import BenchWorkerDied, Laps, Worker
 from wavebatch.tools.simulate import Scene
 
 PEER_GROUPS = 6

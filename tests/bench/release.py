@@ -18,8 +18,14 @@ from bench.stability import FAILURES, measure_stability
 from bench.stability_tables import format_stability
 from bench.system import measure_system
 
-from wavebatch.tools.bench.chains import choose_chains, list_methods, load_chains
-from wavebatch.tools.bench.command import BenchOptions, BenchProgress, run_bench
+from wavebatch.tools.bench.command import (
+    BenchOptions,
+    BenchProgress,
+    choose_chains,
+    list_methods,
+    load_chains,
+    run_bench,
+)
 from wavebatch.tools.bench.report import format_document, write_outputs
 
 SCENES = ("mixed", "open", "forest", "empty")

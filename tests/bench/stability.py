@@ -20,7 +20,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import Survey, survey_block
 from wavebatch.tools.bench.accuracy import AccuracyTally, Group, derive_seed, describe_found, make_group
-from wavebatch.tools.bench.chains import AUTO, find_twin
+from wavebatch.tools.bench.command import AUTO, find_twin
 from wavebatch.tools.simulate import Recording, Scene, find_scene, simulate_blocks
 from wavebatch.tools.simulate.draws import LogUniform, Mixture
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import pytest
 from click.testing import CliRunner
@@ -29,8 +30,8 @@ def run(*arguments):
 def test_a_strip_with_itself_is_identical(strips):
     result = run(strips / "a.las", strips / "a.las", "--min-completeness", 1, "--min-correctness", 1, "--max-rmse", 0)
     assert result.exit_code == 0, result.output
-    assert "missed 0   extra 0" in result.stdout
-    assert "completeness          1.0000" in result.stdout
+    shown = result.stdout.splitlines()
+    assert {"missed            0", "extra             0", "completeness      1.0000"} <= set(shown)
 
 
 def test_json_holds_every_figure_and_no_nan(strips):
@@ -103,12 +104,13 @@ def test_text_table_and_page_have_the_classes_and_the_numbers_of_echoes(strips, 
         assert len(groups) > 1 and sum(one["time"]["number"] for one in groups.values()) == document["matched"]
         for group, quantities in groups.items():
             one = quantities["time"]
-            title = f"{group}, time ns" if kind == "class" else f"{group} of the pulse, time ns"
-            (line,) = [line for line in text.splitlines() if line.startswith(title)]
-            assert line.removeprefix(title).split() == [str(one["number"]), *(f"{one[name]:.4f}" for name in NAMES)]
+            title = group if kind == "class" else f"{group} of the pulse"
+            (line,) = [line for line in text.splitlines() if re.match(rf"  {title} +time ns ", line)]
+            values = [str(one["number"]), *(f"{one[name]:.4f}" for name in NAMES)]
+            assert line.split() == [*title.split(), "time", "ns", *values]
             assert rows[f"differences by {kind}", "", group, "time", "number"] == str(one["number"])
-            row = next(row for row in shown.rows if row[:3] == [kind, group, "time"])
-            assert row[3] == f"{one['number']:,}"
+            row = next(row for row in shown.rows if row[:2] == [title, "time ns"])
+            assert row[2] == f"{one['number']:,}"
 
 
 def test_a_truth_says_whose_times_it_tests(strips):
@@ -116,7 +118,7 @@ def test_a_truth_says_whose_times_it_tests(strips):
     for cloud, said in ((strips / "a.las", True), (strips / "out" / "a.laz", False)):
         shown = run(cloud, "--truth", strips / "a.npz").stdout
         assert ("`run --columns +echo_time` adds" in shown) is said
-        assert ("isolated echo_time" in shown) is not said
+        assert bool(re.search("  isolated +echo_time", shown)) is not said
 
 
 def test_a_truth_is_compared_at_the_chosen_points(strips):

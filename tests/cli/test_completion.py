@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from wavebatch.cli.program.completion import complete_files
+from wavebatch.cli.program.command import complete_files
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = "from wavebatch.cli import main; main.main(prog_name='wavebatch')"

@@ -15,10 +15,8 @@ from click.testing import CliRunner
 import wavebatch as wb
 from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
-from wavebatch.cli.program import log_file
-from wavebatch.cli.program.about import roff
-from wavebatch.cli.program.command import ProgramCommand, group_options
-from wavebatch.cli.program.examples import EXAMPLES, GROUPS
+from wavebatch.cli.messages import log_is_open
+from wavebatch.cli.program.command import EXAMPLES, GROUPS, ProgramCommand, group_options, roff
 from wavebatch.cli.program.settings import HARMLESS, NO_VARIABLE, OLD_NAMES
 from wavebatch.core.errors import ConfigError
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions
@@ -339,7 +337,7 @@ def test_a_log_has_what_quiet_hides_and_is_appended(folder, tmp_path):
     assert any("INFO" in line and "tiny.las" in line and "waveforms" in line for line in lines)
     assert any("ERROR" in line and "broken.las" in line for line in lines)
     assert invoke(*arguments, "--resume", "--log-level", "error").exit_code == 3
-    assert log.read_text().count("broken.las") == 2 and not log_file.is_open()
+    assert log.read_text().count("broken.las") == 2 and not log_is_open()
     loud = invoke(*task, "--overwrite").stderr.splitlines()
     said = [line.partition(": ")[2] for line in loud if "tiny.las: " in line]
     assert len(said) > 1 and all(any(text in line for line in lines) for text in said), "also remarks and warnings"
@@ -383,3 +381,13 @@ def test_python_is_refused_what_the_command_line_is():
     ):  # fmt: skip
         with pytest.raises(ConfigError, match="^--[a-z-]+ [^:]+: (must lie (from|above)|choose) "):
             options(**words)
+
+
+def test_no_command_loads_linear_algebra_before_it_runs():
+    """To explain a variable that no command reads, all commands load; SciPy's BLAS may wait for memory for ever."""
+    script = (
+        "import sys, click; from wavebatch.cli import main; from wavebatch.cli.program.settings import _load_all; "
+        "assert len(dict(_load_all(click.Context(main)))) > 15; print('scipy.linalg' in sys.modules)"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert shown.stdout == "False\n", shown.stderr

@@ -8,14 +8,15 @@ from helpers_scenes import make_scene
 from strips import cut_strip
 
 from wavebatch.cli import main
-from wavebatch.cli.survey import NOISE_KINDS, _pulse_lines
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.stages.chain_file import load_chain
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import chain_text, decide
-from wavebatch.surveying.system_file import SavedSurvey, load_survey
+from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems.figures import Figures, describe_figures
+from wavebatch.tools.sheets.sheet import list_lines
+from wavebatch.tools.sheets.survey import NOISE_KINDS, survey_sheet
 from wavebatch.tools.simulate import simulate_strip
 
 
@@ -131,7 +132,8 @@ def test_what_is_no_strip_gives_one_line(tmp_path, data):
 
 
 def test_figures_have_the_digits_that_they_deserve():
-    lines = list(_pulse_lines(SavedSurvey(Survey(SystemPulse(2.0, misfit=0.00154777), 9, Figures(kappa=-1e-6)))))
+    survey = Survey(SystemPulse(2.0, misfit=0.00154777), 9, Figures(kappa=-1e-6))
+    lines = list(list_lines(survey_sheet(survey, {"decisions": []})))
     assert any(line.split() == ["kappa", "0.0000"] for line in lines)
     assert any(line.startswith("misfit            0.15 % ") for line in lines)
     figures = Figures(n_samples=254.0, bits=8.0, spacing_ns=1.0, descriptors_pooled=14.0)

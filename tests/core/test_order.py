@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.core.order import find_order, group_medians
+from wavebatch.core.order import distinct, find_order, group_medians, median, quantile
 
 
 def test_any_rows_get_the_order_of_a_full_sort(rng):
@@ -27,11 +27,32 @@ def test_medians_of_groups_are_those_of_each_group_alone():
     group = random.integers(0, 40, 300)
     group[group == 7] = 8
     for values in (random.normal(0, 5, 300), random.normal(0, 5, 300).astype(np.float32)):
-        median, std = group_medians(values, group)
-        assert len(median) == len(std) == group.max() + 1 and median.dtype == values.dtype
-        assert median[7] == std[7] == 0
+        medians, std = group_medians(values, group)
+        assert len(medians) == len(std) == group.max() + 1 and medians.dtype == values.dtype
+        assert medians[7] == std[7] == 0
         for row in np.unique(group):
             part = values[group == row]
-            assert median[row] == np.median(part)
+            assert medians[row] == np.median(part)
             assert std[row] == pytest.approx(1.4826 * np.median(np.abs(part - np.median(part))), rel=1e-4, abs=1e-12)
     assert len(group_medians(np.empty(0), np.empty(0, np.int64))[0]) == 0
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int64, np.uint8])
+@pytest.mark.parametrize("n", [1, 2, 3, 10, 11, 1000])
+def test_distinct_median_and_quantile_give_the_bits_of_numpy(dtype, n, rng):
+    values = (rng.normal(0, 40, n) + 100).astype(dtype)
+    table = (rng.normal(0, 40, (n, 6)) + 100).astype(dtype)
+    np.testing.assert_array_equal(distinct(values), np.unique(values), strict=True)
+    for given, axis in ((values, None), (table, None), (table, 0), (table, 1)):
+        expected, found = np.median(given, axis=axis), median(given, axis)
+        assert np.asarray(found).dtype == np.asarray(expected).dtype
+        np.testing.assert_array_equal(found, expected)
+    if np.issubdtype(dtype, np.floating):
+        for share in (0.0, 0.1, 0.25, 0.5, 0.84, 1.0):
+            assert quantile(values, share) == float(np.quantile(values, share))
+
+
+def test_the_median_of_nan_or_of_nothing_is_nan():
+    assert np.isnan(median(np.array([1.0, np.nan, 2.0])))
+    assert np.isnan(median(np.empty(0)))
+    np.testing.assert_array_equal(median(np.array([[1.0, np.nan], [3.0, 4.0]]), 0), [2.0, np.nan])

@@ -19,10 +19,10 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.noise import pooled, tail
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample
-from wavebatch.tools.compare.goodness import measure_fit
+from wavebatch.tools.compare.chains import measure_fit
 from wavebatch.tools.plots.waveform import build_views
 from wavebatch.tools.simulate import StripOptions, simulate_strip
-from wavebatch.tools.slices.lines import _shape
+from wavebatch.tools.slices.segments import _shape
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
 
 DETECTORS = sorted(name for name, stage in STAGES.items() if name.startswith("detect."))

@@ -22,6 +22,8 @@ COMPILED = {
     "pair_differences": ("measure_covariance", "naive_signal.measure_covariance"),
     "judge_packets": ("judge_packets", "naive_packets.judge_packet"),
     "interpolate_columns": ("interpolate", "np.interp"), "fit_stack": ("refine_gaussians", "naive_fit.fit_stack"),
+    "describe_echoes": ("describe_whole", "naive_fit.describe_whole"), "keep_echoes": ("keep_echoes", "naive_fit.keep"),
+    "match_returns": ("match_returns", "naive.match_returns"),
 }  # fmt: skip
 """Function of the library, the kernel that calls it, and the twin that a test compares that with."""
 

@@ -377,7 +377,7 @@ def test_a_vendors_column_of_reflectances_is_an_anchor(tmp_path, vendor):
     # Ranges of 700 to 730 m do not show whether the column holds the air, which takes 7 %.
     assert 0.04 < row.spread < 0.07 and 0.075 < row.relative_error < 0.09
     assert "too alike to show whether it still holds the air" in done.stderr
-    assert f"spread {100 * row.spread:.1f} %" in done.stderr and "incidence" not in done.stderr
+    assert f" {row.spread:.1%} " in done.stderr and "incidence" not in done.stderr
 
 
 @pytest.mark.quick_cases("1.0")

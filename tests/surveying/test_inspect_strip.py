@@ -76,7 +76,7 @@ def test_info_of_a_strip_that_cannot_be_processed_still_tells_what_it_holds(tmp_
     assert facts["samples"]["least"] is None
     json.dumps(facts, allow_nan=False)
     result = run("info", path)
-    assert result.exit_code == 1 and "problem        no packet can be used" in result.stdout
+    assert result.exit_code == 1 and "problem           no packet can be used" in result.stdout
     assert result.stderr.startswith(f"error: {path}: no packet can be used")
 
 

@@ -269,7 +269,7 @@ def test_table_text_and_json_say_the_same(tmp_path):
     again = CliRunner().invoke(stats, arguments)
     assert again.exit_code != 0 and "exists already" in again.stderr
     out = CliRunner().invoke(stats, [*arguments, "--overwrite"]).stdout
-    assert f"and {len(found) - SHOWN} more areas" in out and found[0]["name"] in out
+    assert f"and {len(found) - SHOWN} more; --json has all of them" in out and found[0]["name"] in out
 
 
 def test_an_empty_cloud_has_no_area(tmp_path):

@@ -32,10 +32,9 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
 from wavebatch.tools.bench import command, report
 from wavebatch.tools.bench.accuracy import AccuracyTally, Group, make_group, make_groups
-from wavebatch.tools.bench.command import BenchOptions, run_bench
+from wavebatch.tools.bench.command import BenchOptions, run_bench, shape_scene
 from wavebatch.tools.bench.report import format_document
-from wavebatch.tools.bench.scenes import shape_scene
-from wavebatch.tools.bench.worker import BenchWorkerDied, Worker, peak_memory
+from wavebatch.tools.bench.speed import BenchWorkerDied, Worker, peak_memory
 from wavebatch.tools.simulate import Recording, find_scene, simulate_block, simulate_blocks, simulate_strip
 
 SMALL = BenchOptions(
@@ -102,7 +101,7 @@ def test_document_is_plain_json_and_its_tables_show_all(document):
     text = format_release(document)
     assert text.startswith(format_document(document)) and "isolated, time error / bound" in text
     for row in document["scenes"][0]["rows"]:
-        assert f"\n{row['name']}" in text
+        assert f"\n  {row['name']}" in text
     assert "constant 0, 12 or 255" in text and "cheapest chain with an error of 50 cm" in text
     assert f"{100 * find_row(document, 'fast')['figures']['exact_count']['value']:.2f} +-" in text
 

@@ -11,17 +11,19 @@ from wavebatch.cli.options import parse_length
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.kernels.fit.bounds import crlb
-from wavebatch.tools.bench.accuracy import find_hidden
-from wavebatch.tools.bench.figures import (
+from wavebatch.tools.bench.accuracy import (
     SURVEY_SCATTER,
     Figure,
     choose_cheapest,
+    describe_truth,
+    effective_noise,
+    find_bounds,
     find_front,
+    find_hidden,
     median_range,
     root_mean_square,
     share_figure,
 )
-from wavebatch.tools.bench.truth import describe_truth, effective_noise, find_bounds
 from wavebatch.tools.simulate import PULSES, PulseModel, Recording, simulate_blocks
 from wavebatch.tools.simulate.render import paint_echoes
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from wavebatch.cli import main
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
-from wavebatch.tools.bench.chains import list_methods
+from wavebatch.tools.bench.command import list_methods
 
 
 def test_every_method_has_a_chain():

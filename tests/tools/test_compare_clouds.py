@@ -13,7 +13,7 @@ from wavebatch.files.disk import buckets
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.tools.compare import pairing
 from wavebatch.tools.compare.clouds import compare_clouds, compare_truth
-from wavebatch.tools.compare.differences import SPEED, Differences, measure_lag
+from wavebatch.tools.compare.pairing import SPEED, Differences, measure_lag
 from wavebatch.tools.simulate import StripOptions, TruthReader, simulate_strip
 
 

@@ -9,7 +9,7 @@ from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.decompose.rebuild import fitted_pulse, rebuild_waveforms
-from wavebatch.tools.compare.goodness import FitQuality, measure_fit
+from wavebatch.tools.compare.chains import FitQuality, measure_fit
 
 FINE = 100.0
 LEARNED = ((1.0, 0.0, 2.0), (0.12, 7.0, 2.0))

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from wavebatch.cli import main
-from wavebatch.tools.compare.table import HEAD, format_comparison
+from wavebatch.tools.sheets.compare import HEAD, format_comparison
 
 
 def run(*words):

@@ -15,7 +15,7 @@ from writer_tools import data_file, write_source
 import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.files.las.header import Vlr
-from wavebatch.tools.inspect.file_facts import _describe_time, describe_file
+from wavebatch.tools.file_facts import _describe_time, describe_file
 
 
 @pytest.mark.parametrize("point_format", [0, 1, 3, 6, 8])
@@ -55,7 +55,7 @@ def test_a_cloud_shows_how_it_was_made(tiny_strip, tmp_path):
     assert facts["counts"]["echoes"] == counts["echoes"] and facts["counts"]["added"] == counts["added_echoes"]
     assert facts["counts"]["passed_through"] == counts["points_out"] - counts["echoes"]
     shown = CliRunner().invoke(main, ["info", str(tmp_path / "tiny.laz")]).stdout
-    for line in ("command        wavebatch run tiny.las", "chain          noise.pooled", "range as EchoRange"):
+    for line in ("command           wavebatch run tiny.las", "chain             noise.pooled", "range as EchoRange"):
         assert line in shown
     document = json.loads(CliRunner().invoke(main, ["info", "--json", str(tmp_path / "tiny.laz")]).stdout)
     assert document == {"schema": "wavebatch.info/1", **facts}

@@ -16,9 +16,9 @@ from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.compare.clouds import compare_clouds
-from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, return_light, simulate_returns
+from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, returns, simulate_returns
 from wavebatch.tools.simulate.from_returns import synthesize_strip
-from wavebatch.tools.simulate.return_light import Radar, SynthesisOptions
+from wavebatch.tools.simulate.returns import Radar, SynthesisOptions
 
 
 @pytest.fixture(scope="module")
@@ -243,14 +243,14 @@ def test_each_return_sends_back_its_share_of_the_light(cloud, tmp_path):
 def test_shares_of_a_pulse_are_at_most_one_and_gaps_take_the_rest():
     starts = np.array([0, 2, 5, 7, 8, 10])
     share = np.array([0.3, np.nan, 0.2, np.nan, np.nan, 0.9, 0.6, np.nan, 1.0, np.nan, 1.00005])
-    filled, over = return_light.fill_shares(share, starts)
+    filled, over = returns.fill_shares(share, starts)
     assert filled == pytest.approx([0.3, 0.7, 0.2, 0.4, 0.4, 0.6, 0.4, 1.0, 1.0, 0.0, 1.0])
     assert over == 1  # float32 dust above 1 is none
     rng = np.random.default_rng(0)
     count = rng.integers(1, 6, 500)
     starts = np.cumsum(count) - count
     share = np.where(rng.random(count.sum()) < 0.3, np.nan, rng.random(count.sum()))
-    filled, _ = return_light.fill_shares(share, starts)
+    filled, _ = returns.fill_shares(share, starts)
     assert filled.min() >= 0 and np.add.reduceat(filled, starts).max() < 1 + 1e-12
     for start, n in zip(starts, count, strict=True):
         part = share[start : start + n]
@@ -384,7 +384,7 @@ def test_equal_shares_count_the_returns_that_a_thinned_cloud_lacks(cloud, tmp_pa
     assert whole.light_used == pytest.approx(1) and first.light_used == pytest.approx(np.mean(1 / number))
     assert first.scattered == np.count_nonzero(number > 1)
     starts = np.array([0, 2, 3])
-    assert return_light.share_equally(np.array([2, 2, 4, 0, 0]), starts) == pytest.approx([0.5, 0.5, 0.25, 0.5, 0.5])
+    assert returns.share_equally(np.array([2, 2, 4, 0, 0]), starts) == pytest.approx([0.5, 0.5, 0.25, 0.5, 0.5])
     words = ("-o", tmp_path / "x.las", "--intensity", "reflectance", "--sensor-height", 1200, "--overwrite")
     said = run(tmp_path / "first.las", *words, "--shares", "equal")
     assert "equal shares use number_of_returns, including missing returns" in said.stderr

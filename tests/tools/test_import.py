@@ -105,6 +105,9 @@ def test_energies_and_pulse_are_those_that_were_sent(tmp_path, rng, fwhm):
     saved = load_survey(tmp_path / "o.system.toml").survey
     assert saved.figures.outgoing_fwhm_ns == pytest.approx(fwhm, rel=0.02)
     assert saved.system.sigma_ref * 2.35482 == pytest.approx(fwhm, rel=0.02)
+    shown = CliRunner().invoke(main, ["survey", str(tmp_path / "o.las")]).output
+    width = saved.figures.outgoing_fwhm_ns
+    assert f"outgoing pulses   full width at half maximum {width:.3f} ns, as import found it" in shown
 
 
 def test_segments_of_a_pulse_are_returns_in_order(tmp_path):

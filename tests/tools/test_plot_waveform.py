@@ -25,15 +25,12 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.surveying import survey_block
-from wavebatch.tools.bench.plot import _draw_panel
-from wavebatch.tools.compare.chains import ChainRun
-from wavebatch.tools.compare.goodness import measure_fit
-from wavebatch.tools.html.strip_views import measure_view_residuals
-from wavebatch.tools.plots.draw_sheet import draw_waveform_sheet
-from wavebatch.tools.plots.draw_waveform import _draw_panels, draw_waveform_panels
-from wavebatch.tools.plots.echo_table import list_echoes
+from wavebatch.tools.bench.report import _draw_panel
+from wavebatch.tools.compare.chains import ChainRun, measure_fit
+from wavebatch.tools.plots.charts import measure_view_residuals
+from wavebatch.tools.plots.draw_waveform import _draw_panels, draw_waveform_panels, draw_waveform_sheet
 from wavebatch.tools.plots.packets import MOST, Place, Wanted, find_places
-from wavebatch.tools.plots.waveform import add_ranges, build_views, read_views
+from wavebatch.tools.plots.waveform import add_ranges, build_views, list_echoes, read_views
 
 KAPPA = 0.15
 

@@ -15,7 +15,7 @@ from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.tools.return_stats import dead_zones, returns
+from wavebatch.tools.return_stats import returns
 from wavebatch.tools.return_stats.returns import count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, simulate_returns
 
@@ -168,7 +168,8 @@ def test_text_has_every_figure(tmp_path):
     path = write_cloud(tmp_path / "c.las", **SMALL, flags=[EchoFlag.WEAK] * 7)
     result = CliRunner().invoke(stats, [str(path)])
     assert result.exit_code == 0
-    for text in ("pulses         4", "57.14%", "1-2", "1.900", "0.800", "WEAK", "warning        incomplete: 1 of 4"):
+    wanted = ("pulses            4", "57.14%", "1-2", "1.900", "0.800", "WEAK", "warning           incomplete: 1 of 4")
+    for text in wanted:
         assert text in result.stdout
     other = write_cloud(tmp_path / "d.las", **SMALL)
     assert "total" in CliRunner().invoke(stats, [str(path), str(other)]).stdout
@@ -205,8 +206,8 @@ def test_error_of_a_dead_zone_is_the_size_of_its_miss(rng, pairs, mean):
     misses = []
     for _ in range(300):
         distance = np.minimum(0.7 + rng.exponential(mean, pairs), 99.0)
-        bins = np.bincount((100 * distance).astype(int), minlength=dead_zones.BINS)
-        found = dead_zones.find_dead_zone(bins[: dead_zones.BINS])
+        bins = np.bincount((100 * distance).astype(int), minlength=returns.BINS)
+        found = returns.find_dead_zone(bins[: returns.BINS])
         misses.append((found.size - 0.7) / found.error)
     assert 0.4 < np.sqrt(np.mean(np.square(misses))) < 1.6
     assert np.min(misses) > -1.01

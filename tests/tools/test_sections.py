@@ -18,10 +18,9 @@ from wavebatch.tools.plots import sections
 from wavebatch.tools.plots.sections import cut_section, measure_profile
 from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.slices.cube import align_pulses, build_cube, cut_cube
-from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
 from wavebatch.tools.slices.output import SegmentWriter
 from wavebatch.tools.slices.read_segments import profile_segments
-from wavebatch.tools.slices.segments import Segment
+from wavebatch.tools.slices.segments import ScanLine, Segment, read_scan_lines
 from wavebatch.tools.voxels.grid import COLUMNS
 
 LINE = (500_005.0, 5_400_003.0, 500_030.0, 5_400_020.0)

@@ -19,9 +19,8 @@ from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import EAST, GROUND, NORTH, FlightLine
-from wavebatch.tools.slices import lines, output
-from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
-from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
+from wavebatch.tools.slices import output, segments
+from wavebatch.tools.slices.segments import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
 
 FLIGHT = FlightLine(pulse_rate=50_000, half_angle=12.0, look_ahead=0.0)
 PULSES = 4000
@@ -67,10 +66,10 @@ def test_lines_do_not_depend_on_units_and_samples_are_those_of_the_strip(strip, 
 
 
 def test_long_lines_are_cut_and_short_ones_left_out(strip, monkeypatch):
-    monkeypatch.setattr(lines, "MOST_PULSES", 300)
+    monkeypatch.setattr(segments, "MOST_PULSES", 300)
     found = read_all(strip)
     assert max(len(line) for line in found) == 300
-    monkeypatch.setattr(lines, "LEAST_PULSES", 250)
+    monkeypatch.setattr(segments, "LEAST_PULSES", 250)
     assert min(len(line) for line in read_all(strip)) >= 250
 
 
@@ -302,7 +301,7 @@ def test_the_level_is_that_without_signal_where_signal_fills_most_of_the_wavefor
     samples = np.full((3, 100), 12, np.uint8)
     samples[:, 100 - round(100 * filled) :] = 60
     block = WaveformBlock.from_samples(samples, bits=8, spacing=1.0)
-    values = lines._shape(block).values.reshape(3, 100)
+    values = segments._shape(block).values.reshape(3, 100)
     assert values[:, 0].tolist() == [0.0] * 3 and values[:, -1].tolist() == [48.0] * 3
 
 
@@ -349,7 +348,7 @@ def test_fill_between_recordings_is_no_sample():
     missing = np.zeros((5, 60), bool)
     missing[:, 30:40] = True
     block = replace(WaveformBlock.from_samples(samples, bits=8, spacing=2.0), missing=missing)
-    line = lines._build_line(0, lines._shape(block))
+    line = segments._build_line(0, segments._shape(block))
     assert len(line.value) == 5 * 50 and sorted(set(line.time)) == [2.0 * k for k in range(60) if not 30 <= k < 40]
 
 

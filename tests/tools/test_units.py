@@ -1,6 +1,5 @@
 """Distances are metres whatever the unit of the coordinates is: state planes are in feet."""
 
-import base64
 import json
 import re
 import shutil
@@ -17,7 +16,7 @@ from wavebatch.files.las.crs import metres_per_unit, parse_wkt
 from wavebatch.files.las.geotiff_wkt import build_utm
 from wavebatch.files.las.header import build_wkt
 from wavebatch.files.strip.packet_vectors import DirectionTally, decide_direction
-from wavebatch.tools.html.cloud_pictures import picture_cloud
+from wavebatch.tools.plots.charts import picture_cloud
 from wavebatch.tools.plots.sections import cut_section, measure_profile
 from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.simulate import simulate_strip
@@ -120,9 +119,9 @@ def test_a_foot_in_the_crs_of_a_strip_in_metres_does_not_stop_it(tmp_path):
 
 @pytest.mark.parametrize(("unit", "name"), [("m", "m"), ("ft", "us-ft"), ("deg", "deg")])
 def test_maps_of_report_pages_name_the_unit(clouds, unit, name):
-    maps = picture_cloud(clouds[unit], ["amplitude"])[1]
-    drawn = [base64.b64decode(re.search(r'base64,([^"]+)', one)[1]).decode() for one in maps]
-    assert len(maps) == 2 and all(re.search(rf"Cells of \S+ {name};", one) for one in maps)
+    maps = list(picture_cloud(clouds[unit], ["amplitude"]))[1].parts
+    drawn = [one.svg for one in maps]
+    assert len(maps) == 2 and all(re.search(rf"Cells of \S+ {name};", one.words) for one in maps)
     assert all(f"east [{name}]" in one for one in drawn) and f"[1/{name}2]" in drawn[0]
 
 
@@ -160,7 +159,7 @@ def test_geocentric_coordinates_have_no_height(clouds, tmp_path):
     add_record(cloud, build_wkt(GEOCENTRIC))
     found = measure_profile([cloud], Selection("z"), "count")
     assert found.upright == "z" and found.label.endswith(" m of z")
-    assert "coordinates    geocentric (ECEF)" in _print("info", cloud).stdout
+    assert "coordinates       geocentric (ECEF)" in _print("info", cloud).stdout
 
 
 def test_vectors_in_the_unit_of_the_coordinates_are_no_oddity():

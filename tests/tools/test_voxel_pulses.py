@@ -74,6 +74,7 @@ def test_split_pulses_are_joined_ones(strips, canopy, tmp_path, ratio):
     assert between[0] == pytest.approx(between[1], rel=0.002) and between[1] > 0.8 * N
 
 
+@pytest.mark.slow
 def test_the_strip_may_be_in_any_order_and_cut_anywhere(strips, canopy, tmp_path, monkeypatch):
     *pulses, _ = canopy
     expected = voxelize(strips[1], tmp_path, profiles=tmp_path / "a.npz")[1]
@@ -211,6 +212,7 @@ def test_packets_of_nothing_are_rays_of_nothing():
     assert len(rays.table) == len(rays.samples) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("clumps", "density"), [(None, 0.25), (0.35, 0.3), (0.35, 0.7)])
 def test_errors_of_shares_cover_the_truth(tmp_path, clumps, density):
     """Leaves spread evenly, and in clumps of .35 m that cover a part of each voxel: two of three within an error."""

@@ -26,8 +26,7 @@ from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.blocks import simulate_block
 from wavebatch.tools.simulate.geometry import FlightLine
-from wavebatch.tools.simulate.pulses import find_pulse
-from wavebatch.tools.simulate.render import Recording
+from wavebatch.tools.simulate.render import Recording, find_pulse
 from wavebatch.tools.simulate.strip import WKT, StripOptions
 from wavebatch.tools.voxels.ceiling import Ceiling
 from wavebatch.tools.voxels.floor import Floor
@@ -657,7 +656,7 @@ def test_memory_does_not_grow_with_the_strip(tmp_path):
         simulate_strip("urban", strip, pulses=pulses, seed=1)
         script = f"""
             from pathlib import Path
-            from wavebatch.tools.bench.worker import peak_memory
+            from wavebatch.tools.bench.speed import peak_memory
             from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
             voxelize_strip(Path({str(strip)!r}), Path({str(strip)!r}).with_suffix(".npz"), VoxelOptions(0.25))
             print(peak_memory())

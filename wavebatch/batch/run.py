@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
@@ -22,7 +22,6 @@ from wavebatch.batch.options import RunOptions
 from wavebatch.batch.preflight import check_outputs, flight_path, list_read_files, load_flight, with_flight
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import StripTask
-from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import WorkerDied, Workers, refuse_import
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
@@ -33,6 +32,9 @@ from wavebatch.kernels.library import load as load_kernels
 from wavebatch.surveying import Survey
 from wavebatch.surveying.flight import read_samples, survey_flight, surveys_agree
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
+
+if TYPE_CHECKING:
+    from wavebatch.batch.workers.dask_cluster import Cluster
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +142,8 @@ def run_batch(
     workers: Workers | Cluster = Workers(options.jobs)
     if options.scheduler is not None:
         files = sorted({file for job in jobs for file in job.files})
+        from wavebatch.batch.workers.dask_cluster import Cluster  # 10 ms that other runs do not need
+
         workers = Cluster(options.scheduler, options.folder, files)
     with protecting(list_read_files(jobs)), workers:
         with reporting(options.folder):

@@ -13,16 +13,14 @@ from collections import deque
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.job import StripJob
-from wavebatch.batch.neighbour_pass import SecondPass, begin_unit
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.unit import Prepared, prepare_strip, process_unit
-from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError, StageError
 from wavebatch.core.process import Seconds
@@ -31,6 +29,10 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.text_file import draft_text
+
+if TYPE_CHECKING:
+    from wavebatch.batch.neighbour_pass import SecondPass
+    from wavebatch.batch.workers.dask_cluster import Cluster
 
 T = TypeVar("T")
 
@@ -137,8 +139,10 @@ class StripTask:
             function, arguments = _given(self._second).next_call(self._blob)
             self.pending.append(workers.submit(function, *arguments))
             return
-        arguments = self._blob, self._submitted, self._options.block_size
-        self.pending.append(workers.submit(process_unit if self._second is None else begin_unit, *arguments))
+        function = process_unit
+        if self._second is not None:
+            from wavebatch.batch.neighbour_pass import begin_unit as function
+        self.pending.append(workers.submit(function, self._blob, self._submitted, self._options.block_size))
         self._submitted += 1
 
     def take(self, workers: Workers | Cluster) -> None:
@@ -174,6 +178,8 @@ class StripTask:
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite, threads=threads)
         if prepared.second_step is not None:
+            from wavebatch.batch.neighbour_pass import SecondPass  # 20 ms that other runs do not need
+
             self._second = SecondPass(prepared.second_step, prepared.layout.source.header.scales, cloud)
 
     def finish(self) -> RunReport:

@@ -22,7 +22,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "survey": ("wavebatch.cli.survey:survey", "Measure noise, pulse and scene of a strip; choose its chain."),
     "import": ("wavebatch.cli.archives.import_files:import_", "Make strips of PulseWaves files."),
     "export": ("wavebatch.cli.archives.export:export", "Write strips for other programs: repaired LAS, or arrays."),
-    "stages": ("wavebatch.cli.stages:stages", "List the algorithms, or explain one with its parameters."),
+    "stages": ("wavebatch.cli.inspect:stages", "List the algorithms, or explain one with its parameters."),
     "simulate": ("wavebatch.cli.simulate:simulate", "Simulate a strip with known echoes."),
     "compare": ("wavebatch.cli.compare:compare", "Compare clouds or chains with each other, returns or truth."),
     "stats": ("wavebatch.cli.stats:stats", "Count return numbers, separations and flags of clouds."),
@@ -30,7 +30,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "slice": ("wavebatch.cli.slice:slice_", "Find straight surface lines in the scan lines of a strip."),
     "voxelize": ("wavebatch.cli.voxelize:voxelize", "Deconvolve waveforms into the voxels of a 3D grid."),
     "plot": ("wavebatch.cli.plot:plot", "Draw waveforms with their fit, histograms and maps."),
-    "grid": ("wavebatch.cli.gis.grid:grid", "Write columns of clouds as a GeoTIFF."),
+    "grid": ("wavebatch.cli.grid:grid", "Write columns of clouds as a GeoTIFF."),
     "calibrate": ("wavebatch.cli.calibrate:calibrate", "Find the calibration constant from known reflectances."),
     "bench": ("wavebatch.cli.bench:bench", "Measure error and run time of chains on simulated truth."),
 }
@@ -65,7 +65,7 @@ class LazyGroup(NearestGroup):
 
 def _print_version(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
     if wanted and not context.resilient_parsing:
-        from wavebatch.cli.program.about import describe_version
+        from wavebatch.cli.program.command import describe_version
 
         click.echo(describe_version())
         context.exit()
@@ -74,7 +74,7 @@ def _print_version(context: click.Context, parameter: click.Parameter, wanted: b
 def _write_man_pages(context: click.Context, parameter: click.Parameter, folder: Path | None) -> None:
     if folder is not None and not context.resilient_parsing:
         from wavebatch.cli.messages import report_errors, talk
-        from wavebatch.cli.program.about import write_man_pages
+        from wavebatch.cli.program.command import write_man_pages
 
         pages = report_errors()(write_man_pages)(main, folder)
         talk(f"{folder}: {len(pages)} manual pages written")

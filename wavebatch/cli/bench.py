@@ -13,7 +13,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import print_result, talk
-from wavebatch.cli.program.completion import complete_scenes
+from wavebatch.cli.program.command import complete_scenes
 from wavebatch.tools.bench.command import BenchOptions, run_bench
 
 
@@ -42,7 +42,7 @@ def bench(
 
     Exit code: 0 done, 1 the strip cannot be read or the folder cannot be written, 2 wrong usage.
     """
-    from wavebatch.tools.bench.report import format_document, write_outputs
+    from wavebatch.tools.bench.report import bench_sheet, format_document, write_bench_page, write_outputs
 
     shared.check_html(html_file)
     strips = [path for path in files if path.suffix.lower() != ".toml"]
@@ -59,12 +59,9 @@ def bench(
         tolerance_cm=100.0 * tolerance if tolerance else None,
     )
     document = run_bench(settings, say)
-    text = format_document(document)
-    for line in write_outputs(document, text, output) if output else []:
+    for line in write_outputs(document, format_document(document), output) if output else []:
         talk(line)
     if html_file is not None:
-        from wavebatch.tools.html.bench_page import write_bench_page
-
-        write_bench_page(html_file, document, text)
+        write_bench_page(html_file, document)
         talk(f"{html_file}: written")
-    print_result(options["as_json"], document, [text])
+    print_result(options["as_json"], document, bench_sheet(document))

@@ -5,7 +5,6 @@ Only reads options and prints; the work is in `wavebatch.surveying.calibrating.t
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,15 +13,12 @@ import click
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, format_json, talk, tell
-from wavebatch.core.units import format_relative
+from wavebatch.cli.messages import answer, format_json, talk, tell
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
-    from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
-    from wavebatch.surveying.calibration import ChannelConstant, StripConstant, TargetResult
 
 
 @click.command()
@@ -75,6 +71,8 @@ def calibrate(
     from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
     from wavebatch.surveying.calibrating.calibration_file import format_calibration
     from wavebatch.surveying.calibrating.target_file import load_targets
+    from wavebatch.tools.sheets.calibrate import calibration_sheet, write_calibrate_page
+    from wavebatch.tools.sheets.sheet import list_lines
 
     if (targets is None) == (options["column"] is None):
         raise click.UsageError("give --targets FILE, or --from-column NAME, and not both")
@@ -92,25 +90,13 @@ def calibrate(
     if options["report"] is not None:
         write_text(options["report"], format_json(_list_report(flight)) + "\n", overwrite=overwrite)
     if html_file is not None:
-        from wavebatch.tools.html.calibrate_page import write_calibrate_page
-
         write_calibrate_page(html_file, flight)
     answer(_list_report(flight))
     for note in found.notes:
         talk(f"warning: {note}")
-    for line in [*map(_describe_target, found.targets), *map(_describe_channel, found.channels)]:
+    for line in list_lines(calibration_sheet(flight)):
         tell(line)
-    for line in [*map(_describe_strip, found.strips), *map(_describe_pair, flight.pairs)]:
-        tell(line)
-    if found.swath:
-        most, square, fourth, odd = found.swath
-        left, right = (100 * math.expm1(-square - fourth - side * odd) for side in (-1, 1))
-        sides = f"{left:+.1f} % light to the left and {right:+.1f} % to the right"
-        tell(f"scan angle: {sides}, at {math.degrees(most):.1f} deg against straight down")
-    numbers = f"constant {format_relative(found.constant, found.relative_error)} +- {100 * found.relative_error:.1f} %"
-    if len(found.channels) > 1:
-        numbers = f"constants of {len(found.channels)} channels"
-    tell(f"{output}: {numbers}; {found.conditions}")
+    tell(f"{output}: written")
 
 
 def _read_options(options: dict[str, Any]) -> CalibrationOptions:
@@ -134,41 +120,3 @@ def _list_report(flight: FlightCalibration) -> dict[str, Any]:
         "cell_m": flight.cell,
         "warnings": list(found.notes),
     }
-
-
-def _describe_strip(row: StripConstant) -> str:
-    constant = format_relative(row.constant, row.relative_error)
-    return (
-        f"{row.strip}, digitizer {row.digitizer}, scanner channel {row.scanner}: constant {constant} +- "
-        f"{100 * row.relative_error:.1f} %, drift {100 * row.drift:+.2f} +- {100 * row.drift_error:.2f} %, "
-        f"{count(row.ties, 'tie cell')}"
-    )
-
-
-def _describe_pair(pair: PairOverlap) -> str:
-    return (
-        f"{pair.a} over {pair.b}: {count(pair.cells, 'cell')}, light {100 * (pair.ratio - 1):+.2f} %, calibrated "
-        f"{100 * (pair.after - 1):+.2f} %, spread {100 * pair.spread:.2f} %, height {pair.height:+.3f} m"
-    )
-
-
-def _describe_target(target: TargetResult) -> str:
-    if target.constant is None:
-        return f"{target.name}: reflectance {target.reflectance:g}, refused: {target.refused}"
-    line = (
-        f"{target.label}: reflectance {target.reflectance:.4g}, {count(target.echoes, 'echo')}, constant "
-        f"{target.constant:.4g}, spread {100 * target.spread:.1f} %"
-    )
-    if target.incidence_deg is None:
-        return line
-    return f"{line}, incidence {target.incidence_deg:.1f} +- {target.incidence_error_deg:.1f} deg"
-
-
-def _describe_channel(channel: ChannelConstant) -> str:
-    name = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
-    value = format_relative(channel.constant, channel.relative_error)
-    constant = f"constant {value} +- {100 * channel.relative_error:.1f} %"
-    if not channel.echoes:
-        return f"{name}: no target, by overlap, {constant}"
-    scatter = f"spread {100 * channel.spread:.1f} %, {100 * channel.shot_energy:.1f} % without fit errors"
-    return f"{name}: {count(channel.echoes, 'echo')}, {constant}, {scatter}"

@@ -1,6 +1,6 @@
 """`wavebatch compare`: two clouds, two chains, or one of them with the vendor's returns or the truth.
 
-Reads options and checks thresholds; the figures come from `wavebatch.tools.compare`, the tables from `compare_tables`.
+Reads options and checks thresholds; figures come from `wavebatch.tools.compare`, their sheet from `tools.sheets`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.compare_tables import list_lines, list_match
 from wavebatch.cli.messages import print_result, talk, tell
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
+from wavebatch.tools.sheets.compare import comparison_sheet, format_comparison, write_compare_page
 
 if TYPE_CHECKING:
     from wavebatch.tools.compare.chains import Matchup
@@ -81,11 +81,8 @@ def compare(
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
     if output is not None:
-        from wavebatch.tools.compare.table import format_comparison
-
         write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
-    lines = [*list_lines(between), *(list_match(result) if strip else [])]
-    print_result(as_json, result.to_json(), lines, "chains" if strip else "")
+    print_result(as_json, result.to_json(), comparison_sheet(result), "chains" if strip else "")
     fewer = min(between.echoes_a, between.echoes_b)
     if fewer and between.matched <= fewer * (FEW_COMMON if options["within"] is None else 0.0):
         common = f"{between.matched} of {fewer} echoes" if between.matched else "no echo"
@@ -94,20 +91,13 @@ def compare(
             "Positions of two formats may differ: try a larger --within"
         )
     broken = _check_thresholds(between, options)
-    _write_page(html_file, result, broken)
+    if html_file is not None:
+        write_compare_page(html_file, result, broken)
+        tell(f"{html_file}: written")
     for line in broken:
         talk(line)
     if broken:
         sys.exit(EXIT_VIOLATED)
-
-
-def _write_page(target: Path | None, result: Any, broken: list[str]) -> None:
-    """The page of --html."""
-    if target is not None:
-        from wavebatch.tools.html.compare_page import write_compare_page
-
-        write_compare_page(target, result, broken)
-        tell(f"{target}: written")
 
 
 def _tolerance(options: dict) -> dict[str, float]:
@@ -140,7 +130,7 @@ def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: di
     from wavebatch.core.suggest import nearest
     from wavebatch.surveying.choose_chain import COSTS
     from wavebatch.surveying.system_file import load_survey
-    from wavebatch.tools.api.chain import AUTO
+    from wavebatch.tools.api.strip import AUTO
     from wavebatch.tools.compare.chains import find_contender, match_sides
 
     if truth is not None:

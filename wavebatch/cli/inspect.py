@@ -1,6 +1,6 @@
-"""`wavebatch info` shows what a strip holds, `wavebatch check` what is wrong with strips and chain files.
+"""`wavebatch info` shows what strips hold, `check` what is wrong with them and with chains, `stages` the algorithms.
 
-Only prints; the facts come from `tools.inspect` and `surveying.inspect_strip`.
+Only prints; the facts come from `tools.file_facts` and `surveying.inspect_strip`.
 """
 
 from __future__ import annotations
@@ -9,17 +9,29 @@ import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, print_text, printable, talk
-from wavebatch.cli.program.completion import complete_files
-from wavebatch.tools.inspect.file_facts import describe_file
+from wavebatch.cli.messages import answer, print_result, print_sheet, print_text, printable, talk
+from wavebatch.cli.options import common_options
+from wavebatch.cli.program.command import complete_files, complete_stages
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
+from wavebatch.core.units import count
+from wavebatch.tools.file_facts import describe_file
+from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet
+
+if TYPE_CHECKING:
+    from wavebatch.stages.chain import Parameter, Stage
+
 
 _SHOWN = 20
 """Classes or sources of points that are printed; --json has more."""
+
+_LONG = 100
+"""Characters of a CRS that are printed."""
 
 EXIT_PROBLEMS, EXIT_UNREADABLE = 1, 1
 """`check` found problems; `info` could not read a file."""
@@ -49,8 +61,8 @@ def info(
         if verbose and facts.get("packets", {}).get("count") and not facts["problems"]:
             facts["pulse"] = _describe_pulse(path, **reading)
         if not as_json:
-            lines = ["", *_list_lines(facts)][path == paths[0] :]
-            print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
+            sheet = _sheet(facts)
+            print_sheet(sheet if path == paths[0] else Sheet("info", [sheet]))  # an empty line between two
         if facts["problems"] and not facts.get("points_with_waveform"):  # points are shown, packets cannot be
             nonlocal lost
             lost += 1
@@ -117,108 +129,177 @@ def check(
     sys.exit(0 if clean else EXIT_PROBLEMS)
 
 
-def _list_lines(facts: dict[str, Any]) -> Iterator[str]:
+def _sheet(facts: dict[str, Any]) -> Sheet:
+    return Sheet(facts["file"], [*_list_header(facts), *_list_points(facts), *_list_packets(facts), *_list_rest(facts)])
+
+
+def _list_header(facts: dict[str, Any]) -> Iterator[Part]:
     kind = "LAZ" if facts["compressed"] else "LAS"
-    yield f"file           {facts['file']} ({facts['bytes']} bytes)"
-    yield f"format         {kind} {facts['las_version']}, point format {facts['point_format']}"
+    yield Fact("file", f"{facts['file']} ({facts['bytes']} bytes)")
+    yield Fact("format", f"{kind} {facts['las_version']}, point format {facts['point_format']}")
     made = [facts["system_identifier"], facts["generating_software"], facts["created"]]
-    yield f"made by        {', '.join(part for part in made if part) or 'not said'}"
+    yield Fact("made by", ", ".join(part for part in made if part) or "not said")
     for run in facts["provenance"]:
-        yield from _provenance_lines(run)
-    yield f"CRS            {_shorten(facts['crs'] or 'none')}"
-    yield f"coordinates    {facts['coordinates']}"
-    yield f"points         {facts['points']}"
+        yield Fact("command", f"{run['command']}  (wavebatch {run['version']})")
+        stages = [line.split('"')[1] for line in str(run["chain"] or "").splitlines() if line.startswith("stage =")]
+        if stages:
+            yield Fact("chain", f"{', '.join(stages)}; chosen by {run['chosen_by']}")
+        columns = [name if name == stored else f"{name} as {stored}" for name, stored in run["columns"].items()]
+        if columns:
+            yield Fact("columns", ", ".join(columns))
+    crs = " ".join((facts["crs"] or "none").split())
+    yield Fact("CRS", crs if len(crs) <= _LONG else crs[: _LONG - 3] + "...")
+    yield Fact("coordinates", facts["coordinates"])
+
+
+def _list_points(facts: dict[str, Any]) -> Iterator[Part]:
+    """Number, flags, extent, times, returns and classes of the points."""
+    yield Fact("points", facts["points"])
     if "counts" in facts:
         counts = facts["counts"]
-        yield f"echoes         {counts['echoes']}, added {counts['added']}, passed through {counts['passed_through']}"
-        flags = ", ".join(f"{name} {number}" for name, number in counts["flags"].items())
-        yield f"flags          {flags or 'none'}"
-    yield from _point_lines(facts)
-    if "packets" in facts:
-        yield from _packet_lines(facts)
-    for one in facts["extra_bytes"]:
-        scale = "" if one["scale"] is None else f", scale {one['scale']:g}"
-        empty = "" if one["no_data"] is None else f", no-data {' '.join(one['no_data'])}"
-        yield f"extra bytes    {one['name']} ({one['type']}{scale}{empty}) {one['description']}".rstrip()
-    yield from _record_lines(facts["records"])
-    yield from (f"note           {line}" for line in facts["notes"])
-    yield from (f"warning        {line}" for line in facts["warnings"])
-    yield from (f"problem        {line}" for line in facts["problems"])
-
-
-def _provenance_lines(run: dict[str, Any]) -> Iterator[str]:
-    yield f"command        {run['command']}  (wavebatch {run['version']})"
-    stages = [line.split('"')[1] for line in str(run["chain"] or "").splitlines() if line.startswith("stage =")]
-    if stages:
-        yield f"chain          {', '.join(stages)}; chosen by {run['chosen_by']}"
-    columns = [name if name == stored else f"{name} as {stored}" for name, stored in run["columns"].items()]
-    if columns:
-        yield f"columns        {', '.join(columns)}"
-
-
-def _point_lines(facts: dict[str, Any]) -> Iterator[str]:
-    """Extent, times, returns and classes of the points."""
+        words = f"{counts['echoes']}, added {counts['added']}, passed through {counts['passed_through']}"
+        yield Fact("echoes", words)
+        yield Fact("flags", ", ".join(f"{name} {number}" for name, number in counts["flags"].items()) or "none")
     bounds, time = facts.get("bounds"), facts.get("gps_time")
-    for axis, name in enumerate("xyz"):
-        if bounds:
-            step, given = facts["scales"][axis], facts["header_bounds"]
-            low, high = bounds["least"][axis], bounds["largest"][axis]
-            ends = [math.nan if end is None else end for end in (given["least"][axis], given["largest"][axis])]
-            right = max(abs(ends[0] - low), abs(ends[1] - high)) <= 1.5 * abs(step)  # False for NaN
-            said = "" if right else f"; the header says {ends[0]:.12g} to {ends[1]:.12g}"
-            yield f"{name}              {low:.12g} to {high:.12g}, steps of {step:g}{said}"
+    for axis, name in enumerate("xyz") if bounds else ():
+        step, given = facts["scales"][axis], facts["header_bounds"]
+        low, high = bounds["least"][axis], bounds["largest"][axis]
+        ends = [math.nan if end is None else end for end in (given["least"][axis], given["largest"][axis])]
+        right = max(abs(ends[0] - low), abs(ends[1] - high)) <= 1.5 * abs(step)  # False for NaN
+        said = "" if right else f"; the header says {ends[0]:.12g} to {ends[1]:.12g}"
+        yield Fact(name, f"{low:.12g} to {high:.12g}, steps of {step:g}{said}")
     if time:
         dates = f", {' to '.join(time['dates_gps'])} GPS" if "dates_gps" in time else ""
-        yield f"GPS time       {time['least']:.16g} to {time['largest']:.16g} s, {time['kind']}{dates}"
+        yield Fact("GPS time", f"{time['least']:.16g} to {time['largest']:.16g} s, {time['kind']}{dates}")
     for key, name in (("returns", "return number"), ("numbers_of_returns", "of returns"), ("classes", "classes"),
                       ("point_sources", "sources")):  # fmt: skip
         if facts.get(key):
             pairs = [f"{k}: {n}" for k, n in facts[key].items()]
             more = f" and {len(pairs) - _SHOWN} more" if len(pairs) > _SHOWN else ""
-            yield f"{name:15}{', '.join(pairs[:_SHOWN])}{more}"
+            yield Fact(name, f"{', '.join(pairs[:_SHOWN])}{more}")
     if facts.get("scan_angle_deg"):
-        yield "scan angle     {:g} to {:g} degrees".format(*facts["scan_angle_deg"])
-        yield "intensity      {:g} to {:g}".format(*facts["intensity"])
+        yield Fact("scan angle", "{:g} to {:g} degrees".format(*facts["scan_angle_deg"]))
+        yield Fact("intensity", "{:g} to {:g}".format(*facts["intensity"]))
 
 
-def _record_lines(records: list[dict[str, Any]]) -> Iterator[str]:
-    """A line per VLR; the descriptors of packets have a line each."""
-    for one in records:
-        if not (one["user"].startswith("LAS") and 100 <= one["id"] < 356):
-            kind = "EVLR" if one["extended"] else "VLR "
-            yield f"{kind}           {one['user']} {one['id']}: {one['bytes']} bytes {one['description']}".rstrip()
-
-
-def _packet_lines(facts: dict[str, Any]) -> Iterator[str]:
+def _list_packets(facts: dict[str, Any]) -> Iterator[Part]:
+    if "packets" not in facts:
+        return
     packets, samples, vectors = facts["packets"], facts["samples"], facts["vectors"]
-    share = facts["share_with_waveform"]
-    ratio = vectors["length_over_half_c"]
-    yield f"with waveform  {facts['points_with_waveform']}" + ("" if share is None else f" ({share:.1%})")
-    yield f"without        {facts['points_without_waveform']}, broken {facts['points_broken']}"
-    yield f"packets        {packets['count']} in {packets['file'] or 'no file'} ({packets['bytes']} bytes)"
+    share, ratio = facts["share_with_waveform"], vectors["length_over_half_c"]
+    yield Fact("with waveform", f"{facts['points_with_waveform']}" + ("" if share is None else f" ({share:.1%})"))
+    yield Fact("without", f"{facts['points_without_waveform']}, broken {facts['points_broken']}")
+    yield Fact("packets", f"{packets['count']} in {packets['file'] or 'no file'} ({packets['bytes']} bytes)")
     for one in packets["descriptors"]:
-        samples_text = f"{one['samples']} samples of {one['bits']} bits, {one['spacing_ns']:g} ns apart"
-        yield f"descriptor {one['index']:<3} {samples_text}; {count(one['points'], 'point')}"
+        words = f"{one['samples']} samples of {one['bits']} bits, {one['spacing_ns']:g} ns apart"
+        yield Fact(f"descriptor {one['index']}", f"{words}; {count(one['points'], 'point')}")
     if packets["descriptors_unused"]:
-        yield f"descriptors    {packets['descriptors_unused']} more, which no point uses"
+        yield Fact("descriptors", f"{packets['descriptors_unused']} more, which no point uses")
     if samples["waveforms_read"]:
         lengths = ", ".join(map(str, samples["lengths"][:8])) + (" ..." if len(samples["lengths"]) > 8 else "")
         read, limited = (count(samples[name], "waveform") for name in ("waveforms_read", "waveforms_at_limit"))
         values = f"{samples['least']} to {samples['largest']}"
-        yield f"samples        {values} in {read} of {lengths} samples; {limited} at the limit"
+        yield Fact("samples", f"{values} in {read} of {lengths} samples; {limited} at the limit")
         if samples["waveforms_with_gaps"]:
             gaps = count(samples["waveforms_with_gaps"], "waveform")
-            yield f"gaps           {gaps} with fill between recordings, which is no sample"
-    yield f"vectors        {vectors['direction']} the sensor: {vectors['evidence']}"
+            yield Fact("gaps", f"{gaps} with fill between recordings, which is no sample")
+    yield Fact("vectors", f"{vectors['direction']} the sensor: {vectors['evidence']}")
     if ratio is not None:
-        yield f"vector length  {ratio:.4f} of c/2" + (" (once divided)" if vectors["form"] == "range" else "")
+        yield Fact("vector length", f"{ratio:.4f} of c/2" + (" (once divided)" if vectors["form"] == "range" else ""))
     if "pulse" in facts:
         pulse = facts["pulse"]
         width = f"{pulse['full_width_ns']:.3g} ns at half maximum, noise {pulse['noise_dn']:.3g} DN"
-        yield f"pulse          {width}; {pulse['sentence']}"
+        yield Fact("pulse", f"{width}; {pulse['sentence']}")
 
 
-def _shorten(text: str, limit: int = 100) -> str:
-    """The text on one line, cut if it is longer than the limit."""
-    text = " ".join(text.split())
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+def _list_rest(facts: dict[str, Any]) -> Iterator[Part]:
+    """Extra bytes and records; descriptors of packets have a line already."""
+    for one in facts["extra_bytes"]:
+        scale = "" if one["scale"] is None else f", scale {one['scale']:g}"
+        empty = "" if one["no_data"] is None else f", no-data {' '.join(one['no_data'])}"
+        yield Fact("extra bytes", f"{one['name']} ({one['type']}{scale}{empty}) {one['description']}".rstrip())
+    for one in facts["records"]:
+        if not (one["user"].startswith("LAS") and 100 <= one["id"] < 356):
+            words = f"{one['user']} {one['id']}: {one['bytes']} bytes {one['description']}"
+            yield Fact("EVLR" if one["extended"] else "VLR", words.rstrip())
+    for kind in ("note", "warning", "problem"):
+        yield from (Note(words, kind) for words in facts[f"{kind}s"])
+
+
+@click.command()
+@click.argument("name", required=False, shell_complete=complete_stages)
+@common_options("json")
+def stages(name: str | None, as_json: bool, quiet: bool, debug: bool) -> None:
+    """List the algorithms that a chain can use, those of one kind, or explain the one called NAME.
+
+    Kinds are noise, detect, decompose and attribute.
+
+    The explanation has its parameters with units and ranges, its source, and an example for a chain file.
+
+    Exit code: 0 done, 2 no stage has this name.
+    """
+    from wavebatch.stages.chain import KINDS, STAGES
+    from wavebatch.stages.plugins import load_plugins
+
+    for line in load_plugins() if name not in STAGES else ():
+        talk(f"warning: {line}")
+    kind = name if name in KINDS else None
+    if name is not None and name not in STAGES and kind is None:
+        hint = nearest(name, STAGES)
+        raise ConfigError(f"no stage {name!r}; {hint if '?' in hint else '`wavebatch stages` lists them'}")
+    order = list(KINDS)
+    one = name is not None and kind is None
+    chosen = sorted(STAGES.values(), key=lambda s: (order.index(s.kind), s.name))
+    chosen = [stage for stage in chosen if name in (None, stage.name, stage.kind)]
+    width = max(len(stage.name) for stage in chosen)
+    lines = [_explain(STAGES[name])] if one else [f"{stage.name:<{width}}  {stage.summary}" for stage in chosen]
+    print_result(as_json, [_describe(stage) for stage in chosen], Sheet("stages", list(map(Note, lines))))
+
+
+def _types(parameter: Parameter) -> str:
+    words = {int: "integer", float: "number", bool: "true or false", str: "string", type(None): "nothing"}
+    if parameter.choices:
+        number = ["number"] if float in parameter.types else []
+        return " or ".join([*map(repr, parameter.choices), *number])
+    return " or ".join(words.get(kind, kind.__name__) for kind in parameter.types)
+
+
+def _describe(stage: Stage) -> dict[str, Any]:
+    """The document of a stage for --json."""
+    from wavebatch.stages.chain import Step
+    from wavebatch.stages.chain_file import format_step
+
+    parameters = {
+        name: {"type": _types(one), "default": one.default, "range": one.range, "meaning": one.meaning}
+        for name, one in stage.parameters.items()
+    }
+    return {
+        "name": stage.name,
+        "kind": stage.kind,
+        "text": stage.text,
+        "makes": list(stage.makes),
+        "needs": list(Step(stage).needs),
+        "parameters": parameters,
+        "example": format_step(stage.name, {name: one["default"] for name, one in parameters.items()}),
+    }
+
+
+def _explain(stage: Stage) -> str:
+    """The stage as text."""
+    from wavebatch.core.echoes import COLUMNS
+
+    described = _describe(stage)
+    parts = [f"{stage.name}\n\n{described['text']}"]
+    if stage.makes:
+        known = [COLUMNS[name] for name in stage.makes if name in COLUMNS]
+        parts.append("Makes:\n" + "\n".join(f"  {c.name} [{c.unit}]: {c.meaning}" for c in known))
+    if described["needs"]:
+        parts.append(f"Needs: {', '.join(described['needs'])}")
+    lines = []
+    for name, p in described["parameters"].items():
+        limits = f", {p['range'][0]:g} to {p['range'][1]:g}" if p["range"] else ""
+        lines.append(f"  {name} ({p['type']}{limits}, default {p['default']}): {p['meaning']}")
+    if lines:
+        parts.append("Parameters:\n" + "\n".join(lines))
+    parts.append("In a chain file:\n\n" + described["example"].rstrip())
+    return "\n\n".join(parts)

@@ -1,7 +1,8 @@
 """What the commands print: messages and one-line errors on stderr, results as text or JSON on stdout.
 
 Every command of `wavebatch.cli` uses this module. stdout holds only results, so that programs can read it; everything
-for people goes to stderr. Errors of wavebatch become one line and an exit code in `report_errors`.
+for people goes to stderr, and with its time into the file of --log-file, whatever --quiet says. Errors of wavebatch
+become one line and an exit code in `report_errors`.
 """
 
 from __future__ import annotations
@@ -9,19 +10,116 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import math
+import logging
 import os
+import re
+import shlex
+import stat
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, is_dataclass
+from pathlib import Path
 from typing import IO, Any
 
 import click
 
-from wavebatch.cli.program import log_file
 from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError, StageError
+from wavebatch.tools.sheets.sheet import Sheet, list_lines
+
+_LEVEL, LOG = "wavebatch.log_level", "wavebatch.log_path"
+"""Keys of a context's `meta`: the level, and the file of the log."""
+
+LEVELS = ("error", "warning", "info")
+
+_logger = logging.getLogger("wavebatch.log")
+_logger.propagate = False  # a program that calls commands has its own log
+
+
+class _LogFile(logging.FileHandler):
+    """A file of lines with time and level. A full disk ends the log, not the work; one message says so."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "a", "utf-8", errors="backslashreplace")
+        form = logging.Formatter("%(asctime)sZ %(levelname)-7s %(message)s", "%Y-%m-%dT%H:%M:%S")
+        form.converter = time.gmtime
+        self.setFormatter(form)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Ends the log."""
+        error = sys.exc_info()[1]
+        _logger.removeHandler(self)
+        click.echo(f"warning: --log-file: cannot be written, so it ends here: {error}", err=True)
+
+
+def open_log(path: Path, level: str, command: str) -> None:
+    """Begin to write messages up to a level; the first line holds version and command.
+
+    Raises ConfigError if the file cannot be written, or is something else than a log.
+    """
+    from wavebatch import __version__
+
+    close_log()
+    begin = b""
+    try:
+        if os.path.isfile(path):
+            with open(path, "rb") as old:
+                begin = old.read(20)
+        elif os.path.lexists(path) and stat.S_ISFIFO(os.stat(path).st_mode):  # opening it would wait for a reader
+            raise ConfigError(f"--log-file: {path} is a pipe; choose a file")
+        if begin and not re.fullmatch(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", begin):
+            raise ConfigError(f"--log-file: {path} exists and is no log; choose another name")
+        _logger.addHandler(_LogFile(path))
+    except OSError as error:
+        raise ConfigError(f"--log-file: {path}: cannot be written: {error.strerror or error}") from error
+    _logger.setLevel(level.upper())
+    log_text(f"wavebatch {__version__}: {command}")
+
+
+def close_log() -> None:
+    """End the log; harmless without one."""
+    for handler in [one for one in _logger.handlers if isinstance(one, _LogFile)]:
+        _logger.removeHandler(handler)
+        with contextlib.suppress(OSError):
+            handler.close()
+
+
+def log_is_open() -> bool:
+    """Whether a log is written."""
+    return any(isinstance(one, _LogFile) for one in _logger.handlers)
+
+
+def log_text(message: str, level: str | None = None) -> None:
+    """A line with time and level; the level is found from the message if it is not given. Does nothing without a log.
+    """
+    if log_is_open():
+        level = level or next((name for name in LEVELS[:2] if f"{name}: " in message), "info")
+        _logger.log(getattr(logging, level.upper()), "%s", message)
+
+
+def typed_command(context: click.Context) -> str:
+    """The command line as it was typed, with the short name of the program."""
+    return " ".join([context.find_root().info_name or "wavebatch", *map(shlex.quote, sys.argv[1:])])
+
+
+def keep_level(context: click.Context, parameter: click.Parameter, level: str) -> None:
+    """Keeps the level for `begin_log`, which comes after it."""
+    context.meta[_LEVEL] = level
+
+
+def begin_log(context: click.Context, parameter: click.Parameter, path: Path | None) -> None:
+    """Opens the log of --log-file before the command starts, and closes it after its end."""
+    if path is None or context.resilient_parsing:
+        return
+    try:
+        open_log(path, context.meta.get(_LEVEL, "info"), typed_command(context))
+    except ConfigError as error:
+        raise click.UsageError(str(error), ctx=context) from error
+    context.meta[LOG] = path
+    context.call_on_close(close_log)
+
 
 EXIT_USAGE = 2
 """Wrong usage or chain file; nothing was started."""
@@ -122,14 +220,14 @@ class NearestGroup(click.Group):
 def talk(message: str) -> None:
     """One line on stderr, and in the file of --log-file."""
     write_message(printable(message))
-    log_file.log_text(printable(message))
+    log_text(printable(message))
 
 
 def tell(message: str) -> None:
     """As `talk`; with --quiet in the file of --log-file only."""
     if not click.get_current_context().params["quiet"]:
         write_message(printable(message))
-    log_file.log_text(printable(message))
+    log_text(printable(message))
 
 
 def write_message(line: str) -> None:
@@ -208,12 +306,17 @@ def print_safely(text: str) -> bool:
         return False
 
 
-def print_result(as_json: bool, document: Any, lines: Iterable[str], mode: str = "") -> None:
-    """The result of a command on stdout: the document as JSON, with its mode, or the lines."""
+def print_result(as_json: bool, document: Any, sheet: Sheet, mode: str = "") -> None:
+    """The result of a command on stdout: the document as JSON, with its mode, or the lines of the sheet."""
     if as_json:
         print_json(document, mode)
     else:
-        print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
+        print_sheet(sheet)
+
+
+def print_sheet(sheet: Sheet) -> None:
+    """A result as text on stdout."""
+    print_text("\n".join(printable(part) for line in list_lines(sheet) for part in line.split("\n")))
 
 
 def print_summary(summary: Any, lines: Iterable[str]) -> None:
@@ -221,19 +324,6 @@ def print_summary(summary: Any, lines: Iterable[str]) -> None:
     answer(summary)
     for line in lines:
         tell(line)
-
-
-def count(number: int, name: str) -> str:
-    """`1 echo`, `2 echoes`."""
-    if number == 1:
-        return f"1 {name}"
-    return f"{number} {name}{'es' if name.endswith(('o', 's', 'x', 'ch')) else 's'}"
-
-
-def row(name: str, values: Iterable[Any], form: str = "", *, width: int = 10) -> str:
-    """A line of a table: the name as it is, then values of one width to the right; form: of floats, NaN is `-`."""
-    texts = (("-" if math.isnan(v) else format(v, form)) if isinstance(v, float) else str(v) for v in values)
-    return name + " ".join(f"{text:>{width}}" for text in texts)
 
 
 def one_line(error: BaseException) -> str:
@@ -264,7 +354,7 @@ def report_errors(failure: int = 1) -> Callable:
                 return function(*args, **options)
             except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError) as error:
                 if isinstance(error, click.ClickException):
-                    log_file.log_text(printable(error.format_message()), "error")
+                    log_text(printable(error.format_message()), "error")
                 raise
             except Exception as error:
                 if interrupts.arrived():  # compiled code may have turned KeyboardInterrupt into this

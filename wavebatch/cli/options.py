@@ -20,9 +20,8 @@ import click
 from click.core import ParameterSource
 
 from wavebatch.batch.options import OPTIONS, RunOptions, check_together
-from wavebatch.cli.messages import one_line, report_errors, talk, tell
-from wavebatch.cli.program.completion import complete_files, complete_flags, complete_profiles, complete_written
-from wavebatch.cli.program.log_file import LEVELS, LOG, begin_log, keep_level
+from wavebatch.cli.messages import LEVELS, LOG, begin_log, keep_level, one_line, report_errors, talk, tell
+from wavebatch.cli.program.command import complete_files, complete_flags, complete_profiles, complete_written
 from wavebatch.cli.program.settings import READ
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
@@ -241,7 +240,7 @@ def check_html(target: Path | None, *, will_exist: bool = False) -> None:
     will_exist: its folder will be made.
     """
     if target is not None and not (will_exist and not target.parent.exists()):
-        from wavebatch.tools.html.page import check_page
+        from wavebatch.tools.sheets.page import check_page
 
         check_page(target)
 

@@ -20,7 +20,6 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import (
     EXIT_USAGE,
     Interrupted,
-    count,
     format_json,
     one_line,
     print_json,
@@ -29,11 +28,12 @@ from wavebatch.cli.messages import (
     printable,
     talk,
     tell,
+    typed_command,
 )
-from wavebatch.cli.program.log_file import typed_command
 from wavebatch.cli.program.progress import Progress
 from wavebatch.core.errors import WARNINGS, ConfigError, InputError
 from wavebatch.core.suggest import nearest
+from wavebatch.core.units import count
 from wavebatch.files.disk.protect import refuse_input
 
 EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
@@ -189,7 +189,7 @@ def _write_page(result: Any, folder: Path, options: dict[str, Any]) -> bool:
     target = options["html_file"]
     if target is None:
         return True
-    from wavebatch.tools.html.run_page import write_run_page
+    from wavebatch.tools.sheets.run import write_run_page
 
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

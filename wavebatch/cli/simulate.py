@@ -14,8 +14,9 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, counting, print_summary
-from wavebatch.cli.program.completion import complete_scenes
+from wavebatch.cli.messages import counting, print_summary
+from wavebatch.cli.program.command import complete_scenes
+from wavebatch.core.units import count
 from wavebatch.tools.simulate import (
     CANOPIES,
     OTHER_NAMES,
@@ -31,7 +32,7 @@ from wavebatch.tools.simulate import (
 )
 from wavebatch.tools.simulate.from_returns import SynthesisSummary, synthesize_strip
 from wavebatch.tools.simulate.render import Recording
-from wavebatch.tools.simulate.return_light import EQUAL, Radar, SynthesisOptions
+from wavebatch.tools.simulate.returns import EQUAL, Radar, SynthesisOptions
 
 _RECORDING = ("n_samples", "spacing", "baseline", "noise_std", "rho", "noise_gain", "saturation")
 """Options that change the recording of the scene."""

@@ -16,8 +16,9 @@ import click
 
 from wavebatch import __version__
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, talk, tell
+from wavebatch.cli.messages import answer, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.geojson_crs import GEOJSON_CRS, GeoJsonCrs, plan_crs
@@ -25,9 +26,8 @@ from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import survey_blocks
 from wavebatch.tools.slices.cube import CubeBuilder
-from wavebatch.tools.slices.lines import read_scan_lines
 from wavebatch.tools.slices.output import SEGMENT_SUFFIXES, SegmentWriter, draw_slice
-from wavebatch.tools.slices.segments import Segment, SliceOptions, cut_slice, find_segments
+from wavebatch.tools.slices.segments import Segment, SliceOptions, cut_slice, find_segments, read_scan_lines
 
 EXIT_SOME_FAILED = 1
 """Some strips failed."""
@@ -204,7 +204,7 @@ def _find(
 def _draw_overview(segments: list[Segment], target: Path, reader: StripReader, lines: int, overwrite: bool) -> None:
     """Draws the segments of all lines; InputError without any."""
     from wavebatch.files.las.crs import describe_crs
-    from wavebatch.tools.slices.draw import draw_segments
+    from wavebatch.tools.slices.output import draw_segments
 
     if not segments:
         raise InputError(f"{target}: not drawn, because the scan lines have no segment")

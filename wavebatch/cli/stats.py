@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,17 +15,16 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, print_json, print_text, printable, row, talk
+from wavebatch.cli.messages import print_json, print_sheet, talk
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
-from wavebatch.core.units import HALF_C
+from wavebatch.core.units import HALF_C, count
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
-from wavebatch.tools.csv_table import format_csv
 from wavebatch.tools.return_stats.areas import RANKS, AreaGrid, AreaStats, PolygonSet, Separation, describe_pairs
-from wavebatch.tools.return_stats.dead_zones import BIN, BINS, LEAST_PAIRS, DeadZone
-from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
+from wavebatch.tools.return_stats.returns import BIN, BINS, LEAST_PAIRS, DeadZone, ReturnStats, count_returns
+from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv
 
 EXIT_UNREADABLE = 1
 """A cloud could not be read; the others were counted."""
@@ -81,62 +80,44 @@ def stats(
     if as_json:
         print_json({"files": [_plain(one) for one in each], "total": _plain(total)})
     elif shown:
-        print_text("\n\n".join("\n".join(map(printable, _list_lines(one))) for one in shown))
+        first, *rest = map(_sheet, shown)
+        print_sheet(Sheet("stats", [*first.parts, *rest]))
     sys.exit(EXIT_UNREADABLE if failed else 0)
 
 
-def _list_lines(found: ReturnStats) -> Iterator[str]:
-    yield found.cloud
-    yield f"points         {found.points}"
-    pulses = f" (by {found.pulses_by}), {found.returns_per_pulse:.3f} returns each" if found.pulses else ""
-    yield f"pulses         {found.pulses}{pulses}"
+def _sheet(found: ReturnStats) -> Sheet:
+    """The result of one cloud."""
     numbers = sorted({*found.by_number, *found.by_count})
-    if numbers:
-        yield f"{'k':>14}  {'return k':>10}  {'k returns':>10}"
-    for k in numbers:
-        yield f"{k:>14}  {found.by_number.get(k, 0):>10.2%}  {found.by_count.get(k, 0):>10.2%}"
+    shares = [(k, found.by_number.get(k, 0.0), found.by_count.get(k, 0.0)) for k in numbers]
+    apart = [(name, one.pairs, one.mean, one.least) for name, one in found.separations.items()]
+    parts: list[Part] = [Note(found.cloud), Fact("points", found.points)]
+    each = f" (by {found.pulses_by}), {found.returns_per_pulse:.3f} returns each" if found.pulses else ""
+    parts += [Fact("pulses", f"{found.pulses}{each}"), Table(("k", "return k", "k returns"), shares, ".2%")]
     if found.separations["all"].pairs:
-        yield f"{'separation':<14}  {'pairs':>10}  {'mean m':>10}  {'least m':>10}"
-        for name, one in found.separations.items():
-            yield f"{name:>14}  {one.pairs:>10}  {one.mean:>10.3f}  {one.least:>10.3f}"
-        yield from _list_zones(found)
+        zones = [_list_zone(name, one) for name, one in found.dead_zones.items()]
+        parts += [Table(("separation", "pairs", "mean m", "least m"), apart, ".3f"),
+                  Table(("dead zone", "pairs", "size m", "error m", "ns", ""), zones, (*[".2f"] * 4, ".1f", ""))]
     if found.several:
         pulses = count(found.several, "pulse")
-        yield f"first to last  {found.depth:.3f} m, mean height of the first above the last return of {pulses}"
-    for name, number in (found.flags or {}).items():
-        if number:
-            yield f"{name:<22}  {number:>10}"
-    yield from (f"warning        {line}" for line in found.warnings)
-    yield from _list_areas(found.areas)
+        words = f"{found.depth:.3f} m, mean height of the first above the last return of {pulses}"
+        parts.append(Fact("first to last", words))
+    parts += [Fact(f"  {name}", number) for name, number in (found.flags or {}).items() if number]
+    parts += [Note(words, "warning") for words in found.warnings]
+    number = range(1, max((max(area.by_count) for area in found.areas), default=0) + 1)
+    rows = [(area.name, area.pulses, area.returns_per_pulse, *(area.by_count.get(k, 0.0) for k in number), area.pairs,
+             area.mean, area.least) for area in found.areas]  # fmt: skip
+    head = ("area", "pulses", "each", *(f"{k} of pulse" for k in number), "pairs", "mean m", "least m")
+    forms = ("", "", ".3f", *[".2%"] * len(number), "", ".3f", ".3f")
+    return Sheet(found.cloud, [*parts, Table(head, rows, forms, shown=SHOWN)])
 
 
-def _list_zones(found: ReturnStats) -> Iterator[str]:
-    """The dead zones, of all pairs and by return number."""
-    yield f"{'dead zone':<14}  {'pairs':>10}  {'size m':>10}  {'error m':>10}  {'ns':>10}"
-    for name, one in found.dead_zones.items():
-        if math.isnan(one.size):
-            few = one.pairs < LEAST_PAIRS
-            why = f"fewer than {LEAST_PAIRS} pairs" if few else f"nearly all {BIN * BINS:g} m or more apart"
-            words = f"  no-data: {why}"
-        else:
-            words = f"  {one.size:>10.2f}  {one.error:>10.2f}  {one.size / HALF_C:>10.1f}"
-        yield f"{name:>14}  {one.pairs:>10}{words}"
-
-
-def _list_areas(areas: Sequence[AreaStats]) -> Iterator[str]:
-    shown, left = areas[:SHOWN], len(areas) - SHOWN
-    if not shown:
-        return
-    numbers = range(1, max(max(area.by_count) for area in shown) + 1)
-    width = max(len(area.name) for area in shown)
-    head = ("pulses", "each", *(f"{k} of pulse" for k in numbers), "pairs", "mean m", "least m")
-    yield row(f"{'area':<{width}} ", head)
-    for area in shown:
-        shares = [f"{area.by_count.get(k, 0):.2%}" for k in numbers]
-        values = (area.pulses, area.returns_per_pulse, *shares, area.pairs, area.mean, area.least)
-        yield row(f"{area.name:<{width}} ", values, ".3f")
-    if left > 0:
-        yield f"and {left} more areas; -o FILE.csv and --json have all of them"
+def _list_zone(name: str, one: DeadZone) -> tuple[Any, ...]:
+    """A dead zone, of all pairs or of a return number; or why it is not known."""
+    why = ""
+    if math.isnan(one.size):
+        few = one.pairs < LEAST_PAIRS
+        why = f"no-data: {f'fewer than {LEAST_PAIRS} pairs' if few else f'nearly all {BIN * BINS:g} m or more apart'}"
+    return name, one.pairs, one.size, one.error, one.size / HALF_C, why
 
 
 def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:

@@ -1,12 +1,12 @@
 """`wavebatch survey`: noise, pulse and scene of a strip or of a flight, and the chain that they need.
 
-Calls the survey and prints it; the measurements are in `wavebatch.surveying`.
+Calls the survey and prints its sheet; the measurements are in `wavebatch.surveying`.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,12 +14,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, one_line, print_result, talk, tell
-from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
+from wavebatch.cli.messages import one_line, print_result, talk, tell
+from wavebatch.core.units import count
 
 if TYPE_CHECKING:
-    from wavebatch.core.waveforms import SystemPulse
-    from wavebatch.surveying import Survey
     from wavebatch.surveying.flight import Flight
     from wavebatch.surveying.system_file import SavedSurvey
 
@@ -67,6 +65,8 @@ def survey(
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
+    from wavebatch.tools.sheets.sheet import Sheet
+    from wavebatch.tools.sheets.survey import list_doubts, survey_sheet, write_survey_page
 
     overwrite = options["overwrite"]
     paths = shared.find_inputs(strips, recursive=options["recursive"])
@@ -84,10 +84,9 @@ def survey(
     if chain_file is not None:
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
     document = _document(saved, facts)
-    print_result(as_json, document, [*_lines(saved, facts), *_warning_lines(document)])
+    sheet = survey_sheet(saved.survey, document)
+    print_result(as_json, document, Sheet("survey", [*sheet.parts, *list_doubts(document)]))
     if html_file is not None:
-        from wavebatch.tools.html.survey_page import write_survey_page
-
         reading = {name: options[name] for name in ("direction", "headerless")}
         failed = {*facts.get("failed", ()), *facts.get("misfits", ())}
         used = [path for path in paths if str(path) not in failed]
@@ -215,132 +214,3 @@ def _find_likeness(saved: SavedSurvey) -> dict[str, Any] | None:
     taken = find_source(survey.system) is not None
     return {"sensor": found.known.sensor, "name": found.known.name, "difference": found.difference, "taken": taken,
             "sentence": found.describe()}  # fmt: skip
-
-
-def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
-    figures, size = saved.survey.figures, f"{count(facts['points'], 'point')}, {count(facts['packets'], 'packet')}"
-    if "strips" in facts:
-        yield from _strip_lines(facts, size)
-    else:
-        yield _line("strip", f"{facts['strip']}: {size}")
-    yield _line("surveyed", count(saved.survey.waveforms, "waveform"))
-    yield _line("samples", figures.samples)
-    yield _line("ADC range", f"counts {round(figures.least_count)} to {round(figures.largest_count)}")
-    if "direction" in facts:
-        yield _line("vectors", f"{facts['direction']['sign']} the sensor: {facts['direction']['evidence']}")
-    yield from _noise_lines(saved)
-    yield from _pulse_lines(saved)
-    if figures.divergence_seen_mrad is not None:
-        seen = format_measure(figures.divergence_seen_mrad, figures.divergence_seen_error_mrad)
-        words = "mrad by the widths of echoes over the slopes of their surfaces, if these are plane"
-        yield _line("beam", f"{seen} {words}")
-    yield from _digitizer_lines(saved)
-    yield from _scene_lines(saved)
-    yield "decisions"
-    for decision in saved.survey.decisions:
-        yield f"  {'needed' if decision.needed else 'left out':10}{decision.part:26}{decision.reason}"
-
-
-def _warning_lines(document: dict[str, Any]) -> Iterator[str]:
-    """What is doubtful, also of single strips of a flight."""
-    for strip in document.get("strips", ()):
-        yield from (_line("warning", f"{strip['strip']}: {one['text']}") for one in strip["warnings"])
-    yield from (_line("warning", one["text"]) for one in document["warnings"])
-
-
-def _strip_lines(facts: dict[str, Any], size: str) -> Iterator[str]:
-    """How many strips belong together, and a line for each that does not."""
-    strips = facts["strips"]
-    fitting = sum(strip["fits"] for strip in strips)
-    yield _line("strips", f"{fitting} of {len(strips)} belong together: {size}")
-    for strip in strips:
-        if not strip["fits"]:
-            yield f"  {strip['strip']}: does not belong to them: {strip['reason']}"
-
-
-def _line(name: str, text: str) -> str:
-    return f"{name:18}{text}"
-
-
-NOISE_KINDS = {
-    "quiet": "quiet samples",
-    "quiet_pulse": "quiet samples, as a pulse sees it",
-    "outside": "outside of echoes",
-    "outside_pulse": "outside, as a pulse sees it",
-    "core": "left by fits in strong echoes",
-    "weak_echoes": "left by fits in weak echoes",
-}
-"""Names of the ways in which noise is measured; as a pulse sees it: noise of its amplitude, as that of one sample."""
-
-
-def _noise_lines(saved: SavedSurvey) -> Iterator[str]:
-    noise, strong = saved.survey.system.noise, saved.survey.figures.amplitude_99
-    yield _line("baseline", f"{noise.baseline:.3f} DN, +-{noise.baseline_spread:.3f} DN between waveforms")
-    yield _line("noise", f"{noise.std:.3f} DN for thresholds and errors, chosen from")
-    for kind, value in noise.by_kind.items():
-        known = f"{value:.3f} DN" if value > 0 else "not known: too few samples"
-        yield f"  {NOISE_KINDS.get(kind, kind.replace('_', ' ')):34}{known}"
-    grown = f"{noise.gain * strong:.2f} DN2 at {strong:.0f} DN"
-    text = f"variance grows by {noise.gain:.4f} DN2 per DN, {grown}"
-    yield _line("signal noise", text if noise.gain > 0 else "none")
-
-
-def _name_model(system: SystemPulse) -> str:
-    if system.components:
-        return f"learned, {len(system.components)} Gaussians"
-    return f"skewed, kappa {system.kappa:.4f}" if system.kappa else "Gaussian"
-
-
-def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
-
-    system, figures = saved.survey.system, saved.survey.figures
-    width = f"s_ref {system.sigma_ref:.4f} ns, full width at half maximum {system.sigma_ref * FWHM_PER_SIGMA:.3f} ns"
-    yield _line("system pulse", f"{_name_model(system)}; {width}")
-    for weight, delay, sigma in system.components:
-        yield f"  {weight:8.4f} at {delay:8.3f} ns, sigma {sigma:7.3f} ns"
-    like = _find_likeness(saved)
-    if like is not None:
-        taken = f"{like['sensor']}: its shipped pulse is used"
-        yield _line("sensor", taken if like["taken"] else like["sentence"])
-    yield from _candidate_lines(saved.survey)
-    yield _line("kappa", f"{figures.kappa:z.4f}" if figures.kappa is not None else "not known")
-    yield _line("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
-    yield _line("acceptance", f"one more echo must lower chi2 by {system.acceptance:g}")
-    if system.misfit:
-        yield _line("misfit", f"{100 * system.misfit:.2g} % of the amplitude; residuals below it add no echo")
-
-
-def _digitizer_lines(saved: SavedSurvey) -> Iterator[str]:
-    for index, one in saved.survey.system.digitizers.items():
-        noise = f"baseline {one.noise.baseline:.3f} DN, noise {one.noise.std:.3f} DN"
-        yield _line(f"digitizer {index}", f"{noise}; {_name_model(one)}; s_ref {one.sigma_ref:.4f} ns")
-
-
-def _candidate_lines(survey: Survey) -> Iterator[str]:
-    """Pulses that were tried, the one with the fewest nats first, and what the mirror shows of the one chosen."""
-    figures = survey.figures
-    if survey.candidates:
-        yield _line("pulses tried", "nats that describe a waveform, full width, change from shot to shot, echoes")
-    for one in survey.candidates:
-        change = f"{100 * one.change:.1f} %"
-        text = f"{one.nats:9.2f}  {one.fwhm_ns:7.3f} ns  {change:>6}  {one.echoes_per_waveform:6.3f}"
-        yield f"  {one.name:22}{text}{'  chosen' if one.chosen else f'  longer by {one.longer_by:.1f} errors'}"
-    if figures.false_in_noise_share is not None:
-        shares = figures.false_in_noise_share, figures.false_by_misfit_share
-        noise, misfit = (f"{100 * share:.2g}" for share in shares)
-        words = f"of 100 echoes about {noise} noise (in quiet); beside 100 strong ones about {misfit} of misfit"
-        yield _line("false echoes", words)
-
-
-def _scene_lines(saved: SavedSurvey) -> Iterator[str]:
-    system, figures = saved.survey.system, saved.survey.figures
-    clipped = "none found"
-    if system.saturation is not None:
-        clipped = f"at {system.saturation:.0f} DN, in {100 * figures.saturated_share:.2f} % of the waveforms"
-    yield _line("saturation", clipped)
-    kinds = {"empty": figures.empty_share, "single": figures.single_share, "overlapped": figures.overlapped_share}
-    shares = ", ".join(f"{100 * share:.2f} % {kind}" for kind, share in kinds.items())
-    yield _line("waveforms", f"{shares}; {figures.echoes_per_waveform:.3f} echoes each")
-    yield _line("amplitudes", f"99 % below {figures.amplitude_99:.1f} DN")
-    share = 100 * figures.system_width_share
-    yield _line("widths", f"{share:.1f} % of the clear echoes have the width of the system pulse")

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, counting, talk, tell
+from wavebatch.cli.messages import answer, counting, talk, tell
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.units import format_measure
+from wavebatch.core.units import count, format_measure
 from wavebatch.files.disk.protect import refuse_input
 from wavebatch.tools.voxels.profile import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions

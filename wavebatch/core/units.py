@@ -98,3 +98,10 @@ def format_relative(value: float, relative_error: float) -> str:
         return f"{value:.6g}"
     digits = 2 - math.floor(math.log10(relative_error))
     return f"{value:.{min(max(digits, 2), 10)}g}"
+
+
+def count(number: int, name: str) -> str:
+    """`1 echo`, `2 echoes`: a number of things in a message."""
+    if number == 1:
+        return f"1 {name}"
+    return f"{number} {name}{'es' if name.endswith(('o', 's', 'x', 'ch')) else 's'}"

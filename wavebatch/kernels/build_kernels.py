@@ -14,10 +14,7 @@ import importlib.util
 import os
 import shlex
 import shutil
-import subprocess
 import sys
-import sysconfig
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +45,9 @@ def compile_library(target: Path = LIBRARY, flags: tuple[str, ...] = ()) -> None
     RuntimeError
         There is no compiler, or it failed; one line.
     """
+    import subprocess  # 10 ms of each start, which compiles nothing
+    import tempfile
+
     command = find_compiler()
     if command is None:
         raise RuntimeError("no C compiler found: install cc, gcc or clang, set CC, or `pip install ziglang`")
@@ -130,6 +130,8 @@ def build_wheel(
     wheel_directory: str, config_settings: dict | None = None, metadata_directory: str | None = None
 ) -> str:
     """A wheel for this platform and any Python 3: the library needs no Python headers."""
+    import sysconfig
+
     compile_library()
     platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
     settings = {**(config_settings or {}), "--build-option": ["--plat-name", platform]}

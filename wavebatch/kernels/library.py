@@ -21,7 +21,8 @@ FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
     "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse", "render_pulses",
     "measure_changes", "pair_differences", "judge_packets",
-    "interpolate_columns", "fit_stack",
+    "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes",
+    "match_returns",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -163,6 +164,31 @@ class CJudged(ctypes.Structure):
     """`Judged` of kernels/c/packets.h."""
 
     _fields_ = _fields(_POINTER, "reason n_samples keys short packed")
+
+
+class CWhole(ctypes.Structure):
+    """`Whole` of kernels/c/echoes.h."""
+
+    _fields_ = [
+        *_fields(ctypes.c_int64, "kind n_near n_wide"),
+        *_fields(_POINTER, "near_width near wide_width wide"),
+        *_fields(ctypes.c_double, "datum ref least"),
+    ]
+
+
+class CKeeping(ctypes.Structure):
+    """`Keeping` of kernels/c/echoes.h."""
+
+    _fields_ = [*_fields(_POINTER, "std factors"), *_fields(ctypes.c_double, "spacing last significance")]
+
+
+class CKept(ctypes.Structure):
+    """`Kept` of kernels/c/echoes.h."""
+
+    _fields_ = _fields(
+        _POINTER,
+        "waveform time amplitude sigma time_err amplitude_err sigma_err relative_energy_err residual flags row",
+    )
 
 
 class Samples(NamedTuple):

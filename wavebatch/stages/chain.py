@@ -10,8 +10,9 @@ import dataclasses
 import inspect
 import re
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -144,7 +145,9 @@ def stage(
         name = f"{kind}.{function.__name__}"
         if name in STAGES:
             raise StageError(f"stage {name} is registered twice")
-        parameters = _read_parameters(name, kind, function, shares)
+        parameters = _Signature(name, kind, function, shares)
+        if not function.__module__.startswith("wavebatch."):
+            len(parameters)  # ours are read once a chain has them: all take a tenth of a small run, and a test does so
         if second_pass is not None and "radius" not in parameters:
             raise StageError(f"stage {name} has a second pass, but no parameter radius")
         new = {column.name: column for column in makes if isinstance(column, Column)}
@@ -156,6 +159,29 @@ def stage(
         return function
 
     return register
+
+
+class _Signature(Mapping[str, Parameter]):
+    """The parameters of a stage, read from its function when they are first asked for; pickled as a dict."""
+
+    def __init__(self, *source: Any) -> None:
+        self._source = source
+
+    @cached_property
+    def _parameters(self) -> dict[str, Parameter]:
+        return _read_parameters(*self._source)
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self._parameters[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parameters)
+
+    def __len__(self) -> int:
+        return len(self._parameters)
+
+    def __reduce__(self) -> tuple[type[dict], tuple[dict[str, Parameter]]]:
+        return dict, (self._parameters,)
 
 
 def _read_parameters(name: str, kind: str, function: Callable, shares: Any) -> dict[str, Parameter]:

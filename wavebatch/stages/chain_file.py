@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -127,8 +126,8 @@ def format_step(stage: str, parameters: Mapping[str, Any]) -> str:
     return format_toml({"chain": [{"stage": stage, **parameters}]}).lstrip()
 
 
-def _shipped() -> Any:
-    return resources.files("wavebatch") / "stages" / "profiles"
+def _shipped() -> Path:
+    return Path(__file__).with_name("profiles")
 
 
 def _read_step(table: TomlTable) -> Step:

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.order import median
 from wavebatch.core.units import MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.library import Samples
@@ -141,7 +142,7 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, R
         raise ConfigError(f"samples must be at least 2, got {samples}")
     if block.missing is None:
         end = transpose_samples(block.samples[:, -samples:])
-        baseline = np.median(end, axis=0)
+        baseline = median(end, axis=0)
         deviation = end - baseline
         number = np.array(len(end))
         std = np.sqrt(sum_samples(deviation * deviation) / max(len(end) - 1, 1))

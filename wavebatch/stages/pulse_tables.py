@@ -23,6 +23,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     find_datum,
     measure_pulse,
 )
+from wavebatch.kernels.fit.whole_pulse import NO_ROWS, STRETCHED, SUMMED, WholePulse, describe_whole
 from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, coloured_variance, whitening_filter
 
 
@@ -206,9 +207,14 @@ def _find_delay(shape: PulseShape, ref: float, width: np.ndarray) -> tuple[np.nd
     """
     if shape.components:
         return matched_gaussian(shape, ref)[0], 0.0
-    datum = shape.table.datum if shape.table is not None else matched_gaussian(PulseShape(shape.kappa), 1.0)[0]
+    datum = _unit_datum(shape)
     ratio = np.maximum(width / ref, LEAST_WIDTH)
     return datum * ref * (ratio + ratio**-2 - 1), datum * (1 - 2 * ratio**-3)
+
+
+def _unit_datum(shape: PulseShape) -> float:
+    """Datum of a stretched pulse of width 1 after its fitted time."""
+    return shape.table.datum if shape.table is not None else matched_gaussian(PulseShape(shape.kappa), 1.0)[0]
 
 
 def _is_symmetric(shape: PulseShape) -> bool:
@@ -369,35 +375,39 @@ def describe_echoes(
     parameters, errors : float64 array, shape (m, 3)
         The same of the whole pulse.
     """
+    return describe_whole(whole_pulse(shape, limits, parameters[:, 2]), parameters, errors, shared)
+
+
+def whole_pulse(shape: PulseShape, limits: ShapeLimits, widths: np.ndarray) -> WholePulse:
+    """Return what `describe_echoes` takes whole echoes from.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        The fitted pulse.
+    limits : ShapeLimits
+        Its widths.
+    widths : float array, shape (m,)
+        Fitted widths [samples]: the table of the widest is made where one of them needs it.
+
+    Returns
+    -------
+    WholePulse
+    """
     if _is_symmetric(shape):
-        return parameters, errors
-    whole, whole_errors = parameters.copy(), errors.copy()
-    delay, by_width = _find_delay(shape, limits.ref, parameters[:, 2])
-    whole[:, 1] += delay
-    variance = errors[:, 1] ** 2 + (by_width * errors[:, 2]) ** 2 + 2 * by_width * shared[:, 1]
-    whole_errors[:, 1] = np.sqrt(np.maximum(variance, 0))
-    if shape.components:
-        near = _near_table(shape, limits)
-        beyond = parameters[:, 2] > near.width[-1]
-        tables = ((near, ~beyond), *(((_wide_table(shape, limits), beyond),) if beyond.any() else ()))
-        for table, rows in tables:
-            described = _describe(table, parameters[rows], errors[rows], shared[rows, 0])
-            whole[rows, ::2], whole_errors[rows, ::2] = described
-    return whole, whole_errors
+        return WholePulse()
+    if not shape.components:
+        return WholePulse(STRETCHED, datum=_unit_datum(shape), ref=limits.ref, least=LEAST_WIDTH)
+    near = _near_table(shape, limits)
+    wide = _rows(_wide_table(shape, limits)) if (widths > near.width[-1]).any() else NO_ROWS
+    return WholePulse(SUMMED, _rows(near), wide, datum=matched_gaussian(shape, limits.ref)[0])
 
 
-def _describe(
-    table: PulseMeasures, parameters: np.ndarray, errors: np.ndarray, shared: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitude and sigma of a learned pulse, and their errors, each (m, 2); shared: their covariance (m,)."""
-    amplitude, _, width = parameters.T
-    peak, by_peak = _change_with_width(table, width)
+def _rows(table: PulseMeasures) -> np.ndarray:
+    """Width, peak and its slope, sigma and its slope, float64 (k, 5)."""
     sigma = table.half_width / FWHM_PER_SIGMA
-    steep = np.interp(width, table.width, np.gradient(sigma, table.width))
-    by_width = amplitude * by_peak
-    variance = (peak * errors[:, 0]) ** 2 + (by_width * errors[:, 2]) ** 2 + 2 * peak * by_width * shared
-    whole_errors = np.stack([np.sqrt(np.maximum(variance, 0)), errors[:, 2] * np.abs(steep)], axis=1)
-    return np.stack([amplitude * peak, np.interp(width, table.width, sigma)], axis=1), whole_errors
+    steep = np.gradient(sigma, table.width)
+    return np.stack([table.width, table.peak, np.gradient(table.peak, table.width), sigma, steep], axis=1)
 
 
 def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray) -> np.ndarray:

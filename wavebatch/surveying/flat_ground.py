@@ -11,10 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.order import even_places
@@ -23,12 +22,15 @@ from wavebatch.core.units import SQUARED_NORMAL_MEDIAN, C, format_measure
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
-from wavebatch.kernels.geometry.normals import Surroundings, measure_normals, thin_out
+from wavebatch.kernels.geometry.normals import Surroundings, grow_tree, measure_normals, thin_out
 from wavebatch.kernels.geometry.two_lines import in_two_lines
 from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
 from wavebatch.surveying.measuring.residuals import decompose_sample
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
@@ -165,7 +167,7 @@ def _choose_radius(xyz: np.ndarray) -> float:
     if len(xyz) <= number:
         return RADII[0]
     some = xyz[:: max(len(xyz) // 500, 1)]
-    tree = scipy.spatial.cKDTree(xyz)
+    tree = grow_tree(xyz)
     distance = tree.query(some, k=number)[0][:, -1]
     radius = float(np.clip(np.ceil(10.0 * np.quantile(distance, 0.9)) / 10.0, *RADII))
     while radius < RADII[1] and _share_in_two_lines(xyz, tree, some, radius) > 0.1:
@@ -173,7 +175,7 @@ def _choose_radius(xyz: np.ndarray) -> float:
     return radius
 
 
-def _share_in_two_lines(xyz: np.ndarray, tree: scipy.spatial.cKDTree, some: np.ndarray, radius: float) -> float:
+def _share_in_two_lines(xyz: np.ndarray, tree: cKDTree, some: np.ndarray, radius: float) -> float:
     """Share of the points whose neighbours lie on two scan lines, seen from above: they have no angle."""
     near = tree.query_ball_point(some, radius)
     group = np.repeat(np.arange(len(some)), [len(rows) for rows in near])

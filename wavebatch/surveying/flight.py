@@ -19,6 +19,7 @@ import numpy as np
 from wavebatch.core import interrupts
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.order import quantile
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -313,7 +314,7 @@ def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None
     steady = float(np.mean(np.abs(np.log(lone.sigma / width)) < SAME_WIDTH))
     strong = take_strongest(lone)
     noise = level.std / strong.amplitude.astype(np.float64)
-    left = np.quantile(fit_alone(block, with_pulse(plain, system), strong)[0] ** 2 - noise**2, 0.25)
+    left = quantile(fit_alone(block, with_pulse(plain, system), strong)[0] ** 2 - noise**2, 0.25)
     return Look(level, width, steady, float(np.sqrt(max(left, 0.0))))
 
 

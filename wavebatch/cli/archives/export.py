@@ -13,7 +13,8 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, counting, tell
+from wavebatch.cli.messages import answer, counting, tell
+from wavebatch.core.units import count
 from wavebatch.tools.archives.export_strip import SUFFIXES, ExportSummary, export_strip
 
 

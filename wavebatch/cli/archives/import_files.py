@@ -14,8 +14,9 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, counting, tell
-from wavebatch.cli.program.completion import complete_files
+from wavebatch.cli.messages import answer, counting, tell
+from wavebatch.cli.program.command import complete_files
+from wavebatch.core.units import count
 from wavebatch.tools.archives.import_file import SUFFIXES, ImportOptions, ImportSummary, import_file
 
 EXIT_SOME, EXIT_NONE = 3, 4

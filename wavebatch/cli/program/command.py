@@ -1,19 +1,214 @@
-"""The class of all commands: help with examples and groups, and options that settings can give.
+"""The class of all commands: help with examples and groups, options that settings can give, completion, man pages.
 
-`LazyGroup` gives each command this class when it is loaded, so that a new command only declares itself.
+`LazyGroup` gives each command this class when it is loaded, so that a new command only declares itself. The examples
+and groups are those of --help, of the manual pages and of the page Commands.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Iterator
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import click
+from click.shell_completion import CompletionItem
 
-from wavebatch.batch.options import HEADINGS, OPTIONS
+from wavebatch import __version__
+from wavebatch.batch.options import AIR, CHAIN, HEADINGS, OPTIONS, OUTPUT, READING, RUNNING, WHICH
 from wavebatch.cli.messages import talk
-from wavebatch.cli.program.examples import ALSO_USUAL, EXAMPLES, FEWEST, GROUPS, MANY, USUAL
 from wavebatch.cli.program.settings import OLD_NAMES, add_variables, drop_rivals, read_settings, tell_settings
+
+EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
+    "run": (
+        ("wavebatch run strip.las -o clouds", "one strip; the chain is chosen by a survey of it"),
+        ("wavebatch run strips/ -o clouds --survey flight --jobs 0 --html run.html",
+         "a flight on all processors, with a report page"),
+        ("wavebatch run strips/ -o clouds --resume", "go on after an interruption"),
+        ("wavebatch run strip.las -o clouds --trajectory flight.txt --columns +range",
+         "with a trajectory, and the range as a column"),
+        ("wavebatch run strip.las -o clouds --dry-run", "show chain, columns and sizes; write nothing"),
+    ),
+    "info": (("wavebatch info strip.las", "points, packets, descriptors and samples"),),
+    "check": (
+        ("wavebatch check strip.las mychain.toml", "one line per problem; exit code 1 if there is any"),
+    ),
+    "survey": (
+        ("wavebatch survey strip.las", "noise, pulse and scene, and which chain the strip needs"),
+        ("wavebatch survey strip.las -o system.toml --chain chain.toml", "save both for `run --system` and `--chain`"),
+    ),
+    "import": (
+        ("wavebatch import flight.pls -o flight.las", "flight.las and flight.wdp, and flight.system.toml"),
+        ("wavebatch import archive/ -o strips --resume", "all files of a folder; go on after an interruption"),
+    ),
+    "export": (
+        ("wavebatch export strip.las -o repaired.laz", "packets as the LAS specification has them"),
+        ("wavebatch export strip.las -o strip.npz", "waveforms with their geometry as arrays"),
+    ),
+    "stages": (
+        ("wavebatch stages", "list all algorithms"),
+        ("wavebatch stages decompose.adaptive", "one with parameters, units, source and a TOML example"),
+    ),
+    "simulate": (
+        ("wavebatch simulate forest -o forest.laz --pulses 50000 --truth truth.npz", "a strip with known echoes"),
+    ),
+    "compare": (
+        ("wavebatch compare clouds/strip.laz strip.las", "a cloud with the vendor's returns"),
+        ("wavebatch compare --strip strip.las fast accurate", "two chains on the waveforms of a strip"),
+        ("wavebatch compare clouds/strip.laz --truth truth.npz --min-completeness 0.95",
+         "with the truth; exit code 1 below 95 %"),
+    ),
+    "stats": (("wavebatch stats clouds/*.laz", "return numbers, separations and flags of clouds"),),
+    "synthesize": (
+        ("wavebatch synthesize cloud.laz -o strip.las", "waveforms from the returns of a cloud"),
+        ("wavebatch synthesize cloud.laz -o strip.las --intensity reflectance --sensor-height 1200 --shares equal",
+         "by the lidar equation, with partial footprints"),
+    ),
+    "slice": (("wavebatch slice strip.las -o lines.csv", "straight surface lines in the scan lines"),),
+    "voxelize": (("wavebatch voxelize strip.las --size 1 -o voxels.npz", "cross sections in voxels of 1 m"),),
+    "plot": (),
+    "plot waveform": (
+        ("wavebatch plot waveform strip.las -o fits.png", "six waveforms, spread over the strip"),
+        ("wavebatch plot waveform strip.las -o bad.svg --flags NOT_CONVERGED,AT_BOUND", "fits to look at"),
+        ("wavebatch plot waveform strip.las -o sheet.png --random 100 --sheet", "a sheet of 100 random waveforms"),
+    ),
+    "plot histogram": (
+        ('wavebatch plot histogram clouds/*.laz --column z --where "classification == 2" -o ground.png', "ground only"),
+        ("wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png", "widths of all clouds"),
+    ),
+    "plot map": (
+        ("wavebatch plot map clouds/ --column amplitude --size 1 -o map.png", "mean amplitude in cells of 1 m"),
+    ),
+    "plot section": (
+        ("wavebatch plot section clouds/ --width 2 --column echo_width -o side.png",
+         "2 m wide, along the longer extent"),
+    ),
+    "plot profile": (
+        ("wavebatch plot profile voxels.npz --column energy -o heights.png", "energy by height"),
+        ("wavebatch plot profile lines.csv --column length -o lines.png", "length of surface lines by height"),
+    ),
+    "plot cube": (
+        ("wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png", "scan line 3, and all pulses at 250 ns"),
+    ),
+    "grid": (
+        ("wavebatch grid clouds/ --column amplitude --column echo_width --statistic median --size 1 -o x.tif",
+         "two bands for GIS"),
+        ("wavebatch grid clouds/ --statistic density --size 5 -o density.tif", "points per square metre"),
+        ("wavebatch grid clouds/ --column z --statistic max --where 'classification != 7' -o top.tif",
+         "without points of noise"),
+    ),
+    "calibrate": (
+        ("wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml",
+         "for `run --calibration cal.toml`"),
+        ("wavebatch calibrate *.laz --targets targets.csv --scan-angle --html cal.html -o cal.toml",
+         "with light that falls across the swath"),
+    ),
+    "bench": (
+        ("wavebatch bench strip.las -o bench", "all shipped chains on echoes like those of the strip"),
+        ("wavebatch bench --scene open --tolerance 0.02m", "the cheapest chain with 2 cm of range error"),
+    ),
+}  # fmt: skip
+"""Per command: a line to type, and what it is for."""
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "Options": ("grid columns", "slice most"),
+    READING: ("grid crs",),
+    CHAIN: ("waveforms", "divergence"),
+    AIR: ("reflectance_error", "scan_angle"),
+    WHICH: ("flags", "packets", "point_numbers", "times", "most", "random", "limit"),
+    OUTPUT: ("html_file", "report", "as_json"),
+    RUNNING: ("dry_run", "fail_on", "progress", "verbose", "quiet", "log_path", "log_level", "config", "debug", "help"),
+}
+"""Names of options under a heading of --help, besides those of RunOptions. Others come first, under Options.
+
+With the command in front where the name means something else in others."""
+
+FEWEST = 8
+"""Pages with fewer options than this have no groups."""
+
+MANY, USUAL, ALSO_USUAL = 40, "Options that most runs need", ("html_file",)
+"""Pages with more options than MANY begin with those that RunOptions calls usual, and these."""
+
+
+def complete_files(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Let the shell complete file names; those of lists, which begin with `@`, are found here.
+
+    bash ends a word at `@`: it gives the sign as an argument of its own, but replaces it too.
+    """
+    given = context.params.get(parameter.name or "") if context is not None else None
+    apart = isinstance(given, tuple) and bool(given) and str(given[-1]) == "@"
+    if not (apart or incomplete.startswith("@")):
+        return [CompletionItem(incomplete, type="file")]
+    folder, start = os.path.split(incomplete.removeprefix("@"))
+    try:
+        entries = sorted(os.scandir(folder or "."), key=lambda entry: entry.name)
+    except OSError:
+        return []
+    found = []
+    for entry in entries:
+        if entry.name.startswith(start) and (start or not entry.name.startswith(".")):
+            found.append(CompletionItem("@" + os.path.join(folder, entry.name) + "/" * entry.is_dir()))
+    return found
+
+
+def complete_profiles(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the shipped chains and auto."""
+    from wavebatch.stages.chain_file import list_profiles
+
+    return [name for name in ("auto", *list_profiles()) if name.startswith(incomplete)]
+
+
+def complete_flags(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the last of several flags with commas."""
+    from wavebatch.core.echoes import EchoFlag
+
+    return _complete_last(incomplete, (flag.name or "" for flag in EchoFlag), upper=True)
+
+
+def complete_written(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the last of several columns that `run` can write, with commas, each with or without `+`."""
+    from wavebatch.core.echoes import COLUMNS
+
+    names = [name for name, column in COLUMNS.items() if column.extra_bytes]
+    last = incomplete.rpartition(",")[2]
+    return _complete_last(incomplete, (f"+{name}" for name in names) if last.startswith("+") else names)
+
+
+def complete_columns(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete columns that clouds of wavebatch usually have."""
+    from wavebatch.core.echoes import COLUMNS
+
+    standard = ("x", "y", "z", "intensity", "return_number", "number_of_returns", "classification", "scan_angle",
+                "user_data", "point_source_id", "gps_time")  # fmt: skip
+    names = [*(name for name, column in COLUMNS.items() if column.extra_bytes), *standard]
+    return [name for name in dict.fromkeys(names) if name.startswith(incomplete)]
+
+
+def complete_stages(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the names of stages, those of other packages too."""
+    from wavebatch.stages.chain import STAGES
+    from wavebatch.stages.plugins import load_plugins
+
+    load_plugins()
+    return sorted(name for name in STAGES if name.startswith(incomplete))
+
+
+def complete_scenes(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the scenes of `simulate` and `bench`."""
+    from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES
+
+    return [name for name in (*SCENES, *OTHER_NAMES) if name.startswith(incomplete)]
+
+
+def _complete_last(incomplete: str, names: Iterable[str], *, upper: bool = False) -> list[str]:
+    """Complete the part after the last comma; names that stand before it are not offered again."""
+    before, comma, last = incomplete.rpartition(",")
+    last = last.upper() if upper else last
+    given = {(part.upper() if upper else part).lstrip("+") for part in before.split(",")}
+    return [f"{before}{comma}{name}" for name in names if name.startswith(last) and name.lstrip("+") not in given]
+
 
 MAYBE_NAN = ("no_data",)
 """Options whose number may be NaN."""
@@ -105,3 +300,111 @@ def dress(command: click.Command, title: str) -> click.Command:
     dressed.title = title
     add_variables(dressed, title)
     return dressed
+
+
+LIBRARIES = ("numpy", "scipy", "laspy", "lazrs")
+"""Libraries on which results and files depend."""
+
+
+def describe_version() -> str:
+    """Version of wavebatch, of Python and of the libraries; none of these is imported for it."""
+    import platform
+    from importlib import metadata
+
+    lines = [f"wavebatch {__version__}", f"Python {platform.python_version()}"]
+    for name in LIBRARIES:
+        try:
+            lines.append(f"{name} {metadata.version(name)}")
+        except metadata.PackageNotFoundError:
+            lines.append(f"{name} is not installed")
+    return "\n".join(lines)
+
+
+def write_man_pages(group: click.Group, folder: Path) -> list[Path]:
+    """Write wavebatch.1 and a page per command into a folder, over older ones; returns their names."""
+    from wavebatch.files.text_file import write_text
+
+    folder.mkdir(parents=True, exist_ok=True)
+    top = click.Context(group, info_name="wavebatch")
+    pages = {"wavebatch": _front_page(group, top)}
+    for name in group.list_commands(top):
+        command = group.get_command(top, name)
+        if command is not None:
+            pages |= dict(_pages(command, click.Context(command, info_name=name, parent=top), name))
+    for name, text in pages.items():
+        write_text(folder / f"{name}.1", text, overwrite=True)
+    return [folder / f"{name}.1" for name in pages]
+
+
+def _pages(command: click.Command, ctx: click.Context, title: str) -> Iterator[tuple[str, str]]:
+    yield f"wavebatch-{title.replace(' ', '-')}", _page(command, ctx, title)
+    if isinstance(command, click.Group):
+        for name, one in command.commands.items():
+            yield from _pages(one, click.Context(one, info_name=name, parent=ctx), f"{title} {name}")
+
+
+def _heading(name: str) -> str:
+    return f'.TH "{name.upper()}" "1" "" "wavebatch {__version__}" "wavebatch"'
+
+
+def _front_page(group: click.Group, ctx: click.Context) -> str:
+    lines = [_heading("wavebatch"), ".SH NAME", f"wavebatch \\- {roff(_first_line(group.help))}", ".SH SYNOPSIS",
+             ".B wavebatch", "COMMAND [OPTIONS] ...", ".SH COMMANDS"]  # fmt: skip
+    for name in group.list_commands(ctx):
+        command = group.get_command(ctx, name)
+        text = _first_line(None if command is None else command.help)
+        lines += [".TP", f"\\fB{roff(f'wavebatch-{name}(1)')}\\fR", roff(text)]
+    return "\n".join([*lines, *_options(group, ctx), *SETTINGS_PAGE]) + "\n"
+
+
+SETTINGS_PAGE = (
+    ".SH ENVIRONMENT",
+    "WAVEBATCH_OPTION is the default of an option of every command, WAVEBATCH_COMMAND_OPTION that of one command, for "
+    "example WAVEBATCH_RUN_JOBS=4.",
+    ".SH FILES",
+    "A settings file holds defaults of options in a table per command, for example [run] with jobs = 4. That of "
+    "--config FILE or WAVEBATCH_CONFIG is the only one; without it, wavebatch.toml beside the inputs counts before "
+    "that in the folder for settings of the user. The one beside the inputs can change numbers only. "
+    "Options on the command line count first, then variables, then files.",
+)
+
+
+def _page(command: click.Command, ctx: click.Context, title: str) -> str:
+    name = f"wavebatch-{title.replace(' ', '-')}"
+    lines = [_heading(name), ".SH NAME", f"{roff(name)} \\- {roff(_first_line(command.help))}", ".SH SYNOPSIS",
+             f"\\fB{roff(ctx.command_path)}\\fR {roff(' '.join(command.collect_usage_pieces(ctx)))}",
+             ".SH DESCRIPTION", *_describe(command.help or ""), *_options(command, ctx)]  # fmt: skip
+    examples = EXAMPLES.get(title, ())
+    if examples:
+        lines.append(".SH EXAMPLES")
+        for line, purpose in examples:
+            words = f"{purpose[:1].upper()}{purpose[1:]}:"
+            lines += [".PP", roff(words), ".PP", ".nf", ".RS", roff(line), ".RE", ".fi"]
+    return "\n".join([*lines, ".SH SEE ALSO", "\\fBwavebatch\\fR(1)"]) + "\n"
+
+
+def _options(command: click.Command, ctx: click.Context) -> Iterator[str]:
+    for heading, records in group_options(command, ctx):
+        yield f".SH {heading.upper()}"
+        for names, text in records:
+            yield from (".TP", f"\\fB{roff(names)}\\fR", roff(" ".join(text.split())))
+
+
+def _describe(text: str) -> Iterator[str]:
+    """Paragraphs; those that click must not wrap (\\b) keep their lines."""
+    for part in re.split(r"\n\s*\n", inspect.cleandoc(text).replace("\f", "")):
+        yield ".PP"
+        if part.startswith("\b"):
+            yield from (".nf", *(roff(line) for line in part.lstrip("\b\n").splitlines()), ".fi")
+        else:
+            yield roff(" ".join(part.split()))
+
+
+def _first_line(text: str | None) -> str:
+    return " ".join(inspect.cleandoc(text or "").split("\n\n")[0].split()).rstrip(".")
+
+
+def roff(text: str) -> str:
+    """Text without a meaning for roff: backslashes, hyphens, and dots and quotes that begin a line."""
+    plain = text.replace("\\", "\\e").replace("-", "\\-")
+    return f"\\&{plain}" if plain[:1] in (".", "'") else plain

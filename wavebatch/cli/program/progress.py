@@ -13,9 +13,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from wavebatch.cli.messages import count, one_line, print_safely, printable, write_message
-from wavebatch.cli.program import log_file
+from wavebatch.cli.messages import log_text, one_line, print_safely, printable, write_message
 from wavebatch.core.errors import StripWarning
+from wavebatch.core.units import count
 
 
 class Progress:
@@ -91,13 +91,13 @@ class Progress:
         if self._level >= 0:
             self._say(printable(line))
         else:
-            log_file.log_text(printable(line))
+            log_text(printable(line))
 
     def _say(self, line: str) -> None:
         if self._bar is not None:
             self._bar.clear()
         write_message(line)
-        log_file.log_text(line)
+        log_text(line)
         if self._bar is not None:
             self._bar.refresh()
 

@@ -164,7 +164,7 @@ class OutputLayout:
         for carried, name in zip(self.carried, names, strict=True):
             rows[name] = values[name]
             empty = carried.record.no_data
-            if not (self.whole or matched is None or carried.copied or empty is None):
+            if not (self.whole or matched is None or empty is None):
                 rows[name][~np.asarray(matched)] = empty if len(empty) > 1 else empty[0]
 
     @staticmethod

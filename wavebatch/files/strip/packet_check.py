@@ -12,6 +12,7 @@ from enum import IntEnum
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.order import distinct
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_vectors import RANGE_RATIO, VECTORS
@@ -158,7 +159,7 @@ class Judge:
         good = np.zeros(len(index), bool)
         packets = PacketFile(self._facts.packets, self._facts.compressed)
         try:
-            for kind in np.unique(index).tolist():
+            for kind in distinct(index).tolist():
                 same = np.flatnonzero(index == kind)
                 n_samples, bits = int(self._rules.samples[kind]), 8 * int(self._rules.width[kind])
                 for rows in np.array_split(same, -(-len(same) * n_samples * bits // 8 // BLOCK_BYTES)):

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from wavebatch.core.order import quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.files.disk.raw_bytes import widen_integers
 
@@ -89,7 +90,7 @@ def find_form(points: np.ndarray) -> str:
     """Return the form of the vectors, `stored` or `range`, from the first points of a strip."""
     ratio = measure_ratio(points, "stored")
     ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
-    return "range" if len(ratio) and np.quantile(ratio, 0.5) > RANGE_RATIO else "stored"
+    return "range" if len(ratio) and quantile(ratio, 0.5) > RANGE_RATIO else "stored"
 
 
 def measure_ratio(points: np.ndarray, form: str) -> np.ndarray:
@@ -123,7 +124,7 @@ def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) ->
     if not any(len(part) for part in tally.ratios):
         chosen = "toward" if option == "auto" else option
         return VectorDecision(chosen, tally.form, float("nan"), "no waveform to decide from", (), ())
-    ratio = float(np.quantile(np.concatenate(tally.ratios), 0.5))
+    ratio = quantile(np.concatenate(tally.ratios), 0.5)
     warnings, problems = list(_judge_length(ratio, tally.form, metres)), []
     (toward, away), (up, down) = tally.pairs, tally.heights
     pairs, heights = _verdict(toward, away, _MOSTLY), _verdict(up, down, _CLEAR)

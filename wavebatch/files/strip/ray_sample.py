@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.core.order import even_places
+from wavebatch.core.order import even_places, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.point_formats import locate
@@ -103,8 +103,8 @@ def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
     ratio = np.concatenate(ratios)
     if len(ratio) < LEAST_PAIRS:
         return None
-    low, middle, high = np.quantile(ratio, [0.25, 0.5, 0.75])
-    return float(middle) if high - low < SCALE_SPREAD * middle else None
+    low, middle, high = (quantile(ratio, share) for share in (0.25, 0.5, 0.75))
+    return middle if high - low < SCALE_SPREAD * middle else None
 
 
 def _choose_units(scan: StripScan) -> list[tuple[int, int]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.order import even_places
+from wavebatch.core.order import distinct, even_places
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.closing import Closing
@@ -285,7 +285,7 @@ class StripReader(Closing):
         for samples, digitizer, chosen in self.read_counts(unit, rows, size):
             stored = self.facts.digitizers[digitizer.index]
             length = recorded_lengths(samples)
-            for recorded in np.unique(length).tolist():
+            for recorded in distinct(length).tolist():
                 part = np.flatnonzero(length == recorded)
                 kept = samples if len(part) == len(chosen) else samples[part]
                 kept = np.ascontiguousarray(kept[:, :recorded])

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from wavebatch.core.order import even_places
+from wavebatch.core.order import distinct, even_places, median
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judged, packed_bytes
 from wavebatch.files.strip.packets import PacketFile
@@ -130,7 +130,7 @@ class FormSample:
         keys, n_samples, packed = (np.concatenate(part) for part in (self.keys, self.n_samples, self.packed))
         index = (keys & np.uint64(255)).astype(np.int64)
         found: dict[tuple[int, int, bool], np.ndarray] = {}
-        for number in np.unique(index).tolist():
+        for number in distinct(index).tolist():
             rows = np.flatnonzero(index == number)
             rows = rows[even_places(len(rows), SAMPLED)]
             kinds, kind = np.unique(np.stack([n_samples[rows], packed[rows]], axis=1), axis=0, return_inverse=True)
@@ -190,7 +190,7 @@ class _Votes:
 
 
 def _medians(values: np.ndarray) -> np.ndarray:
-    return np.median(values, axis=1, keepdims=True)
+    return median(values, axis=1)[:, None]
 
 
 def find_forms(digitizers: Mapping[int, Digitizer], packets: PacketFile, sample: FormSample) -> dict[int, SampleForm]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.order import distinct
 from wavebatch.files.disk.raw_bytes import take_whole_records
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.las.crs import metres_per_unit
@@ -106,7 +107,7 @@ class _Scanner:
                 packets, reach = packets + more, max(reach, far_reach)
                 found.append(far_overfull)
             self._context.seal()
-            overfull = np.unique(np.concatenate(found))
+            overfull = distinct(np.concatenate(found))
             if suspects.any():
                 self._vote_far()
             if len(overfull):

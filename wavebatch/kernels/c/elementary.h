@@ -23,18 +23,20 @@ EXPORT int64_t solve_equations(int64_t n, int64_t m, double *matrix, double *rig
 }
 
 /* m columns of a table of k rows, (k, m), linear between its ascending abscissas and level beyond: as NumPy's interp. */
-EXPORT int64_t interpolate_columns(int64_t n, const double *x, int64_t k, int64_t m, const double *at, const double *table, double *out) {
-    for (int64_t i = 0; i < n; i++, out += m) {
-        int64_t low = 0, high = k;             /* the last row at or before x */
-        while (high - low > 1) {
-            int64_t middle = (low + high) / 2;
-            if (x[i] >= at[middle]) low = middle;
-            else high = middle;
-        }
-        const double *here = table + low * m;
-        const int level = x[i] <= at[low] || low + 1 == k;
-        for (int64_t c = 0; c < m; c++)
-            out[c] = isnan(x[i]) ? x[i] : level ? here[c] : (here[m + c] - here[c]) / (at[low + 1] - at[low]) * (x[i] - at[low]) + here[c];
+static void interpolate_row(double x, int64_t k, int64_t m, const double *at, const double *table, double *out) {
+    int64_t low = 0, high = k;                 /* the last row at or before x */
+    while (high - low > 1) {
+        int64_t middle = (low + high) / 2;
+        if (x >= at[middle]) low = middle;
+        else high = middle;
     }
+    const double *here = table + low * m;
+    const int level = x <= at[low] || low + 1 == k;
+    for (int64_t c = 0; c < m; c++)
+        out[c] = isnan(x) ? x : level ? here[c] : (here[m + c] - here[c]) / (at[low + 1] - at[low]) * (x - at[low]) + here[c];
+}
+
+EXPORT int64_t interpolate_columns(int64_t n, const double *x, int64_t k, int64_t m, const double *at, const double *table, double *out) {
+    for (int64_t i = 0; i < n; i++) interpolate_row(x[i], k, m, at, table, out + i * m);
     return 0;
 }

@@ -17,6 +17,8 @@
 #include "describe.h"
 #include "signal.h"
 #include "elementary.h"
+#include "echoes.h"
+#include "returns.h"
 #include "stack.h"
 #include "wdz.h"
 #include "packets.h"

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.kernels.elementary import exp, log, log1p, solve
@@ -376,6 +375,8 @@ def tabulate_pulse(x: np.ndarray, value: np.ndarray) -> PulseTable:
     -------
     PulseTable
     """
+    import scipy.interpolate  # here, because most runs need none of it
+
     step = x[1] - x[0]
     x = np.concatenate([x[0] - step * np.arange(3, 0, -1), x, x[-1] + step * np.arange(1, 4)])
     spline = scipy.interpolate.CubicSpline(x, np.concatenate([np.zeros(3), value, np.zeros(3)]))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.core.order import distinct
 from wavebatch.kernels.elementary import exp, log1p
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse
 
@@ -48,7 +49,7 @@ def render_echoes(
     signal = np.zeros((n, s), np.float32)
     x = np.arange(s, dtype=np.float32)
     # Parts end with a waveform, so that the order in which its echoes are added does not depend on the others.
-    borders = np.append(np.unique(np.searchsorted(waveform, waveform[::rows])), len(waveform))
+    borders = np.append(distinct(np.searchsorted(waveform, waveform[::rows])), len(waveform))
     for begin, end in zip(borders[:-1], borders[1:], strict=True):
         part = slice(begin, end)
         t, w, height = (values[part].astype(np.float32) for values in (time, width, amplitude))

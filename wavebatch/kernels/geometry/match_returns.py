@@ -1,11 +1,15 @@
-"""Pairs of echoes and returns: one to one, nearest in time, for a whole block at once.
+"""Pairs of echoes and returns: one to one, nearest in time, for a whole block at once: kernels/c/returns.h.
 
 Used where echoes are placed on returns, and by the score.
 """
 
 from __future__ import annotations
 
+import ctypes
+
 import numpy as np
+
+from wavebatch.kernels.library import call
 
 
 def match_returns(
@@ -34,39 +38,12 @@ def match_returns(
     int64 (m,)
         Row of the return, -1 without one.
     """
-    matched = np.full(len(echo_waveform), -1, np.int64)
-    if not len(echo_waveform) or not len(return_waveform):
-        return matched
-    size = int(max(echo_waveform[-1], return_waveform[-1])) + 1
-    lone = (np.bincount(echo_waveform, minlength=size) == 1) & (np.bincount(return_waveform, minlength=size) == 1)
-    many_echoes, many_returns = np.flatnonzero(~lone[echo_waveform]), np.flatnonzero(~lone[return_waveform])
-    alone, one = np.flatnonzero(lone[echo_waveform]), np.flatnonzero(lone[return_waveform])
-    matched[alone] = np.where(np.abs(echo_time[alone] - return_time[one]) <= tolerance, one, -1)
-    longest = max(np.abs(echo_time).max(), np.abs(return_time).max(initial=0.0))
-    stride = 4.0 * (longest + tolerance) + 1.0
-    echoes = _sort(many_echoes, echo_waveform * stride + echo_time)
-    returns = _sort(many_returns, return_waveform * stride + return_time)
-    while len(echoes) and len(returns):
-        echo_key = echo_waveform[echoes] * stride + echo_time[echoes]
-        return_key = return_waveform[returns] * stride + return_time[returns]
-        to_return = _nearest(echo_key, return_key)
-        to_echo = _nearest(return_key, echo_key)
-        pair = (to_echo[to_return] == np.arange(len(echoes))) & (np.abs(echo_key - return_key[to_return]) <= tolerance)
-        if not pair.any():
-            break
-        matched[echoes[pair]] = returns[to_return[pair]]
-        taken = np.zeros(len(returns), bool)
-        taken[to_return[pair]] = True
-        echoes, returns = echoes[~pair], returns[~taken]
+    echo_waveform, return_waveform = (np.ascontiguousarray(w, np.int64) for w in (echo_waveform, return_waveform))
+    echo_time, return_time = (np.ascontiguousarray(time, np.float64) for time in (echo_time, return_time))
+    m, k = len(echo_waveform), len(return_waveform)
+    if echo_time.shape != (m,) or return_time.shape != (k,):
+        raise ValueError("an echo or a return has no time")
+    matched = np.empty(m, np.int64)
+    call("match_returns", ctypes.c_int64(m), echo_waveform, echo_time, ctypes.c_int64(k), return_waveform, return_time,
+         ctypes.c_double(tolerance), matched)  # fmt: skip
     return matched
-
-
-def _sort(rows: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    return rows[np.argsort(keys[rows], kind="stable")]
-
-
-def _nearest(keys: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Index of the nearest of sorted `others` for each key; of two equally near ones the first."""
-    right = np.clip(np.searchsorted(others, keys), 0, len(others) - 1)
-    left = np.maximum(right - 1, 0)
-    return np.where(keys - others[left] <= others[right] - keys, left, right)

@@ -7,14 +7,17 @@ tile it is computed in: neighbours are thinned, sorted and summed in an order th
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.kernels.geometry.plane_halves import compare_halves, misfit_of_angles
 from wavebatch.kernels.geometry.planes import Planes, fit_planes, is_flat, measure_angles
 from wavebatch.kernels.geometry.two_lines import in_two_lines
 from wavebatch.kernels.physics.incidence import STEEPEST
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 PAIRS = 500_000
 """Pairs of neighbours that are handled at a time, about 100 bytes each."""
@@ -90,12 +93,19 @@ def thin_out(xyz: np.ndarray, row: np.ndarray, radius: float) -> np.ndarray:
     return kept
 
 
+def grow_tree(points: np.ndarray, **settings: bool) -> cKDTree:
+    """Return a tree of points (m, d), with settings of SciPy's class; here, because most runs need none."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points, **settings)
+
+
 class Surroundings:
     """Points (m, 3) [m], finite, that may be neighbours of others. Sums run in the order of these points."""
 
     def __init__(self, xyz: np.ndarray) -> None:
         self._xyz = np.ascontiguousarray(xyz, np.float64)
-        self._tree = scipy.spatial.cKDTree(self._xyz, balanced_tree=False, compact_nodes=False)
+        self._tree = grow_tree(self._xyz, balanced_tree=False, compact_nodes=False)
 
     def find(self, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Pairs (point, neighbour) that are at most `radius` apart.
@@ -117,7 +127,7 @@ class Surroundings:
         if not len(points) or not len(self._xyz):
             return np.empty(0, np.int64), np.empty((0, 3))
         # Rounded distances differ from tree to tree; the exact test below is the same in every tree.
-        tree = scipy.spatial.cKDTree(points)
+        tree = grow_tree(points)
         near = tree.sparse_distance_matrix(self._tree, radius * (1 + 1e-6), output_type="ndarray")
         key = np.sort(near["i"] * np.int64(len(self._xyz)) + near["j"])
         point, neighbour = np.divmod(key, len(self._xyz))
@@ -277,7 +287,7 @@ def find_edges(
         return edge
     with np.errstate(invalid="ignore", divide="ignore"):
         level = points[:, :2] - (points[:, 2:] - np.median(points[able, 2])) * (ray[:, :2] / ray[:, 2:])
-    tree = scipy.spatial.cKDTree(level[able])
+    tree = grow_tree(level[able])
     few = level[able[:: max(len(able) // SPACED, 1)]]
     spacing = float(np.median(tree.query(few, k=[min(RING, len(able))])[0]))
     # The footprint reaches over the edge, and so does that of the pulses behind it that still see this surface.

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.kernels.geometry.planes import LEAST_SPREAD, Planes
 
@@ -125,6 +124,8 @@ def _choose_cut(sums: np.ndarray, squares: np.ndarray) -> Halves:
     left = np.maximum(squares - both, 0.0) + count * LEAST_SPREAD**2
     freedom = np.maximum(count - 6.0, 1.0)
     ratio = np.maximum(both - whole, 0.0) / 3.0 * freedom / np.maximum(left, LEAST_SPREAD**2)
+    import scipy.special  # here, because most runs need none of it
+
     chance = scipy.special.fdtrc(3.0, freedom, ratio)
     chance = np.where(known, np.minimum(CUTS * chance, 1.0), 1.0)
     pair = np.stack([tilts[rows, best], tilts[rows, best + CUTS]], axis=1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.kernels.physics.incidence import STEEPEST, angle_of_spread
 
@@ -108,6 +107,8 @@ _FARTHEST = 8.0
 def _conditional_table() -> np.ndarray:
     """Rows: a measurement above a threshold at 0, then the means of the normal law (of width 1) for which 16, 50 and
     84 % of the measurements that are above the threshold lie above it."""
+    import scipy.special  # here, because most runs need none of it
+
     over = np.r_[np.geomspace(1e-3, 0.1, 60), np.linspace(0.1, _FARTHEST, 400)[1:]]
     columns = [over]
     for share in (0.1587, 0.5, 0.8413):

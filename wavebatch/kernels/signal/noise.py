@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.order import median, quantile
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.library import call
@@ -182,7 +183,7 @@ def _estimate_from(
             measured = _leave_signal_out(signal, own, used, measured, lags, last if turn else _smoothed_std(measured))
         if measured is None:
             known = level[np.isfinite(level)].astype(np.float64)
-            middle = float(np.mean(known)) if len(known) else float(np.median(signal))
+            middle = float(np.mean(known)) if len(known) else float(median(signal))
             return PooledNoise(middle, max(std, QUANTISATION_STD), 0.0, 0.0, recovery=recovery)
         covariance = measured
         level = np.where(number > 0, np.nan_to_num(level) + mean, np.float32(np.nan))
@@ -214,7 +215,7 @@ def _lopsided(signal: np.ndarray, level: np.ndarray, quiet: np.ndarray) -> float
         return 1.0
     if np.mean(signal[1:-1][inner] == signal.min()) > MOST_LEAST:
         return 1.0
-    values = values - np.median(values)
+    values = values - median(values)
     above, below = (float(np.sum(np.square(values[side]), dtype=np.float64)) for side in (values > 0, values < 0))
     return above / max(below, 1e-12)
 
@@ -249,7 +250,7 @@ def quiet_edges(signal: np.ndarray, missing: np.ndarray | None = None) -> tuple[
     lower = edges[1][0] < edges[0][0]
     level, power = (np.where(lower, edges[1][i], edges[0][i]) for i in (0, 1))
     least = QUANTISATION_STD**2
-    common: float = max(float(np.quantile(power, QUIET_EDGES)), least)
+    common: float = max(quantile(power, QUIET_EDGES), least)
     for _ in range(8):
         quiet = power <= ALIKE * common
         last, common = common, max(float(np.mean(power[quiet], dtype=np.float64)), least)
@@ -299,14 +300,14 @@ def _find_calm(deviation: np.ndarray, quiet: np.ndarray) -> np.ndarray:
     number = quiet.sum(axis=0)
     power = np.einsum("sn,sn->n", deviation * quiet, deviation) / np.maximum(number, 1)
     enough = number >= EDGE
-    typical = float(np.median(power[enough])) if enough.any() else 0.0
+    typical = float(median(power[enough])) if enough.any() else 0.0
     return ~enough | (power <= ALIKE * max(typical, QUANTISATION_STD**2))
 
 
 def _common_level(own: np.ndarray, number: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Level of each waveform (n,) [count]: that of most, or where these scatter by more than the noise its own."""
     _, spread = _spread_of_levels(own[number > 0].astype(np.float64), number[number > 0], covariance)
-    return own if spread**2 > covariance[0] else np.full_like(own, np.median(own[number > 0]))
+    return own if spread**2 > covariance[0] else np.full_like(own, median(own[number > 0]))
 
 
 def _may_be_lopsided(signal: np.ndarray, quiet: np.ndarray, covariance: np.ndarray) -> bool:
@@ -334,7 +335,7 @@ def _leave_signal_out(
     limit, reach, number = np.float32(HIGH * std), -(-lags // 6), quiet.sum(axis=0)
     calm = ~(quiet & (np.abs(smoothed) > limit)).any(axis=0) & (number > 0)
     if calm.any():
-        smoothed -= np.float32(np.median((sum_samples(above) / np.maximum(number, 1))[calm]))
+        smoothed -= np.float32(median((sum_samples(above) / np.maximum(number, 1))[calm]))
     beyond = widen(quiet & (smoothed > limit), reach), widen(quiet & (-smoothed > limit), reach)
     mirrored = measure_covariance(signal, quiet, lags, beyond)
     if mirrored is None:
@@ -521,7 +522,7 @@ def measure_recovery(
     if len(rows) < 2 * LEAST_WAVEFORMS:
         return 0
     peak = above[:, rows].max(axis=0)
-    rows = rows[peak >= np.median(peak)]
+    rows = rows[peak >= median(peak)]
     strong, quiet, above = strong[:, rows], quiet[:, rows], above[:, rows] - before[rows]
     place = np.arange(s, dtype=np.int32)[:, None]
     last = accumulate(np.maximum, (place + np.int32(1)) * strong) - np.int32(1)
@@ -537,12 +538,12 @@ def measure_recovery(
     # Baselines from the samples before the signal and those at least 0, 1, 2 ... steps after it, less the former alone.
     kept = np.cumsum(count[::-1], axis=0)[::-1]
     difference = np.cumsum(total[::-1], axis=0)[::-1] / (kept + number[rows])
-    middle = np.median(difference, axis=1)
+    middle = median(difference, axis=1)
     bias = np.abs(middle)
-    spread = MAD_TO_STD * np.median(np.abs(difference - middle[:, None]), axis=1)
+    spread = MAD_TO_STD * median(np.abs(difference - middle[:, None]), axis=1)
     error = MEDIAN_ERROR * spread / np.sqrt(len(rows))
     # Without those samples a baseline is that of a few before the signal, or the strip's: no worse than its spread.
-    alone = min(noise.spread, noise.std / np.sqrt(np.median(number[rows])))
+    alone = min(noise.spread, noise.std / np.sqrt(median(number[rows])))
     least = np.clip(alone, RECOVERED, 2 * RECOVERED) * max(noise.std, 1.0)
     right = bias <= np.maximum(least, 4 * error)
     return int(np.argmax(np.r_[right, True])) * step

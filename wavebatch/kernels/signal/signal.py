@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.order import distinct
 from wavebatch.kernels.signal.runs import find_stretches
 
 SMOOTH_GAIN = np.sqrt(6.0) / 4.0
@@ -103,7 +104,7 @@ def _rows_with_runs(samples: np.ndarray, value: int) -> np.ndarray:
     at = np.flatnonzero(seen == value) * LEAST_PADDING + first
     after = np.minimum(at + half, len(flat) - 1)
     at = at[(flat[at - half] == value) | (flat[after] == value)]
-    return np.unique(at // s)
+    return distinct(at // s)
 
 
 def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:

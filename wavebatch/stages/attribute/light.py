@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain
@@ -101,6 +100,8 @@ def area_factor(system: SystemPulse, echoes: EchoTable) -> np.ndarray:
         exp(kappa^2 / 2) of a skewed pulse, which may differ from echo to echo; of exp(-|z|^p / 2) by its exponent.
     """
     if "power" in echoes.attributes:
+        import scipy.special  # here, because most runs need none of it
+
         power = echoes.attributes["power"].astype(np.float64)
         half_width = 2 * (2 * log(2)) ** (1 / power) / FWHM_PER_SIGMA
         return 2 ** (1 + 1 / power) * scipy.special.gamma(1 + 1 / power) / half_width / SQRT_2PI

@@ -9,12 +9,12 @@ from typing import Annotated, Any
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Settings, Solution
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.kernels.fit.whole_pulse import keep_echoes
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
@@ -28,12 +28,12 @@ from wavebatch.stages.pulse_tables import (
     MOST_WIDTH,
     ShapeLimits,
     clip_level,
-    describe_echoes,
     error_factors,
     matched_gaussian,
     noise_filter,
     pulse_shape,
     shape_limits,
+    whole_pulse,
 )
 
 
@@ -297,39 +297,23 @@ def describe_solution(
         Fitted echoes with errors and flags.
     """
     given = attributes or {}
-    cluster = solution.cluster
-    waveform, misfit = clusters.waveform[cluster], solution.misfit[cluster]
-    parameters, errors, shared = solution.parameters[:, :3], solution.errors[:, :3], solution.shared
-    flags = np.where(solution.at_bound, EchoFlag.AT_BOUND, 0)
-    flags |= np.where(solution.converged[cluster], 0, EchoFlag.NOT_CONVERGED)
-    flags |= np.where(solution.number[cluster] > 1, EchoFlag.OVERLAPPED, 0)
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     fitted = system if settings.shape.components else replace(system, components=(), kappa=settings.shape.kappa)
-    level_err = None if noise.baseline_err is None else (noise.baseline_err / noise.std)[waveform]
-    factors = error_factors(fitted, block.spacing, parameters[:, 2], level_err)
-    energy_err = relative_energy_errors(parameters, errors, shared) * factors[:, 3]
-    parameters, errors = describe_echoes(settings.shape, limits, parameters, errors, shared)
-    errors *= factors[:, :3]
-    amplitude, time, width = parameters.T
-    energy = amplitude * amplitude * width * SQRT_PI
-    last = block.samples.shape[1] - 1
-    keep = (energy >= (significance * noise.std[waveform]) ** 2) & (time >= -0.5 * width) & (time <= last + 0.5 * width)
-    keep &= np.isfinite(errors).all(axis=1)
-    if block.missing is not None:
-        # An echo between two recorded samples is known, however narrow it is.
-        keep &= gap_distance(block.missing, waveform, time) >= -np.maximum(0.5 * width, 1.0)
-    amplitude, time, width = parameters[keep].T
-    amplitude_err, time_err, width_err = errors[keep].T
-    spacing = block.spacing
+    spacing, length, widths = block.spacing, block.samples.shape[1], solution.parameters[:, 2]
+    level_err = None
+    if noise.baseline_err is not None:
+        level_err = (noise.baseline_err / noise.std)[np.repeat(clusters.waveform, solution.number)]
+    factors = error_factors(fitted, spacing, widths, level_err)
+    whole = whole_pulse(settings.shape, limits, widths)
+    columns, row = keep_echoes(clusters, solution, whole, factors, noise.std, spacing, length, significance)
     if CLUSTER in given:
         # Colour that makes errors larger is left to the acceptance, which has made `noise.std` of it.
         given = {**given, FACTOR: np.minimum(factors[:, 0], 1.0).astype(np.float32)}
-    table = EchoTable.build(
-        waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
-        amplitude_err=amplitude_err, sigma_err=width_err * spacing, relative_energy_err=energy_err[keep],
-        residual=misfit[keep], flags=flags[keep],
-        attributes={name: values[keep] for name, values in given.items()},
-    )  # fmt: skip
+    table = EchoTable.build(**columns, attributes={name: values[row] for name, values in given.items()})
+    if block.missing is not None:
+        # An echo between two recorded samples is known, however narrow it is.
+        away = gap_distance(block.missing, table.waveform, table.time / spacing)
+        table = table.take(away >= -np.maximum(0.5 * table.sigma / spacing, 1.0))
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components or not system.components:
         table = drop_unproven(table, system, clip_level(block, system) - system.noise.baseline)
@@ -340,29 +324,3 @@ def describe_solution(
     if settings.grow:
         table = cover_hidden(table, system, len(block))
     return flag_echoes(block, noise, system, clear_lone(table))
-
-
-def relative_energy_errors(parameters: np.ndarray, errors: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """Compute the relative errors of amplitude times width.
-
-    Parameters
-    ----------
-    parameters, errors : float64 array, shape (m, 3)
-        Amplitude, time and width, and their standard deviations.
-    shared : float64 array, shape (m, 2)
-        Covariance of amplitude and width, and of time and width.
-
-    Returns
-    -------
-    float64 array, shape (m,)
-        Standard deviations; NaN where the covariance is.
-
-    References
-    ----------
-    docs/algorithms.md 5.
-    """
-    amplitude, _, width = parameters.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        variance = (errors[:, 0] / amplitude) ** 2 + (errors[:, 2] / width) ** 2
-        variance += 2 * shared[:, 0] / (amplitude * width)
-    return np.sqrt(np.maximum(variance, 0))

@@ -37,8 +37,9 @@ target itself, inside of an outline that is too large: it is named, and by how m
 MOST_CLIPPED = 0.2
 """Share of clipped echoes from which a target is refused: the others are the dim ones, by a third of their scatter."""
 
-EDGE_SIGMA, LEAST_EDGE = 4.0, 0.01
-"""Echoes of the outer half differ from the others where their medians do by so many errors and by this share."""
+EDGE_SIGMA, LEAST_EDGE, LEAST_CORE = 4.0, 0.01, 0.1
+"""Echoes of the outer half differ from the others where their medians do by so many errors and by the second share; the
+few in the middle differ from all by the third, which no stain does: the target is smaller than its outline."""
 
 
 LEAST_NEGATIVE, MOST_REFLECTANCE = 0.01, 2.0
@@ -132,7 +133,8 @@ def measure_target(
     )
     inner = MEDIAN_ERROR * (result.spread or 0.0) / np.sqrt(result.echoes - 1)
     hot_err = 0.5 * target.hot_spot / (1.0 + target.hot_spot)
-    error = float(np.sqrt(reflectance_error**2 + hot_err**2 + facing_err**2 + inner**2 + edge_err**2 + strange_err**2))
+    other = max(edge_err, strange_err)
+    error = float(np.sqrt(reflectance_error**2 + hot_err**2 + facing_err**2 + inner**2 + other**2))
     return replace(result, relative_error=error), rows[used], constant
 
 
@@ -227,18 +229,24 @@ def _share_strange(constant: np.ndarray) -> tuple[float, float]:
 
 
 def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None, float]:
-    """The outer half's constant over the inner one's, less 1, where they differ; and the error that follows."""
+    """The outer half's constant over the inner one's, or that of all over that of the few in the middle, less 1, where
+    they differ; and the error that follows."""
     outer = depth < np.median(depth)
     if min(outer.sum(), (~outer).sum()) < LEAST_ECHOES // 2:
         return None, 0.0
     parts = [constant[outer], constant[~outer]]
     middle = [float(np.median(part)) for part in parts]
-    spreads = [MAD_TO_STD * np.median(np.abs(p / m - 1.0)) for p, m in zip(parts, middle, strict=True)]
+    spreads = [MAD_TO_STD * float(np.median(np.abs(p / m - 1.0))) for p, m in zip(parts, middle, strict=True)]
     errors = [MEDIAN_ERROR * s / np.sqrt(len(p)) for s, p in zip(spreads, parts, strict=True)]
     off = middle[0] / middle[1] - 1.0
-    if abs(off) < max(LEAST_EDGE, EDGE_SIGMA * float(np.hypot(*errors))):
+    if abs(off) >= max(LEAST_EDGE, EDGE_SIGMA * float(np.hypot(*errors))):
+        return float(off), abs(float(off))
+    few = LEAST_ECHOES // 2
+    core = float(np.median(constant[np.argsort(depth)[-few:]]))
+    off = float(np.median(constant)) / core - 1.0
+    if abs(off) < max(LEAST_CORE, EDGE_SIGMA * max(spreads) * MEDIAN_ERROR / few**0.5):
         return None, 0.0
-    return float(off), abs(float(off))
+    return off, abs(off / (1.0 + off))
 
 
 def combine_targets(results: Sequence[TargetResult], light_err: np.ndarray, channel: int = 0) -> ChannelConstant | None:

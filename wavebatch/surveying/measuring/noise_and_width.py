@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.order import median
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -193,7 +194,7 @@ def find_edge(widths: np.ndarray, errors: np.ndarray | None = None) -> float:
     float
         In the unit of the widths.
     """
-    typical = 0.0 if errors is None else float(np.median(errors / widths))
+    typical = 0.0 if errors is None else float(median(errors / widths))
     allowed, climb = max(REPEAT_SPAN, 3 * typical), max(CLIMB, 5 * typical)
     ordered = log(np.sort(widths.astype(np.float64)))
     hold = min(max(LEAST_REPEATED, int(np.ceil(REPEATED * len(ordered)))), len(ordered))
@@ -204,7 +205,7 @@ def find_edge(widths: np.ndarray, errors: np.ndarray | None = None) -> float:
     half = max(len(near) // 2, min(2, len(near)))
     inner = near[half - 1 :] - near[: len(near) - half + 1]
     begin = int(np.argmin(inner))
-    return float(exp(np.median(near[begin : begin + half])))
+    return float(exp(median(near[begin : begin + half])))
 
 
 def find_saturation(samples: np.ndarray, max_count: int) -> float | None:

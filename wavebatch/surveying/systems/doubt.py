@@ -37,7 +37,8 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
     alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
     if alone is None:
         return
-    known = find_source(system) is not None
+    # Known systems are read and compared only where that decides.
+    known = (alone < FEW or (doubt or 0.0) > MOST_DOUBTED_KNOWN) and find_source(system) is not None
     most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
     reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
     # So few that the judge sees what the pulse was learned from: many Gaussians explain any waveforms.

@@ -10,13 +10,14 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import Any, Literal, TypedDict, Unpack
 
 from wavebatch.batch.job import StripJob, choose_columns, list_column_names
 from wavebatch.batch.options import RunOptions, describe_options
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.selection import build_selection
+from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
 from wavebatch.files.inputs import find_strips
@@ -30,10 +31,52 @@ from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
-from wavebatch.tools.api.chain import AUTO, load_chain
+from wavebatch.tools.api.strip import AUTO, load_chain
 
-if TYPE_CHECKING:
-    from wavebatch.tools.api.run_keywords import RunKeywords
+
+class RunKeywords(TypedDict, total=False):
+    """What RunOptions takes beside the output."""
+
+    chain: Chain | Path | str | None
+    profile: str | None
+    tolerance: float | None
+    system: Survey | Path | str | None
+    force: bool
+    survey: Literal["each", "flight"]
+    calibration: Path | str | None
+    direction: Literal["auto", "toward", "away"]
+    headerless: bool
+    recursive: bool
+    trajectory: Path | str | None
+    lever_arm: tuple[float, float, float] | None
+    crs: str | None
+    flight_height: float | None
+    attenuation: float | None
+    attenuation_error: float | None
+    visibility: float | None
+    wavelength: float | None
+    energy: Path | str | None
+    where: Condition | str | None
+    drop_flags: str | None
+    classes: tuple[int, ...] | None
+    bbox: tuple[float, float, float, float] | None
+    polygon: Path | str | None
+    points: Literal["echoes", "returns"]
+    columns: str | None
+    names: Literal["wavebatch", "asprs", "riegl", "pdal", "opals"]
+    format: Literal["laz", "las"]
+    point_format: int | None
+    las_version: Literal["1.4", "1.3", "keep"]
+    no_data: Literal["-9999", "nan"]
+    strict: bool
+    keep_packets: bool
+    jobs: int
+    scheduler: str | None
+    memory: int | None
+    block_size: int | None
+    overwrite: bool
+    resume: bool
+
 
 Strips = Iterable[Path | str] | Path | str
 

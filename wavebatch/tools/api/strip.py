@@ -1,4 +1,4 @@
-"""A strip as users see it from Python: what its headers say, its waveforms block by block, and its survey."""
+"""A strip as users see it from Python: headers, waveforms block by block, its survey, and the chain that it needs."""
 
 from __future__ import annotations
 
@@ -7,18 +7,69 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
-from wavebatch.surveying import Survey, survey_blocks
+from wavebatch.stages import chain_file
+from wavebatch.stages.chain import Chain
+from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.angle_limits import survey_angles
-from wavebatch.surveying.auto_chain import decide
+from wavebatch.surveying.auto_chain import choose_chain, decide
 from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.outgoing import compare_outgoing
+from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.systems.saved_check import with_look
+
+AUTO = "auto"
+"""In place of a chain's name: the survey of each strip chooses the chain."""
+
+
+def load_chain(name: Path | str) -> Chain:
+    """Load a shipped chain by its name, or a chain file by its path.
+
+    Parameters
+    ----------
+    name : path or str
+        "fast", "balanced", "accurate" or another shipped chain, or the path of a TOML file. Text without a folder and
+        a suffix is a name.
+
+    Returns
+    -------
+    Chain
+        The checked chain. `chain.run(block, system)` gives the echoes of a block.
+
+    Raises
+    ------
+    ConfigError
+        Where there is no such chain or it is wrong; names file, table, key and the nearest known word.
+    """
+    known = chain_file.list_profiles()
+    if isinstance(name, Path) or Path(name).name != name or Path(name).suffix:
+        return chain_file.load_chain(name)
+    if name not in known:
+        raise ConfigError(f"profile {name!r} does not exist; {nearest(name, [AUTO, *known])}")
+    return chain_file.load_profile(name)
+
+
+def auto_chain(survey: Survey) -> Chain:
+    """Choose the cheapest chain that loses nothing on the surveyed strip.
+
+    Parameters
+    ----------
+    survey : Survey
+        Result of `survey`; its `decisions` give the reason for every part that is left out.
+
+    Returns
+    -------
+    Chain
+        The chain that `run` would choose for this strip.
+    """
+    return choose_chain(survey)
+
 
 BLOCK_SIZE = 16_384
 """Waveforms of a block by default: above some 4,000 the speed hardly changes, memory does (80 samples: about 10 MB)."""

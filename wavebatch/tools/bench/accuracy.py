@@ -1,24 +1,243 @@
 """How well chains find the simulated echoes: groups of waveforms with their truth, and the figures over all groups.
 
-`command` and `stability` make groups and add what a chain found to AccuracyTally. Each group has one seed and survey,
-because the survey of a strip is a source of error too.
+`command` and tests/bench make groups and add what a chain found to AccuracyTally. Each group has one seed and survey,
+because the survey of a strip is a source of error too. The error of a figure is that of the difference of two runs with
+other seeds, because that is what a reader compares.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoTable
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.core.no_data import without_nan
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.runs import lobe_edges
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 from wavebatch.stages.score import ISOLATED, QUANTITIES, find_isolated_echoes, list_pairs, match_echoes
 from wavebatch.surveying import Survey, survey_block
-from wavebatch.tools.bench.figures import Figure, root_mean_square, share_figure
-from wavebatch.tools.bench.truth import describe_truth, find_bounds
 from wavebatch.tools.simulate import Scene, simulate_blocks
+from wavebatch.tools.simulate.render import PulseModel, Recording, main_lobe, paint_echoes, spread_lobes
+
+NOTHING = float("nan")
+
+SURVEY_SCATTER = 0.05
+"""Relative scatter of an rms error between strips that differ only in their survey, measured on 16 strips with a
+learned pulse. At least this much is assumed, because a few groups can miss it by chance."""
+
+OUTLIER = 10.0
+"""Error of the worst echo of another run, in units of the root mean square."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A value and its error: the standard error of the difference between two runs that differ in their seed.
+
+    That is 1.41 times the standard error of the value, which is the larger of two estimates: from the scatter of single
+    waveforms, and from the scatter of the groups, which are simulated and surveyed separately.
+    """
+
+    value: float = NOTHING
+    error: float = NOTHING
+
+    def to_json(self) -> dict[str, Any]:
+        """Value and error; None where there were no data."""
+        return without_nan(asdict(self))
+
+    def scale(self, factor: float) -> Figure:
+        """The figure in another unit."""
+        return Figure(self.value * factor, self.error * factor)
+
+
+def share_figure(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Figure:
+    """Sum of `part` over that of `whole`, counts per waveform (n,) in groups (n,), as a figure.
+
+    Shares near 0 or 1 keep the error that two counts more or less would make (Agresti and Coull 1998).
+    """
+    total = float(whole.sum())
+    if not total:
+        return Figure()
+    value = float(part.sum()) / total
+    error = _standard_error((part - value * whole) / total, group)
+    drawn = (total * value + 2) / (total + 4)
+    return Figure(value, float(np.sqrt(2) * max(error, np.sqrt(drawn * (1 - drawn) / (total + 4)))))
+
+
+def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray) -> Figure:
+    """Root mean square of values (m,) of echoes of the given waveforms (m,), unique over all groups, as a figure.
+
+    The error includes the scatter of surveys, and one more echo OUTLIER times as bad as the others.
+    """
+    if len(values) < 2:
+        return Figure()
+    squares = np.square(values.astype(np.float64))
+    mean = float(squares.mean())
+    if not mean:
+        return Figure(0.0, 0.0)
+    influence = (squares - mean) / (2 * np.sqrt(mean) * len(squares))
+    _, place, where = np.unique(waveform, return_index=True, return_inverse=True)
+    per_waveform = np.bincount(where, influence)
+    error = _standard_error(per_waveform, group[place])
+    rare = np.sqrt(mean) * (np.sqrt(1 + OUTLIER**2 / len(squares)) - 1)
+    surveys = SURVEY_SCATTER * np.sqrt(mean / len(np.unique(group)))
+    return Figure(float(np.sqrt(mean)), float(np.hypot(np.sqrt(2) * max(error, surveys), rare)))
+
+
+def _standard_error(influence: np.ndarray, group: np.ndarray) -> float:
+    """Standard error of an estimate from the contribution of each independent waveform, (n,)."""
+    single = float(np.sqrt(np.square(influence).sum()))
+    sums = np.bincount(group, influence)[np.unique(group)]
+    g = len(sums)
+    if g < 4:
+        return single
+    # The scatter of few groups is itself uncertain: the standard deviation of Student's t with g - 1 degrees.
+    return max(single, float(np.sqrt(g / (g - 3) * np.square(sums).sum())))
+
+
+def median_range(values: list[float]) -> dict[str, Any]:
+    """Median, least, most and number of repeated measurements; None without any."""
+    found = [float(measure(values)) if values else None for measure in (np.median, min, max)]
+    return {**dict(zip(("median", "min", "max"), found, strict=True)), "repeats": len(values)}
+
+
+def find_front(costs: Sequence[Sequence[float | None]]) -> np.ndarray:
+    """Pareto front: True for the rows of costs (n, k) that no other row beats.
+
+    A row beats another if it is as good in all columns and better in one. Rows with an unknown cost (None or NaN) are
+    never on the front.
+    """
+    values = np.array(costs, np.float64)
+    known = np.isfinite(values).all(axis=1)
+    no_worse = (values[:, None, :] <= values[None, :, :]).all(axis=2)
+    better = (values[:, None, :] < values[None, :, :]).any(axis=2)
+    return known & ~(no_worse & better & known[:, None]).any(axis=0)
+
+
+def choose_cheapest(rows: Sequence[Mapping], tolerance_cm: float) -> Mapping | None:
+    """The row of least time per waveform whose isolated echoes, their error added, meet the tolerance; None if none.
+
+    rows: as in the document of the benchmark.
+    """
+
+    def is_good(row: Mapping) -> bool:
+        error = row["figures"]["rmse_isolated_cm"]
+        return error["value"] is not None and error["value"] + (error["error"] or 0) <= tolerance_cm
+
+    good = [row for row in rows if row["kernels"]["median"] is not None and is_good(row)]
+    return min(good, key=lambda row: (row["kernels"]["median"], row["name"]), default=None)
+
+
+_GRID = 49
+_STEP = 0.02
+"""Step of the numeric derivatives, in widths of the system pulse."""
+
+
+def describe_truth(truth: EchoTable, pulse: PulseModel) -> EchoTable:
+    """The truth with, as sigma, the full width at half maximum over 2.354820.
+
+    Simulation gives the sigma of the main lobe; decomposers report that of the whole pulse. For a Gaussian they are
+    equal.
+    """
+    return replace(truth, sigma=_measure(pulse, truth.sigma.astype(np.float64)).astype(np.float32))
+
+
+def effective_noise(recording: Recording) -> float:
+    """Standard deviation of one sample [count] of white noise that disturbs an echo as much as the recorded noise.
+
+    Coloured noise: std of the [1 2 1]/4-smoothed samples over the gain for white noise (docs/algorithms.md H11).
+    """
+    smoothed = np.sqrt(smoothed_power(recording.color) / 16) / SMOOTH_GAIN
+    return float(np.hypot(recording.noise_std * smoothed, QUANTISATION_STD))
+
+
+def smoothed_power(color: np.ndarray | int) -> np.ndarray | float:
+    """Variance of noise smoothed by [1 2 1], over that of its samples; color: as Recording.color."""
+    first, second = color / (color + 1), color * (color - 1) / ((color + 1) * (color + 2))
+    return 6 + 8 * first + 2 * second
+
+
+def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
+    """Cramer-Rao bounds of time [ns], amplitude [count] and sigma [ns] of every true echo, (m, 3).
+
+    All echoes of a waveform are estimated together, the baseline is known; clipped samples have no weight, noise grows
+    with the signal. truth: as tools.simulate gives it; the bounds are those of the terms of `describe_truth`, infinite
+    where the samples do not determine them. Source: inverse Fisher matrix, derivatives of the painted pulse by central
+    differences.
+    """
+    if not len(truth):
+        return np.empty((0, 3))
+    columns, painted = _differentiate(recording, truth)
+    weight = _weigh(recording, truth, painted, n)
+    columns *= weight[truth.waveform][:, None, :]
+    bounds = np.full((len(truth), 3), np.inf)
+    count = truth.count(n)
+    first = np.cumsum(count) - count
+    for k in np.unique(count[count > 0]):
+        rows = first[count == k][:, None] + np.arange(k)
+        bounds[rows] = _invert(columns[rows].reshape(len(rows), 3 * k, -1)).reshape(len(rows), k, 3)
+    return bounds
+
+
+def _differentiate(recording: Recording, truth: EchoTable) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of each echo alone by time, amplitude and sigma, (m, 3, s), and the echo, (m, s)."""
+    rows = np.arange(len(truth))
+    amplitude, sigma = truth.amplitude.astype(np.float64), truth.sigma.astype(np.float64)
+
+    def paint(time: np.ndarray, width: np.ndarray) -> np.ndarray:
+        return paint_echoes(recording, len(truth), rows, time, amplitude, width)
+
+    step = _STEP * recording.pulse.sigma
+    echo = paint(truth.time, sigma)
+    by_time = (paint(truth.time + step, sigma) - paint(truth.time - step, sigma)) / (2 * step)
+    wider, narrower = sigma + step, sigma - step
+    grown = _measure(recording.pulse, wider) - _measure(recording.pulse, narrower)
+    by_sigma = (paint(truth.time, wider) - paint(truth.time, narrower)) / np.maximum(grown, 1e-9)[:, None]
+    return np.stack([by_time, echo / amplitude[:, None], by_sigma], axis=1).astype(np.float64), echo
+
+
+def _weigh(recording: Recording, truth: EchoTable, painted: np.ndarray, n: int) -> np.ndarray:
+    """Inverse standard deviation of every sample, 0 where it is clipped, (n, s)."""
+    signal = np.zeros((n, recording.n_samples))
+    np.add.at(signal, truth.waveform, painted)
+    variance = effective_noise(recording) ** 2 + recording.noise_gain * np.maximum(signal, 0)
+    return np.where(signal + recording.baseline < recording.clip, 1 / np.sqrt(variance), 0.0)
+
+
+def _invert(columns: np.ndarray) -> np.ndarray:
+    """Standard deviations (g, p) from weighted derivatives (g, p, s)."""
+    scale = np.sqrt(np.square(columns).sum(axis=2))
+    columns = columns / np.where(scale > 0, scale, 1.0)[:, :, None]
+    values, vectors = np.linalg.eigh(columns @ columns.transpose(0, 2, 1))
+    # Scaled columns: the diagonal is 1, so that eigenvalues show how well the parameters can be separated.
+    values = np.where(values > 1e-11, values, np.nan)
+    variance = (np.square(vectors) / values[:, None, :]).sum(axis=2)
+    known = ~np.isnan(variance) & (scale > 0)
+    return np.where(known, np.sqrt(np.where(known, variance, 1.0)) / np.where(scale > 0, scale, 1.0), np.inf)
+
+
+def _measure(pulse: PulseModel, sigma: np.ndarray) -> np.ndarray:
+    """Full width at half maximum over 2.354820 of true echoes [ns], (m,)."""
+    if not pulse.lobes:
+        skew = abs(pulse.kappa)
+        wider = 2 * np.sinh(skew * FWHM_PER_SIGMA / 2) / (skew * FWHM_PER_SIGMA) if skew > 1e-6 else 1.0
+        return sigma * wider
+    if not len(sigma):
+        return sigma
+    grid = np.linspace(sigma.min(), max(sigma.max(), 1.001 * sigma.min()), _GRID)
+    step = grid[0] / 100
+    x = np.arange(-int(4 * grid[-1] / step), int(6 * grid[-1] / step))[:, None] * step
+    ones = np.ones(_GRID)
+    total = np.zeros((len(x), _GRID))
+    for number, (start, height, width) in enumerate(spread_lobes(pulse, 0 * ones, ones, grid)):
+        total += height * main_lobe((x - start) / width, pulse.kappa if number == 0 else 0.0)
+    edges = np.array([lobe_edges(x[:, 0], curve, 0.5 * curve.max()) for curve in total.T])
+    return np.interp(sigma, grid, np.diff(edges, axis=1)[:, 0] / FWHM_PER_SIGMA)
+
 
 CLEAR = 10.0
 """Signal to noise from which the error of an echo is compared with its bound."""

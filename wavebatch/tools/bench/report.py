@@ -1,21 +1,26 @@
-"""Text tables of a benchmark document, and its files: bench.json, bench.txt and plots.
+"""A benchmark as a sheet, and its files: bench.json, bench.txt, a page and plots of error against run time.
 
-`wavebatch bench` calls `format_document` and `write_outputs`. A column of a table names a figure of the rows; `align`
-makes the text, for the examples and tests/bench too.
+`wavebatch bench` prints `bench_sheet` and calls `write_outputs`. A column of a table names a figure of the rows.
+`align` makes tables of the examples and of tests/bench.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.publish import reporting
-from wavebatch.files.figure_file import has_matplotlib
+from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.score import QUANTITIES
-from wavebatch.tools.bench.plot import NO_PLOT, plot_scene
+from wavebatch.tools.bench.accuracy import find_front
+from wavebatch.tools.sheets.sheet import Cell, Later, Note, Part, Picture, Sheet, Table, list_lines
 
 ReportColumn = tuple[str, str, float, int]
 """Head, name of the figure, factor, decimals."""
@@ -44,46 +49,62 @@ REPORTED: tuple[ReportColumn, ...] = (
 """Errors of times over the reported ones: echoes without and with a flag of UNCLEAN, and by what was found around."""
 
 
+NO_PLOT = f"no plot without matplotlib: {advise_install('matplotlib')}"
+
+PANELS = (
+    ("wrong", 100.0, "echoes missed or false [%]"),
+    ("rmse_all_cm", 1.0, "rms error of the range, all echoes [cm]"),
+)
+
+
 def _ratios(kind: str) -> tuple[ReportColumn, ...]:
     columns = tuple((name, f"{name}_ratio_{kind}", 1.0, 3) for name in QUANTITIES)
     return (*columns, ("gross %", f"gross_{kind}", 100, 2), ("err column", f"time_calibration_{kind}", 1.0, 3))
 
 
-def format_document(document: Mapping[str, Any]) -> str:
-    """All tables as text."""
-    parts = [
+def bench_sheet(document: Mapping[str, Any]) -> Sheet:
+    """The sheet of a benchmark: for each scene what was measured of every chain."""
+    words = (
         f"wavebatch {document['version']} bench, seed {document['seed']}. +- is the {document['error_means']} "
-        "(1.41 times that of the figure).",
-        *(_format_scene(section, document.get("tolerance_cm")) for section in document["scenes"]),
-    ]
-    return "\n\n".join(parts)
+        "(1.41 times that of the figure)."
+    )
+    scenes = (_scene_sheet(one, document.get("tolerance_cm")) for one in document["scenes"])
+    return Sheet("bench", [Note(words), *scenes])
 
 
-def _format_scene(section: Mapping[str, Any], tolerance_cm: float | None) -> str:
+def format_document(document: Mapping[str, Any]) -> str:
+    """The text of a benchmark."""
+    return "\n".join(list_lines(bench_sheet(document)))
+
+
+def write_bench_page(target: Path, document: Mapping[str, Any]) -> None:
+    """Write the page of a benchmark; document: as --json prints it."""
+    from wavebatch.tools.sheets.page import write_page
+
+    names = ", ".join(section["scene"] for section in document["scenes"])
+    write_page(target, f"wavebatch bench: {names}", bench_sheet(document).parts)
+
+
+def _scene_sheet(section: Mapping[str, Any], tolerance_cm: float | None) -> Sheet:
     rows, survey = section["rows"], section["survey"]
-    head = [
-        f"== {section['scene']}: {section['meaning']}",
+    found = (
         f"survey of {survey['groups']} x {survey['waveforms_of_a_group']} waveforms: "
         f"sigma {_span(survey['sigma_ref'])} ns, noise {_span(survey['noise_std'])} DN, "
         f"kappa {_span(survey['kappa'])}, "
-        f"acceptance {_span(survey['acceptance'])}, Gaussians {', '.join(map(str, survey['components']))}",
-    ]
-    parts = [head, _speed_table(rows), _figure_table("echoes found", rows, SHARES)]
-    parts.append(_figure_table("rms error of the range", rows, LENGTHS))
+        f"acceptance {_span(survey['acceptance'])}, Gaussians {', '.join(map(str, survey['components']))}"
+    )
+    parts: list[Part] = [Note(f"== {section['scene']}: {section['meaning']}"), Note(found)]
+    parts += [Later(partial(_draw_scene, section)), _speed_table(rows)]
+    parts += [_figure_table("echoes found", rows, SHARES), _figure_table("rms error of the range", rows, LENGTHS)]
     for kind in ("isolated", "overlapped"):
         parts.append(_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind)))
     parts.append(_figure_table("rms error of the time / its error column, SNR >= 10", rows, REPORTED))
     if tolerance_cm is not None:
-        parts.append([_format_cheapest(section, tolerance_cm)])
-    return "\n\n".join(map("\n".join, parts))
-
-
-def _format_cheapest(section: Mapping[str, Any], tolerance_cm: float) -> str:
-    wanted = f"an error of {tolerance_cm:g} cm for isolated echoes"
-    if section["cheapest"] is None:
-        return f"no chain meets {wanted}"
-    row = next(row for row in section["rows"] if row["name"] == section["cheapest"])
-    return f"cheapest chain with {wanted}: {row['name']} ({figure_text(row, LENGTHS[1])} cm)"
+        wanted = f"an error of {tolerance_cm:g} cm for isolated echoes"
+        best = next((row for row in rows if row["name"] == section["cheapest"]), None)
+        words = f"cheapest chain with {wanted}: {best['name']} ({figure_text(best, LENGTHS[1])} cm)" if best else ""
+        parts.append(Note(words or f"no chain meets {wanted}"))
+    return Sheet(f"Scene {section['scene']}", parts)
 
 
 def _span(times: Mapping[str, Any]) -> str:
@@ -91,32 +112,33 @@ def _span(times: Mapping[str, Any]) -> str:
     return low if low == high else f"{low}..{high}"
 
 
-def rate_text(times: Mapping[str, Any]) -> str:
+def _rate(times: Mapping[str, Any]) -> Cell:
     """Waveforms per second from times in microseconds: median and range."""
     if not times["median"]:
-        return "-"
-    return f"{1e6 / times['median']:,.0f} ({1e6 / times['max']:,.0f}..{1e6 / times['min']:,.0f})"
+        return Cell("-", "")
+    rate = 1e6 / times["median"]
+    return Cell(f"{rate:,.0f} ({1e6 / times['max']:,.0f}..{1e6 / times['min']:,.0f})", rate)
 
 
-def _speed_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    lines = [["median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front"]]
+def _speed_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    head = ("median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front")
+    lines = []
     for row in rows:
         name = row["name"]
         if row.get("same_as"):
             name += f" (is {row['same_as']})"
         if row.get("crashed_or_hung"):
             name += f" ({row['crashed_or_hung']} crashed or hung)"
-        once, memory = row["survey_seconds"]["median"], row["peak_bytes"]
-        rates = (rate_text(row[kind]) for kind in ("kernels", "file", "file_with_survey"))
-        cells = ("-" if once is None else f"{once:.2f}", "-" if memory is None else f"{memory / 1e6:.0f}")
-        lines.append([name, *rates, *cells, "*" if row["pareto"] else ""])
-    return align(lines)
+        rates = (_rate(row[kind]) for kind in ("kernels", "file", "file_with_survey"))
+        megabytes = None if row["peak_bytes"] is None else row["peak_bytes"] / 1e6
+        lines.append((name, *rates, row["survey_seconds"]["median"], megabytes, "*" if row["pareto"] else ""))
+    return Table(head, lines, ("", "", "", "", ".2f", ".0f", ""), sortable=True)
 
 
-def _figure_table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[ReportColumn]) -> list[str]:
-    lines = [[title, *(column[0] for column in columns)]]
-    lines += [[row["name"], *(figure_text(row, column) for column in columns)] for row in rows]
-    return align(lines)
+def _figure_table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[ReportColumn]) -> Table:
+    lines = [(row["name"], *(Cell(figure_text(row, one), row["figures"][one[1]]["value"]) for one in columns))
+             for row in rows]  # fmt: skip
+    return Table((title, *(column[0] for column in columns)), lines, sortable=True)
 
 
 def figure_text(row: Mapping[str, Any], column: ReportColumn) -> str:
@@ -159,3 +181,55 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> str:
         for name, text in texts.items():
             write_text(folder / name, text + "\n", overwrite=True)
     return f"{folder}: {', '.join(texts)}"
+
+
+def plot_scene(section: Mapping[str, Any], target: Path) -> None:
+    """Writes the plot of one scene of a document as PNG, over an older one."""
+    with open_picture(target, (11, 4.6), overwrite=True, dpi=120) as figure:
+        figure.suptitle(plain_text(f"{section['scene']}: error against run time, one core"))
+        for axes, panel in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+            _draw_panel(axes, section["rows"], *panel)
+
+
+def _draw_scene(section: Mapping[str, Any]) -> Iterator[Picture]:
+    """The same panels for a page."""
+    from wavebatch.tools.plots.charts import picture
+
+    for panel in PANELS:
+        draw = lambda figure, panel=panel: _draw_panel(  # noqa: E731
+            figure.add_axes((0.12, 0.14, 0.85, 0.82)), section["rows"], *panel
+        )
+        yield from picture(panel[2], (5.6, 3.6), draw, "Below and to the left is better.")
+
+
+def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: float, label: str) -> None:
+    """Draws one error against time."""
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+    from wavebatch.tools.plots.draw_cloud import MARKERS, SERIES
+
+    twins = {row["same_as"]: row["name"] for row in rows if "same_as" in row}
+    rows = [row for row in rows if "same_as" not in row]
+    known = [row for row in rows if row["kernels"]["median"] and row["figures"][name]["value"] is not None]
+    time = np.array([row["kernels"]["median"] for row in known])
+    value = np.array([row["figures"][name]["value"] * factor for row in known])
+    error = np.array([(row["figures"][name]["error"] or 0.0) * factor for row in known])
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("kernels: microseconds per waveform")
+    axes.set_ylabel(label)
+    if not known:
+        return
+    chains = np.array([row["kind"] == "chain" for row in known])
+    front = find_front(np.where(chains[:, None], np.stack([time, value], axis=1), np.nan))
+    order = np.flatnonzero(front)[np.argsort(time[front])]
+    axes.plot(time[order], value[order], color="tab:red", zorder=1, label="Pareto front")
+    for i, row in enumerate(known):
+        names = " = ".join([row["name"], *filter(None, [twins.get(row["name"])])])
+        marker, color = MARKERS[i // len(SERIES) % len(MARKERS)], SERIES[i % len(SERIES)]
+        axes.errorbar(time[i], value[i], yerr=error[i], fmt=marker, color=color, capsize=2, label=names)
+    axes.margins(x=0.25, y=0.15)
+    axes.set_ylim(bottom=0)
+    axes.legend(fontsize=7.0)

@@ -25,9 +25,9 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.angle_limits import REFERENCE_ERROR
-from wavebatch.tools.csv_table import format_csv
 from wavebatch.tools.plots.draw_cloud import SERIES
 from wavebatch.tools.plots.labels import set_head
+from wavebatch.tools.sheets.sheet import format_csv
 
 ANGLES = np.arange(0.0, 81.0)
 """Angles of the table [deg]."""

@@ -9,12 +9,228 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy  # parts of it load when they are first asked for
 
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
+from wavebatch.files.las.point_formats import CLASS_NAMES
+from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
-from wavebatch.tools.compare.breakdown import Breakdown, Table, name_class
-from wavebatch.tools.compare.differences import SPEED, Differences, ErrorSpread
+from wavebatch.tools.even_sample import EvenSample
+
+_OCTAVES = 18
+"""Classes of amplitude: below 1, then one per doubling; the last one holds everything larger."""
+
+_NUMBERS = 16
+"""Return numbers that a LAS point can hold, 0 to 15."""
+
+Table = dict[str, tuple[int, int]]
+"""Per class: echoes without a partner, and all echoes."""
+
+
+class Breakdown:
+    """Counts echoes of one side, with and without a partner on the other side, by possible reasons."""
+
+    def __init__(self) -> None:
+        self._tallies = {kind: np.zeros((len(names), 2), np.int64) for kind, names in _NAMES.items()}
+
+    def add(self, rows: np.ndarray, alone: np.ndarray, others: np.ndarray | None) -> None:
+        """Adds echoes (k,), CLOUD_DTYPE.
+
+        alone: echoes without a partner, bool (k,). others: number of echoes of the other side in the pulse of each
+        echo, (k,); None if unknown.
+        """
+        numbered = rows["number"] > 0
+        code = np.minimum(rows["total"], _NUMBERS - 1) * np.int64(_NUMBERS) + np.minimum(rows["number"], _NUMBERS - 1)
+        self._count("return", code[numbered], alone[numbered])
+        self._count("class", rows["classification"], alone)
+        known = ~np.isnan(rows["amplitude"])
+        self._count("amplitude", _octave(rows["amplitude"][known]), alone[known])
+        self._count("intensity", _octave(rows["intensity"]), alone)
+        if others is not None:
+            self._count("pulse", (others > 0).astype(np.int64), alone)
+        flags = [*((rows["flags"] & np.uint16(flag)) != 0 for flag in EchoFlag), rows["flags"] == 0]
+        for place, has in enumerate(flags):
+            self._count("flag", np.full(int(has.sum()), place), alone[has])
+
+    def _count(self, kind: str, code: np.ndarray, alone: np.ndarray) -> None:
+        tally = self._tallies[kind]
+        tally[:, 0] += np.bincount(code[alone], minlength=len(tally))
+        tally[:, 1] += np.bincount(code, minlength=len(tally))
+
+    def tables(self) -> dict[str, Table]:
+        """For each kind the classes that have an echo; kinds without data are left out.
+
+        `intensity` is there only without amplitudes and if not all are 0; `flag` and `class` only if any echo has one.
+        """
+        tables = {}
+        for kind, tally in self._tallies.items():
+            rows = np.flatnonzero(tally[:, 1]).tolist()
+            tables[kind] = {_NAMES[kind][row]: (int(tally[row, 0]), int(tally[row, 1])) for row in rows}
+        if tables["amplitude"] or set(tables["intensity"]) <= {_OCTAVE_NAMES[0]}:
+            del tables["intensity"]
+        if set(tables["flag"]) <= {"none"}:
+            del tables["flag"]
+        if set(tables["class"]) <= {name_class(0)}:
+            del tables["class"]
+        return {kind: table for kind, table in tables.items() if table}
+
+
+def _octave(values: np.ndarray) -> np.ndarray:
+    """Classes of amplitudes: 0 below 1, 1 from 1 to 2, 2 from 2 to 4 ..., i8 (k,)."""
+    return np.clip(np.frexp(np.clip(values.astype(np.float64), 0.0, 1e9))[1], 0, _OCTAVES - 1).astype(np.int64)
+
+
+def name_class(number: int) -> str:
+    """A LAS class with its name, if the standard has one."""
+    return f"{number} {CLASS_NAMES[number]}" if number in CLASS_NAMES else str(number)
+
+
+_OCTAVE_NAMES = ["below 1", *(f"{1 << n}-{2 << n}" for n in range(_OCTAVES - 2)), f"from {1 << (_OCTAVES - 2)}"]
+_NAMES = {
+    "return": [f"{number} of {total}" for total in range(_NUMBERS) for number in range(_NUMBERS)],
+    "class": [name_class(number) for number in range(256)],
+    "amplitude": _OCTAVE_NAMES,
+    "intensity": _OCTAVE_NAMES,
+    "pulse": ["nothing of the other side", "other echoes of the other side"],
+    "flag": [*(flag.name for flag in EchoFlag), "none"],
+}
+"""Per kind of class the names of its classes."""
+
+
+SPEED = 0.9997 * HALF_C
+"""Metres along the ray per ns; the factor is the refractive index of air, n = 1.0003."""
+
+_BOTH = ("echo_time", "amplitude", "echo_width")
+"""Columns that are compared if both sides have them."""
+
+GROUPS = {"class": "classification", "echoes": "total"}
+"""By what differences are grouped: the LAS class, and the number of echoes of the pulse."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSpread:
+    """Differences a minus b of one quantity, over the echoes that both sides have."""
+
+    number: int
+    median: float
+    mean: float
+    rms: float
+    nmad: float
+
+
+class Differences:
+    """Collects pairs of echoes (CLOUD_DTYPE): sums of all pairs, and an even sample of them for medians."""
+
+    def __init__(self, limit: int | None = None) -> None:
+        self._sample = EvenSample(limit)
+        self.sums = {name: np.zeros(3) for name in ("time", *_BOTH)}
+        self._grouped = {
+            (kind, side, name): np.zeros((256, 3)) for kind in GROUPS for side in "ab" for name in self.sums
+        }
+
+    def add(self, a: np.ndarray, b: np.ndarray) -> None:
+        """Adds pairs: a[i] with b[i]."""
+        part = {name: a[name].astype(np.float64) - b[name] for name in _BOTH}
+        part["time"] = measure_lag(a, b) / SPEED
+        for name, values in part.items():
+            good = values[~np.isnan(values)]
+            self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
+            for kind, column in GROUPS.items():
+                for side, rows in (("a", a), ("b", b)):
+                    group = rows[column][~np.isnan(values)]
+                    sums = self._grouped[kind, side, name]
+                    for place, weights in enumerate((None, good, np.square(good))):
+                        sums[:, place] += np.bincount(group, weights, len(sums))
+        for name in ("amplitude_err", "echo_width_err", "range_err"):
+            part[name] = a[name]
+        for name in ("amplitude", "echo_width", "flags"):
+            part[f"true_{name}"] = b[name]
+        for kind, column in GROUPS.items():
+            part |= {f"{kind}_a": a[column], f"{kind}_b": b[column]}
+        part["isolated"] = b["isolated"] if "isolated" in b.dtype.names else np.zeros(len(b), bool)
+        self._sample.add(part)
+
+    def spreads(self) -> dict[str, ErrorSpread]:
+        """Median, mean, rms and NMAD of a minus b, for each quantity that both sides have."""
+        data = self._sample.read()
+        return {name: _spread(sums, data[name]) for name, sums in self.sums.items() if sums[0]}
+
+    def groups(self) -> dict[str, dict[int, dict[str, ErrorSpread]]]:
+        """The same by kind of GROUPS and by number: of the class, and of the echoes that the pulse has.
+
+        A pair belongs to the group of its echo of b; where b has no groups (all are 0), to that of its echo of a.
+        Kinds in which both sides have none are left out. Medians of rare groups are NaN if the sample has none of them.
+        """
+        data, result = self._sample.read(), {}
+        for kind in GROUPS:
+            side = next((side for side in "ba" if self._grouped[kind, side, "time"][1:, 0].any()), None)
+            if side is None:
+                continue
+            result[kind] = {
+                group: {
+                    name: _spread(sums[group], data[name][data[f"{kind}_{side}"] == group])
+                    for name in self.sums if (sums := self._grouped[kind, side, name])[group, 0]
+                }
+                for group in np.flatnonzero(self._grouped[kind, side, "time"][:, 0]).tolist()
+            }  # fmt: skip
+        return result
+
+    def errors(self, meta: dict) -> dict[str, dict[str, ErrorStats]]:
+        """Errors of time [ns], amplitude [DN] and sigma [ns], in units of the bound and of the reported errors."""
+        data = self._sample.read()
+        if not data:
+            return {}
+        sigma = data["true_echo_width"].astype(np.float64) / FWHM_PER_SIGMA
+        amplitude = data["true_amplitude"].astype(np.float64)
+        sigma[~(sigma > 0)] = amplitude[~(amplitude > 0)] = np.nan  # of a damaged truth: there is no bound
+        reported = {name: data[name].astype(np.float64) for name in ("range_err", "amplitude_err", "echo_width_err")}
+        bounds = crlb(amplitude, sigma, meta["noise_std"], meta["spacing"])
+        columns = {
+            "time": (data["time"], bounds[0], reported["range_err"] / SPEED),
+            "echo_time": (data["echo_time"], bounds[0], reported["range_err"] / SPEED),
+            "amplitude": (data["amplitude"], bounds[1], reported["amplitude_err"]),
+            "sigma": (data["echo_width"] / FWHM_PER_SIGMA, bounds[2], reported["echo_width_err"] / FWHM_PER_SIGMA),
+        }
+        classes = {
+            "all": np.ones(len(sigma), bool),
+            "isolated": data["isolated"],
+            "overlapped": (data["true_flags"] & np.uint16(EchoFlag.OVERLAPPED)) != 0,
+        }
+        return {
+            kind: {name: _measure(rows, *values) for name, values in columns.items()} for kind, rows in classes.items()
+        }
+
+
+def _spread(sums: np.ndarray, values: np.ndarray) -> ErrorSpread:
+    """The spread from number, sum and sum of squares of all pairs, and from the differences of a sample of them."""
+    number, total, squares = sums.tolist()
+    values = values[~np.isnan(values)]
+    median = np.median(values) if len(values) else np.nan
+    nmad = MAD_TO_STD * np.median(np.abs(values - median)) if len(values) else np.nan
+    return ErrorSpread(int(number), float(median), total / number, float(np.sqrt(squares / number)), float(nmad))
+
+
+def measure_lag(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance of a after b along the ray [m], f8 (k,), positive away from the sensor.
+
+    The ray is the packet vector of b, or of a; without both, the lower point counts as the farther one.
+    """
+    step = a["xyz"] - b["xyz"]
+    ray = np.where(np.any(b["ray"] != 0, axis=1)[:, None], b["ray"], a["ray"]).astype(np.float64)
+    length = np.linalg.norm(ray, axis=1)
+    known = length > 0
+    down = -np.sign(ray[:, 2]) / np.where(known, length, 1.0)
+    along = np.einsum("ij,ij->i", step, ray) * down
+    by_height = np.linalg.norm(step, axis=1) * -np.sign(step[:, 2])
+    return np.where(known & (down != 0), along, by_height)
+
+
+def _measure(rows: np.ndarray, error: np.ndarray, bound: np.ndarray, reported: np.ndarray) -> ErrorStats:
+    rows = rows & ~np.isnan(error)
+    return ErrorStats.compute(error[rows], bound[rows], reported[rows])
+
 
 MOST_PER_PULSE = 64
 """More echoes than this with one GPS time are not a pulse: such times are missing or rounded."""
@@ -128,8 +344,8 @@ class Pairing:
         """
         left = right = np.empty(0, np.int64)
         if len(a) and len(b):
-            to_b, nearest_b = cKDTree(b["xyz"]).query(a["xyz"], distance_upper_bound=self.tolerance)
-            _, nearest_a = cKDTree(a["xyz"]).query(b["xyz"], distance_upper_bound=self.tolerance)
+            to_b, nearest_b = scipy.spatial.cKDTree(b["xyz"]).query(a["xyz"], distance_upper_bound=self.tolerance)
+            _, nearest_a = scipy.spatial.cKDTree(a["xyz"]).query(b["xyz"], distance_upper_bound=self.tolerance)
             left = np.flatnonzero(np.isfinite(to_b))
             right = nearest_b[left]
             mutual = nearest_a[right] == left
@@ -215,7 +431,7 @@ def _list_crowded(
     rows_a, rows_b = (np.flatnonzero(crowd[pulse]) for pulse in (pulse_a, pulse_b))
     if not len(rows_a) or not len(rows_b):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    trees = cKDTree(xyz_a[rows_a]), cKDTree(xyz_b[rows_b])
+    trees = scipy.spatial.cKDTree(xyz_a[rows_a]), scipy.spatial.cKDTree(xyz_b[rows_b])
     if trees[0].count_neighbors(trees[1], reach) > MOST_PAIRS:
         raise InputError(
             f"{len(rows_a)} and {len(rows_b)} points share their GPS times with more than {MOST_PER_PULSE} others and "

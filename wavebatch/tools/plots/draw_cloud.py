@@ -118,7 +118,10 @@ def _draw_series(axes: Axes, found: Histogram, series: int, as_counts: bool) -> 
     text = f"{label}{number:,} values, mean {_value_text(found.means[series], found.edges)}, median {median}{unit}"
     if number < FEWEST_IN_LINE:
         filled, middles = np.flatnonzero(counts), 0.5 * (found.edges[:-1] + found.edges[1:])
-        axes.plot(middles[filled], counts[filled], "o", color=color, label=text)
+        # A share of two values is a half: it would press all other series down.
+        place = {} if as_counts else {"transform": axes.get_xaxis_transform()}
+        height = counts[filled] if as_counts else np.full(len(filled), 0.02)
+        axes.plot(middles[filled], height, "o", color=color, label=text, **place)
     else:
         axes.stairs(counts, found.edges, color=color, linewidth=1.2, linestyle=style, label=text)
     if math.isnan(middle):

@@ -2,21 +2,20 @@
 
 Where to find what:
 
-scenes, canopy, hazards, draws   which echoes a waveform holds: kinds of land, plants, difficult cases, distributions
-geometry                         flight, rays and terrain
-pulses, render                   shape of an echo; echoes to samples with noise
-blocks                           a scene as blocks in memory, with the true echoes
-returns                          true echoes to discrete returns, as vendors and discrete receivers record them
-strip, truth                     a scene as a LAS or LAZ file, and the .npz with its true echoes
-from_returns, return_light       an existing cloud of returns as a strip with modelled waveforms
+scenes, draws   which echoes a waveform holds: kinds of land, difficult cases; distributions, plants
+geometry        flight, rays and terrain
+render          shape of an echo; echoes to samples with noise
+blocks          a scene as blocks in memory, with the true echoes
+returns         true echoes to discrete returns, as vendors and discrete receivers record them; the light of a return
+strip, truth    a scene as a LAS or LAZ file, and the .npz with its true echoes
+from_returns    an existing cloud of returns as a strip with modelled waveforms
 
 Called by `wavebatch simulate`, `wavebatch synthesize`, tools.bench, the examples and the tests.
 """
 
 from wavebatch.tools.simulate.blocks import flag_truth, simulate_block, simulate_blocks
-from wavebatch.tools.simulate.canopy import CANOPIES
-from wavebatch.tools.simulate.pulses import PULSES, PulseModel, find_pulse, shape_pulse
-from wavebatch.tools.simulate.render import Recording
+from wavebatch.tools.simulate.draws import CANOPIES
+from wavebatch.tools.simulate.render import PULSES, PulseModel, Recording, find_pulse, shape_pulse
 from wavebatch.tools.simulate.returns import DiscreteReceiver
 from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES, Scene, find_scene
 from wavebatch.tools.simulate.strip import ReturnSummary, StripOptions, StripSummary, simulate_returns, simulate_strip

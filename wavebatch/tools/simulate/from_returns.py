@@ -25,8 +25,7 @@ from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.files.wkt_repair import repair_records
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
-from wavebatch.tools.simulate.return_light import LightCounts, LightModel, ReturnLight, SynthesisOptions
-from wavebatch.tools.simulate.returns import fill_packets
+from wavebatch.tools.simulate.returns import LightCounts, LightModel, ReturnLight, SynthesisOptions, fill_packets
 
 MARGIN = 6.0
 """Time before the first and after the last return of a pulse, in standard deviations of the pulse."""

@@ -1,20 +1,287 @@
 """From true echoes to discrete returns: those of a vendor's software, and those of a receiver with a dead zone.
 
 `strip.simulate_strip` stores the returns of `list_returns` with the waveforms; `strip.simulate_returns` stores those of
-a DiscreteReceiver, which has no waveforms. Both models give a Returns table.
+a DiscreteReceiver, which has no waveforms. Both models give a Returns table. For `from_returns` it also says how much
+light each return of a cloud sends back, how wide its echo is, and which share of the beam it takes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
-from wavebatch.tools.simulate.render import Recording
+from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
+from wavebatch.tools.simulate.render import MOST_NOISE, PulseModel, Recording
+
+EQUAL = "equal"
+"""Word in place of a column of shares: the returns of a pulse take the same share each, as many as it had."""
+
+WIDEST = 50.0
+"""Largest standard deviation of an echo [ns]; the least is half a sample."""
+
+_MOST_LIMITED = 0.5
+"""Largest share of the widths of a column that may be limited: with more, the column is not what was meant."""
+
+_TOLERANCE = 1e-4
+"""Shares that are stored as float32 or in steps of 1e-4 may be above 1 by so much."""
+
+
+@dataclass(frozen=True, slots=True)
+class Radar:
+    """Parameters of the lidar equation besides range and reflectance, see kernels.physics.radar."""
+
+    height: Annotated[float, Range(-1e6, 1e6)] = option(
+        MISSING, "Reflectance: height of the sensor, in the heights of CLOUD [m].", form="M", name="sensor-height"
+    )
+    power: Annotated[float, Range(1e-6, 1e12)] = option(
+        1.0, "Reflectance: peak power of the pulse [W].", form="W", unset="1"
+    )  # matters only with a gain
+    aperture: Annotated[float, Range(1e-4, 100.0)] = option(
+        0.1, "Reflectance: diameter of the receiver [m].", form="M", unset="0.1"
+    )
+    divergence: Annotated[float, Range(0.001, 100.0)] = option(
+        0.5, "Reflectance: full angle of the beam [mrad].", form="MRAD", unset="0.5"
+    )
+    efficiency: Annotated[float, Range(1e-6, 1.0)] = option(
+        0.5, "Reflectance: efficiency of the optics.", form="SHARE", unset="0.5"
+    )
+    attenuation: Annotated[float, Range(0.0, 100.0)] = option(
+        0.22, "Reflectance: attenuation of the air [dB/km].", form="DB_KM", unset="0.22"
+    )
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+@dataclass(frozen=True, slots=True)
+class SynthesisOptions:
+    """How returns become waveforms."""
+
+    intensity: Literal["peak", "reflectance"] = option(
+        "peak", "Meaning of the intensities: peak amplitudes, or reflectances (65535 is 1), from which the lidar "
+        "equation computes amplitudes.",
+    )  # fmt: skip
+    gain: Annotated[float | None, Above(0.0, 1e20)] = option(
+        None, "DN per unit of intensity, or per W.", form="DN", unset="fills 80 % of the digitizer"
+    )  # amplitudes must stay numbers in float32
+    radar: Radar | None = None
+    """Needed for `reflectance`, and only there."""
+    width: Annotated[float, Above(0.0, 1000.0)] = option(
+        4.7, "Full width of the pulse at half maximum [ns], and of echoes without a width.", form="NS"
+    )
+    widths: str | None = option(
+        None, "Column with the full width of each echo at half maximum [ns].", form="COLUMN",
+        unset="echo_width, if present",
+    )  # fmt: skip
+    shares: str | None = option(
+        None, "Reflectance: column with the share of the footprint that each return takes, 0 to 1, or equal. Returns "
+        "without data take evenly what the others of their pulse leave; shares above 1 together are scaled to 1.",
+        form="COLUMN|equal", unset="each return fills it",
+    )  # fmt: skip
+    spacing: Annotated[float, Range(0.001, 4000.0)] = option(1.0, "Time between samples [ns].", form="NS")
+    bits: Literal[8, 16, 32] = option(8, "Bits per sample.")
+    baseline: float = option(12.0, "Level without signal [DN].")
+    noise: Annotated[float, Range(0.0, MOST_NOISE)] = option(
+        0.0, "Standard deviation of the noise before rounding [DN].", form="DN"
+    )
+    seed: int = 0
+    internal: bool = option(
+        True, "Store packets in the file or in a .wdp file.", opposite="external", unset="internal"
+    )
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if (self.radar is None) != (self.intensity == "peak"):
+            raise ConfigError("the sensor's height is needed for intensity reflectance, and only there")
+        if self.shares is not None and self.radar is None:
+            raise ConfigError(
+                "shares of the beam need intensity reflectance: the peaks of returns hold their shares already"
+            )
+        if self.sigma < 0.5 * self.spacing:
+            raise ConfigError(f"a pulse of {self.width} ns is too short for samples every {self.spacing} ns")
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of an echo [ns]."""
+        return self.width / FWHM_PER_SIGMA
+
+    def recording(self, n_samples: int) -> Recording:
+        """The receiver with waveforms of that length; raises ConfigError for values that none can have."""
+        pulse = PulseModel(self.sigma)
+        return Recording(n_samples, self.spacing, self.bits, self.baseline, 0.0, self.noise, pulse=pulse)
+
+
+@dataclass(slots=True)
+class LightCounts:
+    """What was assumed about widths and shares."""
+
+    own_width: int = 0
+    """Returns with a width in the cloud; the others have the width of the pulse."""
+    limited_width: int = 0
+    """Of these, returns whose width lies outside of half a sample to WIDEST, and was set to that limit."""
+    assumed_unit: bool = False
+    """Whether the column of the widths states no unit, and its values were taken as ns."""
+    own_share: int = 0
+    """Returns with a share in the cloud."""
+    assumed_share: int = 0
+    """Returns that take, together and evenly, what the others of their pulse leave."""
+    over_one: int = 0
+    """Pulses whose shares were more than 1 together, and were divided by their sum."""
+    pulses: int = 0
+    """Pulses with shares."""
+    shares: float = 0.0
+    """Sum of all shares."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReturnLight:
+    """k returns of whole pulses."""
+
+    strength: np.ndarray
+    """Peak of each before the gain: intensity, or received power [W], f8 (k,)."""
+    sigma: np.ndarray
+    """Standard deviation of each echo [ns], f8 (k,)."""
+
+
+class LightModel:
+    """The light of the returns of one cloud; counts what is assumed.
+
+    Raises ConfigError if the cloud lacks a column of the options, or has it in another unit, or if it is a field that
+    LAS itself defines: none of these is a width or a share, and integers such as the class pass for both.
+    """
+
+    def __init__(self, path: Path, options: SynthesisOptions) -> None:
+        self.path, self.options, self.counts = path, options, LightCounts()
+        self._read_width = self._open("widths", ("-", "ns"), "the width of each echo in ns")
+        self._read_share = None
+        if options.shares != EQUAL:
+            self._read_share = self._open("shares", ("-",), "the share of each return, 0 to 1")
+
+    def _open(self, option: str, units: tuple[str, ...], needed: str) -> Callable[[np.ndarray], np.ndarray] | None:
+        """From raw records to the values of an option's column; None where none is named."""
+        column = getattr(self.options, option)
+        if column is None:
+            return None
+        with ColumnReader(self.path, column) as reader:
+            facts = reader.facts[0]
+            if facts.unit not in units:
+                raise ConfigError(f"{self.path}: --{option} {column}: is in [{facts.unit}], needed is [{units[-1]}]")
+            if facts.is_standard:
+                raise ConfigError(
+                    f"{self.path}: --{option} {column}: is the LAS field {facts.name}; give an extra dimension with "
+                    f"{needed}"
+                )
+            self.counts.assumed_unit |= option == "widths" and facts.unit == "-"
+            return reader.find_value(column)
+
+    def measure(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> ReturnLight:
+        """The light of returns (k,), RETURN_DTYPE, with their raw records; starts: first return of each pulse.
+
+        Raises InputError for shares that are none, and for points above the sensor.
+        """
+        sigma = self._measure_sigma(rows["echo_width"] if self._read_width is None else self._read_width(records))
+        intensity = rows["intensity"].astype(np.float64)
+        if self.options.radar is None:
+            return ReturnLight(intensity, sigma)
+        power = _receive(intensity / 65535, rows, self.options.radar, self.path)
+        # The power is that of an echo as short as the pulse: a wider one spreads the same energy over a longer time.
+        power *= self.options.sigma / sigma
+        if self.options.shares is not None:
+            power *= self._measure_shares(rows, records, starts)
+        return ReturnLight(power, sigma)
+
+    def check_widths(self) -> None:
+        """Raises ConfigError where most widths of the named column had to be limited: they are no widths in ns."""
+        counts = self.counts
+        if self.options.widths is not None and counts.limited_width > _MOST_LIMITED * counts.own_width:
+            least, most = 0.5 * self.options.spacing * FWHM_PER_SIGMA, WIDEST * FWHM_PER_SIGMA
+            raise ConfigError(
+                f"{self.path}: --widths {self.options.widths}: {counts.limited_width} of {counts.own_width} values are "
+                f"outside of {least:.2g} to {most:.0f} ns; give a column with the width of each echo in ns"
+            )
+
+    def _measure_sigma(self, width: np.ndarray) -> np.ndarray:
+        known = width > 0
+        measured = np.where(known, width, 0.0) / FWHM_PER_SIGMA
+        limited = np.clip(measured, 0.5 * self.options.spacing, WIDEST)
+        self.counts.own_width += int(np.count_nonzero(known))
+        self.counts.limited_width += int(np.count_nonzero(known & (limited != measured)))
+        return np.where(known, limited, self.options.sigma)
+
+    def _measure_shares(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        known = over = 0
+        if self._read_share is None:
+            share = share_equally(rows["total"], starts)
+        else:
+            share = self._read_share(records).astype(float)
+            wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
+            if len(wrong):
+                raise InputError(
+                    f"{self.path}: {self.options.shares} holds {share[wrong[0]]:g}, which is no share of a footprint: "
+                    "shares are 0 to 1; give a column with such values to --shares"
+                )
+            known = int(np.count_nonzero(np.isfinite(share)))
+            share, over = fill_shares(share, starts)
+        self.counts.own_share += known
+        self.counts.assumed_share += len(share) - known
+        self.counts.over_one += over
+        self.counts.pulses += len(starts)
+        self.counts.shares += float(share.sum())
+        return share
+
+
+def share_equally(total: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Equal shares of the returns of whole pulses, f8 (k,).
+
+    total: number of returns that the points state, (k,): returns that the cloud lacks take their share, too. starts:
+    first return of each pulse.
+    """
+    number = np.diff(np.append(starts, len(total)))
+    return 1.0 / np.maximum(np.repeat(number, number), total)
+
+
+def fill_shares(share: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, int]:
+    """Shares of the returns of whole pulses, at most 1 together, without gaps.
+
+    share: f8 (k,), NaN for no data: such returns take, evenly, what the others of their pulse leave. starts: first
+    return of each pulse. Returns the shares, and the number of pulses with more than 1, divided by their sum.
+    """
+    if not len(starts):
+        return share, 0
+    known = np.isfinite(share)
+    pulse = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(share))))
+    total = np.add.reduceat(np.where(known, share, 0.0), starts)
+    unknown = np.add.reduceat((~known).astype(np.float64), starts)
+    rest = np.clip(1.0 - total, 0.0, 1.0) / np.maximum(unknown, 1.0)
+    filled = np.where(known, share, rest[pulse]) / np.maximum(total, 1.0)[pulse]
+    return filled, int(np.count_nonzero(total > 1.0 + _TOLERANCE))
+
+
+def _receive(reflectance: np.ndarray, rows: np.ndarray, radar: Radar, path: Path) -> np.ndarray:
+    """Received power of surfaces that fill the beam [W]."""
+    distance = (radar.height - rows["xyz"][:, 2]) / np.cos(np.radians(np.clip(rows["scan_angle"], -80, 80)))
+    if len(distance) and distance.min() <= 0:
+        highest = rows["xyz"][:, 2].max()
+        raise InputError(f"{path}: points as high as {highest:g} m lie above the sensor at {radar.height:g} m")
+    return receive_power(
+        spread_cross_section(reflectance, distance, 1e-3 * radar.divergence),
+        distance,
+        transmitted=radar.power,
+        aperture=radar.aperture,
+        divergence=1e-3 * radar.divergence,
+        efficiency=radar.efficiency,
+        attenuation=radar.attenuation,
+    )
+
 
 WEAKEST = 3.0
 """Echoes below this many standard deviations of the noise give no return."""

@@ -18,7 +18,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.npz_reader import read_npz
 from wavebatch.files.disk.publish import Draft, reporting
-from wavebatch.tools.slices.lines import ScanLine, align_times, find_main_axis
+from wavebatch.tools.slices.segments import ScanLine, align_times, find_main_axis
 
 MOST_VALUES = 200_000_000
 """Most values of a cube (800 MB): it is built in memory."""

@@ -147,7 +147,7 @@ def _build_header(space: VoxelSpace) -> LasHeader:
         point_length=0,
         scales=(0.5 * space.size,) * 3,
         offsets=tuple(float(value) for value in space.origin),
-        vlrs=[*vlrs, Vlr(b"wavebatch", 1, text, b"how these voxels were made (JSON)")],
+        vlrs=[*vlrs, Vlr(b"wavebatch", 1, text, b"how voxels were made (JSON)")],
         file_source_id=source.file_source_id,
         global_encoding=encoding,
         project_id=source.project_id,

@@ -362,6 +362,7 @@ def _describe(
     deconvolution = options.deconvolution
     return {
         "wavebatch": __version__,
+        "command": f"wavebatch voxelize {strip.name} --size {options.size:g}{' --forest' * options.forest}",
         "strip": strip.name,
         "size_m": options.size,
         "headroom_m": options.headroom,

@@ -106,7 +106,7 @@ def _describe_provenance(run: Mapping[str, Any]) -> dict[str, Any]:
         "input": _table(run.get("input")).get("file"),
         "chain": run.get("chain"),
         "chosen_by": _table(run.get("choice")).get("by"),
-        "columns": _table(run.get("columns")),
+        "columns": {name: text for name, text in _table(run.get("columns")).items() if isinstance(text, str)},
     }
 
 

@@ -12,10 +12,11 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, count, talk, tell
-from wavebatch.cli.plot.clouds import find_clouds, select
-from wavebatch.cli.program.completion import complete_columns
+from wavebatch.cli.messages import answer, talk, tell
+from wavebatch.cli.plot import find_clouds, select
+from wavebatch.cli.program.command import complete_columns
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import count
 from wavebatch.tools.rasters.forest import ForestOptions
 from wavebatch.tools.rasters.grid import GridOptions, GridResult, write_grid
 

@@ -1,0 +1,417 @@
+"""`wavebatch plot`: pictures of waveforms, histograms, maps, side views, heights, and slices of a data cube.
+
+Reads options, calls `wavebatch.tools.plots` and prints one line. The modules that draw are imported only after all
+else has succeeded: matplotlib takes long to import and may be missing.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wavebatch.cli import options as shared
+from wavebatch.cli.messages import NearestGroup, answer, tell
+from wavebatch.cli.program.command import complete_columns, complete_flags
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import count
+from wavebatch.files.disk.publish import check_target
+from wavebatch.files.figure_file import check_picture
+from wavebatch.files.inputs import SUFFIXES
+from wavebatch.files.text_file import write_text
+
+output_option = shared.output_option("Picture to write: .png, .svg or .pdf.")
+
+
+def find_clouds(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
+    """The files that the arguments name."""
+    return shared.find_inputs(clouds, recursive=options["recursive"])
+
+
+def draws_clouds(
+    *options_here: Callable, name: str | None = None, find: Callable[..., list[Path]] = find_clouds
+) -> Callable[[Callable[..., tuple[str, dict[str, Any]]]], click.Command]:
+    """A command that draws clouds: with its options, and those that all such commands share.
+
+    The function gets paths, picture and options, and gives what is printed and what --json adds. find: gives the paths
+    from arguments and options.
+    """
+
+    def decorate(draw: Callable[..., tuple[str, dict[str, Any]]]) -> click.Command:
+        @functools.wraps(draw)
+        def command(clouds: Sequence[Path], output: Path, **options: Any) -> None:
+            paths = find(clouds, options)
+            check_picture(output, overwrite=options["overwrite"])
+            text, found = draw(paths, output, options)
+            tell(f"{output}: {text}")
+            answer({"output": str(output), "clouds": [str(path) for path in paths], **found})
+
+        common = shared.selection_options, shared.common_options("overwrite", "json")
+        every = shared.clouds_argument, shared.declared("recursive"), output_option, *options_here, *common
+        return click.command(name or draw.__name__)(shared.together(*every)(command))
+
+    return decorate
+
+
+def select(column: str | None, options: dict[str, Any], *others: str) -> Any:
+    """The selection of columns and of the flags in the options."""
+    from wavebatch.core.condition import read_flags
+    from wavebatch.tools.plots.values import Selection
+
+    flags = read_flags(options["flags"]), read_flags(options["drop_flags"])
+    return Selection(column, *flags, others, options["where"])
+
+
+def list_tally(tally: Any) -> dict[str, int]:
+    """How many points were drawn, and how many were not, for --json."""
+    return {name: getattr(tally, name) for name in tally.__slots__}
+
+
+def describe_tally(tally: Any, outside: int, kind: str = "value") -> str:
+    """How many points were drawn, and how many were not, for people."""
+    left_out = f", {tally.left_out} left out" * bool(tally.left_out)
+    return f"{count(tally.values, kind)}, {tally.no_data} without data{left_out}, {outside} outside the picture"
+
+
+def read_range(text: str) -> tuple[float, ...]:
+    """Two finite numbers that go up."""
+    low, high = shared.parse_floats(text, "LOW:HIGH")
+    if not low < high or high - low == float("inf"):
+        raise click.BadParameter(f"{text!r} does not go up from one finite number to another")
+    return low, high
+
+
+@draws_clouds(
+    click.option("--column", required=True, shell_complete=complete_columns,
+                 help="Extra dimension or standard field; echo_flags counts flags."),
+    click.option("--by", metavar="COLUMN", shell_complete=complete_columns,
+                 help="Draw one line per value of this column, e.g. number_of_returns or classification."),
+    click.option("--bins", type=click.IntRange(1, 10_000), metavar="N",
+                 help="Number of bins.  [default: by the spread]"),
+    click.option("--range", "limits", type=shared.Text("LOW:HIGH", read_range), metavar="LOW:HIGH",
+                 help="Values to show.  [default: 5 to 95 % of each line, and 1.5 times that range on both sides; what "
+                 "lies outside is counted]"),
+    click.option("--log", is_flag=True, help="Use a logarithmic axis of counts."),
+    click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all."),
+    click.option("--counts", is_flag=True,
+                 help="Draw numbers also for several lines, not shares of each line's values."),
+)  # fmt: skip
+def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Draw the histogram of a column of CLOUDs of any size.
+
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. Points without data are left
+    out and counted. For a column with discrete values, each bin holds the same number of possible values.
+
+    Several lines (of --by or --each) are drawn as shares of their values, so that they can be compared.
+
+    Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.tools.plots.histogram import count_points_by_flag, count_values
+    from wavebatch.tools.plots.values import Clouds
+
+    selection = select(options["column"], options)
+    if Clouds(clouds, selection).facts.is_flags:
+        for name in ("bins", "limits", "each", "by", "counts"):
+            if options[name]:
+                option = "--range" if name == "limits" else f"--{name}"
+                raise ConfigError(f"{option} is of no use for flags, which are counted by name")
+        flags = count_points_by_flag(clouds, selection)
+        from wavebatch.tools.plots.draw_cloud import draw_flags
+
+        draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
+        total, text = flags.total, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
+        text += f", {total.left_out} left out" * bool(total.left_out)
+    else:
+        found = count_values(clouds, selection, **{name: options[name] for name in ("bins", "limits", "each", "by")})
+        from wavebatch.tools.plots.draw_cloud import draw_cloud_histogram
+
+        draw_cloud_histogram(found, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
+        total, text = found.total, describe_tally(found.total, int(found.below.sum() + found.above.sum()))
+    return text, {"column": options["column"], **list_tally(total)}
+
+
+@draws_clouds(
+    click.option("--column", shell_complete=complete_columns,
+                 help="Extra dimension or standard field; not needed for count and density."),
+    click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]),
+                 default="mean", show_default=True,
+                 help="Statistic of the values in a cell; density is points per square metre."),
+    click.option("--size", type=float, metavar="M",
+                 help="Side of a cell, in the unit of the coordinates.  [default: gives a few points per cell]"),
+    shared.bbox_option("Show"), name="map",
+)  # fmt: skip
+def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Draw a map of a column of CLOUDs of any size, over x and y.
+
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. Colours range from the 2nd to
+    the 98th percentile of the cells.
+
+    Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.tools.plots.raster import grid_values
+
+    column, statistic = options["column"], options["statistic"]
+    selection = select(column, options)
+    found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bbox"])
+    from wavebatch.tools.plots.draw_cloud import draw_cloud_map
+
+    draw_cloud_map(found, output, overwrite=options["overwrite"])
+    grid = found.grid
+    more = {"statistic": statistic, "outside": found.outside, "columns": grid.columns, "rows": grid.rows,
+            "size": grid.size, "unit": found.crs.unit}  # fmt: skip
+    cells = f"{grid.columns} x {grid.rows} cells of {grid.size:g} {found.crs.unit}"
+    text = f"{describe_tally(found.total, found.outside)}; {cells}"
+    return text, {"column": column, **list_tally(found.total), **more}
+
+
+def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> list[Path]:
+    """Clouds, one file of voxels, or files of segments: these from a folder or pattern where it has no clouds."""
+    from wavebatch.tools.slices.output import SEGMENT_SUFFIXES
+    from wavebatch.tools.slices.read_segments import check_alone, is_segments
+
+    kinds = (SUFFIXES, SEGMENT_SUFFIXES) if or_segments else (SUFFIXES,)
+    paths = shared.find_inputs(clouds, recursive=options["recursive"], kinds=kinds)
+    segments = [path for path in paths if is_segments(path)]
+    voxels = [path for path in paths if path.suffix.lower() == ".npz"]
+    if segments and or_segments:
+        check_alone(paths, options)
+    elif segments:
+        raise ConfigError(f"{segments[0]}: segments have no side view; use `plot profile`, or `slice --overview`")
+    if voxels and options["where"] is not None:
+        raise ConfigError(f"{voxels[0]}: --where is for points; give it to `wavebatch voxelize`")
+    return paths
+
+
+@draws_clouds(
+    shared.floats_option("--line", "X0,Y0,X1,Y1", "Ends of the section, in the coordinates of the clouds.  [default: "
+                         "along the longer extent]"),
+    click.option("--width", type=float, metavar="W",
+                 help="Show what lies within half of W from the line.  [default: a fiftieth of its length]"),
+    click.option("--column", shell_complete=complete_columns,
+                 help="Column for the colours.  [default: z; energy for voxels]"),
+    click.option("--aspect", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, metavar="F",
+                 help="Exaggerate heights F times."),
+    find=_find,
+)  # fmt: skip
+def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Draw a side view of CLOUDs or voxels along a line.
+
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
+    voxelize`. Scales are equal without --aspect. Of more than 200,000 points an even sample is drawn. The few points
+    that lie far above or below all others are left out and counted as outside.
+
+    Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.tools.plots.sections import cut_section
+
+    column = options["column"] or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
+    found = cut_section(paths, select(column, options), line=options["line"], width=options["width"])
+    from wavebatch.tools.plots.sections import draw_section
+
+    draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
+    kind = "voxel" if found.voxel else "point"
+    place = {"line": list(found.line), "width": found.width, "unit": found.crs.unit, "crs": found.crs.name or None}
+    more = {"inside": found.inside, "drawn": len(found.value), "voxel": found.voxel or None, **place}
+    text = f"{found.inside} of {describe_tally(found.total, found.outside, kind)}"
+    return text, {"column": column, **list_tally(found.total), **more, "outside": found.outside}
+
+
+@draws_clouds(
+    click.option("--column", shell_complete=complete_columns, help="Column for --statistic sum and mean, e.g. energy."),
+    click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,
+                 help="Of the points or voxels of a height.  [default: sum with --column, else count]"),
+    click.option("--size", type=float, metavar="M", help="Height of a bin.  [default: about a sixtieth of all]"),
+    click.option("--each", is_flag=True, help="Draw one line per cloud instead of one of all."),
+    click.option("--log", is_flag=True, help="Use a logarithmic axis of values."),
+    find=functools.partial(_find, or_segments=True),
+)  # fmt: skip
+def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Draw how many points, or how much of a column, of CLOUDs, voxels or segments lie at each height.
+
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
+    voxelize`; or .csv or .geojson files of `wavebatch slice` (a folder gives these where it has no clouds), whose
+    segments count in each bin by the share of their height there (columns: length, slope, residual, pulses, weight).
+    Heights are those of the coordinates, not above ground. Far outliers in height are left out and counted.
+
+    Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.tools.plots.sections import measure_profile
+    from wavebatch.tools.slices.read_segments import is_segments, profile_segments
+
+    column = options["column"]
+    statistic = options["statistic"] or ("count" if column is None else "sum")
+    how = {"size": options["size"], "each": options["each"]}
+    if segments := is_segments(paths[0]):
+        found = profile_segments(paths, column, statistic, **how)
+    else:
+        found = measure_profile(paths, select(column, options), statistic, **how)
+    from wavebatch.tools.plots.sections import draw_profile
+
+    draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
+    series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]
+    more = {"statistic": statistic, "outside": found.outside, "edges": found.edges.tolist(), "series": series}
+    text = describe_tally(found.total, found.outside, "segment" if segments else "value")
+    return text, {"column": column, **list_tally(found.total), **more, "unit": found.unit}
+
+
+@click.command()
+@click.argument("cube_file", type=shared.INPUT, metavar="CUBE.npz")
+@output_option
+@click.option("--x", type=click.IntRange(0), metavar="N", help="Slice across the lines at pulse N of each.")
+@click.option("--y", type=click.IntRange(0), metavar="N", help="Slice along scan line N.")
+@click.option("--t", type=float, metavar="NS", help="Slice of all pulses at one time [ns].")
+@shared.common_options("overwrite", "json")
+def cube(cube_file: Path, output: Path, **options: Any) -> None:
+    """Draw slices of a data cube of `wavebatch slice --cube`: x (pulse), y (scan line) and t (time).
+
+    Each given option adds a slice; without any, the middle ones are drawn, and the time with the most signal.
+
+    Exit code: 0 done, 1 the cube cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.tools.slices.cube import cut_cube
+
+    check_picture(output, overwrite=options["overwrite"])
+    slices = cut_cube(cube_file, {name: options[name] for name in "xyt"})
+    from wavebatch.tools.slices.output import draw_cube
+
+    draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
+    tell(f"{output}: {', '.join(one.title for one in slices)}")
+    drawn = [{"title": one.title, "rows": one.image.shape[0], "columns": one.image.shape[1],
+              "extent": list(one.extent), "across": one.across, "up": one.up} for one in slices]  # fmt: skip
+    answer({"output": str(output), "cube": str(cube_file), "slices": drawn})
+
+
+_SHOWN = ("detector", "asdf", "wavelet", "correlation", "deconvolved", "derivative")
+
+
+def _read_times(text: str) -> tuple[float, ...] | str:
+    return "all" if text == "all" else read_range(text)
+
+
+@click.group(cls=NearestGroup)
+def plot() -> None:
+    """Draw waveforms, histograms, maps, sections and profiles as .png, .svg or .pdf.
+
+    Needs matplotlib: pip install matplotlib. No screen is needed; the same input gives the same bytes.
+    """
+
+
+@plot.command()
+@shared.strip_argument
+@output_option
+@click.option("--packet", "packets", multiple=True, metavar="N|FIRST:END",
+              callback=lambda context, parameter, texts: tuple(map(shared.parse_span, texts)),
+              help="Draw these packets, counted from 0; END is not included; may be repeated.  [default: six, spread "
+              "over the strip]")
+@click.option("--point", "point_numbers", multiple=True, type=int, metavar="N",
+              help="Draw the packet of this point, counted from 0; may be repeated.")
+@click.option("--gps-time", "times", multiple=True, type=float, metavar="T",
+              help="Draw the pulse nearest to this GPS time [s]; may be repeated.")
+@click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete_flags,
+              help="Draw the first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
+@shared.where_option("Draw the first waveforms with echoes")
+@click.option("--most", type=click.IntRange(1, 100), metavar="N",
+              help="Most waveforms of --flags, --where or of the default.  [default: 6; with --sheet: 100]")
+@click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
+@shared.seed_option("Seed of the random packets.")
+@click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
+@click.option("--times", "shown", type=shared.Text("LOW:HIGH|all", _read_times), metavar="LOW:HIGH|all",
+              help="Part of the waveforms to show [ns].  [default: the part with signal, of each waveform]")
+@click.option("--show", metavar="|".join(_SHOWN), help="Also draw the signal in which the detector searches, with its "
+              "threshold; detector: that of the chain's detector.")
+@click.option("--echoes", "table", is_flag=True,
+              help="List amplitude, time, width, range and errors of all echoes below; -o FILE.csv writes only them.")
+@shared.chain_options
+@shared.system_option
+@shared.strip_options
+@shared.common_options("overwrite", "json")
+def waveform(strip: Path, output: Path, **options: Any) -> None:
+    """Draw waveforms of STRIP with their fit, residual and echoes; or write the echoes as a table.
+
+    Shows samples, baseline and noise, the fitted sum, the pulse of each echo, the residual in standard deviations of
+    the noise, echoes with their errors, and the returns of the file. The chain is chosen and run as by `wavebatch run`.
+
+    Exit code: 0 done, 1 the strip cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.core.condition import read_flags
+    from wavebatch.tools.plots.packets import Wanted
+
+    named = any(options[name] for name in ("packets", "point_numbers", "times"))
+    for option in ("flags", "where"):
+        if options[option] and (named or options["random"]):
+            raise ConfigError(f"--{option} chooses the waveforms; leave out --packet, --point, --gps-time and --random")
+    if options["random"] and named:
+        raise ConfigError("--random chooses the waveforms; leave out --packet, --point and --gps-time")
+    if options["most"] and (named or options["random"]):
+        raise ConfigError("--most is for --flags, --where and the default; leave it out, or leave out the numbers")
+    if options["sheet"] and (options["show"] or options["table"]):
+        raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
+    tabular = output.suffix.lower() == ".csv"
+    for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
+        if options[name]:
+            raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
+    (check_target if tabular else check_picture)(output, overwrite=options["overwrite"])
+    flags = read_flags(options["flags"])
+    wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
+    views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
+    if tabular:
+        from wavebatch.tools.plots.waveform import format_echoes
+
+        write_text(output, format_echoes(views), overwrite=options["overwrite"])
+    else:
+        _draw_waveforms(views, output, strip.name, chain, options)
+    echoes = sum(len(view.echoes) for view in views)
+    tell(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
+    answer({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
+
+
+def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, options: dict[str, Any]) -> None:
+    """Draws the waveforms as small multiples or as a contact sheet."""
+    shown, more = options["shown"], {"strip": strip, "chain": chain, "overwrite": options["overwrite"]}
+    if shown == "all":
+        last = max(float(view.time[-1] + 0.5 * view.spacing) for view in views)
+        shown = (min(-0.5 * view.spacing for view in views), last)
+    if shown and all(view.time[-1] < shown[0] or shown[1] < 0 for view in views):
+        end = max(view.time[-1] for view in views)
+        raise ConfigError(f"--times {shown[0]:g}:{shown[1]:g}: no sample lies there; the waveforms end at {end:g} ns")
+    if options["sheet"]:
+        from wavebatch.tools.plots.draw_waveform import draw_waveform_sheet
+
+        draw_waveform_sheet(views, output, times=shown, **more)
+        return
+    from wavebatch.tools.plots.draw_waveform import draw_waveform_panels
+
+    draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
+
+
+def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) -> tuple[list[Any], str]:
+    """The waveforms that are wanted, and the chain that they were run through, in words.
+
+    ranges: compute the distances of the echoes from the sensor, too, if its position is known.
+    """
+    from wavebatch.batch.options import RunOptions
+    from wavebatch.files.strip.reader import StripReader
+    from wavebatch.surveying.prepare import Positions, prepare
+    from wavebatch.tools.api.run import find_request
+    from wavebatch.tools.plots.packets import find_places
+    from wavebatch.tools.plots.waveform import add_ranges, name_chain, read_views
+
+    chain, request = find_request(shared.from_options(RunOptions, options))
+    opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
+    with opened as reader, reader.scan(force=options["force"]) as scan:
+        choice = prepare(reader, scan, chain, request, positions=Positions.NONE).choice
+        system = choice.survey.system
+        places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))
+        run, fill = choice.chain, None
+        if ranges:
+            run, fill, error = add_ranges(choice.chain, reader, scan)
+            system = system.with_radiometry(sensor_error=error)
+        views = read_views(reader, scan, places, run, system, options["show"], fill)
+        return views, name_chain(choice.chain)
+
+
+for command in (histogram, map_, section, profile, cube):
+    plot.add_command(command)

@@ -1,0 +1,64 @@
+/* Pairs of echoes and returns of one waveform: mutual nearest neighbours, then again among the rest, until none is left.
+
+   A lone echo beside a lone return, the usual case, needs no search. */
+
+static void sort_by_time(int64_t n, int64_t *rows, const double *time) { /* by insertion: nearly always in order */
+    for (int64_t i = 1; i < n; i++) {
+        const int64_t row = rows[i];
+        int64_t at = i;
+        for (; at > 0 && time[rows[at - 1]] > time[row]; at--) rows[at] = rows[at - 1];
+        rows[at] = row;
+    }
+}
+
+/* Place in `others`, which is not empty, of the one nearest to each row; both in order; of two equally near ones the first. */
+static void find_near(int64_t n, const int64_t *rows, const double *time, int64_t m, const int64_t *others, const double *other_time, int64_t *near) {
+    for (int64_t i = 0, right = 0; i < n; i++) {
+        const double here = time[rows[i]];
+        while (right < m - 1 && other_time[others[right]] < here) right++;
+        const int64_t left = right ? right - 1 : 0;
+        near[i] = here - other_time[others[left]] <= other_time[others[right]] - here ? left : right;
+    }
+}
+
+/* m echoes and k returns, each sorted by waveform; `matched` gets the return of each echo, -1 without one. */
+EXPORT int64_t match_returns(int64_t m, const int64_t *echo_waveform, const double *echo_time, int64_t k, const int64_t *return_waveform,
+                             const double *return_time, double tolerance, int64_t *matched) {
+    int64_t *echoes = malloc((2 * (m + k) + 1) * sizeof(int64_t));
+    if (!echoes) return -1;
+    int64_t *returns = echoes + m, *to_return = returns + k, *to_echo = to_return + m;
+    for (int64_t i = 0, j = 0, end, stop; i < m; i = end, j = stop) {
+        const int64_t waveform = echo_waveform[i];
+        for (end = i; end < m && echo_waveform[end] == waveform; end++) matched[end] = -1;
+        while (j < k && return_waveform[j] < waveform) j++;
+        for (stop = j; stop < k && return_waveform[stop] == waveform;) stop++;
+        int64_t n = end - i, r = stop - j, pairs = 1;
+        if (n == 1 && r == 1) {
+            if (fabs(echo_time[i] - return_time[j]) <= tolerance) matched[i] = j;
+            continue;
+        }
+        for (int64_t x = 0; x < n; x++) echoes[x] = i + x;
+        for (int64_t x = 0; x < r; x++) returns[x] = j + x;
+        sort_by_time(n, echoes, echo_time);
+        sort_by_time(r, returns, return_time);
+        while (n && r && pairs) {
+            find_near(n, echoes, echo_time, r, returns, return_time, to_return);
+            find_near(r, returns, return_time, n, echoes, echo_time, to_echo);
+            int64_t left = 0;
+            pairs = 0;
+            for (int64_t x = 0; x < n; x++) {
+                const int64_t near = to_return[x], row = returns[near];
+                if (to_echo[near] == x && fabs(echo_time[echoes[x]] - return_time[row]) <= tolerance) {
+                    matched[echoes[x]] = row;
+                    to_echo[near] = -1; /* taken: no other echo can be its nearest */
+                    pairs++;
+                } else echoes[left++] = echoes[x];
+            }
+            n = left, left = 0;
+            for (int64_t y = 0; y < r; y++) if (to_echo[y] >= 0) returns[left++] = returns[y];
+            r = left;
+        }
+    }
+    free(echoes);
+    return 0;
+}

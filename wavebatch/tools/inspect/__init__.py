@@ -1,1 +1,0 @@
-"""What any LAS or LAZ file holds, for `wavebatch info`."""

@@ -1,0 +1,381 @@
+"""The pictures of pages: pulses, histograms, values with errors, maps of clouds, sheets of waveforms; by matplotlib.
+
+Each function gives a list with one picture as a part of a sheet, or an empty one where there is nothing to draw or
+matplotlib is not installed: the page then says how to get the pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader
+from wavebatch.files.figure_file import has_matplotlib, open_svg, plain_text
+from wavebatch.files.las.crs import describe_crs
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
+from wavebatch.stages.chain import Chain
+from wavebatch.stages.decompose.rebuild import rebuild_waveforms
+from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.surveying.choose_chain import sample_size
+from wavebatch.surveying.systems.shown import full_width, sample_pulse
+from wavebatch.tools.even_sample import EvenSample
+from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, draw_cells
+from wavebatch.tools.plots.draw_waveform import HEAD, LEGEND, draw_small_waveforms, sheet_size
+from wavebatch.tools.plots.raster import Raster, choose_grid, find_shown
+from wavebatch.tools.plots.values import Tally, robust_limits
+from wavebatch.tools.plots.waveform import WaveformView, build_views
+from wavebatch.tools.rasters.cells import compute_cells
+from wavebatch.tools.sheets.sheet import Note, Picture, Sheet
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SHOWN_SHARE = 0.001
+"""Share of the values at each end that a histogram leaves out and counts in words."""
+
+MOST_BARS = 60
+
+SIZE = (4.2, 2.7)
+"""Width and height of a chart [inch]."""
+
+PLACE = (0.19, 0.18, 0.78, 0.69)
+"""Of the axes in it: left, bottom, width and height."""
+
+SAMPLED = 400_000
+"""Most points of the sample of a cloud."""
+
+MOST_CELLS = 160
+"""Cells along the longer side of a map, which is small."""
+
+BINS = 60
+
+MAP_SIDE = 3.4
+"""Most width and height of a map [inch]."""
+
+SHEET_COLUMNS = 4
+
+SEARCHED = 4096
+"""Waveforms among which the worst fits are looked for."""
+
+SHOWN_RANDOM, SHOWN_WORST = 8, 4
+"""Waveforms drawn of each kind."""
+
+
+def picture(title: str, size: tuple[float, float], draw: Callable[[Figure], None], words: str = "",
+            kind: str = "figures") -> list[Picture]:  # fmt: skip
+    """A figure with words below it; nothing without matplotlib."""
+    if not has_matplotlib():
+        return []
+    with open_svg(size) as (figure, drawn):
+        draw(figure)
+    return [Picture(title, drawn[0], size, words, kind)]
+
+
+def chart(title: str, labels: tuple[str, str], draw: Callable[[Axes], None], words: str = "") -> list[Picture]:
+    """A figure of one chart with a title and labels of its axes."""
+
+    def fill(figure: Figure) -> None:
+        axes = figure.add_axes(PLACE)
+        axes.set_title(plain_text(title, 60))
+        axes.set_xlabel(plain_text(labels[0], 60))
+        axes.set_ylabel(plain_text(labels[1], 40))
+        draw(axes)
+
+    return picture(title, SIZE, fill, words)
+
+
+def chart_pulse(system: SystemPulse, spacing: float, title: str = "System pulse") -> list[Picture]:
+    """The pulse that is fitted, height 1 at its peak, with a Gaussian of its width and the distance of samples."""
+    time, pulse = sample_pulse(system, spacing)
+    gaussian = evaluate_pulse(GAUSSIAN, time / system.sigma_ref, np.float64(0.0), np.float64(1.0))[0]
+    at = np.arange(np.ceil(time[0] / spacing), np.floor(time[-1] / spacing) + 1) * spacing
+
+    def draw(axes: Axes) -> None:
+        axes.plot(time, gaussian, "--", color="#8a8a8a", linewidth=1, label="Gaussian of the same width")
+        axes.plot(time, pulse, color=SERIES[0], label="pulse of this strip")
+        axes.plot(at, np.interp(at, time, pulse), "o", color=SERIES[0], markersize=2.5)
+        axes.set(xlim=(time[0], time[-1]), ylim=(min(0.0, float(pulse.min())) - 0.05, 1.35))
+        axes.legend(loc="upper right", fontsize=7.5, borderaxespad=0.2)
+
+    words = f"Full width at half maximum {full_width(system):.3f} ns; dots are {spacing:g} ns apart, as samples are."
+    return chart(title, ("time after the peak [ns]", "height"), draw, words)
+
+
+def draw_sheet(views: Sequence[WaveformView], title: str, notes: Sequence[str] = ()) -> list[Picture]:
+    """Small pictures of waveforms; notes: a word on each."""
+    columns = min(SHEET_COLUMNS, len(views)) or 1
+    wide, high = sheet_size(len(views), columns)
+    size = (wide, high - HEAD)
+    draw = lambda figure: draw_small_waveforms(figure, views, columns, notes=notes, head=0.0)  # noqa: E731
+    return picture(title, size, draw, LEGEND, "sheet")
+
+
+def draw_histogram(edges: np.ndarray, counts: np.ndarray, *, title: str, label: str, log: bool = False,
+                   beyond: int = 0) -> list[Picture]:  # fmt: skip
+    """A histogram of counts i8 (b,) between edges (b + 1,) without its outermost values, which are counted.
+
+    beyond: values outside of the edges, to be counted too.
+    """
+    borders, merged = merge_bins(edges, counts)
+    total, shown = int(counts.sum()) + beyond, int(merged.sum())
+    if not shown:
+        return []
+
+    def draw(axes: Axes) -> None:
+        axes.stairs(merged, borders, fill=True, color=SERIES[0], alpha=0.75)
+        if log and borders[0] > 0:
+            _scale_log(axes.set_xscale, axes.xaxis)
+        axes.set(xlim=(borders[0], borders[-1]), ylim=(0, 1.06 * merged.max()))
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value == round(value) else "")
+
+    words = f"{total:,} values; {total - shown:,} of them outside of the picture."
+    return chart(title, (label, "number"), draw, words)
+
+
+def merge_bins(edges: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most MOST_BARS bins without the outermost SHOWN_SHARE of the values at each end."""
+    total = int(counts.sum())
+    sums = np.cumsum(counts)
+    first = int(np.searchsorted(sums, SHOWN_SHARE * total, side="right"))
+    last = int(np.searchsorted(sums, (1 - SHOWN_SHARE) * total))
+    first, last = min(first, last, len(counts) - 1), max(first, last)
+    step = max(1, -(-(last - first + 1) // MOST_BARS))
+    last = min(first + step * -(-(last - first + 1) // step), len(counts))
+    return np.append(edges[first:last:step], edges[last]), np.add.reduceat(
+        counts[first:last], np.arange(0, last - first, step)
+    )
+
+
+def _scale_log(scale: Callable[..., Any], axis: Any) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    scale("log")
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def draw_counts(counts: Mapping[str, int] | Sequence[tuple[str, int]], *, title: str, label: str) -> list[Picture]:
+    """A bar per name, which are few and short."""
+    rows = list(counts.items() if isinstance(counts, Mapping) else counts)
+
+    def draw(axes: Axes) -> None:
+        axes.bar(range(len(rows)), [number for _, number in rows], color=SERIES[0], alpha=0.75)
+        axes.set_xticks(range(len(rows)), [name for name, _ in rows], fontsize=8)
+        axes.grid(axis="x", visible=False)
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value == round(value) else "")
+
+    return chart(title, (label, "number"), draw, "; ".join(f"{name}: {number:,}" for name, number in rows))
+
+
+def draw_map(found: Raster, note: str = "") -> list[Picture]:
+    """A map: cells coloured from the 2nd to the 98th percentile, north up, equal scales; note: added to the caption."""
+    grid = found.grid
+    across, up = (MAP_SIDE * side / max(grid.columns, grid.rows) for side in (grid.columns, grid.rows))
+    across, up = max(across, 0.8), max(up, 0.8)
+    size = (across + 2.2, up + 1.0)
+    west, east, south, north = grid.extent
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_axes((0.95 / size[0], 0.55 / size[1], across / size[0], up / size[1]))
+        axes.set_title(f"{found.statistic} of {found.facts.name}", fontsize=9.5)
+        shown = draw_cells(axes, found, (0, east - west, 0, north - south))
+        place = figure.add_axes(((1.1 + across) / size[0], 0.55 / size[1], 0.12 / size[0], up / size[1]))
+        label = found.label if found.statistic == "density" else f"{found.facts.name} [{found.facts.unit}]"
+        add_colorbar(axes, shown, found.values, found.shown, label, length=up, flat=False, place=place)
+        axes.locator_params(axis="x", nbins=4 if across > 1.5 else 1)
+        axes.locator_params(axis="y", nbins=4 if up > 1.5 else 1)
+        axes.set_xlabel(f"east [{found.crs.unit}]")
+        axes.set_ylabel(f"north [{found.crs.unit}]")
+
+    words = f"Cells of {grid.size:g} {found.crs.unit}; origin {west:.10g} E, {south:.10g} N{note}."
+    return picture(f"{found.statistic} of {found.facts.name}", size, draw, words)
+
+
+def draw_values(
+    names: Sequence[str], values: Sequence[float], errors: Sequence[float], *, title: str, label: str
+) -> list[Picture]:
+    """Values with their errors, side by side."""
+    middle, spread = np.asarray(values, np.float64), np.nan_to_num(np.asarray(errors, np.float64))
+    # Small constants: a power of ten in the label, so that ticks differ and stay short.
+    largest = float(np.abs(middle).max())
+    power = int(np.floor(np.log10(largest))) if largest else 0
+    if abs(power) > 3:
+        middle, spread, label = middle / 10.0**power, spread / 10.0**power, f"1e{power} {label}"
+
+    def draw(axes: Axes) -> None:
+        axes.errorbar(np.arange(len(names)) + 1, middle, yerr=spread, fmt="o", color=SERIES[0], capsize=3)
+        axes.set_xticks(np.arange(len(names)) + 1)
+        axes.margins(x=0.1, y=0.15)
+
+    return chart(title, ("", label), draw, ", ".join(f"{place + 1}: {name}" for place, name in enumerate(names)))
+
+
+def figures_of(document: Mapping[str, Any]) -> list[Picture]:
+    """Histograms of a report's `quality`: amplitudes and widths of all echoes, echoes per waveform."""
+    parts = []
+    for name, title, label in (("amplitude_dn", "Amplitude", "[DN]"), ("echo_width_ns", "Echo width", "[ns]")):
+        one = document[name]["histogram"]
+        counts = np.array(one["counts"], np.int64)
+        edges = one["low"] * np.exp(one["log_step"] * (one["first_bin"] + np.arange(len(counts) + 1)))
+        if counts.any():
+            parts += draw_histogram(edges, counts, title=title, label=f"{title.lower()} {label}", log=True)
+    per = document["echoes_per_waveform"]
+    last = max((number for number, count in enumerate(per) if count), default=0)
+    shown = [(f"{n}" if n < len(per) - 1 else f"{n} or more", count) for n, count in enumerate(per[: last + 1])]
+    return [*parts, *draw_counts(shown, title="Echoes per waveform", label="echoes")]
+
+
+def picture_cloud(path: Path, columns: Sequence[str]) -> Iterator[Sheet]:
+    """Histograms and maps of the columns that the cloud has, from an even sample of its points.
+
+    Raises InputError if it cannot be read. `wavebatch plot` and `wavebatch grid` show every point, and finer cells.
+    """
+    sample = EvenSample(SAMPLED)
+    with ColumnReader(path, *columns, missing_ok=True) as reader:
+        for rows in reader.read_pieces():
+            good = np.isfinite(rows["x"]) & np.isfinite(rows["y"])
+            sample.add({"place": np.stack([rows["x"], rows["y"]], axis=1)[good], "values": rows["values"][good]})
+        facts = reader.facts
+    seen = sample.read()
+    if not seen or not len(seen["place"]):
+        return
+    pairs = zip(facts, seen["values"].T, strict=True)
+    if drawn := [part for one, values in pairs for part in draw_column(one, values)]:
+        yield Sheet("Columns of the cloud", drawn)
+    note = f"; every {sample.step}th point" if sample.step > 1 else ""
+    if drawn := [part for one in map_columns(path, facts, sample) for part in draw_map(one, note)]:
+        yield Sheet("Maps", drawn)
+
+
+def draw_column(facts: ColumnFacts, values: np.ndarray) -> list[Picture]:
+    """The histogram of a column without far outliers; empty without values."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return []
+    low, high = robust_limits(values, float(values.min()), float(values.max()))
+    room = 0.5 * (high == low) * max(abs(high), 1.0)
+    counts, edges = np.histogram(values, BINS, (low - room, high + room))
+    beyond = len(values) - int(counts.sum())
+    return draw_histogram(edges, counts, title=facts.name, label=f"{facts.name} [{facts.unit}]", beyond=beyond)
+
+
+def map_columns(path: Path, facts: Sequence[ColumnFacts], sample: EvenSample) -> list[Raster]:
+    """The density of the points, and the mean of each column that has values."""
+    seen = sample.read()
+    places = seen["place"]
+    box = (*places.min(axis=0).tolist(), *places.max(axis=0).tolist())
+    grid = choose_grid(str(path), sample, box, None, fixed=False, most=MOST_CELLS)
+    crs = describe_crs(path)
+    row, column, inside = grid.place(*places.T)
+    cell = (row * grid.columns + column)[inside]
+    every = np.full(len(places), float(sample.step))
+    points = ColumnFacts("points", "-", "", 0.0)
+    wanted = [("density", points, every)]
+    wanted += [("mean", one, values) for one, values in zip(facts, seen["values"].T, strict=True)]
+    maps, size = [], grid.rows * grid.columns
+    for statistic, one, values in wanted:
+        found = compute_cells(statistic, cell, values[inside], size, grid.size**2 / sample.step)
+        if np.isfinite(found).any():
+            found = found.reshape(grid.rows, grid.columns)
+            maps.append(Raster((path.name,), one, statistic, grid, found, Tally(), 0, find_shown(found), crs))
+    return maps
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """Waveforms of a strip with the result of its chain."""
+
+    searched: int
+    total: int
+    """Waveforms of the strip."""
+    random: tuple[WaveformView, ...]
+    worst: tuple[tuple[WaveformView, float], ...]
+    """With the root mean square of their residual in standard deviations of the noise, the largest first."""
+
+
+def read_page_views(path: Path, chain: Chain, system: SystemPulse, *, seed: int = 0, **reading: Any) -> Views:
+    """Waveforms of a sample that is spread evenly over the strip; reading: direction and headerless.
+
+    Raises InputError if the strip cannot be read.
+    """
+    generator = np.random.default_rng(seed)
+    drawn: list[tuple[float, WaveformView]] = []
+    worst: list[tuple[float, WaveformView]] = []
+    searched = 0
+    with StripReader(path, **reading) as reader, reader.scan() as scan:
+        total = scan.packets
+        for block in reader.sample_blocks(scan, min(SEARCHED, sample_size(reader, scan))):
+            searched += len(block)
+            residual = measure_view_residuals(block, chain, system)
+            # The least of random numbers, kept over all blocks, draw each waveform with the same chance.
+            order = generator.random(len(block))
+            drawn = _keep(drawn, block, chain, system, order, SHOWN_RANDOM)
+            worst = _keep(worst, block, chain, system, -residual, SHOWN_WORST)
+    bad = tuple((view, -key) for key, view in worst if np.isfinite(key))
+    return Views(searched, total, tuple(sorted((view for _, view in drawn), key=lambda view: view.point)), bad)
+
+
+def _keep(
+    kept: list[tuple[float, WaveformView]], block: WaveformBlock, chain: Chain, system: SystemPulse, keys: np.ndarray,
+    most: int,
+) -> list[tuple[float, WaveformView]]:  # fmt: skip
+    """The waveforms with the `most` least keys of those kept so far and of the block."""
+    rows = np.argsort(keys, kind="stable")[:most]
+    rows = np.sort(rows[np.isfinite(keys[rows])])
+    if not len(rows):
+        return kept
+    views = build_views(block.rows(rows), chain, system, [-1] * len(rows))
+    return sorted([*kept, *zip(keys[rows].tolist(), views, strict=True)], key=lambda pair: pair[0])[:most]
+
+
+def measure_view_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -> np.ndarray:
+    """Root mean square of each waveform's residual in standard deviations of the noise, f8 (n,); NaN without a model.
+
+    Samples that are missing, or at the digitizer's limit, are left out.
+    """
+    block, noise, system, echoes = chain.solve(block, system)
+    fit = rebuild_waveforms(block, system, chain.steps[2], echoes)
+    if fit is None:
+        return np.full(len(block), np.nan)
+    samples = block.samples.astype(np.float64)
+    used = samples < clip_level(block, system)
+    if block.missing is not None:
+        used &= ~block.missing
+    level = np.stack([np.broadcast_to(noise.level[row], samples.shape[1:]) for row in range(len(block))])
+    variance = noise.std[:, None].astype(np.float64) ** 2 + system.noise.gain * np.maximum(fit, 0)
+    square = np.where(used, (samples - level - fit) ** 2 / variance, 0.0)
+    number = used.sum(axis=1)
+    return np.sqrt(square.sum(axis=1) / np.maximum(number, 1))
+
+
+def draw_waveforms(path: Path, chain: Chain, system: SystemPulse, name: str, **reading: Any) -> Iterator[Sheet]:
+    """Random waveforms of a strip, and the worst fits among a sample, as parts of a page; name: of the chain.
+
+    reading, errors: as for `read_page_views`.
+    """
+    views = read_page_views(path, chain, system, **reading)
+    whole = f"all {views.searched:,} waveforms"
+    part = f"{views.searched:,} waveforms that are spread over the strip ({views.total:,} in all)"
+    head = (
+        f"Drawn at random from {whole if views.searched >= views.total else part}. Chain: {name}. `wavebatch plot "
+        "waveform STRIP --point N -o FILE.png` draws one of them large."
+    )
+    yield Sheet("Random waveforms", [Note(head), *draw_sheet(views.random, "Random waveforms")])
+    if views.worst:
+        words = (
+            f"The largest residuals among these {views.searched:,} waveforms, as root mean square in standard "
+            "deviations of the noise (1 is noise alone)."
+        )
+        if views.searched < views.total:
+            words += f" The other {views.total - views.searched:,} waveforms of the strip were not searched."
+        notes = [f"residual {rms:.2f}" for _, rms in views.worst]
+        worst = draw_sheet([view for view, _ in views.worst], "Worst fits", notes)
+        yield Sheet("Worst fits", [Note(words), *worst])
