@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings
 from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
-from wavebatch.kernels.fit.problem import Settings
 
 TIGHT = {"tolerance": 1e-8, "max_iterations": 60}
 

@@ -21,12 +21,11 @@ import numpy as np
 
 from wavebatch.kernels import library
 from wavebatch.kernels.build_kernels import compile_library, find_compiler
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, cluster_candidates
+from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings, cluster_candidates
 from wavebatch.kernels.fit.decompose import decompose_clusters, promise_echoes
-from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable
 from wavebatch.kernels.library import Samples
-from wavebatch.kernels.signal.maxima import find_maxima, quiet_levels
+from wavebatch.kernels.signal.filters import find_maxima, quiet_levels
 
 FLAGS = ("-g", "-O1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
 SETTINGS = {

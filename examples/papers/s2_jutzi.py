@@ -21,9 +21,8 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings
 from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
-from wavebatch.kernels.fit.problem import Settings
 from wavebatch.stages.decompose.fit import gauss_newton
 from wavebatch.stages.detect.classic import sustained_threshold
 from wavebatch.stages.detect.maximum import matched_filter

@@ -24,7 +24,7 @@ from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
-from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
+from wavebatch.tools.return_stats import ReturnStats, count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, simulate_returns
 from wavebatch.tools.simulate.from_returns import synthesize_strip
 from wavebatch.tools.simulate.render import paint_echoes

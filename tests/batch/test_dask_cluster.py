@@ -246,7 +246,9 @@ def _hold(go_on):
 
 
 @pytest.mark.slow
-def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, strips):
+@pytest.mark.parametrize("restarts", [False, True])
+def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, strips, restarts):
+    """Also where a new scheduler and a new worker come at the same address."""
     cluster = Dask(tmp_path)
     out = tmp_path / "out"
     try:
@@ -260,6 +262,10 @@ def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, s
         )
         cluster.wait_until(lambda: (out / "a.report.json").exists())
         cluster.stop()
+        if restarts:
+            port = cluster.address.rpartition(":")[2]
+            cluster._start(*_SCHEDULER, "--port", port, "--no-dashboard", "--host", "127.0.0.1")
+            cluster.start_worker()
         _, said = process.communicate(timeout=300)
     finally:
         cluster.stop()
@@ -349,7 +355,7 @@ def test_a_worker_on_another_kind_of_processor_is_refused_by_name(tmp_path, stri
 
 
 @pytest.mark.slow
-def test_a_worker_that_joins_later_gets_no_work(tmp_path):
+def test_a_worker_that_joins_later_and_does_not_fit_gets_no_work(tmp_path):
     from wavebatch.batch.workers.dask_cluster import Cluster
 
     dask = Dask(tmp_path)
@@ -363,6 +369,39 @@ def test_a_worker_that_joins_later_gets_no_work(tmp_path):
             while left:
                 left = [future for future in left if future not in cluster.wait(left)]
             assert {future.result() for future in futures} == {fit.pid}
+    finally:
+        dask.stop()
+
+
+def _busy_pid():
+    """The process, after some time in which others may take calls."""
+    time.sleep(0.3)
+    return os.getpid()
+
+
+@pytest.mark.slow
+def test_workers_that_join_later_take_part_and_replace_those_that_die(tmp_path, monkeypatch):
+    """Calls of a worker that is gone go to the one that came, also those that dask keeps for the first."""
+    from wavebatch.batch.workers import dask_cluster
+
+    monkeypatch.setattr(dask_cluster, "_POLL", 0.3)
+    dask = Dask(tmp_path)
+    try:
+        first = dask.start_worker()
+        with dask_cluster.Cluster(dask.address, tmp_path) as cluster:
+            assert (cluster.jobs, cluster.limit) == (1, 2)
+            second = dask.start_worker()
+            dask.wait_until(lambda: len(cluster._look()) == 2)
+            assert (cluster.jobs, cluster.limit) == (2, 4)
+            futures = [cluster.submit(_busy_pid) for _ in range(8)]
+            assert {future.result(timeout=300) for future in futures} == {first.pid, second.pid}
+            for process in first, second:
+                process.kill()
+                process.wait()
+            left = cluster.submit(os.getpid)
+            third = dask.start_worker()
+            cluster.wait([left])
+            assert left.result() == third.pid
     finally:
         dask.stop()
 

@@ -216,12 +216,12 @@ from batch_tools import make_job
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
 
-def prepare(job):
+def prepare(job, parts):
     once = Path({once!r})
     if job.path.stem == "b" or job.path.stem == "a" and not once.exists():
         once.touch(exist_ok=True)
         os.kill(os.getpid(), 9)
-    return wavebatch.batch.unit.prepare_strip(job)
+    return wavebatch.batch.unit.prepare_strip(job, parts)
 
 if __name__ == "__main__":
     wavebatch.batch.strip_task.prepare_strip = prepare

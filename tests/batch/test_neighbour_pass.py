@@ -15,15 +15,16 @@ from click.testing import CliRunner
 from strips import descriptor, make_raw, vlr
 
 from wavebatch.batch import neighbour_pass
+from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.neighbour_pass import ENTRY, SecondPass, process_tile
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.selection import build_selection
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk import spool
 from wavebatch.kernels.geometry.normals import Gap
 from wavebatch.stages.chain import STAGES, Stage, Step
@@ -47,10 +48,10 @@ def strips(tmp_path_factory):
     return folder
 
 
-def run_strip(path, folder, *, columns=None, chain=None, batch=None, selection=None, **options):
+def run_strip(path, folder, *, columns=None, chain=None, batch=None, chosen=None, **options):
     chain = chain or parse_chain(CHAIN, "test")
     job = StripJob(Path(path), chain, RunOptions(**options), choose_columns(chain, columns))
-    job = job if selection is None else replace(job, selection=selection)
+    job = job if chosen is None else replace(job, chosen=chosen)
     outcome = run_batch([job], RunOptions(Path(folder), **(batch or {}))).outcomes[0]
     assert outcome.error is None, outcome.error
     return outcome.report
@@ -139,8 +140,8 @@ def test_stages_after_it_see_its_columns_whatever_the_units(strips, clouds, tmp_
     chain = parse_chain(CHAIN, "test")
     chain = replace(chain, steps=(*chain.steps, Step(after)))
     monkeypatch.setattr("wavebatch.files.strip.reader.UNIT_POINTS", 3000)
-    selection = build_selection(RunOptions(where="energy < 40 and z > 0"))
-    report = run_strip(strips / "slope.las", tmp_path, chain=chain, selection=selection, points=points)
+    chosen = PointFilter.build(where="energy < 40 and z > 0")
+    report = run_strip(strips / "slope.las", tmp_path, chain=chain, chosen=chosen, points=points)
     cloud = laspy.read(tmp_path / "slope.laz")
     angle = np.asarray(cloud[COLUMNS[0]])
     assert len(cloud) > 2000 and (angle < 20).all()
@@ -249,7 +250,7 @@ def take_all(second, number):
     while second.has_more:
         function, arguments = second.next_call(b"")
         if function is process_tile:
-            assert second.take(function(*arguments))[0] is None
+            assert isinstance(second.take(function(*arguments)), RunReport)
         else:
             found.append(arguments[2])
             second.take((None, None))

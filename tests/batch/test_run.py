@@ -179,7 +179,7 @@ def test_a_failure_while_writing_leaves_nothing(tiny_strip, tmp_path, monkeypatc
     def fail(self, rows):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("wavebatch.files.cloud.writer.CloudWriter.write", fail)
+    monkeypatch.setattr("wavebatch.files.cloud.writer.CloudWriter.append", fail)
     outcome = run_one(tiny_strip, tmp_path)
     assert outcome.status == "failed" and "No space left" in str(outcome.error)
     assert _files(tmp_path) == []
@@ -203,13 +203,13 @@ def test_a_strip_that_changes_while_it_is_read_is_not_written(tiny_strip, tmp_pa
     strip = tmp_path / "tiny.las"
     shutil.copyfile(tiny_strip, strip)
     task = StripTask(make_job(strip), RunOptions(tmp_path), alone=False)
-    assert task.start() is None
+    assert task.start(jobs=1) is None
     from wavebatch.batch.workers.processes import Workers
 
     with Workers(1) as workers:
         while not task.is_complete:
             task.submit(workers)
-            task.take(workers)
+            task.take()
     strip.write_bytes(strip.read_bytes() + b"more")
     with pytest.raises(InputError, match="changed while it was read"):
         task.finish()

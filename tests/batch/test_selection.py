@@ -15,7 +15,8 @@ from wavebatch.cli import main
 from wavebatch.core.condition import parse_condition
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.column_reader import find_keep
+from wavebatch.files.cloud.cloud_reader import CloudReader
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.stages.chain_file import effective, load_profile
 
 
@@ -271,8 +272,10 @@ def test_conditions_of_a_cloud_read_as_those_of_its_run(full, riegl, tmp_path, n
     some, _ = _run(riegl, tmp_path / "some", where=where, names=names)
     _run(riegl, tmp_path / "all", names=names)
     path = next((tmp_path / "all").glob("*.laz"))
-    keep = find_keep(path, parse_condition(where))
-    assert 0 < len(some.points) == np.count_nonzero(keep(laspy.read(path).points.array))
+    with CloudReader(path) as reader:
+        keep = reader.plan(PointFilter.build(where=where))
+    raw = laspy.read(path).points.array
+    assert 0 < len(some.points) == np.count_nonzero(keep.test(raw, len(raw)) == 0)
 
 
 def test_api_refuses_a_wrong_condition(riegl, tmp_path):

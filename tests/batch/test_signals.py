@@ -118,12 +118,12 @@ import os, signal
 from wavebatch.files.las import laz_encode
 from wavebatch.__main__ import main
 
-class File(laz_encode._WatchedFile):
+class File(laz_encode.BytesIO):
     def write(self, data):
         os.kill(os.getpid(), signal.{name})
         return super().write(data)
 
-laz_encode._WatchedFile = File
+laz_encode.BytesIO = File
 main()
 """
 
@@ -140,12 +140,12 @@ def test_a_signal_inside_the_compressor_is_not_taken_for_a_failed_write(strip, t
 def test_ctrl_c_inside_the_compressor_reaches_a_program_that_uses_the_library(strip, tmp_path, monkeypatch):
     from wavebatch.files.las import laz_encode
 
-    class File(laz_encode._WatchedFile):
+    class File(laz_encode.BytesIO):
         def write(self, data):
             os.kill(os.getpid(), signal.SIGINT)
             return super().write(data)
 
-    monkeypatch.setattr(laz_encode, "_WatchedFile", File)
+    monkeypatch.setattr(laz_encode, "BytesIO", File)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):

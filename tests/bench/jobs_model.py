@@ -30,6 +30,7 @@ from wavebatch.batch.unit import prepare_strip
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import UNIT_POINTS
+from wavebatch.files.strip.scanner import PART_UNITS
 from wavebatch.tools.api.run import plan_run
 from wavebatch.tools.bench.report import write_texts
 from wavebatch.tools.bench.speed import Worker
@@ -71,8 +72,10 @@ class Parts:
     """Before a run begins: processor seconds of the imports."""
     start_worker: float
     """The same of a worker; all start at once, while the parent starts."""
-    prepare: float
-    """Scan and survey of a strip, by one process: processor seconds."""
+    scan: float
+    """Scan of a strip: processor seconds, which several jobs share."""
+    survey: float
+    """What one process does after it, before the units of a strip."""
     single: float
     """One job: seconds per waveform; NaN for a strip that is too short, as the next ones."""
     work: float
@@ -83,6 +86,15 @@ class Parts:
     """The same per strip, however small."""
     tail: float
     """Workers wait for the last unit of a strip [s]; NaN too for a strip that is too short."""
+
+    @property
+    def prepare(self) -> float:
+        """Scan and survey of a strip: processor seconds."""
+        return self.scan + self.survey
+
+    def scan_with(self, jobs: int) -> float:
+        """Return the seconds until so many jobs have scanned a strip."""
+        return self.scan / max(1, min(jobs, self.waveforms // (PART_UNITS * UNIT_POINTS)))
 
     @property
     def is_short(self) -> bool:
@@ -97,7 +109,8 @@ class Parts:
         start = max(self.start, self.start_worker)
         writing = strips * (self.strip + n * self.write)
         if strips == 1:
-            return start + self.prepare + max(n * self.work / jobs + self.tail * (1 - 1 / jobs), writing)
+            before = start + self.scan_with(jobs) + self.survey
+            return before + max(n * self.work / jobs + self.tail * (1 - 1 / jobs), writing)
         return start + max(strips * (self.prepare + n * self.work) / jobs, writing) + self.prepare
 
     @property
@@ -133,13 +146,15 @@ def measure_jobs(
     laps: dict[int, list[Lap]] = {1: [], 2: []}
     with Worker() as worker:
         start_worker = worker.call(measure_worker)
-        prepare = _middle([worker.call(time_preparation, strip, folder) for _ in range(rounds)])
+        spent = [worker.call(time_preparation, strip, folder) for _ in range(rounds)]
         for turn in range(rounds):
             for jobs in (1, 2) if turn % 2 else (2, 1):
                 say(f"running {strip.name} with {jobs} jobs, turn {turn + 1} of {rounds}")
                 laps[jobs].append(worker.call(run_lap, strip, folder, jobs))
         say(f"running {SMALL_STRIPS} small strips")
         few = worker.call(run_small, small, folder / "small")
+    scan, survey = (_middle(times) for times in zip(*spent, strict=True))
+    prepare = scan + survey
     one, two = laps[1], laps[2]
     n = one[0].waveforms
     if not n:
@@ -154,7 +169,8 @@ def measure_jobs(
         waveforms=n,
         start=time_imports(),
         start_worker=start_worker,
-        prepare=prepare,
+        scan=scan,
+        survey=survey,
         single=single,
         work=work,
         write=write,
@@ -184,12 +200,14 @@ def measure_worker() -> float:
     return (_usage()[2] - before) / 2
 
 
-def time_preparation(strip: Path, folder: Path) -> float:
-    """Processor seconds of scan and survey."""
+def time_preparation(strip: Path, folder: Path) -> tuple[float, float]:
+    """Processor seconds of scan, and of survey and planning."""
     (job,), _ = plan_run([strip], RunOptions(folder, overwrite=True))
     begin = time.process_time()
-    prepare_strip(job).scan.close()
-    return time.process_time() - begin
+    prepared = prepare_strip(job)
+    prepared.scan.close()
+    scan = prepared.report.timing["scan"].processor
+    return scan, time.process_time() - begin - scan
 
 
 def run_lap(strip: Path, folder: Path, jobs: int) -> Lap:
@@ -239,7 +257,7 @@ def format_jobs(strip: str, parts: Parts, laps: dict[int, list[Lap]]) -> str:
     lines = [
         f"{strip}: {parts.waveforms} waveforms; processor time, medians of {len(laps[1])} runs with one job and two",
         f"  start: {parts.start:.2f} s; of a worker, at the same time: {parts.start_worker:.2f} s",
-        f"  scan and survey of the strip, by one process: {parts.prepare:.2f} s",
+        f"  scan of the strip, which jobs share: {parts.scan:.2f} s; survey, by one process: {parts.survey:.2f} s",
         f"  one job: {_list_cost(parts.single, 2)}",
         f"  two jobs: {_list_cost(parts.work, 2)} in the workers",
         f"  the process that writes: {_list_cost(parts.write, 3)}, or {1e3 * parts.strip:.1f} ms per strip",

@@ -10,7 +10,7 @@ from strips import cut_strip
 from wavebatch.cli import main
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.disk.fingerprint import take_fingerprint
-from wavebatch.stages.chain_file import load_chain
+from wavebatch.stages.chain_file import load_chain_file
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import chain_text, decide
 from wavebatch.surveying.system_file import load_survey
@@ -68,7 +68,7 @@ def test_the_files_say_the_same(flat_strip, surveyed):
     assert saved.strip == "flat.las" and saved.fingerprint == take_fingerprint(flat_strip)
     assert (folder / "CHAIN.toml").read_text() == chain_text(saved.survey)
     assert "# growth of fits: left out: " in (folder / "CHAIN.toml").read_text()
-    assert load_chain(folder / "CHAIN.toml").steps[2].effective()["max_echoes"] == 1
+    assert load_chain_file(folder / "CHAIN.toml").steps[2].effective()["max_echoes"] == 1
 
 
 def test_a_run_with_the_files_writes_the_cloud_of_a_run_that_surveys(flat_strip, surveyed, tmp_path):
@@ -108,7 +108,7 @@ def test_existing_files_are_kept_unless_told(flat_strip, tmp_path):
     assert refused.exit_code == 1 and "--overwrite" in refused.stderr and refused.stderr.count("\n") == 1
     assert not system.exists() and chain.read_text() == "mine" and refused.stdout == ""
     assert _survey(flat_strip, "-o", system, "--chain", chain, "--overwrite").exit_code == 0
-    assert load_chain(chain) and load_survey(system)
+    assert load_chain_file(chain) and load_survey(system)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["CHAIN.toml", "SYSTEM.toml"]
 
 

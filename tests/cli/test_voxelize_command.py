@@ -63,7 +63,7 @@ def test_every_method_and_option_changes_the_result(strip, tmp_path):
 
 def test_calibrated_strips_have_cross_sections(strip, tmp_path):
     path = tmp_path / "CAL.toml"
-    path.write_text(format_calibration(Calibration(2.5e-8, 0.03, 0.22, 0.5)))
+    path.write_text(format_calibration(Calibration(2.5e-8, 0.03, 0.22, divergence=0.5)))
     result = voxelize(strip, "--size", 2, "-o", tmp_path / "v.npz", "--calibration", path, "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["sensor"] == "direction vectors"

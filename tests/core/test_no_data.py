@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from wavebatch.cli.messages import format_json
-from wavebatch.core.no_data import NoData, count_reasons, explain, without_nan
+from wavebatch.core.no_data import NoData, count_reasons, explain_no_data, without_nan
 
 
 def test_json_has_null_for_what_is_no_number():
@@ -17,7 +17,8 @@ def test_json_has_null_for_what_is_no_number():
 
 def test_the_first_reason_that_applies_is_given_and_counted():
     values = np.array([1.0, np.nan, np.nan, np.nan])
-    codes = explain(values, (NoData.NO_SENSOR, np.array([True, True, False, False])), (NoData.CUT, values != values))
+    unplaced = np.array([True, True, False, False])
+    codes = explain_no_data(values, (NoData.NO_SENSOR, unplaced), (NoData.CUT, values != values))
     assert codes.tolist() == [NoData.KNOWN, NoData.NO_SENSOR, NoData.CUT, NoData.CUT]
     assert count_reasons({"range": values, "range_reason": codes}) == {"range": {"KNOWN": 1, "NO_SENSOR": 1, "CUT": 2}}
-    assert explain(values, (NoData.CUT, False))[1] == NoData.OTHER
+    assert explain_no_data(values, (NoData.CUT, False))[1] == NoData.OTHER

@@ -11,13 +11,12 @@ from click.testing import CliRunner
 from strips import add_record
 
 import wavebatch
-from wavebatch.batch.options import RunOptions
-from wavebatch.batch.selection import build_selection
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.area_crs import AreaFile, describe_miss, place_rings, read_area_file
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.geojson import load_polygons
-from wavebatch.files.las.geotiff_wkt import build_utm
+from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import build_wkt, read_header
 from wavebatch.tools.simulate import simulate_strip
 
@@ -295,10 +294,9 @@ def test_an_area_that_misses_the_strip_is_named_with_both_extents(strip, tmp_pat
 
 def test_a_selection_keeps_the_corners_of_its_file_for_the_report(strip, tmp_path):
     degrees = _write(tmp_path / "deg.geojson", _project(_box(strip), "EPSG:32633", "EPSG:4326"))
-    chosen = build_selection(RunOptions(polygon=degrees))
-    facts = type("F", (), {"path": strip, "header": read_header(strip)})()
-    placed = chosen.place(facts)
-    assert placed.describe() == chosen.describe() and placed.areas != chosen.areas
+    chosen = PointFilter.build(polygon=degrees)
+    placed = chosen.place(strip, read_header(strip))
+    assert placed.describe() == chosen.describe() and placed.polygons != chosen.polygons
 
 
 def test_help_says_in_which_coordinates_areas_are():

@@ -25,9 +25,8 @@ from writer_tools import (
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.cloud.cloud_reader import CloudReader, ColumnReader
 from wavebatch.files.cloud.column_names import STYLES
-from wavebatch.files.cloud.column_reader import ColumnReader
-from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.publish import remove_stale
 from wavebatch.files.las.extra_bytes import ExtraRecord
@@ -507,6 +506,7 @@ def test_several_scanner_channels_with_packets_are_refused_as_laz(tmp_path):
         CloudWriter(layout, tmp_path / "out.laz", provenance={}) as cloud,
     ):
         cloud.write(rows)
+        cloud.commit()
     assert os.listdir(tmp_path) == ["a.las"]
     one = rows[::3].copy()
     write(layout, tmp_path / "one.laz", one)  # a single channel is fine, whichever it is

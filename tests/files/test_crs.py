@@ -15,8 +15,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits, looks_geocentric, parse_wkt, read_crs_definition
-from wavebatch.files.las.epsg_units import find_unit
-from wavebatch.files.las.geo_keys import METRES, GeoKeys
+from wavebatch.files.las.geo_keys import METRES, GeoKeys, find_unit
 from wavebatch.files.strip.ray_sample import measure_scale
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.basic import position

@@ -10,8 +10,7 @@ import pytest
 from strips import make_raw
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnReader
-from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader
+from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader, ColumnReader
 from wavebatch.files.las.header import STANDARD_DTYPES
 from wavebatch.tools.api.cloud import read_cloud
 

@@ -10,7 +10,7 @@ from writer_tools import data_file
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.geojson_crs import plan_crs
 from wavebatch.files.las.crs import read_crs, read_crs_definition
-from wavebatch.files.las.geotiff_wkt import build_utm
+from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import read_header
 from wavebatch.tools.slices.output import SegmentWriter
 from wavebatch.tools.slices.segments import Segment

@@ -8,8 +8,7 @@ from writer_tools import data_file
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.las.crs import parse_wkt
-from wavebatch.files.las.geo_keys import find_code
-from wavebatch.files.las.geotiff_wkt import build_utm, convert_geotiff
+from wavebatch.files.las.geo_keys import build_utm, convert_geotiff, find_code
 from wavebatch.files.las.header import Vlr, read_header
 
 

@@ -11,9 +11,9 @@ from scipy.optimize import least_squares
 
 from wavebatch.kernels.elementary import exp, log, log1p, solve
 from wavebatch.kernels.fit.closed_form import estimate_starts, fit_parabola, start_errors
+from wavebatch.kernels.fit.cluster import Solution, choose
 from wavebatch.kernels.fit.hermite import residual_moments
 from wavebatch.kernels.fit.learn_pulse import Stack, fit_bounded, refine_gaussians, stack_pulse
-from wavebatch.kernels.fit.problem import Solution, choose
 from wavebatch.kernels.fit.pulse_shape import (
     TAIL_STEP,
     PulseShape,
@@ -24,9 +24,9 @@ from wavebatch.kernels.fit.pulse_shape import (
     tail_reach,
 )
 from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.signal.deconvolve import keep_signal, measure_offsets
 from wavebatch.kernels.signal.filters import refine_peaks
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
-from wavebatch.kernels.signal.profiles import keep_signal, measure_offsets
 from wavebatch.kernels.signal.signal import recorded_lengths
 
 

@@ -6,8 +6,7 @@ import pytest
 
 from wavebatch.kernels.fit.cluster import Candidates, cluster_candidates
 from wavebatch.kernels.library import Samples
-from wavebatch.kernels.signal.filters import gaussian_taps
-from wavebatch.kernels.signal.maxima import find_maxima, quiet_levels
+from wavebatch.kernels.signal.filters import find_maxima, gaussian_taps, quiet_levels
 
 GAIN_121 = np.sqrt(6.0) / 4.0
 

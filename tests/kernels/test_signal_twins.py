@@ -8,9 +8,9 @@ import pytest
 from scipy.linalg import toeplitz
 
 from wavebatch.kernels.signal import noise as noise_kernels
-from wavebatch.kernels.signal.deconvolve import correlate_pulse, deconvolve_wiener, wiener_taps
+from wavebatch.kernels.signal.deconvolve import correlate_pulse, deconvolve_wiener, fit_height, wiener_taps
 from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
-from wavebatch.kernels.signal.filters import curvature_taps, filter_autocorrelation, gaussian_taps
+from wavebatch.kernels.signal.filters import curvature_taps, filter_autocorrelation, gaussian_taps, smooth_b3
 from wavebatch.kernels.signal.noise import (
     PooledNoise,
     colour_factors,
@@ -25,10 +25,8 @@ from wavebatch.kernels.signal.noise import (
     residual_noise,
     whitening_filter,
 )
-from wavebatch.kernels.signal.profiles import fit_height
 from wavebatch.kernels.signal.runs import find_stretches, lobe_edges
 from wavebatch.kernels.signal.signal import NARROW, accumulate, find_quiet, sum_samples, widen_after
-from wavebatch.kernels.signal.wavelet import smooth_b3
 
 PULSE = np.exp(-0.5 * (np.arange(-5, 6) / 1.7) ** 2)
 

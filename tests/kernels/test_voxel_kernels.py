@@ -16,7 +16,7 @@ from wavebatch.kernels.geometry.voxels import (
     sum_before,
     unpack_index,
 )
-from wavebatch.kernels.signal.profiles import keep_signal, measure_offsets, window_signal
+from wavebatch.kernels.signal.deconvolve import keep_signal, measure_offsets, window_signal
 
 
 def walk(start, step, begin, end, size):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from naive_wdz import Decoder, Differences, compress
 
-from wavebatch.kernels.signal.compressed import MOST_BYTES, decode_packets
+from wavebatch.kernels.packets import MOST_BYTES, decode_packets
 
 
 def _pack(rows, bits):

@@ -6,7 +6,7 @@ import pytest
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES, Chain
-from wavebatch.stages.chain_file import effective, list_profiles, load_chain, load_profile, parse_chain
+from wavebatch.stages.chain_file import effective, list_profiles, load_chain_file, load_profile, parse_chain
 
 GOOD = """
 [[chain]]
@@ -84,7 +84,7 @@ def test_wrong_chains_are_refused_in_one_line_that_says_where(tmp_path, text, wo
     path = tmp_path / "wrong.toml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        load_chain(path)
+        load_chain_file(path)
     message = str(caught.value)
     assert "\n" not in message and "wrong.toml" in message
     for word in words:
@@ -115,10 +115,10 @@ def test_values_that_only_the_stage_knows_to_be_wrong_are_no_bugs(text, message)
 
 def test_unreadable_chain_files_are_config_errors(tmp_path):
     with pytest.raises(ConfigError, match=r"none\.toml: chain file cannot be read"):
-        load_chain(tmp_path / "none.toml")
+        load_chain_file(tmp_path / "none.toml")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="UTF-8"):
-        load_chain(tmp_path / "bytes.toml")
+        load_chain_file(tmp_path / "bytes.toml")
 
 
 def test_unknown_profile_names_the_nearest():

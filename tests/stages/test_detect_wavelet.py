@@ -17,7 +17,7 @@ from wavebatch.kernels.signal.deconvolve import (
     deconvolve_richardson_lucy,
     deconvolve_wiener,
 )
-from wavebatch.kernels.signal.wavelet import b3_detail, b3_gain, b3_level
+from wavebatch.kernels.signal.filters import b3_detail, b3_gain, b3_level
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.detect.wavelet import transform
 

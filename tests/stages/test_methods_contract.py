@@ -111,7 +111,7 @@ def test_factors_of_coloured_noise_are_bounded_for_any_spacing(spacing, kappa):
 def test_a_wrong_level_moves_echoes_as_far_as_their_errors_say(kappa, correlation):
     n, std, wrong = 300, 100.0, 50.0
     time = np.random.default_rng(4).uniform(20, 24, n)
-    system = SystemPulse(2.0, kappa, noise=ReceiverNoise(baseline=1000.0, std=std, correlation=correlation))
+    system = SystemPulse(2.0, kappa=kappa, noise=ReceiverNoise(baseline=1000.0, std=std, correlation=correlation))
     pulse = evaluate_pulse(pulse_shape(system, 1.0), np.arange(48.0)[:, None], time, np.full(n, 2.0))[0].T
     block = WaveformBlock.from_samples(np.rint(1000 + 20_000 * pulse).astype(np.uint16), bits=16)
     found = []

@@ -8,7 +8,7 @@ import pytest
 from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain
+from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain_no_data
 from wavebatch.core.system import LevelWidths, Radiometry, ReceiverNoise
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -20,7 +20,7 @@ from wavebatch.kernels.physics.radar import receive_power
 from wavebatch.stages.attribute.light import echo_light
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import load_profile, parse_chain
-from wavebatch.stages.pulse_tables import describe_echoes, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.angle_limits import SLOPE, predict_angles
 from wavebatch.surveying.calibration import with_physics
@@ -42,7 +42,7 @@ KNOWN = set(COLUMNS) - {"range_error"}
 
 def whole_pulse(shape, limits, main):
     """Amplitude, time and sigma of the whole pulse (m, 3) from those of its main component."""
-    return describe_echoes(shape, limits, main, np.ones_like(main), np.zeros((len(main), 2)))[0]
+    return describe_fitted(shape, limits, main, np.ones_like(main), np.zeros((len(main), 2)))[0]
 
 
 def run(block, echoes, system, *names, **parameters):
@@ -376,9 +376,9 @@ def test_reasons_of_single_echoes_and_that_they_add_up():
 def test_the_first_reason_counts_and_all_are_explained():
     values = np.array([1.0, np.nan, np.nan, np.inf])
     first = np.array([True, True, False, False])
-    codes = explain(values, (NoData.NO_SENSOR, first), (NoData.CUT, np.array([True, True, True, False])))
+    codes = explain_no_data(values, (NoData.NO_SENSOR, first), (NoData.CUT, np.array([True, True, True, False])))
     assert codes.tolist() == [NoData.KNOWN, NoData.NO_SENSOR, NoData.CUT, NoData.OTHER]
-    assert explain(values, (NoData.NO_SENSOR, True)).tolist() == [0, 1, 1, 1]
+    assert explain_no_data(values, (NoData.NO_SENSOR, True)).tolist() == [0, 1, 1, 1]
     assert set(REASONS) == set(NoData) - {NoData.KNOWN}
 
 

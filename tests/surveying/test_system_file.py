@@ -14,6 +14,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.system import Defects, LevelWidths, Radiometry, ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.text_file import write_text
+from wavebatch.files.toml_schema import list_entries, list_keys
 from wavebatch.surveying import Decision, Survey, survey_block
 from wavebatch.surveying.system_file import (
     SYSTEM_SCHEMA,
@@ -24,7 +25,6 @@ from wavebatch.surveying.system_file import (
     parse_survey,
 )
 from wavebatch.surveying.systems.figures import Figures, Kind, Level, Look
-from wavebatch.surveying.systems.system_table import NUMBERS, ROWS
 
 SYSTEM = SystemPulse(
     sigma_ref=1.8581162121217176,
@@ -116,11 +116,12 @@ def test_figures_of_other_versions_are_left_out_and_a_flight_is_whole_or_none():
 
 
 def test_every_number_of_the_system_has_a_key():
-    keys = {entry.field for entry in (NUMBERS | ROWS).values()} | {"noise.by_kind", "digitizers"}
+    keys = {entry.field for entry in list_entries(SystemPulse) if entry.shape != "record"} | {"digitizers"}
     # Of a calibration and of the sensor's position, which come with files of their own.
     elsewhere = {"constant", "constant_error", "channels", "attenuation", "sensor_error", "shot_error"}
     elsewhere |= {"attenuation_error", "swath", "right"}
     parts = {"noise": ReceiverNoise, "defects": Defects, "widths": LevelWidths, "radiometry": Radiometry}
+    keys |= {f"{name}.{entry.field}" for name, part in parts.items() for entry in list_entries(part)}
     fields = set(SystemPulse.__dataclass_fields__) - set(parts)
     fields |= {f"{name}.{field}" for name, part in parts.items() for field in part.__dataclass_fields__}
     # Set by a chain while it runs.
@@ -135,7 +136,9 @@ def test_figures_decisions_and_fingerprint_may_be_missing():
     assert saved.survey.figures == Figures() and saved.survey.decisions == () and not saved.fingerprint
 
 
-@pytest.mark.parametrize("key", [key for key in NUMBERS if not NUMBERS[key].optional])
+@pytest.mark.parametrize(
+    "key", [key for key, one in list_keys(SystemPulse).items() if one.needed and one.shape == "value"]
+)
 def test_a_missing_quantity_is_named(key):
     text = re.sub(rf"^{key} = .*\n", "", TEXT, flags=re.M)
     with pytest.raises(ConfigError, match=rf"x\.toml: \[system\]: key '{key}' is missing"):

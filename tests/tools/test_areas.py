@@ -13,10 +13,9 @@ from wavebatch.cli.stats import SHOWN, stats
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk import buckets
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
-from wavebatch.tools.return_stats import areas as module
-from wavebatch.tools.return_stats import returns
-from wavebatch.tools.return_stats.areas import AreaGrid, PolygonSet
-from wavebatch.tools.return_stats.returns import count_returns
+from wavebatch.tools import return_stats as module
+from wavebatch.tools import return_stats as returns
+from wavebatch.tools.return_stats import AreaGrid, PolygonSet, count_returns
 
 
 def make_cloud(path, n=800, seed=0, east=300_000.0):

@@ -384,7 +384,7 @@ def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path, monkeypatch):
     document = json.loads((tmp_path / "out" / "jobs.json").read_text())
     parts = document["parts"]
     assert 2900 < parts["waveforms"] <= 3000
-    assert all(parts[name] > 0 for name in ("start", "start_worker", "prepare", "write", "strip"))
+    assert all(parts[name] > 0 for name in ("start", "start_worker", "scan", "survey", "write", "strip"))
     text = (tmp_path / "out" / "jobs.txt").read_text()
     assert [line.split()[0] for line in text.splitlines()[11:16]] == ["1", "2", "4", "16", "64"]
     (warning,) = document["warnings"]  # two units, which is few
@@ -435,18 +435,18 @@ def test_a_small_strip_that_fails_is_no_time(tmp_path):
 
 
 def test_the_slowest_part_bounds_many_jobs():
-    """A strip that is prepared alone; one process that writes; many strips hide the preparation."""
-    parts = Parts(1_000_000, start=0.25, start_worker=0.5, prepare=1.0, single=10e-6, work=10e-6, write=0.5e-6,
+    """A scan that jobs share, a survey; one process that writes; many strips hide scan and survey."""
+    parts = Parts(1_000_000, start=0.25, start_worker=0.5, scan=0.6, survey=0.4, single=10e-6, work=10e-6, write=0.5e-6,
                   strip=0.0, tail=0.0)  # fmt: skip
     assert parts.predict(1) == pytest.approx(0.25 + 1 + 10)
-    assert parts.predict(2) == pytest.approx(0.5 + 1 + 5)
-    assert parts.predict(64) == pytest.approx(0.5 + 1 + 0.5)
+    assert parts.predict(2) == pytest.approx(0.5 + 0.3 + 0.4 + 5)
+    assert parts.predict(64) == pytest.approx(0.5 + 0.6 / 5 + 0.4 + 0.5)  # four units for each, of twenty
     assert parts.predict(1, 100) == pytest.approx(0.25 + 1100)
     assert parts.predict(10, 100) == pytest.approx(0.5 + 110 + 1)
     assert parts.predict(64, 100) == pytest.approx(0.5 + 50 + 1)
     assert parts.most == pytest.approx(22)
     assert replace(parts, strip=1.0).predict(64, 100) == pytest.approx(0.5 + 150 + 1)
-    assert replace(parts, tail=0.4).predict(2) == pytest.approx(0.5 + 1 + 5 + 0.2)
+    assert replace(parts, tail=0.4).predict(2) == pytest.approx(0.5 + 0.3 + 0.4 + 5 + 0.2)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
+from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.disk import buckets
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.tools.compare import pairing

@@ -8,7 +8,7 @@ from published import RETURN_TABLES
 
 from wavebatch.cli.simulate import simulate
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.tools.return_stats.returns import count_returns
+from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, find_scene, simulate_block, simulate_returns
 from wavebatch.tools.simulate.draws import CANOPIES
 

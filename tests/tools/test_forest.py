@@ -13,7 +13,6 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey
-from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.rasters import cells
 from wavebatch.tools.rasters.forest import COLUMNS, Forest, ForestOptions
 from wavebatch.tools.rasters.grid import GridOptions, write_grid
@@ -33,7 +32,7 @@ def measure(voxels, folder, size=CELL, box=(0.0, 0.0, SIDE, SIDE), **options):
     """The result, and each band by its name, rows from the north."""
     rasterio = pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     paths = voxels if isinstance(voxels, list) else [voxels]
-    how = GridOptions(Selection(None), size=size, bbox=box, no_data=np.nan, forest=ForestOptions(**options))
+    how = GridOptions(size=size, bbox=box, no_data=np.nan, forest=ForestOptions(**options))
     result = write_grid(paths, folder / "f.tif", how, overwrite=True)
     with rasterio.open(folder / "f.tif") as file:
         assert set(file.dtypes) == {"float32"} and file.tags()["LEAF_PROJECTION"] == f"{how.forest.leaf_projection:g}"

@@ -16,14 +16,15 @@ from wavebatch.cli import main
 from wavebatch.core.condition import read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud import echo_reader as io_cloud
-from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.files.cloud import cloud_reader as io_cloud
+from wavebatch.files.cloud.cloud_reader import ColumnReader
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots import raster, values
 from wavebatch.tools.plots.histogram import count_points_by_flag, count_values, place_edges
 from wavebatch.tools.plots.raster import grid_values
 from wavebatch.tools.plots.sections import cut_section
-from wavebatch.tools.plots.values import Selection, robust_limits
+from wavebatch.tools.plots.values import robust_limits
 from wavebatch.tools.rasters import cells
 
 
@@ -58,7 +59,7 @@ def run(*words):
 
 
 def test_histogram_is_that_of_numpy(cloud):
-    found = count_values([cloud], Selection("amplitude"), bins=37, limits=(5.0, 120.0))
+    found = count_values([cloud], "amplitude", bins=37, limits=(5.0, 120.0))
     _, _, amplitude, _ = read_plainly(cloud)
     good = amplitude[~np.isnan(amplitude)]
     counts, edges = np.histogram(good, 37, (5.0, 120.0))
@@ -71,7 +72,7 @@ def test_histogram_is_that_of_numpy(cloud):
 
 
 def test_chosen_bins_hold_all_but_far_outliers(cloud):
-    found = count_values([cloud], Selection("amplitude"))
+    found = count_values([cloud], "amplitude")
     assert found.counts.sum() + found.below[0] + found.above[0] == found.total.values
     assert found.above[0] < 0.002 * POINTS and 20 <= found.counts.shape[1] <= 300
 
@@ -84,8 +85,8 @@ def test_nothing_depends_on_the_size_of_the_pieces(cloud, monkeypatch, size):
     monkeypatch.setattr(EvenSample, "LIMIT", 600)
     with ColumnReader(cloud, "amplitude") as reader:
         assert max(len(rows) for rows in reader.read_pieces()) == min(size, POINTS)
-    found = count_values([cloud], Selection("amplitude"), bins=20)
-    again = grid_values([cloud], Selection("amplitude"), "mean", size=1.7)
+    found = count_values([cloud], "amplitude", bins=20)
+    again = grid_values([cloud], "amplitude", "mean", size=1.7)
     _, _, amplitude, _ = read_plainly(cloud)
     good = amplitude[~np.isnan(amplitude)]
     step = 8
@@ -123,15 +124,15 @@ def test_edges_rise_and_hold_the_range(low, span, step, bins):
 
 
 def test_bins_of_stepped_columns_hold_whole_steps(cloud):
-    found = count_values([cloud], Selection("echo_width"))
+    found = count_values([cloud], "echo_width")
     assert found.facts.name == "Pulse width" and found.facts.step == pytest.approx(0.1)
     stride = np.diff(found.edges) / 0.1
     assert np.allclose(stride, round(stride[0])) and np.allclose(found.edges[0] / 0.1 % 1, 0.5)
     values = np.rint(np.array(laspy.read(cloud)["Pulse width"]) / 0.1).astype(int)
     assert np.array_equal(found.counts[0], np.bincount(values - 38, minlength=len(found.counts[0])))
-    wide = count_values([cloud], Selection("Pulse width"), bins=5)
+    wide = count_values([cloud], "Pulse width", bins=5)
     assert len(wide.counts[0]) <= 5 and wide.counts.sum() == POINTS
-    number = count_values([cloud], Selection("return_number"))
+    number = count_values([cloud], "return_number")
     assert number.edges.tolist() == [0.5, 1.5, 2.5, 3.5]
 
 
@@ -182,17 +183,17 @@ def test_ours_comes_before_the_vendors_but_the_vendors_own_name_wins(tmp_path):
 
 def test_each_cloud_has_its_series_and_all_together_are_their_sum(cloud, tmp_path):
     other = write_cloud(tmp_path / "other.las", seed=9, amplitude=(np.full(POINTS, 50, "f4"), None, None, "[DN]"))
-    both = count_values([cloud, other], Selection("amplitude"), each=True, bins=30, limits=(0.0, 200.0))
+    both = count_values([cloud, other], "amplitude", each=True, bins=30, limits=(0.0, 200.0))
     assert both.names == ("cloud.laz", "other.las") and both.counts.shape == (2, 30)
-    one = count_values([cloud, other], Selection("amplitude"), bins=30, limits=(0.0, 200.0))
+    one = count_values([cloud, other], "amplitude", bins=30, limits=(0.0, 200.0))
     assert np.array_equal(one.counts[0], both.counts.sum(axis=0)) and one.total == both.total
     assert both.percentiles[1].tolist() == [50.0, 50.0, 50.0]
     late = write_cloud(tmp_path / "late.las", wb_amplitude=(np.full(POINTS, 50, "f4"), None, None, "[DN]"))
     for clouds in ([late, other], [other, late]):
-        assert count_values(clouds, Selection("amplitude"), each=True).facts.name == "amplitude"
+        assert count_values(clouds, "amplitude", each=True).facts.name == "amplitude"
     wrong = write_cloud(tmp_path / "dB.las", amplitude=(np.ones(POINTS, "f4"), None, None, "of the echo [dB]"))
     with pytest.raises(ConfigError, match=r"dB.las.*\[dB\].*cloud.laz.*\[DN\]"):
-        count_values([cloud, wrong], Selection("amplitude"))
+        count_values([cloud, wrong], "amplitude")
 
 
 def test_groups_are_series_of_one_histogram(tmp_path):
@@ -207,7 +208,7 @@ def test_groups_are_series_of_one_histogram(tmp_path):
     las.write(path)
     kind = np.array(las.classification)
     whole = {"bins": 30, "limits": (0.0, 12.0)}
-    found = count_values([path], Selection("width"), by="classification", **whole)
+    found = count_values([path], "width", by="classification", **whole)
     assert found.names == ("classification 2 (ground)", "classification 5 (high vegetation)")
     known = a != -1
     for series, code in enumerate((2, 5)):
@@ -217,13 +218,13 @@ def test_groups_are_series_of_one_histogram(tmp_path):
         assert found.percentiles[series][1] == pytest.approx(np.median(mine))
     assert (found.total.values, found.total.no_data, found.total.points) == (n - 1, 1, n)
     with pytest.raises(ConfigError, match="more than 12 different values"):
-        count_values([path], Selection("width"), by="other")
+        count_values([path], "width", by="other")
 
 
 def test_points_without_data_in_the_column_of_groups_are_a_group(tmp_path):
     group = np.array([1, 1, 2, -9, -9], "f4")
     path = write_cloud(tmp_path / "n.las", n=5, group=(group, np.array([-9.0]), None, "g"))
-    found = count_values([path], Selection("z"), by="group")
+    found = count_values([path], "z", by="group")
     assert found.names == ("no group", "group 1", "group 2") and found.values.tolist() == [2, 2, 1]
 
 
@@ -242,7 +243,7 @@ def test_rare_far_values_are_outside_and_counted(tmp_path):
     values = np.random.default_rng(3).normal(10, 1, 20_000)
     values[:10] = 1000.0
     path = write_cloud(tmp_path / "far.las", n=20_000, a=(values, None, None, "a"))
-    found = count_values([path], Selection("a"))
+    found = count_values([path], "a")
     low, high = values[10:].min(), values[10:].max()
     width = found.edges[1] - found.edges[0]
     assert abs(found.edges[0] - low) <= width and abs(found.edges[-1] - high) <= width
@@ -252,12 +253,12 @@ def test_rare_far_values_are_outside_and_counted(tmp_path):
     las = laspy.read(rare)
     las.classification = np.where(np.arange(20_000) < 3, 18, 2)
     las.write(rare)
-    assert count_values([rare], Selection("classification")).above[0] == 0
+    assert count_values([rare], "classification").above[0] == 0
 
 
 def test_maps_say_their_crs_and_refuse_two(tmp_path, riegl, cloud):
     pytest.importorskip("matplotlib")
-    found = grid_values([riegl], Selection("z"))
+    found = grid_values([riegl], "z")
     assert "UTM" in found.crs.name and found.crs.unit == "m"
     assert run("map", riegl, "--column", "z", "-o", tmp_path / "r.svg").exit_code == 0
     assert f"CRS: {found.crs.name}" in (tmp_path / "r.svg").read_text("utf-8")
@@ -267,11 +268,11 @@ def test_maps_say_their_crs_and_refuse_two(tmp_path, riegl, cloud):
     las.header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(feet))
     las.header.global_encoding.wkt = True
     las.write(other)
-    assert grid_values([other], Selection("z")).crs.unit == "us-ft"
-    assert grid_values([other], Selection(None), "density").label == "points per area [1/us-ft2]"
+    assert grid_values([other], "z").crs.unit == "us-ft"
+    assert grid_values([other], None, "density").label == "points per area [1/us-ft2]"
     with pytest.raises(ConfigError, match="its CRS is"):
-        grid_values([riegl, other], Selection("z"))
-    assert grid_values([cloud], Selection("z")).crs.name == ""
+        grid_values([riegl, other], "z")
+    assert grid_values([cloud], "z").crs.name == ""
 
 
 def test_clouds_far_apart_are_refused(tmp_path, cloud):
@@ -280,38 +281,38 @@ def test_clouds_far_apart_are_refused(tmp_path, cloud):
     las.x = np.array(las.x) + 3000.0
     las.write(away)
     with pytest.raises(ConfigError, match=r"away.las: lies 3000.* from .*cloud.laz.*one by one, or give --bbox"):
-        grid_values([cloud, away], Selection("z"))
+        grid_values([cloud, away], "z")
     with pytest.raises(ConfigError, match=r"away.las: lies 3000.* from .*cloud.laz.*one by one, or give --line"):
-        cut_section([cloud, away], Selection("z"))
-    assert cut_section([cloud, away], Selection("z"), line=(500_000.0, 5_400_010.0, 503_040.0, 5_400_010.0)).inside
+        cut_section([cloud, away], "z")
+    assert cut_section([cloud, away], "z", line=(500_000.0, 5_400_010.0, 503_040.0, 5_400_010.0)).inside
     bounds = (500_000.0, 5_400_000.0, 500_040.0, 5_400_025.0)
-    assert grid_values([cloud, away], Selection("z"), bounds=bounds).total.values == 2 * POINTS
+    assert grid_values([cloud, away], "z", bounds=bounds).total.values == 2 * POINTS
     las.x = np.array(las.x) - 2900.0
     las.write(away)
-    assert grid_values([cloud, away], Selection("z")).outside == 0
+    assert grid_values([cloud, away], "z").outside == 0
 
 
 def test_flags_select_and_are_counted(cloud):
     _, _, amplitude, flags = read_plainly(cloud)
-    counted = count_points_by_flag([cloud], Selection("echo_flags"))
+    counted = count_points_by_flag([cloud], "echo_flags")
     for name, count in zip(counted.names, counted.counts, strict=True):
         assert count == np.sum((flags & int(EchoFlag[name])) != 0)
     assert counted.clean == np.sum(flags == 0)
     bits = read_flags(["saturated, OVERLAPPED"])
     assert bits == 24
-    chosen = count_values([cloud], Selection("amplitude", flags_with=8, flags_without=16), bins=4)
+    chosen = count_values([cloud], "amplitude", PointFilter(flags=8, drop_flags=16), bins=4)
     keep = ((flags & 8) != 0) & ((flags & 16) == 0)
     assert chosen.total.values == np.sum(keep & ~np.isnan(amplitude)) and chosen.total.left_out == np.sum(~keep)
     with pytest.raises(ConfigError, match="SATURATED"):
         read_flags(["SATURATD"])
     with pytest.raises(ConfigError, match="bits"):
-        count_values([cloud], Selection("echo_flags"))
+        count_values([cloud], "echo_flags")
 
 
 @pytest.mark.parametrize("statistic", ["mean", "median", "min", "max", "count", "density"])
 def test_map_is_that_of_a_loop_over_cells(cloud, monkeypatch, statistic):
     monkeypatch.setattr(cells, "HELD", 700)
-    found = grid_values([cloud], Selection("amplitude"), statistic, size=2.5)
+    found = grid_values([cloud], "amplitude", statistic, size=2.5)
     x, y, amplitude, _ = read_plainly(cloud)
     grid = found.grid
     west, _, south, _ = grid.extent
@@ -333,7 +334,7 @@ def test_map_is_that_of_a_loop_over_cells(cloud, monkeypatch, statistic):
 
 
 def test_chosen_cells_hold_a_few_points_each(cloud):
-    found = grid_values([cloud], Selection(None), "count")
+    found = grid_values([cloud], None, "count")
     assert 2 < np.nanmean(found.values) < 4 * raster.POINTS_PER_CELL
     assert np.nansum(found.values) == POINTS and found.label == "points per cell [-]"
 
@@ -343,9 +344,9 @@ def test_a_far_point_does_not_squeeze_the_map(tmp_path):
     las = laspy.read(path)
     las.points.array["X"][7] = 2_000_000_000
     las.write(path)
-    found = grid_values([path], Selection("z"))
+    found = grid_values([path], "z")
     assert found.outside == 1 and found.grid.columns * found.grid.size < 100
-    part = grid_values([path], Selection("z"), bounds=(500_010.0, 5_400_005.0, 500_020.0, 5_400_010.0), size=1.0)
+    part = grid_values([path], "z", bounds=(500_010.0, 5_400_005.0, 500_020.0, 5_400_010.0), size=1.0)
     assert part.grid.extent == (500_010.0, 500_021.0, 5_400_005.0, 5_400_011.0)
     x, y = np.array(las.x), np.array(las.y)
     inside = (x >= 500_010) & (x < 500_021) & (y >= 5_400_005) & (y < 5_400_011)
@@ -371,11 +372,11 @@ def test_limits_ignore_outliers_only():
 )
 def test_wrong_options_of_a_map(cloud, change, message):
     with pytest.raises(ConfigError, match=message):
-        grid_values([cloud], Selection("amplitude"), **{"statistic": "mean", **change})
+        grid_values([cloud], "amplitude", **{"statistic": "mean", **change})
 
 
 def test_the_size_that_is_proposed_does(cloud):
-    found = grid_values([cloud], Selection("amplitude"), size=0.02)
+    found = grid_values([cloud], "amplitude", size=0.02)
     assert found.grid.rows * found.grid.columns <= raster.MOST_CELLS
 
 
@@ -410,7 +411,7 @@ def test_one_point_and_one_value_can_be_drawn(tmp_path):
     one = write_cloud(tmp_path / "one.las", n=1, amplitude=(np.array([7.0], "f4"), None, None, "peak [DN]"))
     for kind in ("histogram", "map"):
         assert run(kind, one, "--column", "amplitude", "-o", tmp_path / f"{kind}.png").exit_code == 0
-    assert grid_values([one], Selection("amplitude")).values.tolist() == [[7.0]]
+    assert grid_values([one], "amplitude").values.tolist() == [[7.0]]
 
 
 COMMANDS = {
@@ -525,20 +526,20 @@ def test_matplotlib_is_not_imported_before_something_is_drawn(cloud, tmp_path):
 def test_unreadable_values_do_not_count(tmp_path):
     stored = np.array([1.0, np.nan, np.inf, -np.inf, 1e300, 2.0])
     path = write_cloud(tmp_path / "odd.las", n=6, odd=(stored, None, None, "odd"))
-    found = count_values([path], Selection("odd"))
+    found = count_values([path], "odd")
     assert (found.total.values, found.total.no_data) == (2, 4)
     with pytest.raises(InputError, match="left out"):
         grid_values([write_cloud(tmp_path / "f.las", n=3, echo_flags=(np.zeros(3, "u2"), None, None, ""))],
-                    Selection("z", flags_with=1))  # fmt: skip
+                    "z", chosen=PointFilter(flags=1))  # fmt: skip
 
 
 def test_real_clouds(riegl, leica, tmp_path):
     pytest.importorskip("matplotlib")
-    found = count_values([riegl], Selection("Pulse width"))
+    found = count_values([riegl], "Pulse width")
     assert found.total.values == 2535 and found.percentiles[0][1] == pytest.approx(4.4)
-    assert values.Clouds([riegl], Selection("amplitude")).facts.unit == "dB"
+    assert values.Clouds([riegl], ["amplitude"]).facts.unit == "dB"
     assert run("map", riegl, "--column", "z", "--statistic", "max", "-o", tmp_path / "r.png").exit_code == 0
-    assert grid_values([leica], Selection("intensity")).total.values == 999
+    assert grid_values([leica], "intensity").total.values == 999
 
 
 def test_groups_of_few_values_are_points(tmp_path, monkeypatch):
@@ -549,7 +550,7 @@ def test_groups_of_few_values_are_points(tmp_path, monkeypatch):
     from wavebatch.tools.plots import draw_cloud
 
     group = np.repeat([1, 2, 3], [4000, 998, 2]).astype("u1")
-    found = count_values([write_cloud(tmp_path / "c.las", n=5000, group=(group, None, None, "-"))], Selection("z"),
+    found = count_values([write_cloud(tmp_path / "c.las", n=5000, group=(group, None, None, "-"))], "z",
                          by="group", limits=(-1e6, 1e6))  # fmt: skip
     assert found.names == ("group 1", "group 2", "group 3") and found.values.tolist() == [4000, 998, 2]
     points, plot = [], Axes.plot
@@ -567,7 +568,7 @@ def test_more_than_six_groups_have_axes_of_their_own(tmp_path):
 
     group = np.repeat(np.arange(8), 625).astype("u1")
     path = write_cloud(tmp_path / "c.las", n=5000, group=(group, None, None, "-"))
-    found = count_values([path], Selection("z"), by="group")
+    found = count_values([path], "z", by="group")
     parts = draw_cloud._split_series(found)
     assert [part.names for part in parts] == [(f"group {number}",) for number in range(8)]
     assert [part.total.values for part in parts] == [625] * 8 and found.total.values == 5000
@@ -577,7 +578,7 @@ def test_more_than_six_groups_have_axes_of_their_own(tmp_path):
         patch.setattr(Figure, "savefig", lambda figure, *args, **more: drawn.extend(figure.axes) or args[0].write(b"x"))
         draw_cloud.draw_cloud_histogram(found, tmp_path / "h.png")
     assert len(drawn) == 8 and matplotlib
-    few = count_values([path], Selection("z"), by=None)
+    few = count_values([path], "z", by=None)
     assert draw_cloud._split_series(few) == [few]
 
 
@@ -591,7 +592,7 @@ def test_a_group_of_two_values_does_not_press_the_others_down(tmp_path):
     for few in (2, 0):
         group = np.repeat([1, 2], [5000 - few, few]).astype("u1")
         path = write_cloud(tmp_path / f"{few}.las", n=5000, group=(group, None, None, "-"))
-        found = count_values([path], Selection("z"), by="group")
+        found = count_values([path], "z", by="group")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Figure, "savefig", lambda figure, *args, **more: tops.append(figure.axes[0].get_ylim()[1])
                           or args[0].write(b"x"))  # fmt: skip

@@ -14,10 +14,10 @@ from scipy.optimize import curve_fit
 from strips import make_raw
 
 from wavebatch.cli import main
-from wavebatch.core.condition import parse_condition
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.strip import reader as io_strip
 from wavebatch.files.strip.reader import StripReader
@@ -178,7 +178,7 @@ def test_pulses_are_found_by_time_and_flag(tiny_strip):
             for block, table in tables
             for row in np.unique(table.waveform[(table.flags & bits) != 0])
         )
-        wanted = Wanted(flags=int(bits), most=4)
+        wanted = Wanted(chosen=PointFilter(flags=int(bits)), most=4)
         places = find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE))
         assert [view.point for view in read_views(reader, scan, places, chain, PULSE)] == flagged[:4]
         with pytest.raises(InputError, match="no echo"):
@@ -431,9 +431,9 @@ def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):
 
 def test_waveforms_are_those_with_an_echo_that_meets_a_condition(tiny_strip):
     chain = load_profile("balanced")
-    condition = parse_condition("number_of_returns >= 2 and not echo_width > 5 and not flag(WEAK)")
+    chosen = PointFilter.build(where="number_of_returns >= 2 and not echo_width > 5 and not flag(WEAK)")
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
-        places = find_places(reader, scan, Wanted(where=condition, most=4), lambda block: chain.run(block, PULSE))
+        places = find_places(reader, scan, Wanted(chosen=chosen, most=4), lambda block: chain.run(block, PULSE))
         every = [Place(unit.number, row, -1) for unit in reader.read_units(scan)
                  for row in np.flatnonzero(unit.packets.owned)[:400].tolist()]  # fmt: skip
         meets = []

@@ -15,8 +15,8 @@ from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.tools.return_stats import returns
-from wavebatch.tools.return_stats.returns import count_returns
+from wavebatch.tools import return_stats as returns
+from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, simulate_returns
 
 

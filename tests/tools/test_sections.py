@@ -16,7 +16,6 @@ from wavebatch.core.units import HALF_C
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.plots import sections
 from wavebatch.tools.plots.sections import cut_section, measure_profile
-from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.slices.cube import align_pulses, build_cube, cut_cube
 from wavebatch.tools.slices.output import SegmentWriter
 from wavebatch.tools.slices.read_segments import profile_segments
@@ -48,7 +47,7 @@ def voxels(tmp_path):
 
 
 def test_a_section_has_the_points_beside_its_line(cloud):
-    found = cut_section([cloud], Selection("amplitude"), line=LINE, width=3.0)
+    found = cut_section([cloud], "amplitude", line=LINE, width=3.0)
     las = laspy.read(cloud)
     places = np.stack([las.x, las.y], axis=1) - LINE[:2]
     value = np.array(las["amplitude"])
@@ -65,7 +64,7 @@ def test_a_section_has_the_points_beside_its_line(cloud):
 def test_a_section_of_many_points_is_an_even_sample_that_says_so(cloud, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(sections, "MOST_POINTS", 300)
-    found = cut_section([cloud], Selection("z"), line=LINE, width=10.0)
+    found = cut_section([cloud], "z", line=LINE, width=10.0)
     assert len(found.value) <= 300 < found.inside
     assert run("plot", "section", cloud, "--width", 10, "-o", tmp_path / "s.svg", "--aspect", 2).exit_code == 0
     text = (tmp_path / "s.svg").read_text("utf-8")
@@ -73,7 +72,7 @@ def test_a_section_of_many_points_is_an_even_sample_that_says_so(cloud, tmp_path
 
 
 def test_without_a_line_the_longer_extent_is_cut(cloud):
-    found = cut_section([cloud], Selection("z"))
+    found = cut_section([cloud], "z")
     x0, y0, x1, y1 = found.line
     assert abs(y1 - y0) < 0.2 * (x1 - x0) and 38 < found.along.max() - found.along.min() <= 45
     assert found.width == pytest.approx(np.hypot(x1 - x0, y1 - y0) / 50)
@@ -81,7 +80,7 @@ def test_without_a_line_the_longer_extent_is_cut(cloud):
 
 def test_sections_of_voxels(voxels):
     path, place, energy = voxels
-    found = cut_section([path], Selection("energy"), line=(10.0, 30.0, 30.0, 30.0), width=2.0)
+    found = cut_section([path], "energy", line=(10.0, 30.0, 30.0, 30.0), width=2.0)
     keep = np.abs(place[:, 1] - 30.0) <= 1.0
     assert found.voxel == 0.5 and found.inside == keep.sum() > 100
     assert found.along == pytest.approx(place[keep, 0] - 10.0) and found.value == pytest.approx(energy[keep])
@@ -116,18 +115,18 @@ def test_wrong_usage_is_one_line(cloud, voxels, tmp_path, words, code, message):
 def test_profiles_count_sum_and_average(cloud, voxels):
     las = laspy.read(cloud)
     height, value = np.array(las.z), np.array(las["amplitude"], np.float64)
-    count = measure_profile([cloud], Selection(None), "count", size=2.0)
+    count = measure_profile([cloud], None, "count", size=2.0)
     assert count.values[0].tolist() == np.histogram(height, count.edges)[0].tolist()
     assert count.values.sum() + count.outside == 5000 and np.all(count.edges % 2.0 == 0)
     known = value != -1
-    both = measure_profile([cloud, cloud], Selection("amplitude"), "mean", size=2.0, each=True)
+    both = measure_profile([cloud, cloud], "amplitude", "mean", size=2.0, each=True)
     sums = np.histogram(height[known], both.edges, weights=value[known])[0]
     number = np.histogram(height[known], both.edges)[0]
     full = number > 0
     for row in both.values:
         assert row[full] == pytest.approx(sums[full] / number[full]) and np.isnan(row[~full]).all()
     path, place, energy = voxels
-    found = measure_profile([path], Selection("energy"), "sum")
+    found = measure_profile([path], "energy", "sum")
     expected = [energy[place[:, 2] == level].sum() for level in 100.25 + 0.5 * np.arange(40)]
     assert np.diff(found.edges) == pytest.approx(0.5), "a layer of voxels is a bin"
     assert found.values[0][: len(expected)] == pytest.approx(expected, rel=1e-5)
@@ -333,7 +332,7 @@ def test_far_points_leave_the_frame_of_a_section_and_are_counted(tmp_path, monke
     height[0], height[1] = 353.0, 234.0
     las.x, las.y, las.z = np.linspace(0.0, 80.0, many), rng.uniform(0, 1, many), height
     las.write(tmp_path / "c.las")
-    found = cut_section([tmp_path / "c.las"], Selection("z"), line=(0, 0.5, 80, 0.5), width=2.0)
+    found = cut_section([tmp_path / "c.las"], "z", line=(0, 0.5, 80, 0.5), width=2.0)
     assert (found.inside, found.outside) == (many, 1)
     assert found.height.min() > 345 and found.height.max() == pytest.approx(353.0)
     result = run("plot", "section", tmp_path / "c.las", "-o", tmp_path / "s.svg")
@@ -372,7 +371,7 @@ def test_tails_of_voxels_are_not_drawn(voxels):
 
     from wavebatch.tools.plots import sections
 
-    found = cut_section([voxels[0]], Selection("energy"), line=(10.0, 30.0, 30.0, 30.0), width=0.5)
+    found = cut_section([voxels[0]], "energy", line=(10.0, 30.0, 30.0, 30.0), width=0.5)
     value = np.where(np.arange(len(found.value)) % 2, 50.0, 0.5)
     axes = SimpleNamespace(grid=lambda **_: None, imshow=lambda image, **_: image)
     for name, faint in (("energy", False), ("count", True)):

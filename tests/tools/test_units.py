@@ -13,12 +13,11 @@ from strips import add_record
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.las.crs import metres_per_unit, parse_wkt
-from wavebatch.files.las.geotiff_wkt import build_utm
+from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import build_wkt
 from wavebatch.files.strip.packet_vectors import DirectionTally, decide_direction
 from wavebatch.tools.plots.charts import picture_cloud
 from wavebatch.tools.plots.sections import cut_section, measure_profile
-from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.simulate import simulate_strip
 
 FOOT = 1200 / 3937
@@ -134,12 +133,12 @@ def test_no_waveforms_are_modelled_with_distances_in_another_unit(clouds, tmp_pa
 
 
 def test_pictures_name_the_unit_of_heights(clouds):
-    made = {name: measure_profile([path], Selection("z"), "count") for name, path in clouds.items()}
+    made = {name: measure_profile([path], "z", "count") for name, path in clouds.items()}
     units = {name: (found.facts.unit, found.label.split(" of ")[0].split()[-1]) for name, found in made.items()}
     assert units == {"m": ("m", "m"), "ft": ("us-ft", "us-ft"), "deg": ("m", "m")}
     assert "of height" in made["m"].label
     with pytest.raises(ConfigError, match="coordinates are degrees, heights are not"):
-        cut_section([clouds["deg"]], Selection("z"))
+        cut_section([clouds["deg"]], "z")
 
 
 def test_bands_of_rasters_name_the_unit_of_heights(clouds, tmp_path):
@@ -157,7 +156,7 @@ def test_geocentric_coordinates_have_no_height(clouds, tmp_path):
     cloud = tmp_path / "g.las"
     cloud.write_bytes(clouds["m"].read_bytes())
     add_record(cloud, build_wkt(GEOCENTRIC))
-    found = measure_profile([cloud], Selection("z"), "count")
+    found = measure_profile([cloud], "z", "count")
     assert found.upright == "z" and found.label.endswith(" m of z")
     assert "coordinates       geocentric (ECEF)" in _print("info", cloud).stdout
 

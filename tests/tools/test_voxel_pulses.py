@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from packet_strips import LENGTHS, draw_canopy, record, render, write_recorded
 
-from wavebatch.core.condition import parse_condition
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.voxels.pulses import LOST, read_batches
@@ -20,7 +20,8 @@ N = 1500
 
 
 def voxelize(strip, folder, *, size=1.0, ratio=2.0, where=None, all_crossed=True, **options):
-    settings = VoxelOptions(size, headroom=50.0, reflectance_ratio=ratio, where=where, all_crossed=all_crossed)
+    chosen = PointFilter.build(where=where)
+    settings = VoxelOptions(size, headroom=50.0, reflectance_ratio=ratio, all_crossed=all_crossed, chosen=chosen)
     summary = voxelize_strip(strip, folder / "v.npz", settings, system=SAVED, force=True, overwrite=True, **options)
     with np.load(folder / "v.npz") as file:
         return summary, {name: file[name] for name in file}
@@ -174,13 +175,13 @@ def test_pulses_of_equal_time_are_not_one(canopy, tmp_path, apart):
     assert summary.pulses == n
     assert found["light"][layer_of(found) == 126].sum() == pytest.approx(n, abs=12 if apart == "direction" else 0)
     if apart == "scanner":
-        summary, _ = voxelize(strip, tmp_path, where=parse_condition("scanner_channel == 1"))
+        summary, _ = voxelize(strip, tmp_path, where="scanner_channel == 1")
         assert summary.pulses == n / 2 and summary.left_out + summary.waveforms > n
 
 
 def test_where_takes_whole_pulses(strips, tmp_path):
     """The ground's return chooses the pulse, with its canopy."""
-    summary, found = voxelize(strips[1], tmp_path, where=parse_condition("z < 102"))
+    summary, found = voxelize(strips[1], tmp_path, where="z < 102")
     whole, _ = voxelize(strips[1], tmp_path)
     assert 0.8 * N < summary.pulses < N and summary.waveforms + summary.left_out == whole.waveforms
     assert shares(found, LAYERS)[0] > 0.1

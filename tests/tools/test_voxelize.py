@@ -28,8 +28,7 @@ from wavebatch.tools.simulate.blocks import simulate_block
 from wavebatch.tools.simulate.geometry import FlightLine
 from wavebatch.tools.simulate.render import Recording, find_pulse
 from wavebatch.tools.simulate.strip import WKT, StripOptions
-from wavebatch.tools.voxels.ceiling import Ceiling
-from wavebatch.tools.voxels.floor import Floor
+from wavebatch.tools.voxels.floor import Ceiling, Floor
 from wavebatch.tools.voxels.profile import Deconvolution, _pulse_taps, deconvolve_block
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
@@ -307,7 +306,7 @@ def test_followed_up_to_the_highest_return_rays_count_as_if_from_the_sensor(tmp_
 
 @pytest.mark.parametrize("most", [8, 100, 1 << 18])
 def test_ceilings_are_those_of_a_slow_search(monkeypatch, most):
-    monkeypatch.setattr("wavebatch.tools.voxels.cell_map.MOST_CELLS", most)
+    monkeypatch.setattr("wavebatch.tools.voxels.floor.MOST_CELLS", most)
     rng = np.random.default_rng(9)
     points = rng.uniform(0, 120, (300, 3)) * [1, 1, 0.3]
     ceiling = Ceiling(np.array([60.0, 60.0, 0.0]), 1.0)
@@ -422,7 +421,7 @@ def test_a_point_cloud_holds_what_the_npz_holds(tmp_path, point_format, output, 
     assert meta == [json.loads(str(found["meta"]))] and meta[0]["deconvolution"]["iterations"] == 40
 
 
-CALIBRATION = Calibration(2.5e-8, 0.03, 0.22, 0.5)
+CALIBRATION = Calibration(2.5e-8, 0.03, 0.22, divergence=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -608,7 +607,7 @@ def test_light_is_normalised_by_range(tmp_path):
 
 @pytest.mark.parametrize("most", [20, 1 << 18])
 def test_the_floor_is_the_ground_below_plants(monkeypatch, most):
-    monkeypatch.setattr("wavebatch.tools.voxels.cell_map.MOST_CELLS", most)
+    monkeypatch.setattr("wavebatch.tools.voxels.floor.MOST_CELLS", most)
     rng = np.random.default_rng(5)
     xyz = rng.uniform(0, 60, (6000, 3)) * [1, 1, 0]
     ground = 0.3 * xyz[:, 0] - 0.1 * xyz[:, 1] + 0.05 * rng.standard_normal(6000)

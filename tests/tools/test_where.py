@@ -11,14 +11,15 @@ from click.testing import CliRunner
 from wavebatch.cli import main
 from wavebatch.core.condition import parse_condition
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.column_reader import ColumnReader, select_points
+from wavebatch.files.cloud.cloud_reader import ColumnReader
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.compare.clouds import compare_clouds
 from wavebatch.tools.plots.histogram import count_values
-from wavebatch.tools.plots.values import Selection
-from wavebatch.tools.return_stats.returns import count_returns
+from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 TEXT = "number_of_returns >= 2 and echo_width < 5"
+CHOSEN = PointFilter.build(where=TEXT)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def test_readers_give_the_points_that_meet_it(cloud, split):
     path, number, total = split
     assert 50 < number < total - 50
     with ColumnReader(cloud, "z") as some, ColumnReader(path, "z") as other:
-        select_points(some, parse_condition(TEXT))
+        some.select(CHOSEN)
         rows = np.concatenate(list(some.read_pieces(999)))
         np.testing.assert_array_equal(rows, np.concatenate(list(other.read_pieces())))
         assert some.left_out == total - number
@@ -52,7 +53,7 @@ def test_readers_give_the_points_that_meet_it(cloud, split):
 
 def test_stats_counts_them_and_what_is_left_out(cloud, split):
     path, number, total = split
-    (found,), _ = count_returns([cloud], where=parse_condition(TEXT))
+    (found,), _ = count_returns([cloud], chosen=CHOSEN)
     (wanted,), _ = count_returns([path])
     assert (found.points, found.left_out) == (number, total - number)
     assert (found.by_number, found.separations, found.flags) == (wanted.by_number, wanted.separations, wanted.flags)
@@ -61,8 +62,8 @@ def test_stats_counts_them_and_what_is_left_out(cloud, split):
 
 def test_histograms_count_them(cloud, split):
     path, number, total = split
-    found = count_values([cloud], Selection("amplitude", where=parse_condition(TEXT)), bins=20)
-    wanted = count_values([path], Selection("amplitude"), bins=20)
+    found = count_values([cloud], "amplitude", CHOSEN, bins=20)
+    wanted = count_values([path], "amplitude", bins=20)
     assert (found.total.points, found.total.left_out) == (total, total - number)
     assert found.total.values == wanted.total.values
     np.testing.assert_array_equal(found.counts, wanted.counts)
@@ -70,14 +71,14 @@ def test_histograms_count_them(cloud, split):
 
 def test_clouds_are_compared_at_them(cloud, split):
     path, number, total = split
-    found = compare_clouds(cloud, path, where=parse_condition(TEXT))
+    found = compare_clouds(cloud, path, chosen=CHOSEN)
     assert (found.matched, found.missed, found.extra) == (number, 0, 0)
     assert (found.left_out_a, found.left_out_b) == (total - number, 0)
 
 
 def test_voxels_are_of_waveforms_with_such_a_return(riegl, tmp_path):
     all_, some, rest = (
-        voxelize_strip(riegl, tmp_path / f"{number}.npz", VoxelOptions(2.0, where=where))
+        voxelize_strip(riegl, tmp_path / f"{number}.npz", VoxelOptions(2.0, chosen=PointFilter(where=where)))
         for number, where in enumerate(
             [None, parse_condition("number_of_returns >= 2"), parse_condition("not number_of_returns >= 2")]
         )
@@ -89,19 +90,19 @@ def test_voxels_are_of_waveforms_with_such_a_return(riegl, tmp_path):
 
 
 def test_voxels_may_lack_any_waveform(riegl, tmp_path):
-    found = voxelize_strip(riegl, tmp_path / "x.npz", VoxelOptions(2.0, where=parse_condition("z > 1e6")))
+    found = voxelize_strip(riegl, tmp_path / "x.npz", VoxelOptions(2.0, chosen=PointFilter.build(where="z > 1e6")))
     assert (found.waveforms, found.voxels) == (0, 0) and found.left_out > 0
 
 
 def test_an_unknown_column_is_named_with_its_place_and_the_nearest(cloud):
     for work in (
-        lambda where: count_returns([cloud], where=where),
-        lambda where: compare_clouds(cloud, cloud, where=where),
+        lambda chosen: count_returns([cloud], chosen=chosen),
+        lambda chosen: compare_clouds(cloud, cloud, chosen=chosen),
     ):
         with pytest.raises(
             ConfigError, match=r"^--where: character 12: .*no column 'ecko_width'; did you mean 'echo_width'"
         ):
-            work(parse_condition("z > 0 and (ecko_width < 5)"))
+            work(PointFilter.build(where="z > 0 and (ecko_width < 5)"))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator, Mapping
 
 from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
-from wavebatch.batch.selection import describe_extent
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StripWarning
@@ -184,7 +183,7 @@ def _miss_all(prepared: Prepared, report: RunReport) -> Iterator[str]:
     number = sum(report.left_out.values())
     if number and not report.count("points_out"):
         reasons = ", ".join(f"{n} {LEFT_OUT[name]}" for name, n in report.left_out.items() if n)
-        place = describe_extent(prepared.layout, prepared.job.selection)
+        place = prepared.chosen.chosen.describe_extent(prepared.facts.header)
         yield f"no point is written: of {number}, {reasons}{place and '; ' + place}"
 
 

@@ -7,22 +7,31 @@ Before you change it: a job travels to other processes, and all of it that decid
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.output_rows import NEEDED
-from wavebatch.batch.selection import WITHOUT_STAGE, RowFilter
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.cloud.column_names import name_standard, read_field, resolve
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
+from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter
+from wavebatch.files.las.point_formats import read_classes
 from wavebatch.files.strip.reader import StripFacts, StripReader
 from wavebatch.stages.chain import STAGES, Chain
 from wavebatch.surveying.calibration import Calibration, with_columns, with_physics
 from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.sensor import SensorRequest
+
+WITHOUT_STAGE = ("echo_time", "echo_flags")
+"""Columns that need no attribute stage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +51,7 @@ class StripJob:
     calibration: Calibration | None = None
     attenuation: tuple[float, float] | None = None
     """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
-    selection: RowFilter = RowFilter()
+    chosen: PointFilter = PointFilter()
     """What is written."""
 
     def extend(self, chain: Chain) -> Chain:
@@ -54,7 +63,7 @@ class StripJob:
         divergence = any(value is not None for value in known)
         given = self.sensor != SensorRequest()
         chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
-        return with_columns(chain, (*self.columns, *self.selection.list_wanted()))
+        return with_columns(chain, (*self.columns, *self.chosen.list_wanted()))
 
     def calibrate(self, system: SystemPulse) -> SystemPulse:
         """Return the system pulse with the job's calibration and air, if it has them."""
@@ -168,3 +177,77 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
         points=options.points,
         strict=options.strict,
     )
+
+
+class UnitRows(NamedTuple):
+    """Rows of a unit before they are written."""
+
+    rows: np.ndarray
+    """Structured (m,), in the cloud's layout."""
+    columns: Mapping[str, np.ndarray]
+    """Computed columns (m,) as the chain gave them, whatever the cloud's names and units; echo_flags among them."""
+
+
+@dataclass(frozen=True, slots=True)
+class RowColumn:
+    """A column of UnitRows; picklable."""
+
+    kind: str
+    """`computed`, `standard` or `carried`."""
+    name: str
+    """Of the column, or of the field of the layout."""
+    layout: OutputLayout
+
+    def __call__(self, unit: UnitRows) -> np.ndarray:
+        """Values (m,), NaN for no data."""
+        if self.kind == "computed":
+            return unit.columns[self.name].astype(COLUMNS[self.name].dtype, copy=False)
+        if self.kind == "carried":
+            return self.layout.carried[self.layout.extra_fields.index(self.name)].record.read(unit.rows[self.name])
+        if self.name == "classification":
+            return read_classes(unit.rows)
+        return read_field(unit.rows, self.layout.point_format, self.name, self.layout.source.header)
+
+
+def plan_filter(job: StripJob, layout: OutputLayout) -> PlannedFilter:
+    """Look up the columns of --where among those that the rows of the output have, and place the polygons.
+
+    Parameters
+    ----------
+    job : StripJob
+        With the chain that makes the rows.
+    layout : OutputLayout
+
+    Returns
+    -------
+    PlannedFilter
+        For UnitRows.
+
+    Raises
+    ------
+    ConfigError
+        Where --where names a column that the rows do not have, or the polygons cannot be placed in the strip.
+    """
+    source, chain = layout.source, job.chain
+    made = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
+    fields = zip(layout.carried, layout.extra_fields, strict=False)
+    names = {
+        "computed": {name: name for name in [*made, *WITHOUT_STAGE]},
+        "standard": name_standard(layout.point_format),
+        "carried": {one.record.name: field for one, field in fields if not layout.dtype[field].shape},
+    }
+    kinds = [{name: (kind, meant) for name, meant in known.items()} for kind, known in names.items()]
+
+    def find(name: str) -> RowColumn:
+        found = resolve(name, *kinds)
+        if found is not None:
+            return RowColumn(found[0], found[1], layout)
+        makers = [stage.name for stage in STAGES.values() if name in stage.makes and name in COLUMNS]
+        remedy = nearest(name, [one for known in kinds for one in known])
+        if makers:
+            remedy = f"chain {chain.name} does not compute it; add stage {' or '.join(makers)} to it"
+        raise ConfigError(f"{source.path}: there is no column {name!r}; {remedy}")
+
+    standard = {name: RowColumn("standard", name, layout) for name in ("x", "y", "classification")}
+    standard["echo_flags"] = RowColumn("computed", "echo_flags", layout)
+    return job.chosen.place(source.path, source.header).plan(standard, find, str(source.path))

@@ -24,7 +24,7 @@ import numpy as np
 
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, spread
-from wavebatch.batch.unit import Prepared, SolvedBlocks, solve_unit, unpack
+from wavebatch.batch.unit import Prepared, SolvedBlocks, UnitResult, finish_rows, solve_unit, unpack
 from wavebatch.core.echoes import COLUMNS, EchoTable
 from wavebatch.core.errors import StageError
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
@@ -158,14 +158,14 @@ class SecondPass:
         rows, state = self._units.popleft()
         return end_unit, (blob, self._states.read(state.start, state.stop), self._found.read(rows.start, rows.stop))
 
-    def take(self, result: Any) -> tuple[np.ndarray | None, RunReport]:
-        """Take the result of the oldest call: rows of the cloud, None for a tile; and its report."""
+    def take(self, result: Any) -> UnitResult | RunReport:
+        """Take the result of the oldest call: a finished unit, or of a tile the report."""
         if not self._tiles_left:
             self._units_left -= 1
             return result
         self._found.put(*result[:2])
         self._tiles_left -= 1
-        return None, result[2]
+        return result[2]
 
     def close(self) -> None:
         """Remove all temporary files; harmless twice."""
@@ -192,14 +192,14 @@ def begin_unit(blob: bytes, number: int, block_size: int | None) -> tuple[tuple[
     prepared: Prepared = unpack(blob)
     timing: dict[str, Seconds] = {}
     solved, echoes, made = solve_unit(prepared, number, block_size, timing)
-    needed = {name: made.columns[name] for name in ("echo_flags", *prepared.selector.needed)}
+    needed = {name: made.columns[name] for name in ("echo_flags", *prepared.needed)}
     chain = prepared.job.chain
     kept = [(index, chain.keep_needed(block)) for index, block in solved] if chain.after_second else []
     state = np.frombuffer(pickle.dumps((made._replace(columns=needed), kept), PROTOCOL), np.uint8)
     return (_list_entries(echoes, made), state), RunReport(timing=timing)
 
 
-def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, RunReport]:
+def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> UnitResult:
     """Make the rows of a unit that are written, once the second pass has been over its points.
 
     Parameters
@@ -213,8 +213,7 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndar
 
     Returns
     -------
-    rows : structured array (m,)
-    report : RunReport
+    UnitResult
     """
     _gather.cache_clear()  # tiles are done: their memory is needed for the unit
     prepared: Prepared = unpack(blob)
@@ -233,10 +232,9 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> tuple[np.ndar
     values |= _solve_again(prepared.job.chain, solved, values, timing)
     columns = {name: spread(name, column, made.echo) for name, column in values.items() if name in COLUMNS}
     prepared.layout.fill(made.rows, columns)
-    rows, left = prepared.selector.select(made.rows, {**made.columns, **columns})
     reasons = count_reasons({name: codes[made.counted] for name, codes in values.items()})
-    report = replace(made.report, no_data={**made.report.no_data, **reasons}, timing=timing)
-    return rows, report + left
+    report = replace(made.report, no_data={**made.report.no_data, **reasons})
+    return finish_rows(prepared, made.rows, {**made.columns, **columns}, report, timing)
 
 
 def _solve_again(

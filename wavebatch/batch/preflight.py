@@ -12,10 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.job import StripJob, plan_layout
+from wavebatch.batch.job import StripJob, plan_filter, plan_layout
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.report_file import cloud_path, report_path
-from wavebatch.batch.selection import RowSelector
 from wavebatch.batch.strip_task import StripTask
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.protect import protecting, refuse_input
@@ -76,7 +75,7 @@ def check_outputs(jobs: Sequence[StripJob], options: RunOptions) -> None:
 
 def list_read_files(jobs: Sequence[StripJob]) -> list[Path]:
     """Return the files that the jobs read, also those that are read already: no output may replace them."""
-    read = {Path(job.selection.polygon) for job in jobs if job.selection.polygon is not None}
+    read = {Path(job.chosen.polygon_file["file"]) for job in jobs if job.chosen.polygon_file is not None}
     return sorted(read.union(*(job.files for job in jobs)))
 
 
@@ -147,10 +146,10 @@ def plan_strip(job: StripJob, options: RunOptions) -> dict[str, Any]:
     """
     (job,) = with_flight([job], load_flight([job], options))
     task = StripTask(job, options, alone=False)
-    done = task.start() is not None
+    done = task.start(jobs=1) is not None
     facts = task.facts
     layout, is_laz = plan_layout(job, facts), job.options.format == "laz"
-    RowSelector.plan(job.selection.place(layout.source), job.chain, layout)
+    plan_filter(job, layout)
     return {
         "action": "skip" if done else "write",
         "strip": str(job.path),

@@ -79,7 +79,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
             "attenuation_db_km": None if job.attenuation is None else list(job.attenuation),
             "pulse_energy": energy,
             **flight,
-            **({"selection": job.selection.describe()} if job.selection else {}),
+            **({"selection": job.chosen.describe()} if job.chosen else {}),
         },
     }
 

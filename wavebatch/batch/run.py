@@ -255,7 +255,7 @@ class _Batch:
             self._active.append(strip)
             with self._failing(strip):
                 strip.claim()
-                report = strip.start()
+                report = strip.start(self._workers.jobs)
                 self._tell({"event": "start", "strip": str(strip.job.path)})
                 if report is None:
                     return strip
@@ -267,9 +267,9 @@ class _Batch:
             return
         with self._failing(strip):
             before = strip.written
-            strip.take(self._workers)
-            done, units = strip.written, strip.ready.units
-            if done > before:
+            strip.take()
+            if strip.written > before:
+                done, units = strip.written, strip.ready.units
                 self._tell({"event": "unit", "strip": str(strip.job.path), "done": done, "of": units})
             if strip.is_complete:
                 report = strip.finish()

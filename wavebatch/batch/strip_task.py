@@ -10,24 +10,31 @@ import contextlib
 import os
 import pickle
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
 
 from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.options import RunOptions
-from wavebatch.batch.unit import Prepared, prepare_strip, process_unit
+from wavebatch.batch.packing import Packing, pack_chunk
+from wavebatch.batch.unit import Prepared, UnitResult, prepare_strip, process_unit, scan_run
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError, StageError
 from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.writer import CloudWriter
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target
+from wavebatch.files.las.laz_encode import Chunk
 from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.files.text_file import draft_text
 
 if TYPE_CHECKING:
@@ -55,6 +62,8 @@ class StripTask:
         self.job = job
         self.alone = alone
         self.pending: deque[Future] = deque()
+        self._takers: deque[Callable[[Any], None]] = deque()
+        """Who takes the result of each."""
         self.prepared: Prepared | None = None
         self.written = 0
         self._options = options
@@ -63,6 +72,10 @@ class StripTask:
         self._claim: Claim | None = None
         self._writer: CloudWriter | None = None
         self._second: SecondPass | None = None
+        self._runs: deque[tuple[int, int]] = deque()
+        """Units that several processes scan, not yet submitted; empty where one process scans the strip."""
+        self._scanned: list[ScanPart] = []
+        self._packing = Packing()
         self._report = RunReport()
         self._described: dict[str, Any] = {}
         self._files: list[Path] = []
@@ -79,8 +92,8 @@ class StripTask:
             self._claim.discard()
             self._claim = None
 
-    def start(self) -> RunReport | None:
-        """Look at strip and outputs before any work.
+    def start(self, jobs: int) -> RunReport | None:
+        """Look at strip and outputs before any work; up to `jobs` processes will scan the strip.
 
         Returns
         -------
@@ -95,6 +108,8 @@ class StripTask:
         options, job = self._options, self.job
         with job.open() as reader:
             self.facts = reader.facts
+            runs = reader.cut_scan(jobs)
+            self._runs = deque(runs if len(runs) > 1 else ())
         packet_file = self.facts.packets.file
         self._files = [job.path] + ([packet_file] if packet_file not in (None, job.path) else [])
         self._state = self._stat()
@@ -118,65 +133,112 @@ class StripTask:
     def has_more(self) -> bool:
         """Whether there is a call to submit now."""
         if self.prepared is None:
-            return not self.pending
-        if self._submitted < self.prepared.units:
+            return bool(self._runs) or not self.pending
+        if self._submitted < self.prepared.units or self._packing.has_chunk(last=self._has_all_rows):
             return True
         return self._second is not None and self._second.has_more
 
     @property
     def is_complete(self) -> bool:
-        """Whether all units are done, also by a second pass."""
-        if self.prepared is None or self.written < self.prepared.units:
-            return False
-        return self._second is None or self._second.is_complete
+        """Whether all units are done, also by a second pass, and all rows are written."""
+        return self.prepared is not None and self._has_all_rows and self._packing.is_empty
+
+    @property
+    def _has_all_rows(self) -> bool:
+        return self.written == self.ready.units and (self._second is None or self._second.is_complete)
 
     def submit(self, workers: Workers | Cluster) -> None:
-        """Submit the next call: the preparation, then unit by unit, then those of a second pass."""
+        """Submit the next call: scan, preparation, then chunks of rows and units, and those of a second pass."""
         if self.prepared is None:
-            self.pending.append(workers.submit(prepare_strip, self.job.absolute() if workers.is_remote else self.job))
-            return
-        if self._submitted == self.prepared.units:
-            function, arguments = _given(self._second).next_call(self._blob)
-            self.pending.append(workers.submit(function, *arguments))
-            return
-        function = process_unit
-        if self._second is not None:
-            from wavebatch.batch.neighbour_pass import begin_unit as function
-        self.pending.append(workers.submit(function, self._blob, self._submitted, self._options.block_size))
-        self._submitted += 1
-
-    def take(self, workers: Workers | Cluster) -> None:
-        """Use the oldest result: open the output, or write rows."""
-        result = self.pending.popleft().result()
-        start = Seconds.now()
-        if self.prepared is None:
-            self.prepared = result
-            self._report += result.report
-            self._open(result, workers.jobs)
-        elif self.written == self.prepared.units:
-            rows, report = _given(self._second).take(result)
-            if rows is not None:
-                _given(self._writer).write(rows)
-            self._report += report
-        else:
-            rows, report = result
-            if self._second is None:
-                _given(self._writer).write(rows)
+            job = self.job.absolute() if workers.is_remote else self.job
+            if self._runs:
+                self._call(workers, self._take_scanned, scan_run, job, *self._runs.popleft())
             else:
-                self._second.add(*rows)
-            self.written += 1
-            self._report += report + RunReport(timing={"write": Seconds.now() - start})
-        if self.written == self.ready.units and self._second is not None:
+                self._call(workers, self._take_prepared, prepare_strip, job, self._scanned)
+        elif self._packing.has_chunk(last=self._has_all_rows):
+            rows, point_format = self._packing.next_chunk(), self.prepared.layout.point_format
+            self._call(workers, self._take_chunk, pack_chunk, self.job.path, rows, point_format)
+        elif self._submitted < self.prepared.units:
+            arguments = self._blob, self._submitted, self._options.block_size
+            if self._second is None:
+                self._call(workers, self._take_unit, process_unit, *arguments)
+            else:
+                from wavebatch.batch.neighbour_pass import begin_unit
+
+                self._call(workers, self._take_begun, begin_unit, *arguments)
+            self._submitted += 1
+        else:
+            function, arguments = _given(self._second).next_call(self._blob)
+            self._call(workers, self._take_second, function, *arguments)
+
+    def _call(self, workers: Workers | Cluster, take: Callable[[Any], None], function: Callable, *given: Any) -> None:
+        self.pending.append(workers.submit(function, *given))
+        self._takers.append(take)
+
+    def take(self) -> None:
+        """Use the oldest result: open the output, keep rows for a chunk, or write one."""
+        self._takers.popleft()(self.pending.popleft().result())
+        if self._second is not None and self.written == self.ready.units:
             self._report += self._second.cut()
 
-    def _open(self, prepared: Prepared, threads: int) -> None:
+    def _take_scanned(self, scanned: tuple[ScanPart, Seconds]) -> None:
+        part, took = scanned
+        self._scanned.append(part)
+        self._report += RunReport(timing={"scan": took})
+
+    def _take_prepared(self, prepared: Prepared) -> None:
+        self.prepared = prepared
+        self._scanned = []
+        self._report += prepared.report
+        self._open(prepared)
+
+    def _take_unit(self, unit: UnitResult) -> None:
+        self.written += 1
+        self._add_rows(unit)
+
+    def _take_begun(self, begun: tuple[tuple[np.ndarray, np.ndarray], RunReport]) -> None:
+        start = Seconds.now()
+        entries, report = begun
+        _given(self._second).add(*entries)
+        self.written += 1
+        self._report += report + RunReport(timing={"write": Seconds.now() - start})
+
+    def _take_second(self, result: Any) -> None:
+        made = _given(self._second).take(result)
+        if isinstance(made, UnitResult):
+            self._add_rows(made)
+        else:
+            self._report += made
+
+    def _add_rows(self, unit: UnitResult) -> None:
+        """Rows of LAS are written at once, those of LAZ wait until they fill a chunk."""
+        start, writer = Seconds.now(), _given(self._writer)
+        writer.count_rows(unit.statistics)
+        for chunk in unit.chunks:
+            writer.append(chunk)
+        if self.job.options.format == "laz":
+            self._packing.add(unit.rows)
+        else:
+            rows = unit.rows.read(0, len(unit.rows))
+            writer.append(Chunk(len(rows), rows.view(np.uint8)))
+            unit.rows.close()
+        self._report += unit.report + RunReport(timing={"write": Seconds.now() - start})
+
+    def _take_chunk(self, packed: tuple[Chunk, Seconds]) -> None:
+        start = Seconds.now()
+        chunk, took = packed
+        _given(self._writer).append(chunk)
+        self._packing.end_chunk()
+        self._report += RunReport(timing={"write": took + (Seconds.now() - start)})
+
+    def _open(self, prepared: Prepared) -> None:
         options = self._options
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
         command = self.job.options.command(self.job.path.name)
         provenance = {**self._described, "command": command, **report_file.describe_chain(prepared)}
         provenance |= report_file.describe_strip_result(prepared, self._described)
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
-        self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite, threads=threads)
+        self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
         if prepared.second_step is not None:
             from wavebatch.batch.neighbour_pass import SecondPass  # 20 ms that other runs do not need
 
@@ -224,8 +286,8 @@ class StripTask:
     def drop(self) -> None:
         """Give the strip up: remove its files and cancel its calls."""
         for future in self.pending:
-            if not future.cancel() and self.prepared is None:
-                future.add_done_callback(_close_scan)
+            if not future.cancel():
+                future.add_done_callback(_close_result)
         self.pending.clear()
         if self._writer is not None:
             self._writer.abort()
@@ -234,10 +296,9 @@ class StripTask:
 
     def _close(self) -> None:
         """Remove temporary files."""
-        if self._second is not None:
-            self._second.close()
-        if self.prepared is not None:
-            self.prepared.scan.close()
+        for one in (*self._scanned, self._packing, self._second, None if self.prepared is None else self.prepared.scan):
+            if one is not None:
+                one.close()
 
     def _stat(self) -> list[tuple[int, int]]:
         """Size and time of the input files, to see whether they change during the run."""
@@ -259,7 +320,10 @@ def _name_stranger(prepared: Prepared) -> tuple[str, ...]:
     return (f"does not belong to the flight that was surveyed: {prepared.stranger}; it was surveyed alone",)
 
 
-def _close_scan(future: Future) -> None:
-    """A preparation that ends after its strip was dropped leaves a scan with temporary files."""
+def _close_result(future: Future) -> None:
+    """A call that ends after its strip was dropped may leave temporary files: of the scan, or of rows."""
     with contextlib.suppress(Exception):
-        future.result().scan.close()
+        result = future.result()
+        for one in (result.scan,) if isinstance(result, Prepared) else result:
+            if isinstance(one, Closing):
+                one.close()

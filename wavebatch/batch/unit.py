@@ -8,25 +8,31 @@ from __future__ import annotations
 
 import functools
 import pickle
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from wavebatch.batch.counts import RunReport
-from wavebatch.batch.job import StripJob, plan_layout
+from wavebatch.batch.counts import LEFT_OUT, RunReport, count_flags
+from wavebatch.batch.job import RowColumn, StripJob, UnitRows, plan_filter, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
-from wavebatch.batch.selection import RowSelector
+from wavebatch.batch.packing import pack_rows
 from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.process import Seconds
 from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
+from wavebatch.files.disk.row_parcel import RowParcel
+from wavebatch.files.las.laz_encode import Chunk
+from wavebatch.files.las.point_formats import split_numbers
+from wavebatch.files.las.write_points import Statistics
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
+from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.kernels.geometry.normals import find_edges
-from wavebatch.stages.attribute.reflectance import REFLECTANCES, hide_edges
+from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
 from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
@@ -62,6 +68,8 @@ class Prepared:
     units: int
     choice: ChainChoice
     layout: OutputLayout
+    chosen: PlannedFilter
+    """Chooses the rows that are written, from UnitRows."""
     report: RunReport
     """Timing of the preparation, and how many points have lost their packets."""
     sensor: SensorSource = UNKNOWN
@@ -83,20 +91,72 @@ class Prepared:
         """The step whose columns need a second pass over the strip's points; None where nothing wanted needs them."""
         chain, step = self.job.chain, self.job.chain.second_step
         made = {name for one in (step, *chain.after_second) if one is not None for name in one.stage.makes}
-        return None if made.isdisjoint([*self.job.columns, *self.selector.needed]) else step
+        return None if made.isdisjoint([*self.job.columns, *self.needed]) else step
 
     @property
-    def selector(self) -> RowSelector:
-        """Chooses the rows that are written."""
-        return RowSelector.plan(self.job.selection, self.job.chain, self.layout)
+    def needed(self) -> tuple[str, ...]:
+        """The computed columns that decide which rows are written."""
+        columns = [one for one in self.chosen.columns.values() if isinstance(one, RowColumn)]
+        return tuple(one.name for one in columns if one.kind == "computed")
+
+    def choose_rows(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, RunReport]:
+        """Choose the rows that are written.
+
+        Parameters
+        ----------
+        rows : structured array (m,)
+            In the cloud's layout.
+        columns : mapping of str to array (m,)
+            Those `needed` and echo_flags as they were computed, whatever the cloud's names and units.
+
+        Returns
+        -------
+        rows : structured array (k,)
+            Those that are written.
+        report : RunReport
+            Points and flags that are written, and points left out by reason.
+        """
+        left = self.chosen.test(UnitRows(rows, columns), len(rows))
+        kept = left == 0
+        numbers = dict(zip(("", *REASONS), np.bincount(left, minlength=len(REASONS) + 1).tolist(), strict=True))
+        number, total = split_numbers(rows[left == len(REASONS)])
+        report = RunReport(
+            counts={"points_out": numbers[""]},
+            last_left_out=int(np.count_nonzero(number == total)),
+            left_out={name: numbers[name] for name in LEFT_OUT if numbers[name]},
+            flags=count_flags(columns["echo_flags"][kept]),
+        )
+        return rows if kept.all() else rows[kept], report
 
 
-def prepare_strip(job: StripJob) -> Prepared:
+class UnitResult(NamedTuple):
+    """What a unit becomes."""
+
+    rows: RowParcel
+    """Those that are written and not yet compressed, in the cloud's layout."""
+    statistics: Statistics
+    """Of all rows that are written."""
+    report: RunReport
+    chunks: Sequence[Chunk] = ()
+    """Of LAZ: the only unit of a strip is compressed at once."""
+
+
+def scan_run(job: StripJob, first: int, last: int) -> tuple[ScanPart, Seconds]:
+    """Scan some units of a strip; what was found, and the time that it took. Raises InputError as the scan."""
+    start = Seconds.now()
+    with job.open() as reader:
+        part = reader.scan_units(first, last)
+    return part, Seconds.now() - start
+
+
+def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
     """Scan and survey a strip, choose its chain, find the sensor, and plan its output.
 
     Parameters
     ----------
     job : StripJob
+    parts : sequence of ScanPart
+        From `scan_run`, all units in order; none where this process scans them.
 
     Returns
     -------
@@ -113,9 +173,8 @@ def prepare_strip(job: StripJob) -> Prepared:
     start = Seconds.now()
     with job.open() as reader:
         facts = reader.facts
-        job = replace(job, selection=job.selection.place(facts))
-        RowSelector.plan(job.selection, job.chain, plan_layout(job, facts))
-        scan = reader.scan(force=job.request.force)
+        plan_filter(job, plan_layout(job, facts))
+        scan = reader.scan(force=job.request.force, parts=parts)
         try:
             scanned = Seconds.now()
             setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, calibration=job.calibration,
@@ -139,14 +198,14 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.calibration is not None:
                 doubts += StripWarning.of("energy", setup.sent.notes)
             layout = plan_layout(job, facts)
-            RowSelector.plan(job.selection, job.chain, layout)
+            chosen = plan_filter(job, layout)
             units = reader.unit_count()
         except BaseException:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": Seconds.now() - surveyed}
     report = RunReport(counts={"points_cut": scan.cut}, timing=timing)
-    found = choice, layout, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
+    found = choice, layout, chosen, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
     return Prepared(job, facts, scan, units, *found)
 
 
@@ -205,7 +264,7 @@ def _take_reference(system: SystemPulse, seen: SystemPulse) -> SystemPulse:
     return replace(system, digitizers=others, widths=seen.widths)
 
 
-def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:
+def process_unit(blob: bytes, number: int, block_size: int | None = None) -> UnitResult:
     """Make the output rows of one unit.
 
     Parameters
@@ -219,17 +278,50 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
 
     Returns
     -------
-    rows : structured array (m,)
-        Those that are written, in the cloud's layout.
-    report : RunReport
+    UnitResult
     """
     prepared: Prepared = unpack(blob)
     timing: dict[str, Seconds] = {}
     _, _, made = solve_unit(prepared, number, block_size, timing)
+    return finish_rows(prepared, made.rows, made.columns, made.report, timing)
+
+
+def finish_rows(
+    prepared: Prepared,
+    rows: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    report: RunReport,
+    timing: dict[str, Seconds],
+) -> UnitResult:
+    """Choose the rows of a unit that are written.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    rows : structured array (m,)
+        All rows of the unit, in the cloud's layout.
+    columns : mapping of str to array (m,)
+        Those that the selection needs.
+    report : RunReport
+        Of the unit; it gets what the selection leaves out.
+    timing : dict
+        Seconds of every step so far; they become those of the report.
+
+    Returns
+    -------
+    UnitResult
+    """
     start = Seconds.now()
-    rows, left = prepared.selector.select(made.rows, made.columns)
-    timing["assemble"] += Seconds.now() - start
-    return rows, replace(made.report + left, timing=timing)
+    rows, left = prepared.choose_rows(rows, columns)
+    statistics = Statistics(rows.dtype, prepared.layout.extra_records)
+    statistics.add(rows)
+    timing["assemble"] = timing.get("assemble", Seconds()) + (Seconds.now() - start)
+    chunks: list[Chunk] = []
+    if prepared.units == 1 and prepared.job.options.format == "laz":
+        start = Seconds.now()
+        chunks, rows = pack_rows(prepared.job.path, rows, prepared.layout.point_format), rows[:0]
+        timing["write"] = Seconds.now() - start
+    return UnitResult(RowParcel(rows), statistics, replace(report + left, timing=timing), chunks)
 
 
 def solve_unit(
@@ -251,7 +343,7 @@ def solve_unit(
     echoes : UnitEchoes
         The same echoes, by packet.
     made : Assembled
-        With the columns that the selection needs.
+        With the columns that decide which rows are written.
     """
     start = Seconds.now()
     echoes_mode = prepared.job.options.points == "echoes"
@@ -263,9 +355,9 @@ def solve_unit(
     start = Seconds.now()
     solved = _mark_edges(prepared, solved)
     echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
-    layout, needed = prepared.layout, prepared.selector.needed
+    layout, needed = prepared.layout, prepared.needed
     if echoes_mode:
-        made = assemble_echoes(unit, echoes, layout, needed, prepared.job.selection.drop_flags)
+        made = assemble_echoes(unit, echoes, layout, needed, prepared.job.chosen.drop_flags)
     else:
         made = assemble_returns(unit, echoes, layout, needed)
     timing["assemble"] = Seconds.now() - start

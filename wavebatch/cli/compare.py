@@ -14,6 +14,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import print_result, talk, tell
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
@@ -116,8 +117,8 @@ def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comp
     if b is not None and b.suffix.lower() == ".npz":
         raise click.UsageError(f"{b} looks like a truth file; give it with --truth")
     if truth:
-        return compare_truth(a, truth, **_tolerance(options), where=options["where"])
-    return compare_clouds(a, b, **_tolerance(options), where=options["where"])
+        return compare_truth(a, truth, **_tolerance(options), chosen=PointFilter(where=options["where"]))
+    return compare_clouds(a, b, **_tolerance(options), chosen=PointFilter(where=options["where"]))
 
 
 def _is_chain(side: Path) -> bool:

@@ -13,7 +13,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, talk, tell
-from wavebatch.cli.plot import find_clouds, select
+from wavebatch.cli.plot import choose_points, find_clouds
 from wavebatch.cli.program.command import complete_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import count
@@ -58,9 +58,8 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
         raise ConfigError("--forest and --column exclude each other; give one of them")
     paths = find_clouds(clouds, options)
     check_raster(output, overwrite=options["overwrite"])
-    selection = select(next(iter(columns), None), options, *columns[1:])
     forest = shared.from_options(ForestOptions, options) if options["forest"] else None
-    how = shared.from_options(GridOptions, options, selection=selection, forest=forest)
+    how = shared.from_options(GridOptions, options, columns=columns, chosen=choose_points(options), forest=forest)
     found = write_grid(paths, output, how, overwrite=options["overwrite"])
     layout = found.layout
     if layout.crs is None:

@@ -56,13 +56,13 @@ def draws_clouds(
     return decorate
 
 
-def select(column: str | None, options: dict[str, Any], *others: str) -> Any:
-    """The selection of columns and of the flags in the options."""
+def choose_points(options: dict[str, Any]) -> Any:
+    """The points that --flags, --drop-flags and --where choose."""
     from wavebatch.core.condition import read_flags
-    from wavebatch.tools.plots.values import Selection
+    from wavebatch.files.cloud.point_filter import PointFilter
 
-    flags = read_flags(options["flags"]), read_flags(options["drop_flags"])
-    return Selection(column, *flags, others, options["where"])
+    flags, dropped = read_flags(options["flags"]), read_flags(options["drop_flags"])
+    return PointFilter(flags=flags, drop_flags=dropped, where=options["where"])
 
 
 def list_tally(tally: Any) -> dict[str, int]:
@@ -112,20 +112,21 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
     from wavebatch.tools.plots.histogram import count_points_by_flag, count_values
     from wavebatch.tools.plots.values import Clouds
 
-    selection = select(options["column"], options)
-    if Clouds(clouds, selection).facts.is_flags:
+    column, chosen = options["column"], choose_points(options)
+    if Clouds(clouds, (column,), chosen).facts.is_flags:
         for name in ("bins", "limits", "each", "by", "counts"):
             if options[name]:
                 option = "--range" if name == "limits" else f"--{name}"
                 raise ConfigError(f"{option} is of no use for flags, which are counted by name")
-        flags = count_points_by_flag(clouds, selection)
+        flags = count_points_by_flag(clouds, column, chosen)
         from wavebatch.tools.plots.draw_cloud import draw_flags
 
         draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
         total, text = flags.total, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
         text += f", {total.left_out} left out" * bool(total.left_out)
     else:
-        found = count_values(clouds, selection, **{name: options[name] for name in ("bins", "limits", "each", "by")})
+        how = {name: options[name] for name in ("bins", "limits", "each", "by")}
+        found = count_values(clouds, column, chosen, **how)
         from wavebatch.tools.plots.draw_cloud import draw_cloud_histogram
 
         draw_cloud_histogram(found, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
@@ -154,8 +155,7 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
     from wavebatch.tools.plots.raster import grid_values
 
     column, statistic = options["column"], options["statistic"]
-    selection = select(column, options)
-    found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bbox"])
+    found = grid_values(clouds, column, statistic, choose_points(options), size=options["size"], bounds=options["bbox"])
     from wavebatch.tools.plots.draw_cloud import draw_cloud_map
 
     draw_cloud_map(found, output, overwrite=options["overwrite"])
@@ -208,7 +208,7 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     from wavebatch.tools.plots.sections import cut_section
 
     column = options["column"] or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
-    found = cut_section(paths, select(column, options), line=options["line"], width=options["width"])
+    found = cut_section(paths, column, choose_points(options), line=options["line"], width=options["width"])
     from wavebatch.tools.plots.sections import draw_section
 
     draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
@@ -247,7 +247,7 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     if segments := is_segments(paths[0]):
         found = profile_segments(paths, column, statistic, **how)
     else:
-        found = measure_profile(paths, select(column, options), statistic, **how)
+        found = measure_profile(paths, column, statistic, choose_points(options), **how)
     from wavebatch.tools.plots.sections import draw_profile
 
     draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
@@ -337,6 +337,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     Exit code: 0 done, 1 the strip cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.core.condition import read_flags
+    from wavebatch.files.cloud.point_filter import PointFilter
     from wavebatch.tools.plots.packets import Wanted
 
     named = any(options[name] for name in ("packets", "point_numbers", "times"))
@@ -354,8 +355,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         if options[name]:
             raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
     (check_target if tabular else check_picture)(output, overwrite=options["overwrite"])
-    flags = read_flags(options["flags"])
-    wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
+    chosen = PointFilter(flags=read_flags(options["flags"]), where=options["where"])
+    wanted = shared.from_options(Wanted, options, points=options["point_numbers"], chosen=chosen)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
     if tabular:
         from wavebatch.tools.plots.waveform import format_echoes

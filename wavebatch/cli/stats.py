@@ -19,11 +19,24 @@ from wavebatch.cli.messages import print_json, print_sheet, talk
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C, count
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
-from wavebatch.tools.return_stats.areas import RANKS, AreaGrid, AreaStats, PolygonSet, Separation, describe_pairs
-from wavebatch.tools.return_stats.returns import BIN, BINS, LEAST_PAIRS, DeadZone, ReturnStats, count_returns
+from wavebatch.tools.return_stats import (
+    BIN,
+    BINS,
+    LEAST_PAIRS,
+    RANKS,
+    AreaGrid,
+    AreaStats,
+    DeadZone,
+    PolygonSet,
+    ReturnStats,
+    Separation,
+    count_returns,
+    describe_pairs,
+)
 from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv
 
 EXIT_UNREADABLE = 1
@@ -71,7 +84,7 @@ def stats(
         failed.append(error)
         talk(f"error: {error}")
 
-    each, total = count_returns(files, skip, divisions=divisions, where=where)
+    each, total = count_returns(files, skip, divisions=divisions, chosen=PointFilter(where=where))
     if output is not None and failed:
         talk(f"error: {output}: not written, because {count(len(failed), 'cloud')} of {len(files)} cannot be read")
     elif output is not None:

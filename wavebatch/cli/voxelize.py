@@ -87,13 +87,15 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
     """  # fmt: skip
     from wavebatch.batch.options import RunOptions
+    from wavebatch.files.cloud.point_filter import PointFilter
     from wavebatch.surveying.calibrating.calibration_file import load_calibration
     from wavebatch.surveying.system_file import load_survey
     from wavebatch.tools.api.run import read_sensor
     from wavebatch.tools.voxels.strip import voxelize_strip
 
     _check_options(options)
-    settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options))
+    settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options),
+                                   chosen=PointFilter(where=options["where"]))  # fmt: skip
     names = ("direction", "headerless", "overwrite", "force", "profiles")
     asked = shared.from_options(RunOptions, options)
     more: dict[str, Any] = {"sensor": read_sensor(asked), **{name: options[name] for name in names}}

@@ -92,7 +92,7 @@ SUFFIX = "_reason"
 """Ending of the names of attributes that hold codes."""
 
 
-def explain(values: np.ndarray, *cases: tuple[NoData, np.ndarray | bool]) -> np.ndarray:
+def explain_no_data(values: np.ndarray, *cases: tuple[NoData, np.ndarray | bool]) -> np.ndarray:
     """The reason code of each value of a column.
 
     Parameters

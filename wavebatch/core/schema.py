@@ -1,4 +1,4 @@
-"""Types, choices and ranges from annotations, and options that are declared once: as fields of a dataclass.
+"""Types, choices, ranges and keys from annotations: options and files are declared once, as fields of a dataclass.
 
 A signature is a schema: `stages.chain` reads the parameters of stages with it. A field made by `option` has the default
 and the help of an option too: `cli.options` makes click's options of them; Python fills the dataclass itself.
@@ -38,6 +38,24 @@ class Above(Range):
 
     def __str__(self) -> str:
         return f"above {self.low:g}, up to {self.high:g}"
+
+
+class Key(NamedTuple):
+    """How a field of a dataclass stands in files and reports: `files.toml_schema` writes and reads them."""
+
+    name: str = ""
+    """With the unit; empty: the name of the field. `{}` in it stands for the number of each item of a mapping. Of a
+    field that is itself a record: what its keys begin with."""
+    meaning: str = ""
+    """A comment in the file."""
+    needed: bool = False
+    """A file without it is refused, although the field has a default."""
+    blank: bool = False
+    """An empty list is written too."""
+    missing: Any = None
+    """The value where a file lacks the key, for a field without a default."""
+    form: str = "numbers"
+    """What a list holds, for messages, e.g. `[lag, share]`."""
 
 
 def read_hint(hint: Any) -> tuple[tuple[type, ...], tuple[Any, ...] | None, Range | None]:

@@ -1,15 +1,18 @@
 """The parts of a SystemPulse beside the pulse: the receiver's noise and defects, the widths of level ground, the light.
 
-The survey measures the first three, `surveying.calibration` and options of a run give the last.
+The survey measures the first three, `surveying.calibration` and options of a run give the last. Fields with a Key
+stand in system files (`surveying/system_file.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
+from wavebatch.core.schema import Key, Range
 from wavebatch.core.units import AIR_ATTENUATION, QUANTISATION_STD
 
 
@@ -17,21 +20,39 @@ from wavebatch.core.units import AIR_ATTENUATION, QUANTISATION_STD
 class ReceiverNoise:
     """What a receiver records without signal."""
 
-    baseline: float = 0.0
+    baseline: Annotated[float, Range(-1e10, 1e10), Key("baseline_dn", "level without signal", needed=True)] = 0.0
     """Typical level without signal [count]."""
-    baseline_spread: float = 0.0
+    baseline_spread: Annotated[
+        float, Range(0.0, 1e10), Key("baseline_spread_dn", "its standard deviation between waveforms", needed=True)
+    ] = 0.0
     """Standard deviation of the true baseline between waveforms [count]."""
-    recovery: float = 0.0
+    recovery: Annotated[float, Range(0.0, 1e9), Key("recovery_ns", "after strong signal, until the level is back")] = (
+        0.0
+    )
     """Time after a strong signal until the level is back to what it was before it [ns]."""
-    std: float = QUANTISATION_STD
+    std: Annotated[
+        float, Range(1e-3, 1e10), Key("noise_std_dn", "noise of one sample, for thresholds and errors", needed=True)
+    ] = QUANTISATION_STD
     """Noise of one sample that thresholds and errors use [count]."""
-    by_kind: Mapping[str, float] = field(default_factory=dict)
+    by_kind: Annotated[Mapping[str, Annotated[float, Range(0.0, 1e30)]], Key("noise_by_kind_dn", needed=True)] = field(
+        default_factory=dict
+    )
     """The estimates that `std` was chosen from: quiet, outside of echoes, core ... [count]."""
-    correlation: tuple[float, ...] = ()
+    correlation: Annotated[
+        tuple[Annotated[float, Range(-1.0, 1.0)], ...],
+        Key("correlation", "of the noise of two samples 1, 2, ... spacings apart; empty: white noise", blank=True),
+    ] = ()
     """Correlation of the noise of two samples 1, 2, ... spacings apart; empty where it is white."""
-    gain: float = 0.0
+    gain: Annotated[
+        float, Range(0.0, 1e6), Key("noise_gain", "growth of the noise's variance per count of signal", needed=True)
+    ] = 0.0
     """Signal-dependent noise variance per count of signal [count] (docs/algorithms.md H12)."""
-    whitening: tuple[float, ...] = ()
+    whitening: Annotated[
+        tuple[Annotated[float, Range(-2.0, 2.0)], ...],
+        Key(
+            "whitening", "what predicts the noise of a sample from the two before it; empty: fits take noise for white"
+        ),
+    ] = ()
     """What predicts the noise of a sample from the two before it; empty where fits take noise for white."""
 
     @property
@@ -44,13 +65,18 @@ class ReceiverNoise:
 class Defects:
     """What waveforms have before any signal, and what is taken off them before they are read."""
 
-    pattern: tuple[float, ...] = ()
+    pattern: Annotated[
+        tuple[Annotated[float, Range(-1e6, 1e6)], ...],
+        Key("pattern_dn", "offsets that repeat along the samples, taken off; empty: none", blank=True),
+    ] = ()
     """Offsets that repeat along the samples, of converters that take samples in turn [count]; empty for none."""
-    slope_spread: float = 0.0
+    slope_spread: Annotated[
+        float, Range(0.0, 1e9), Key("slope_spread_dn_ns", "of baselines within a waveform, taken off")
+    ] = 0.0
     """Standard deviation of the slopes of baselines [count/ns]; 0 where baselines are level."""
-    spikes: float = 0.0
+    spikes: Annotated[float, Range(0.0, 1e6), Key("spikes", "of one sample, per waveform, taken off")] = 0.0
     """Spikes of one sample per waveform; 0 where they are not taken off."""
-    transient: float = 0.0
+    transient: Annotated[float, Range(0.0, 1e9), Key("transient_ns", "at the start of waveforms, left out")] = 0.0
     """Time at the start of every waveform in which its receiver is not at rest [ns]."""
 
     def __bool__(self) -> bool:
@@ -62,15 +88,21 @@ class Defects:
 class LevelWidths:
     """How wide the echoes of level ground are, seen from above."""
 
-    variance: float = 0.0
+    variance: Annotated[
+        float, Range(-1e8, 0.0), Key("level_variance_ns2", "of level ground's echoes less the pulse's")
+    ] = 0.0
     """Their variance minus that of the system pulse [ns2]: zero or negative, because the echoes that the pulse was
     learned from come from slopes too.
     """
-    error: float | None = None
+    error: Annotated[float | None, Range(0.0, 1e8), Key("level_error_ns2", "standard deviation of level_variance")] = (
+        None
+    )
     """Standard deviation of `variance` [ns2]; None where it was not measured, infinite where surfaces of known slope
     were sought and not found, so that widths mean no angle.
     """
-    scatter: float = 0.0
+    scatter: Annotated[
+        float, Range(0.0, 1e4), Key("width_scatter_ns", "of echo widths beyond the errors of their fits")
+    ] = 0.0
     """Scatter of the echo widths of one surface beyond their fit errors [ns]: no pulse model is exact."""
 
 
@@ -78,9 +110,15 @@ class LevelWidths:
 class Radiometry:
     """What turns amplitudes and times into light: beam, calibration, air, and the errors of each."""
 
-    divergence: float | None = None
+    divergence: Annotated[
+        float | None,
+        Range(1e-3, 100.0),
+        Key("divergence_mrad", "full angle of the beam, 1/e^2, from its data sheet"),
+    ] = None
     """Full angle of the beam between the 1/e^2 points [mrad]; None where it is not known."""
-    divergence_error: float = 0.0
+    divergence_error: Annotated[
+        float, Range(0.0, 1.0), Key("divergence_error", "standard deviation of the divergence, relative")
+    ] = 0.0
     """Relative standard deviation of the divergence."""
     constant: float | None = None
     """Constant C' of kernels/physics/radiometry [1/(m2 count ns)]; None where the strip is not calibrated."""

@@ -7,12 +7,13 @@ never write into them. The meaning, dtype and unit of a field stand below it, an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Annotated, Any
 
 import numpy as np
 
 from wavebatch.core.errors import StageError
+from wavebatch.core.schema import Key, Range
 from wavebatch.core.system import (
     Defects,
     LevelWidths,
@@ -244,50 +245,96 @@ class Noise:
         return Noise(self.baseline[rows], self.std[rows], *further)
 
 
+_Lag = Annotated[float, Range(-1e5, 1e5)]
+"""Time after the peak of an echo [ns]."""
+_Times = Annotated[float, Range(0.0, 10.0)]
+"""How many times another value."""
+_Gaussian = tuple[Annotated[float, Range(-10.0, 10.0)], Annotated[float, Range(-1e4, 1e4)],
+                  Annotated[float, Range(1e-3, 1e4)]]  # fmt: skip
+"""Weight, delay and sigma."""
+
+
 @dataclass(frozen=True, slots=True)
 class SystemPulse:
-    """What the survey found out about sensor and scene of a strip: the same for every block of one digitizer."""
+    """What the survey found out about sensor and scene of a strip: the same for every block of one digitizer.
 
-    sigma_ref: float
+    A field with a Key stands in system files, in this order: `surveying/system_file.py` writes and reads them.
+    """
+
+    sigma_ref: Annotated[
+        float, Range(1e-3, 1e4), Key("sigma_ref_ns", "Gaussian standard deviation of the echo of a flat target")
+    ]
     """Gaussian standard deviation of the echo of a flat target [ns]."""
-    kappa: float = 0.0
+    _: KW_ONLY
+    noise: Annotated[ReceiverNoise, Key()] = ReceiverNoise()
+    kappa: Annotated[float, Range(-0.9, 0.9), Key("kappa", "skew of the pulse; 0 is a Gaussian", needed=True)] = 0.0
     """Skew of the system pulse; 0 for a Gaussian."""
-    components: tuple[tuple[float, float, float], ...] = ()
-    """Learned pulse: (weight, delay [ns], sigma [ns]) per component; empty when no pulse was learned."""
-    noise: ReceiverNoise = ReceiverNoise()
-    defects: Defects = Defects()
-    widths: LevelWidths = LevelWidths()
-    radiometry: Radiometry = Radiometry()
-    other_pulse: bool = False
-    """Whether the echoes of a block were fitted with another pulse than the survey's; set while a chain runs."""
-    skew: float | None = None
+    skew: Annotated[
+        float | None, Range(-0.9, 0.9), Key("skew", "of the best skewed pulse, whichever pulse was chosen")
+    ] = None
     """Skew of the best skewed pulse, whichever pulse the survey chose; None where it was not measured."""
-    skew_spread: float = 0.0
+    skew_spread: Annotated[float, Range(0.0, 10.0), Key("skew_spread", "of the skews of single echoes about it")] = 0.0
     """Standard deviation of the skews of single echoes about it: ground and plants differ; 0 where not measured."""
-    ringing: float = 0.0
+    defects: Annotated[Defects, Key()] = Defects()
+    ringing: Annotated[
+        float, Range(0.0, 1.0), Key("ringing", "largest after-pulse, as a share of the amplitude", needed=True)
+    ] = 0.0
     """Largest after-pulse as a share of the amplitude."""
-    acceptance: float = 15.0
+    saturation: Annotated[
+        float | None, Range(1.0, 1e10), Key("saturation_dn", "count at which the digitizer clips")
+    ] = None
+    """Count from which samples are clipped, as the survey saw; None if only the digitizer's largest count is."""
+    acceptance: Annotated[
+        float, Range(1.0, 1e6), Key("acceptance", "least fall of chi2 for which an echo is added", needed=True)
+    ] = 15.0
     """Smallest fall of chi2 for which an echo is added."""
-    significance: float = 0.0
+    significance: Annotated[
+        float, Range(0.0, 1e3), Key("significance", "least energy of an echo, where that is more than the chain's")
+    ] = 0.0
     """Least energy of an echo [standard deviations of the noise's], where that is more than the chain asks for: a
     survey raises it where noise makes more echoes than expected.
     """
-    misfit: float = 0.0
+    misfit: Annotated[float, Range(0.0, 1.0), Key("misfit", "of strong echoes to the pulse, as a share of them")] = 0.0
     """How far strong echoes deviate from the pulse, as a share of their amplitude. A fall of chi2 that this explains
     does not add an echo.
     """
-    tail_misfit: tuple[tuple[float, float], ...] = ()
+    widths: Annotated[LevelWidths, Key()] = LevelWidths()
+    radiometry: Annotated[Radiometry, Key()] = Radiometry()
+    components: Annotated[
+        tuple[_Gaussian, ...],
+        Key("components", "(weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first",
+            needed=True, blank=True, form="[weight, delay, sigma]"),
+    ] = ()  # fmt: skip
+    """Learned pulse: (weight, delay [ns], sigma [ns]) per component; empty when no pulse was learned."""
+    tail_misfit: Annotated[
+        tuple[tuple[_Lag, _Times], ...],
+        Key("tail_misfit", "(lag [ns], share of the amplitude) that the pulse leaves before and after strong echoes",
+            blank=True, form="[lag, share]"),
+    ] = ()  # fmt: skip
     """(lag after the peak [ns], share of the amplitude): what the pulse leaves unexplained around strong echoes."""
-    beside: tuple[tuple[float, float], ...] = ()
+    beside: Annotated[
+        tuple[tuple[_Lag, Annotated[float, Range(0.0, 1e4)]], ...],
+        Key("beside", "(lag [ns], variance over that of the noise) of what fits leave beside strong echoes",
+            form="[lag, variance]"),
+    ] = ()  # fmt: skip
     """(lag after a strong echo [ns], variance of what a pulse sees there beyond noise, over that of the noise)."""
-    hidden: tuple[tuple[float, float, float], ...] = ()
+    seams: Annotated[
+        Mapping[Annotated[int, Range(3, 1e9)], Annotated[int, Range(1, 1e9)]],
+        Key("seams", "(samples of a packet, sample of it that was interpolated between two recordings)",
+            form="[samples, sample]"),
+    ] = field(default_factory=dict)  # fmt: skip
+    """Sample between two recordings of a packet that was interpolated, by the number of samples of such packets."""
+    hidden: Annotated[
+        tuple[tuple[Annotated[float, Range(0.0, 1e4)], _Times, _Times], ...],
+        Key("hidden",
+            "(excess variance of a width, that of times over it for lone and other echoes) by unseen neighbours",
+            blank=True, form="[excess, lone, others]"),
+    ] = ()  # fmt: skip
     """What neighbours that were not found do to times: variance of an echo over that of the pulse, less 1; and the
     variance of its time over that excess, of lone echoes and of others (docs/algorithms.md 2.2). Empty for none.
     """
-    saturation: float | None = None
-    """Count from which samples are clipped, as the survey saw; None if only the digitizer's largest count is."""
-    seams: Mapping[int, int] = field(default_factory=dict)
-    """Sample between two recordings of a packet that was interpolated, by the number of samples of such packets."""
+    other_pulse: bool = False
+    """Whether the echoes of a block were fitted with another pulse than the survey's; set while a chain runs."""
     digitizers: Mapping[int, SystemPulse] = field(default_factory=dict)
     """Pulse and noise of digitizers that record differently from the commonest one of the strip, by their index."""
 

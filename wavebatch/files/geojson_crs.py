@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import need
 from wavebatch.files.las.crs import find_epsg
-from wavebatch.files.wkt_repair import drop_empty_codes
+from wavebatch.files.wkt import drop_empty_codes
 
 GEOJSON_CRS = ("wgs84", "keep")
 """Values of --geojson-crs."""

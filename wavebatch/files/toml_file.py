@@ -63,7 +63,7 @@ def format_toml(document: Mapping[str, Any], *, heading: str = "", comments: Map
     return "\n".join(lines) + "\n"
 
 
-def format_value(value: Any) -> str:
+def format_toml_value(value: Any) -> str:
     """Return the value as it stands in TOML, on one line; raises TypeError for a type that TOML does not have."""
     value = value.item() if hasattr(value, "dtype") else value
     if isinstance(value, bool):
@@ -79,9 +79,9 @@ def format_value(value: Any) -> str:
     if isinstance(value, datetime.date | datetime.time):
         return value.isoformat()
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(format_value, value)) + "]"
+        return "[" + ", ".join(map(format_toml_value, value)) + "]"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_format_key(key)} = {format_value(item)}" for key, item in _present(value)) + "}"
+        return "{" + ", ".join(f"{_format_key(key)} = {format_toml_value(item)}" for key, item in _present(value)) + "}"
     raise TypeError(f"TOML cannot hold {shorten(value)} of type {type(value).__name__}")
 
 
@@ -95,7 +95,7 @@ def _format_table(table: Mapping[str, Any], prefix: str, comments: Mapping[str, 
             nested.append((path, value, is_tables))
             continue
         comment = _one_line(comments.get(path, ""))
-        line = f"{_format_key(key)} = {format_value(value)}"
+        line = f"{_format_key(key)} = {format_toml_value(value)}"
         if comment and isinstance(value, list | tuple):
             yield f"# {comment}"
         yield f"{line}  # {comment}" if comment and not isinstance(value, list | tuple) else line
@@ -113,7 +113,7 @@ def _present(table: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def _format_key(key: str) -> str:
-    return key if _BARE_KEY.fullmatch(key) else format_value(key)
+    return key if _BARE_KEY.fullmatch(key) else format_toml_value(key)
 
 
 def _one_line(text: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.text_file import read_text
-from wavebatch.files.toml_file import TomlTable, check_range, check_type, format_toml, format_value, parse_toml
+from wavebatch.files.toml_file import TomlTable, check_range, check_type, format_toml, format_toml_value, parse_toml
 from wavebatch.stages.chain import Chain, Stage, Step
 from wavebatch.stages.plugins import find_stage
 
@@ -42,7 +42,7 @@ def load_profile(name: str) -> Chain:
     return parse_chain((_shipped() / f"{name}.toml").read_text("utf-8"), f"profile {name}")
 
 
-def load_chain(path: Path | str) -> Chain:
+def load_chain_file(path: Path | str) -> Chain:
     """Load the chain of a TOML file.
 
     Parameters
@@ -143,10 +143,10 @@ def _read_value(stage: Stage, key: str, value: Any, where: str) -> Any:
     parameter = stage.parameters[key]
     value = check_type(value, parameter.types, where)
     if parameter.choices is not None and value not in parameter.choices:
-        choices = ", ".join(map(format_value, parameter.choices))
+        choices = ", ".join(map(format_toml_value, parameter.choices))
         if parameter.range is None or isinstance(value, str):
             number = "" if parameter.range is None else " or a number"
-            raise ConfigError(f"{where} must be one of {choices}{number}, it is {format_value(value)}")
+            raise ConfigError(f"{where} must be one of {choices}{number}, it is {format_toml_value(value)}")
     if parameter.range is not None and not isinstance(value, str):
         check_range(value, *parameter.range, where)
     return value

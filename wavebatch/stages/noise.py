@@ -12,8 +12,8 @@ from wavebatch.core.order import median
 from wavebatch.core.units import MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.library import Samples
+from wavebatch.kernels.signal.filters import quiet_levels
 from wavebatch.kernels.signal.floor import MOST_CUT, MOST_LEAST, floor_response, floor_share
-from wavebatch.kernels.signal.maxima import quiet_levels
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
 from wavebatch.kernels.signal.runs import find_stretches, list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, quiet_mean, sum_samples, transpose_samples

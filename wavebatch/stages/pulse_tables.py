@@ -286,7 +286,7 @@ def error_factors(
     Returns
     -------
     float64 array, shape (m, 4)
-        Of amplitude, time and sigma as `describe_echoes` gives them, and of the energy; 1 in white noise. They are
+        Of amplitude, time and sigma as `describe_fitted` gives them, and of the energy; 1 in white noise. They are
         those of lone echoes.
 
     Notes
@@ -350,7 +350,7 @@ def _change_with_width(table: PulseMeasures, width: np.ndarray) -> list[np.ndarr
     return [np.interp(width, table.width, values) for values in (table.peak, np.gradient(table.peak, table.width))]
 
 
-def describe_echoes(
+def describe_fitted(
     shape: PulseShape, limits: ShapeLimits, parameters: np.ndarray, errors: np.ndarray, shared: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turn fitted parameters into amplitude, time and sigma of the whole pulse.
@@ -379,7 +379,7 @@ def describe_echoes(
 
 
 def whole_pulse(shape: PulseShape, limits: ShapeLimits, widths: np.ndarray) -> WholePulse:
-    """Return what `describe_echoes` takes whole echoes from.
+    """Return what `describe_fitted` takes whole echoes from.
 
     Parameters
     ----------
@@ -411,7 +411,7 @@ def _rows(table: PulseMeasures) -> np.ndarray:
 
 
 def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray) -> np.ndarray:
-    """Invert `describe_echoes`: amplitude, time and width of the fitted pulse, of a learned one its main component.
+    """Invert `describe_fitted`: amplitude, time and width of the fitted pulse, of a learned one its main component.
 
     Parameters
     ----------

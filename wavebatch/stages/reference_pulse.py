@@ -12,7 +12,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.signal.filters import refine_peaks
-from wavebatch.stages.pulse_tables import describe_echoes, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits
 
 ReferenceKind = Literal["gaussian", "system", "given"]
 
@@ -67,7 +67,7 @@ def reference_pulse(
         return PulseReference(exp(-0.5 * (x * spacing / system.sigma_ref) ** 2), float(half))
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
     flat = np.array([[1.0, 0.0, limits.ref]])
-    (peak, datum, _), *_ = describe_echoes(shape, limits, flat, np.ones((1, 3)), np.zeros((1, 2)))[0]
+    (peak, datum, _), *_ = describe_fitted(shape, limits, flat, np.ones((1, 3)), np.zeros((1, 2)))[0]
     taps = evaluate_pulse(shape, x[:, None], np.full(1, -datum), np.full(1, limits.ref))[0][:, 0]
     return PulseReference(taps / peak, float(half))
 

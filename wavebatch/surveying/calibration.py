@@ -11,9 +11,10 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.schema import Key, Range
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import STAGES, Chain, Step
 
@@ -83,32 +84,32 @@ class ChannelConstant:
     What is None or empty is not known: the file is of an earlier version.
     """
 
-    digitizer: int
+    digitizer: Annotated[int, Range(1, 255), Key()]
     """Index of the wave packet descriptor."""
-    scanner: int
+    scanner: Annotated[int, Range(0, 3), Key(missing=0)]
     """Scanner channel of the points."""
-    constant: float
-    relative_error: float
-    spread: float = 0.0
+    constant: Annotated[float, Range(1e-30, 1e30), Key()]
+    relative_error: Annotated[float, Range(0.0, 10.0), Key()]
+    spread: Annotated[float, Range(0.0, 1e6), Key()] = 0.0
     """Robust standard deviation of the echoes' constants, relative."""
-    echoes: int = 0
+    echoes: Annotated[int, Range(0, 10**12), Key()] = 0
     """Echoes that the constant was measured from."""
-    shot_energy: float = 0.0
+    shot_energy: Annotated[float, Range(0.0, 1e6), Key()] = 0.0
     """Scatter of the energy from shot to shot and of the targets' surfaces, relative: `spread` without fit errors."""
-    bits: int | None = None
+    bits: Annotated[int | None, Range(1, 32), Key()] = None
     """Bits per sample."""
-    samples: int | None = None
+    samples: Annotated[int | None, Range(1, 1 << 32), Key()] = None
     """Samples per waveform."""
-    spacing_ns: float | None = None
-    gain: float | None = None
+    spacing_ns: Annotated[float | None, Range(1e-6, 1e9), Key()] = None
+    gain: Annotated[float | None, Range(-math.inf, math.inf), Key()] = None
     """Volts per count, as the descriptor has it."""
-    pulse_ns: float | None = None
+    pulse_ns: Annotated[float | None, Range(1e-6, 1e9), Key()] = None
     """Full width at half maximum of the system pulse [ns]."""
-    noise_dn: float | None = None
+    noise_dn: Annotated[float | None, Range(0.0, 1e12), Key()] = None
     """Standard deviation of the noise of a sample [DN]."""
-    brightest: float | None = None
+    brightest: Annotated[float | None, Range(0.0, 1e30), Key()] = None
     """Light of its strongest waveforms [DN m2]: see `setting.Setting`."""
-    scene: tuple[float, ...] = ()
+    scene: Annotated[tuple[Annotated[float, Range(-100.0, 100.0)], ...], Key(blank=True)] = ()
     """Quantiles of the light of its waveforms, logarithms: see `setting.Setting`."""
 
     @property
@@ -121,19 +122,19 @@ class ChannelConstant:
 class StripConstant:
     """The constant of one channel on one strip of the flight that was calibrated."""
 
-    strip: str
+    strip: Annotated[str, Key(missing="")]
     """Name of the strip's file."""
-    sha256: str
+    sha256: Annotated[str, Key()]
     """Of the strip, from its fingerprint: a strip is known by it, not by its name."""
-    digitizer: int
-    scanner: int
-    constant: float
-    relative_error: float
-    drift: float = 0.0
+    digitizer: Annotated[int, Range(1, 255), Key()]
+    scanner: Annotated[int, Range(0, 3), Key(missing=0)]
+    constant: Annotated[float, Range(1e-30, 1e30), Key()]
+    relative_error: Annotated[float, Range(0.0, 10.0), Key()]
+    drift: Annotated[float, Range(-1.0, 1e6), Key()] = 0.0
     """Constant over the mean constant of the channel, less 1."""
-    drift_error: float = 0.0
+    drift_error: Annotated[float, Range(0.0, 1e6), Key()] = 0.0
     """Standard deviation of the drift."""
-    ties: int = 0
+    ties: Annotated[int, Range(0, 10**12), Key()] = 0
     """Places that tie it to other strips or channels."""
 
 
@@ -141,50 +142,78 @@ class StripConstant:
 class Calibration:
     """Constants that turn amplitudes into backscatter; picklable."""
 
-    constant: float
+    constant: Annotated[
+        float,
+        Range(1e-30, 1e30),
+        Key("constant", "C' [1/(m2 count ns)]: gamma = C' R^2 amplitude sigma / transmission"),
+    ]
     """C' [1/(m2 count ns)]."""
-    relative_error: float
+    relative_error: Annotated[
+        float, Range(0.0, 10.0), Key("relative_error", "standard deviation of the constant, relative")
+    ]
     """Standard deviation of the constant, relative."""
-    attenuation: float = 0.22
+    attenuation: Annotated[
+        float, Range(0.0, 100.0), Key("attenuation_db_km", "of the air, one way, as it was used for the constant")
+    ] = 0.22
     """Of the air, one way [dB/km]."""
-    divergence: float | None = None
+    haze: Annotated[
+        float | None, Range(1e-6, 10.0), Key("haze", "of the flight over usual ones: other heights have other air")
+    ] = None
+    """As `SensorSource.haze`, where the attenuation was not given: that at other heights follows."""
+    divergence: Annotated[
+        float | None,
+        Range(1e-3, 100.0),
+        Key("divergence_mrad", "full angle of the beam between the 1/e^2 points; needed for m2"),
+    ] = None
     """Full angle of the beam between the 1/e^2 points [mrad]; None where unknown."""
-    strip: str = ""
-    date: str = ""
-    conditions: str = ""
-    sensor: str = ""
+    strip: Annotated[str, Key()] = ""
+    date: Annotated[str, Key()] = ""
+    conditions: Annotated[str, Key()] = ""
+    sensor: Annotated[str, Key()] = ""
     """System identifier of the strip's header."""
-    flight: str = ""
-    """Day of the flight by GPS time, as 2026-11-22; empty where the time does not say."""
-    chain: str = ""
-    """Name of the chain that decomposed the echoes."""
-    decomposer: str = ""
-    """Its decompose stage."""
-    height: float | None = None
-    """Median height of the sensor above the targets [m]."""
-    distance: float | None = None
-    """Median distance from the sensor to the targets [m]."""
-    rate: float | None = None
-    """Pulses per second by GPS times; None where they do not show it."""
-    software: str = ""
+    software: Annotated[str, Key()] = ""
     """Generating software of the strip's header."""
+    flight: Annotated[str, Key()] = ""
+    """Day of the flight by GPS time, as 2026-11-22; empty where the time does not say."""
+    chain: Annotated[str, Key()] = ""
+    """Name of the chain that decomposed the echoes."""
+    decomposer: Annotated[str, Key()] = ""
+    """Its decompose stage."""
+    height: Annotated[float | None, Range(0.0, 1e7), Key("height_m", "of the sensor above the targets, median")] = None
+    """Median height of the sensor above the targets [m]."""
+    distance: Annotated[
+        float | None,
+        Range(0.0, 1e7),
+        Key("distance_m", "from the sensor to the targets, median: others are less certain"),
+    ] = None
+    """Median distance from the sensor to the targets [m]."""
+    rate: Annotated[
+        float | None,
+        Range(1e-3, 1e12),
+        Key("pulse_rate_hz", "by GPS times: a laser has another energy at another rate"),
+    ] = None
+    """Pulses per second by GPS times; None where they do not show it."""
     fingerprint: Mapping[str, Any] = field(default_factory=dict)
     """Of the strip that was measured."""
     targets: tuple[TargetResult, ...] = ()
-    channels: tuple[ChannelConstant, ...] = ()
+    channels: Annotated[tuple[ChannelConstant, ...], Key("channel")] = ()
     """Channels that have a constant of their own."""
-    strips: tuple[StripConstant, ...] = ()
+    strips: Annotated[tuple[StripConstant, ...], Key("flight_strip")] = ()
     """Constants of single strips, where several were calibrated together."""
-    energy_mean: float | None = None
+    energy_mean: Annotated[
+        float | None,
+        Range(1e-30, 1e30),
+        Key("energy_mean", "mean energy of the pulses: light was divided by the energy over it"),
+    ] = None
     """Mean energy of the pulses by which the light was divided, in the unit of its source; None where it was not."""
-    energy_spread: float = 0.0
+    energy_spread: Annotated[
+        float, Range(0.0, 1e6), Key("energy_spread", "of the energies from shot to shot, relative")
+    ] = 0.0
     """Standard deviation of these energies from shot to shot, relative."""
-    energy_source: str = ""
-    energy_unit: str = ""
+    energy_source: Annotated[str, Key()] = ""
+    energy_unit: Annotated[str, Key()] = ""
     swath: tuple[float, ...] = ()
     """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
-    haze: float | None = None
-    """As `SensorSource.haze`, where the attenuation was not given: that at other heights follows."""
     right: tuple[float, float] = (0.0, 0.0)
     """Of the strip's flight, as `Radiometry.right`; not kept in the file."""
     notes: tuple[str, ...] = ()

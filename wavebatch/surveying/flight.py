@@ -10,7 +10,7 @@ import functools
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -308,7 +308,7 @@ def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None
     quiet = plain.noise.by_kind.get("quiet", 0.0)
     if quiet:
         # The mean square of all quiet samples holds weak echoes too: 2.2 DN in a RIEGL strip, 1.6 in a part of it.
-        level = level._replace(std=max(quiet, QUANTISATION_STD))
+        level = replace(level, std=max(quiet, QUANTISATION_STD))
     if not width:
         return Look(level, 0.0, 0.0, 0.0)
     steady = float(np.mean(np.abs(np.log(lone.sigma / width)) < SAME_WIDTH))
@@ -386,8 +386,9 @@ def _compare_kinds(blocks: Iterable[WaveformBlock], kinds: Mapping[int, Kind]) -
             continue
         other = kinds.get(index) or next(iter(kinds.values()))
         if kind != other:
-            apart = [place for place in range(len(kind)) if kind[place] != other[place]]
-            own, theirs = (", ".join(_FORMS[i].format(values[i]) for i in apart) for values in (kind, other))
+            both = astuple(kind), astuple(other)
+            apart = [place for place, pair in enumerate(zip(*both, strict=True)) if pair[0] != pair[1]]
+            own, theirs = (", ".join(_FORMS[i].format(values[i]) for i in apart) for values in both)
             return f"its descriptor {index} has {own}; that of the flight has {theirs}"
     return ""
 

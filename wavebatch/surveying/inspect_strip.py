@@ -77,10 +77,10 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
 
 
 def _check_chain(path: Path) -> Findings:
-    from wavebatch.stages.chain_file import load_chain  # stages and survey: half of the start of `info`
+    from wavebatch.stages.chain_file import load_chain_file  # stages and survey: half of the start of `info`
 
     try:
-        chain = load_chain(path)
+        chain = load_chain_file(path)
     except (ConfigError, InputError) as error:
         return Findings(str(path), (_without_name(path, error),), ())
     return Findings(str(path), (), (), f"{len(chain.steps)} stages")

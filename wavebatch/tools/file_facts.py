@@ -17,7 +17,7 @@ import numpy as np
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.core.no_data import without_nan
-from wavebatch.files.cloud.echo_reader import CloudReader
+from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.provenance import read_provenance
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
 from wavebatch.files.las.crs import name_units, read_crs

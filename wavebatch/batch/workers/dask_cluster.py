@@ -1,6 +1,7 @@
 """Workers of an existing dask cluster, for `wavebatch run --scheduler`; files must be visible to all machines.
 
-`Cluster` has the same methods as `processes.Workers`. Work goes to the workers that are there when the run starts.
+`Cluster` has the same methods as `processes.Workers`. Work goes to workers that were asked whether they fit: those that
+are there when the run starts must, of those that join later the others get no work.
 Before you change it: calls and results travel as bytes, because dask takes tuples with functions for tasks and makes
 arrays read-only; and a cluster that is lost must end the run with a message, never hang it.
 """
@@ -53,17 +54,19 @@ class Cluster:
     """
 
     is_remote = True
-    jobs = 1
-    """Threads of this machine that compress."""
 
     def __init__(self, address: str, folder: Path, files: Sequence[Path] = ()) -> None:
         self.address, self._folder, self._files = address, folder.absolute(), files
         self._workers: dict[str, int] = {}
         """Threads of each worker that is known to fit; others get no call."""
-        self.limit = 2
+        self._asked: dict[str, Any] = {}
+        """Answers, there or to come, of the workers that have joined since the start."""
+        self._looked = time.monotonic()
         self._client: Any = None
         self._scratch: Path | None = None
         self._heard = time.monotonic()
+        self._shared: list[str] = []
+        """Files that all workers must see with the same sizes."""
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Cluster:
@@ -73,26 +76,57 @@ class Cluster:
             stack.enter_context(silent())
             self._client = stack.enter_context(connected(self.address))
             self._workers = self._find_workers()
-            self.limit = 2 * sum(self._workers.values())
             self._check_versions()
             with reporting(self._folder):
                 self._folder.mkdir(parents=True, exist_ok=True)
             self._check_files()
             self._scratch = stack.enter_context(owning_scratch(self._folder))
+            self._shared += [str(file) for file in self._scratch.iterdir()] if self._scratch else []
             self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *error: object) -> None:
         self._stack.close()
 
+    @property
+    def jobs(self) -> int:
+        """Threads of all workers."""
+        return sum(self._workers.values())
+
+    @property
+    def limit(self) -> int:
+        """Most calls that may be under way."""
+        return 2 * self.jobs
+
     def submit(self, function: Callable, *arguments: Any) -> Future:
         """Return the future result of `function(*arguments)`; both must be picklable."""
-        call = pickle.dumps((self._scratch, function, arguments), pickle.HIGHEST_PROTOCOL)
+        if time.monotonic() - self._looked > _POLL:
+            self._look()
+        promise = _Promise(pickle.dumps((self._scratch, function, arguments), pickle.HIGHEST_PROTOCOL), self._translate)
+        self._send(promise)
+        return promise
+
+    def _send(self, promise: _Promise) -> None:
         try:
-            remote = self._client.submit(_work, call, pure=False, workers=list(self._workers))
+            promise.follow(self._client.submit(_work, promise.call, pure=False, workers=list(self._workers)))
         except Exception as error:
             raise self._lost(error) from error
-        return _Promise(remote, self._translate)
+        promise.workers = frozenset(self._workers)
+
+    def _look(self) -> set[str]:
+        """Take in workers that have joined and fit; return those that are there and fit, none where nobody answers."""
+        self._looked = time.monotonic()
+        there: dict[str, int] = {}
+        with contextlib.suppress(Exception):
+            there = self._client.sync(self._client.scheduler.ncores, workers=None, callback_timeout=_POLL)
+            for worker in there.keys() - self._workers.keys() - self._asked.keys():
+                self._asked[worker] = self._client.submit(_introduce, self._shared, pure=False, workers=[worker])
+        for worker in [worker for worker in there.keys() & self._asked.keys() if self._asked[worker].done()]:
+            with contextlib.suppress(Exception):
+                kind, sizes = self._asked[worker].result(timeout=_POLL)
+                if not compare_workers(describe_worker(), kind) and sizes == list_sizes(self._shared):
+                    self._workers.setdefault(worker, there[worker])
+        return there.keys() & self._workers.keys()
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
         """Yield `function(item)` of every item, in this process: short calls are slower on another machine."""
@@ -103,10 +137,12 @@ class Cluster:
         futures = list(futures)
         self._heard = time.monotonic()
         while not (done := wait_uninterrupted(futures, _POLL)):
-            with contextlib.suppress(Exception):
-                there = self._client.sync(self._client.scheduler.ncores, workers=None, callback_timeout=_POLL)
-                if self._workers.keys() & there.keys():
-                    self._heard = time.monotonic()
+            if there := self._look():
+                self._heard = time.monotonic()
+                for promise in futures:
+                    # Dask would wait until these workers come back.
+                    if isinstance(promise, _Promise) and not promise.workers & there:
+                        self._send(promise)
             if self._client.status == "closed" or time.monotonic() - self._heard > PATIENCE:
                 raise self._lost("no worker answers")
         return done
@@ -144,8 +180,8 @@ class Cluster:
         with Draft(self._folder / "workers", overwrite=False) as token:  # never published
             token.file.write(b"seen")
             token.file.flush()
-            files = [str(file) for path in self._files for file in _with_packets(path.absolute())]
-            files.append(str(token.path))
+            self._shared = [str(file) for path in self._files for file in _with_packets(path.absolute())]
+            files = [*self._shared, str(token.path)]
             here = list_sizes(files)
             for worker, there in sorted(self._ask(list_sizes, files).items()):
                 lost = [file for file, mine, theirs in zip(files, here, there, strict=True) if mine != theirs]
@@ -182,14 +218,23 @@ class Cluster:
 
 
 class _Promise(Future):
-    """A remote future with the interface of concurrent.futures."""
+    """The result of a call by a worker, with the interface of concurrent.futures."""
 
-    def __init__(self, remote: Any, translate: Callable[[BaseException], BaseException]) -> None:
+    def __init__(self, call: bytes, translate: Callable[[BaseException], BaseException]) -> None:
         super().__init__()
-        self._remote, self._translate = remote, translate
+        self.call, self._translate = call, translate
+        self.workers: frozenset[str] = frozenset()
+        """Those that may make the call."""
+        self._remote: Any = None
+
+    def follow(self, remote: Any) -> None:
+        """Take the result of this remote future, and of no earlier one."""
+        self._remote = remote
         remote.add_done_callback(self._take)
 
     def _take(self, remote: Any) -> None:
+        if remote is not self._remote:
+            return
         try:
             result, error = pickle.loads(remote.result()), None
         except BaseException as failure:
@@ -212,6 +257,11 @@ def _work(call: bytes) -> bytes:
         return pickle.dumps(function(*arguments), pickle.HIGHEST_PROTOCOL)
     finally:
         use_scratch(None)
+
+
+def _introduce(files: list[str]) -> tuple[dict[str, str], list[int]]:
+    """On a worker: its kind, and the sizes of the files as it sees them."""
+    return describe_worker(), list_sizes(files)
 
 
 def _with_packets(path: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Names, types and units of written columns: one table for wavebatch's style and four styles of other programs.
+"""Names, types and units of columns: one table for wavebatch's style and four styles of other programs.
 
 The layout of a cloud names columns with it, and the cloud readers find columns of all styles. A style may use a name
 only if the column has the meaning and unit that the other program gives to this name.
@@ -9,14 +9,16 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, Column
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
+from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.point_formats import read_angles
 from wavebatch.files.point_dtypes import STANDARD_DTYPES, field_names, list_dimensions
 
 
@@ -156,6 +158,40 @@ def resolve(name: str, *kinds: Mapping[str, Any]) -> Any:
             return known[name]
     alike = (known[one] for known in kinds for one in known if normalise(one) == normalise(name))
     return next(alike, None)
+
+
+def name_standard(point_format: int) -> dict[str, str]:
+    """Return the names of the fields of a point format, x, y and z for its integers, each with the field that it means.
+
+    The scan angle also has the name that other point formats give it.
+    """
+    names = ("x", "y", "z", *(name for name in list_dimensions(point_format) if name not in ("X", "Y", "Z")))
+    angle = next(name for name in names if name in ("scan_angle", "scan_angle_rank"))
+    return {**{name: name for name in names}, "scan_angle": angle, "scan_angle_rank": angle}
+
+
+class Placing(Protocol):
+    """A header or a reader: what stored positions mean."""
+
+    scales: tuple[float, ...]
+    offsets: tuple[float, ...]
+
+
+def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) -> np.ndarray:
+    """Return the values (n,) of a field of raw records, NaN for those that are not finite.
+
+    placing: scales and offsets of the positions.
+    """
+    if name in ("x", "y", "z"):
+        axis = "xyz".index(name)
+        return raw[name.upper()] * placing.scales[axis] + placing.offsets[axis]
+    if name.startswith("scan_angle"):
+        return read_angles(raw)
+    import laspy
+
+    values = widen_integers(np.asarray(laspy.PackedPointRecord(raw, laspy.PointFormat(point_format))[name]))
+    values[~np.isfinite(values)] = np.nan
+    return values
 
 
 def describe(column: Column, unit: str | None = None) -> str:

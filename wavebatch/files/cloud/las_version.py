@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.las.geotiff_wkt import convert_geotiff
+from wavebatch.files.las.geo_keys import convert_geotiff
 from wavebatch.files.las.header import (
     GEOTIFF_ID,
     PROJECTION,
@@ -24,7 +24,7 @@ from wavebatch.files.las.header import (
     has_record,
 )
 from wavebatch.files.las.point_formats import MODERN, choose_format
-from wavebatch.files.wkt_repair import repair_evlr, repair_records
+from wavebatch.files.wkt import repair_evlr, repair_records
 
 LAS_VERSIONS = ("1.4", "1.3", "keep")
 """Values of --las-version."""

@@ -44,7 +44,7 @@ from wavebatch.files.las.header import (
     has_record,
 )
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
-from wavebatch.files.wkt_repair import repair_evlr
+from wavebatch.files.wkt import repair_evlr
 
 _DESCRIPTORS = range(100, 356)
 MOST_PAYLOAD = 65535
@@ -67,7 +67,6 @@ class CloudWriter(PointFile):
         *,
         provenance: Mapping[str, Any],
         overwrite: bool = False,
-        threads: int = 1,
     ) -> None:
         self._layout = layout
         packets = layout.packets
@@ -77,7 +76,7 @@ class CloudWriter(PointFile):
         for name in _clean_ids(header.vlrs):
             self.dropped[name] = "bytes of its id or description that are no UTF-8 text are question marks"
         with protecting(self._inputs):
-            super().__init__(target, header, layout.dtype, layout.extra_records, overwrite=overwrite, threads=threads)
+            super().__init__(target, header, layout.dtype, layout.extra_records, overwrite=overwrite)
 
     def _append_records(self) -> None:
         with reporting(self._layout.source.path), open(self._layout.source.path, "rb") as source:

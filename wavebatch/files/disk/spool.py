@@ -40,6 +40,11 @@ class Spool(Closing):
         self._segments: list[int] = []
         self._memory: tuple[np.ndarray, np.ndarray] | None = None
         self._sealed = False
+        self._joined: list[Spool] = []
+
+    def join(self, other: Spool) -> None:
+        """Read, and close, with this one the entries of another sealed spool of as many buckets, before its own."""
+        self._joined.append(other)
 
     def append(self, bucket: np.ndarray, entries: np.ndarray) -> None:
         """Add entries (k,) to buckets (k,)."""
@@ -72,6 +77,8 @@ class Spool(Closing):
     def pieces(self, bucket: int) -> Iterator[np.ndarray]:
         """Yield the same entries in parts, one per segment."""
         self.seal()
+        for other in self._joined:
+            yield from other.pieces(bucket)
         if self._memory is not None:
             starts, entries = self._memory
             if starts[bucket + 1] > starts[bucket]:
@@ -91,6 +98,8 @@ class Spool(Closing):
 
     def close(self) -> None:
         """Remove the temporary file; may be called twice."""
+        for other in self._joined:
+            other.close()
         if self.path is not None:
             shutil.rmtree(self.path.parent, ignore_errors=True)
         self._pending, self._memory = [], None

@@ -24,8 +24,7 @@ from wavebatch.files.las.header import (
     is_projection,
     read_header,
 )
-from wavebatch.files.wkt import Node, read_wkt
-from wavebatch.files.wkt_repair import LONGEST_WKT, repair_wkt
+from wavebatch.files.wkt import LONGEST_WKT, Node, read_wkt, repair_wkt
 
 DOUBLES_ID, CITATION_ID = 34736, 34737
 _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)

@@ -1,15 +1,15 @@
-"""Point records written to a file: plain, or compressed by lazrs.
+"""Point records written to a file: plain, or as LAZ chunks that lazrs compresses.
 
-`write_points.PointFile` calls it. lazrs has defects with waveform formats (see `_LazrsEncoder` and `_patch_wave_item`);
-test changes by reading the output with LASzip too.
+`write_points.PointFile` calls it; workers call `compress_rows`, so that the process that writes only joins chunks.
+lazrs has defects with waveform formats (see `_check_channel` and `_patch_wave_item`), and seeks the wrong points where
+chunks have different numbers of them; test changes by reading the output with LASzip too.
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Callable, Iterator
-from typing import Any, BinaryIO
+import struct
+from io import BytesIO
+from typing import BinaryIO, NamedTuple
 
 import lazrs
 import numpy as np
@@ -20,9 +20,40 @@ from wavebatch.files.las.header import STANDARD_DTYPES, LasHeader, Vlr
 
 _WAVE_ITEM, _BROKEN_VERSION, _READABLE_VERSION = 9, 2, 1
 CHUNK_POINTS = 50_000
-"""Points of a LAZ chunk: what lazrs writes."""
+"""Points of every LAZ chunk but the last: what lazrs and LASzip write."""
 _ITEMS_AT = 34
 """Offset of the list of items in the "laszip encoded" record."""
+
+
+class Chunk(NamedTuple):
+    """Records as their bytes in the file; of LAZ one chunk."""
+
+    points: int
+    data: np.ndarray
+    """u1 (k,)."""
+
+
+def compress_rows(rows: np.ndarray, point_format: int) -> Chunk:
+    """Compress records (m,), at most CHUNK_POINTS; the bytes depend on nothing that is written before them.
+
+    Raises
+    ------
+    InputError
+        Where lazrs cannot compress them.
+    """
+    if point_format in (9, 10):
+        _check_channel(rows)
+    coding = lazrs.LazVlr(_encode_coding(point_format, rows.itemsize))
+    file = BytesIO()
+    try:
+        with uninterrupted():  # lazrs takes KeyboardInterrupt for a failed write
+            compressor = lazrs.LasZipCompressor(file, coding)
+            compressor.compress_many(np.ascontiguousarray(rows).view(np.uint8))
+            compressor.done()
+    except lazrs.LazrsError as error:
+        raise InputError(f"the points cannot be compressed: {error}") from error
+    whole = np.frombuffer(file.getbuffer(), np.uint8)
+    return Chunk(len(rows), whole[8 : int(whole[:8].view("<i8")[0])])  # between the place of the table and the table
 
 
 class PointEncoder:
@@ -35,100 +66,76 @@ class PointEncoder:
     def write(self, rows: np.ndarray) -> None:
         self._file.write(rows.view(np.uint8).data)
 
+    def append(self, chunk: Chunk) -> None:
+        """Write what another process has encoded."""
+        self._file.write(chunk.data.data)
+
     def finish(self) -> None:
         """Write what is left to be written."""
 
 
-def open_encoder(file: BinaryIO, header: LasHeader, threads: int = 1) -> PointEncoder:
+def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
     """Write header and VLRs at the start of `file` and return the encoder for the points after them.
 
-    For a compressed file the "laszip encoded" record is added to `header.vlrs`, and `threads` compress; the bytes do
-    not depend on their number.
+    For a compressed file the "laszip encoded" record is added to `header.vlrs`.
     """
-    if not header.compressed:
-        return PointEncoder(file, header)
-    return _LazrsEncoder(file, header, threads)
+    return _LazEncoder(file, header) if header.compressed else PointEncoder(file, header)
 
 
-class _WatchedFile:
-    """File for the compressors that keeps the first error: they report only that a write failed, not why."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._error: BaseException | None = None
-
-    def __getattr__(self, name: str) -> Callable:
-        function = getattr(self._file, name)
-
-        def watched(*arguments: Any) -> Any:
-            try:
-                return function(*arguments)
-            except BaseException as error:
-                self._error = self._error or error
-                raise
-
-        return watched
-
-    @contextlib.contextmanager
-    def explaining(self) -> Iterator[None]:
-        """Around every call of a compressor, which would take KeyboardInterrupt for a failed write."""
-        try:
-            with uninterrupted():
-                yield
-        except lazrs.LazrsError as error:
-            raise self._error or InputError(f"the points cannot be compressed: {error}") from error
-
-
-class _LazrsEncoder(PointEncoder):
-    """lazrs 0.8 writes wrong packet fields in formats 9 and 10 after a change of scanner channel; refused here."""
-
-    def __init__(self, file: BinaryIO, header: LasHeader, threads: int) -> None:
-        extra = header.point_length - STANDARD_DTYPES[header.point_format].itemsize
-        vlr = lazrs.LazVlr.new_for_compression(header.point_format, extra)
-        payload = _patch_wave_item(bytes(vlr.record_data()))
-        header.vlrs.append(Vlr(b"laszip encoded", 22204, payload, b"http://laszip.org"))
+class _LazEncoder(PointEncoder):
+    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
+        self._format, self._coding = header.point_format, _encode_coding(header.point_format, header.point_length)
+        header.vlrs.append(Vlr(b"laszip encoded", 22204, self._coding, b"http://laszip.org"))
         super().__init__(file, header)
-        self._guarded = header.point_format in (9, 10)
-        self._channel: int | None = None
-        self._watched = _WatchedFile(file)
-        self._coding, self._threads = lazrs.LazVlr(payload), threads
-        self._compressor: Any = None
+        self._start = file.tell()
+        file.write(bytes(8))
+        self._chunks: list[tuple[int, int]] = []
+        """Points and bytes of each."""
         self._held: list[np.ndarray] = []
+        self._count = 0
+        """Of the points held."""
 
     def write(self, rows: np.ndarray) -> None:
-        if self._guarded:
-            self._check_channel(rows)
-        self._held.append(rows.view(np.uint8))
-        least = self._threads * CHUNK_POINTS if self._threads > 1 else 1  # each thread takes a chunk
-        if sum(map(len, self._held)) >= least * rows.itemsize:
-            self._compress()
+        self._held.append(rows.copy())
+        self._count += len(rows)
+        if self._count >= CHUNK_POINTS:
+            held = np.concatenate(self._held)
+            whole = self._count // CHUNK_POINTS * CHUNK_POINTS
+            for first in range(0, whole, CHUNK_POINTS):
+                self.append(compress_rows(held[first : first + CHUNK_POINTS], self._format))
+            self._held, self._count = [held[whole:].copy()], self._count - whole
 
-    def _compress(self) -> None:
-        if self._compressor is None:
-            os.environ.setdefault("RAYON_NUM_THREADS", str(self._threads))  # lazrs reads it when its threads start
-            # Several threads would write a chunk into a file without points.
-            several = self._threads > 1 and self._held
-            make = lazrs.ParLasZipCompressor if several else lazrs.LasZipCompressor
-            self._compressor = make(self._watched, self._coding)
-        with self._watched.explaining():
-            for held in [np.concatenate(self._held)] if len(self._held) > 1 else self._held:
-                self._compressor.compress_many(held)
-        self._held = []
-
-    def _check_channel(self, rows: np.ndarray) -> None:
-        channels = (rows["classification_flags"] >> 4) & 0b11
-        if self._channel is None and len(rows):
-            self._channel = int(channels[0])
-        if np.any(channels != self._channel):
-            raise InputError(
-                "points of several scanner channels with packets cannot be written as LAZ; write LAS, or leave "
-                "--keep-packets out"
-            )
+    def append(self, chunk: Chunk) -> None:
+        if self._chunks and self._chunks[-1][0] != CHUNK_POINTS or chunk.points > CHUNK_POINTS:
+            raise ValueError(f"only the last LAZ chunk may have another number of points than {CHUNK_POINTS}")
+        super().append(chunk)
+        self._chunks.append((chunk.points, len(chunk.data)))
 
     def finish(self) -> None:
-        self._compress()
-        with self._watched.explaining():
-            self._compressor.done()
+        if self._count:
+            self.append(compress_rows(np.concatenate(self._held), self._format))
+        table = BytesIO()
+        lazrs.write_chunk_table(table, self._chunks, lazrs.LazVlr(self._coding))
+        at = self._file.tell()
+        self._file.write(table.getbuffer())
+        self._file.seek(self._start)
+        self._file.write(struct.pack("<q", at))
+
+
+def _check_channel(rows: np.ndarray) -> None:
+    """lazrs 0.8 writes wrong packet fields of formats 9 and 10 after a change of scanner channel in a chunk."""
+    channels = (rows["classification_flags"] >> 4) & 0b11
+    if np.any(channels != channels[0]):
+        raise InputError(
+            "points of several scanner channels with packets cannot be written as LAZ; write LAS, or leave "
+            "--keep-packets out"
+        )
+
+
+def _encode_coding(point_format: int, point_length: int) -> bytes:
+    """The content of the "laszip encoded" record."""
+    extra = point_length - STANDARD_DTYPES[point_format].itemsize
+    return _patch_wave_item(bytes(lazrs.LazVlr.new_for_compression(point_format, extra).record_data()))
 
 
 def _patch_wave_item(payload: bytes) -> bytes:

@@ -7,7 +7,7 @@ it is complete; the header is written last, because counts and bounds are known 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,7 +19,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord
 from wavebatch.files.las.header import WAVEFORM_RECORD_ID, LasHeader, Vlr, encode_evlr_header, has_record
-from wavebatch.files.las.laz_encode import open_encoder
+from wavebatch.files.las.laz_encode import Chunk, open_encoder
 from wavebatch.files.point_dtypes import field_names
 
 _COPY_SIZE = 1 << 22
@@ -31,7 +31,6 @@ class PointFile(contextlib.AbstractContextManager):
 
     header: of the output; counts, bounds and offsets are filled in here.
     records: one per extra dimension of dtype; their VLR replaces that in `header.vlrs`, or is appended.
-    threads: that compress; above 1 `write` keeps the rows that it is given for a while.
     As a context manager it aborts unless committed.
     Raises InputError if the target exists (without overwrite) or cannot be written, ConfigError for another suffix.
     """
@@ -44,7 +43,6 @@ class PointFile(contextlib.AbstractContextManager):
         records: Sequence[ExtraRecord],
         *,
         overwrite: bool,
-        threads: int = 1,
     ) -> None:
         self.target = Path(target)
         self.dtype = dtype
@@ -61,7 +59,7 @@ class PointFile(contextlib.AbstractContextManager):
         """All files that are published together, the point file last."""
         try:
             with self._guarded():
-                self._encoder = open_encoder(self.draft.file, header, threads)
+                self._encoder = open_encoder(self.draft.file, header)
         except BaseException:
             self.draft.discard()
             raise
@@ -73,16 +71,26 @@ class PointFile(contextlib.AbstractContextManager):
         """Append records (m,) of `dtype`."""
         if rows.dtype != self.dtype:
             raise InputError(f"{self.target}: rows of another layout than the file's; this is a bug, please report it")
+        if len(rows):
+            rows = np.ascontiguousarray(rows)
+            self._statistics.add(rows)
+            self._write(self._encoder.write, rows)
+
+    def count_rows(self, statistics: Statistics) -> None:
+        """Count rows of `dtype` that `append` writes."""
+        self._statistics.join(statistics)
+
+    def append(self, chunk: Chunk) -> None:
+        """Append rows of `dtype` as they stand in the file; of LAZ CHUNK_POINTS each time, but for the last."""
+        self._write(self._encoder.append, chunk)
+
+    def _write(self, write: Callable[[Any], None], what: Any) -> None:
         interrupts.check()
-        if not len(rows):
-            return
-        rows = np.ascontiguousarray(rows)
-        self._statistics.add(rows)
         if self._statistics.count >= 2**32 and self._header.version < (1, 4):
             version = "{}.{}".format(*self._header.version)
             raise InputError(f"{self.target}: LAS {version} holds at most 4294967295 points; use --las-version 1.4")
         with self._guarded():
-            self._encoder.write(rows)
+            write(what)
             self.draft.file.flush()  # else a worker forked now would inherit the buffer and write it again
 
     def finish_points(self) -> None:
@@ -186,6 +194,14 @@ class Statistics:
         for field, record in self._records.items():
             if record.code:
                 self._widen(field, rows[field], record.no_data)
+
+    def join(self, other: Statistics) -> None:
+        """Add those of further rows of the same file."""
+        self.count += other.count
+        self._bits += other._bits
+        for key, (low, high) in other._extremes.items():
+            least, largest = self._extremes.get(key, (low, high))
+            self._extremes[key] = min(low, least), max(high, largest)
 
     def _widen(self, name: str, values: np.ndarray, no_data: np.ndarray | None = None) -> None:
         for element, column in enumerate(np.atleast_2d(values.T)):

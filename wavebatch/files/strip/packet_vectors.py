@@ -60,6 +60,12 @@ class DirectionTally:
     ratios: list[np.ndarray] = field(default_factory=list)
     """Lengths over c/2."""
 
+    def join(self, other: DirectionTally) -> None:
+        """Add the votes of further points."""
+        self.pairs = [mine + more for mine, more in zip(self.pairs, other.pairs, strict=True)]
+        self.heights = [mine + more for mine, more in zip(self.heights, other.heights, strict=True)]
+        self.ratios += other.ratios
+
     def add_points(self, points: np.ndarray) -> None:
         """Add the votes of usable points (n,): length and height of their vectors."""
         some = points[:: max(1, len(points) // _PER_CALL)]

@@ -28,7 +28,7 @@ from wavebatch.files.las.header import (
     LasHeader,
     find_evlrs,
 )
-from wavebatch.kernels.signal.compressed import MOST_BYTES, decode_packets
+from wavebatch.kernels.packets import MOST_BYTES, decode_packets
 
 MAX_SAMPLES = 1 << 16
 """Longer waveforms are damage: digitizers record a few hundred samples."""

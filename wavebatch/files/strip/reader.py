@@ -6,7 +6,7 @@ exactly one of them; results must not depend on blocks or processes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from wavebatch.files.strip.packet_vectors import OPTIONS, VectorDecision, read_t
 from wavebatch.files.strip.packets import PacketFile, block_rows
 from wavebatch.files.strip.sample_form import PLAIN, SampleForm, read_packet_samples
 from wavebatch.files.strip.scan_result import StripScan
-from wavebatch.files.strip.scanner import scan_strip, unique_entries
+from wavebatch.files.strip.scanner import ScanPart, cut_scan, scan_strip, scan_units, unique_entries
 from wavebatch.files.strip.shared_packets import expand, group_keys
 from wavebatch.kernels.signal.signal import find_fill, quiet_fill, recorded_lengths
 
@@ -141,13 +141,15 @@ class StripReader(Closing):
         self._points.close()
         self._packets.close()
 
-    def scan(self, *, tolerant: bool = False, force: bool = False) -> StripScan:
+    def scan(
+        self, *, tolerant: bool = False, force: bool = False, parts: Sequence[ScanPart] = ()
+    ) -> StripScan:
         """Return the result of one pass over the point records; samples of some packets are read.
 
         tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
-        packets of another strip.
+        packets of another strip. parts: of all units, in order, where other processes have passed over the points.
         """
-        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points)
+        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points, parts)
         if not scan.problems and (stranger := self._find_stranger(scan)):
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
             scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
@@ -155,6 +157,14 @@ class StripReader(Closing):
             scan.close()
             raise InputError(f"{self.facts.path}: {scan.problems[0]}")
         return scan
+
+    def scan_units(self, first: int, last: int) -> ScanPart:
+        """Return what `scan` needs to know of the units [first, last), which are among those of `cut_scan`."""
+        return scan_units(self.facts, self._points, self._packets, self._unit_points, first, last)
+
+    def cut_scan(self, parts: int) -> list[tuple[int, int]]:
+        """Return at most so many runs of units that may be scanned one by one, by any processes."""
+        return cut_scan(self.unit_count(), self._unit_points, parts)
 
     def _find_stranger(self, scan: StripScan) -> str:
         """Why the packets of the .wdp are certainly those of another strip; empty where they may be its own."""

@@ -123,6 +123,12 @@ class FormSample:
         self.n_samples.append(judged.n_samples[rows])
         self.packed.append(judged.packed[rows])
 
+    def join(self, other: FormSample) -> None:
+        """Take the packets of the units that follow."""
+        self.keys += other.keys
+        self.n_samples += other.n_samples
+        self.packed += other.packed
+
     def by_kind(self) -> dict[tuple[int, int, bool], np.ndarray]:
         """Return byte offsets (k,) by descriptor, number of samples and whether they are packed."""
         if not self.keys:

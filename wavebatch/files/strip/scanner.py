@@ -7,13 +7,14 @@ Borders depend only on the file, so that results are equal for any number of pro
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.order import distinct
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import take_whole_records
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.las.crs import metres_per_unit
@@ -38,17 +39,36 @@ _PAIRS, _VOTERS = 4096, 256
 _FAR_SAMPLES = 32
 """Units of a shuffled strip that vote again with their context."""
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
+PART_UNITS = 4
+"""Fewest units that a process scans: it reads again what lies before them, up to one unit."""
 _KEPT_BYTES = 1 << 28
 """Most bytes of decompressed points that a scan keeps for later passes, in a temporary file."""
 
 
-def scan_strip(facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int) -> StripScan:
+def scan_strip(
+    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, parts: Sequence[ScanPart] = ()
+) -> StripScan:
     """Scan all points of a strip.
 
-    unit_points: points per unit before borders are moved to the next pulse.
+    unit_points: points per unit before borders are moved to the next pulse. parts: what `scan_units` found in all
+    units, in their order; the result is the same.
     Raises InputError if points cannot be read; other reasons against processing are in the scan's `problems`.
     """
-    return _Scanner(facts, source, packets, unit_points).run()
+    return _Scanner(facts, source, packets, unit_points).run(parts)
+
+
+def scan_units(
+    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, first: int, last: int
+) -> ScanPart:
+    """Scan the units [first, last) of a strip; arguments and errors as for `scan_strip`."""
+    return _Scanner(facts, source, packets, unit_points).scan_units(first, last).seal()
+
+
+def cut_scan(units: int, unit_points: int, parts: int) -> list[tuple[int, int]]:
+    """Cut a strip into at most so many runs of units [first, last) that `scan_units` may take one by one."""
+    most = units // PART_UNITS if unit_points >= shared_packets.WINDOW + LONGEST_RUN else 1
+    parts = max(1, min(parts, most))
+    return list(itertools.pairwise(units * part // parts for part in range(parts + 1)))
 
 
 @dataclass(slots=True)
@@ -66,27 +86,57 @@ class _Tally:
         self.by_descriptor += np.bincount(points["wavepacket_index"][has], minlength=256)
         self.short += int(judged.short.sum())
 
+    def join(self, other: _Tally) -> None:
+        self.first = np.where(self.first < 0, other.first, self.first)
+        self.reasons += other.reasons
+        self.by_descriptor += other.by_descriptor
+        self.short += other.short
+
     def describe(self) -> dict[Reason, tuple[int, int]]:
         return {r: (int(self.reasons[r]), int(self.first[r])) for r in Reason if r in REASON_TEXTS and self.reasons[r]}
+
+
+class ScanPart(Closing):
+    """What was found in consecutive units of a strip; sealed it can be pickled."""
+
+    def __init__(self, facts: StripFacts, form: str, units: int) -> None:
+        self.borders: list[int] = []
+        self.tally, self.votes, self.sample, self.claimed = _Tally(), DirectionTally(form), FormSample(), 0
+        self.context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
+        self.decoded = Spool(units, facts.dtype)
+        low, high = facts.packets.offsets
+        self.near = NearSharing(low, max(low, high), self.context)
+
+    def seal(self) -> ScanPart:
+        self.context.seal()
+        return self
+
+    def join(self, other: ScanPart) -> None:
+        """Add what was found in the units that follow."""
+        self.borders += other.borders[1:] if self.borders else other.borders
+        for name in ("tally", "votes", "sample", "near", "context", "decoded"):
+            getattr(self, name).join(getattr(other, name))
+        self.claimed += other.claimed
+
+    def close(self) -> None:
+        """Remove the temporary files."""
+        self.context.close()
+        self.decoded.close()
 
 
 class _Scanner:
     def __init__(self, facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int) -> None:
         self._facts, self._source, self._unit_points = facts, source, unit_points
-        self._packets, self._sample = packets, FormSample()
+        self._packets = packets
         self._judge = Judge(facts)
         self._form = find_form(self._take_first())
-        self._tally, self._votes = _Tally(), DirectionTally(self._form)
-        self._claimed = 0
-        self._borders = [0]
-        units = -(-facts.header.point_count // unit_points)
-        self._context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
-        self._decoded = Spool(units, facts.dtype)
+        self._units = -(-facts.header.point_count // unit_points)
+        self._found = ScanPart(facts, self._form, self._units)
         self._keeps = facts.header.compressed
-        low, high = facts.packets.offsets
         self._widths = np.zeros(256, np.int64)
         self._widths[list(facts.digitizers)] = [digitizer.width for digitizer in facts.digitizers.values()]
-        self._near = NearSharing(low, max(low, high), self._context)
+        self._first = 0
+        """Number of the first unit that is scanned."""
         self._window: list[_Part] = []
 
     def _take_first(self) -> np.ndarray:
@@ -95,86 +145,109 @@ class _Scanner:
         points = self._source.read(0, min(self._facts.header.point_count, most))
         return points[(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
 
-    def run(self) -> StripScan:
+    def scan_units(self, first: int, last: int) -> ScanPart:
+        """Scan the units [first, last)."""
+        self._first = first
         try:
-            for start, points in self._cut_units():
+            for start, points in self._cut_units(first, last):
                 self._add_unit(start, points)
-            suspects = self._near.suspects()
-            packets, reach = self._near.count_packets(suspects), self._near.reach
-            found = [np.empty(0, np.uint64), *self._near.overfull]
+            self._try_keeping(self._found.decoded.seal)
+        except BaseException:
+            self._found.close()
+            raise
+        return self._found
+
+    def run(self, parts: Sequence[ScanPart]) -> StripScan:
+        """Scan all units, or join what was found in them; then look at all of them together."""
+        found = self._found
+        for part in parts:
+            found.join(part)
+        if not parts:
+            self.scan_units(0, self._units)
+        near = found.near
+        try:
+            suspects = near.suspects()
+            packets, reach = near.count_packets(suspects), near.reach
+            full = [np.empty(0, np.uint64), *near.overfull]
             if suspects.any():
                 more, far_reach, far_overfull = self._go_far(suspects)
                 packets, reach = packets + more, max(reach, far_reach)
-                found.append(far_overfull)
-            self._context.seal()
-            overfull = distinct(np.concatenate(found))
+                full.append(far_overfull)
+            found.seal()
+            overfull = distinct(np.concatenate(full))
             if suspects.any():
                 self._vote_far()
             if len(overfull):
                 self._count_overfull(overfull)
-            self._try_keeping(self._decoded.seal)
         except BaseException:
-            self._context.close()
-            self._decoded.close()
+            found.close()
             raise
         return self._finish(packets - len(overfull), reach, overfull, MAX_RETURNS if suspects.any() else MOST_OVERLAP)
 
-    def _cut_units(self) -> Iterator[tuple[int, np.ndarray]]:
+    def _cut_units(self, first: int, last: int) -> Iterator[tuple[int, np.ndarray]]:
         """Yields first index and points of each unit, and collects the borders."""
-        step, count = self._unit_points, self._facts.header.point_count
-        rest = np.empty(0, self._facts.dtype)
-        for begin in range(0, count, step):
-            part = self._source.read(begin, min(begin + step, count))
-            if begin:
-                cut = _find_cut(rest["gps_time"][-LONGEST_RUN:], part["gps_time"][:LONGEST_RUN])
-                start = self._borders[-1]
-                self._borders.append(begin + cut)
-                yield start, np.concatenate([rest, part[:cut]]) if cut else rest
-                rest = part[cut:]
+        step, count, borders = self._unit_points, self._facts.header.point_count, self._found.borders
+        begin, end = first * step, min(last * step, count)
+        rest = self._source.read(max(begin - shared_packets.WINDOW, 0), begin)
+        for at in range(begin, end, step):
+            part = self._source.read(at, min(at + step, count))
+            cut = _find_cut(rest, part) if at else 0
+            if at == begin:
+                self._open_window(np.concatenate([rest, part[:cut]]), at + cut)
             else:
-                rest = part
-        if count:
-            self._borders.append(count)
-            yield self._borders[-2], rest
+                yield borders[-1], np.concatenate([rest, part[:cut]]) if cut else rest
+            borders.append(at + cut)
+            rest = part[cut:]
+        if end > begin:
+            after = self._source.read(end, min(end + LONGEST_RUN, count))
+            cut = _find_cut(rest, after) if len(after) else 0
+            yield borders[-1], np.concatenate([rest, after[:cut]]) if cut else rest
+            borders.append(end + cut)
+
+    def _open_window(self, points: np.ndarray, stop: int) -> None:
+        """Begin with the last points before the first unit."""
+        rows = np.flatnonzero((judged := self._judge.judge(points, self._form)).usable)
+        start = stop - len(points)
+        self._window = [_Part(judged.keys[rows], start + rows, self._first - 1, points, start)]
 
     def _keep(self, unit: int, points: np.ndarray) -> None:
         """Keep the points of a compressed strip: to decode them again takes twenty times as long as to read them."""
-        size = (self._decoded.count + len(points)) * self._decoded.dtype.itemsize
-        self._keeps = self._keeps and size <= _KEPT_BYTES
-        if self._keeps:
-            self._try_keeping(lambda: self._decoded.append(np.full(len(points), unit), points))
+        size = (unit + 1) * self._unit_points * points.itemsize
+        if self._keeps and size <= _KEPT_BYTES:
+            self._try_keeping(lambda: self._found.decoded.append(np.full(len(points), unit), points))
 
     def _try_keeping(self, write: Callable[[], object]) -> None:
         """Do without the kept points where there is no room for them."""
         try:
             write()
         except InputError:
-            self._decoded.close()
-            self._decoded, self._keeps = Spool(self._decoded.buckets, self._decoded.dtype).seal(), False
+            self._found.decoded.close()
+            self._found.decoded, self._keeps = Spool(self._units, self._facts.dtype).seal(), False
 
     def _add_unit(self, start: int, points: np.ndarray) -> None:
-        self._keep(len(self._borders) - 2, points)
+        unit = self._first + len(self._found.borders) - 1
+        self._keep(unit, points)
         judged = self._judge.judge(points, self._form)
-        self._tally.add(points, start, judged)
+        self._found.tally.add(points, start, judged)
         rows = np.flatnonzero(judged.usable)
-        part = _Part(judged.keys[rows], start + rows, len(self._borders) - 2, points, start)
+        part = _Part(judged.keys[rows], start + rows, unit, points, start)
         tails = (old.tail(start - shared_packets.WINDOW) for old in self._window)
         self._window = [tail for tail in tails if len(tail.keys)]
         parts = _Parts([*self._window, part])
         own = np.arange(len(parts.keys)) >= len(parts.keys) - len(rows)
-        groups = self._near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
+        groups = self._found.near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
         first = groups.order[groups.starts] - (len(parts.keys) - len(rows))
         new = rows[first[first >= 0]]
-        self._sample.add(judged, new)
+        self._found.sample.add(judged, new)
         width = np.take(self._widths, points["wavepacket_index"][new])
-        self._claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
+        self._found.claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
         if len(rows):
-            self._votes.add_points(take_whole_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
+            self._found.votes.add_points(take_whole_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
             self._vote(groups, parts, own)
         self._window.append(part)
 
     def _entries(self, parts: _Parts, rows: np.ndarray) -> np.ndarray:
-        entries = np.empty(len(rows), self._context.dtype)
+        entries = np.empty(len(rows), self._found.context.dtype)
         entries["index"], entries["record"] = parts.index[rows], parts.take(rows)
         return entries
 
@@ -186,12 +259,12 @@ class _Scanner:
         place = place[:: max(1, len(place) // _PAIRS)]
         first, second = parts.take(groups.order[place - 1]), parts.take(groups.order[place])
         xyz = np.stack([locate(records, self._facts.header) for records in (first, second)])
-        self._votes.add_pairs(xyz, first, second)
+        self._found.votes.add_pairs(xyz, first, second)
 
     def _go_far(self, suspects: np.ndarray) -> tuple[int, int, np.ndarray]:
         """Finds points anywhere in the strip that share packets of suspect bins, and adds them to the context."""
-        borders = np.array(self._borders)
-        count = int(self._tally.reasons[Reason.USABLE])
+        borders = np.array(self._found.borders)
+        count = int(self._found.tally.reasons[Reason.USABLE])
         far = find_far(self._suspect_keys(suspects), count, borders)
         try:
             for unit in range(len(borders) - 1):
@@ -204,27 +277,26 @@ class _Scanner:
 
     def _judge_again(self, overfull: np.ndarray | None = None) -> Iterator[tuple[int, Judged]]:
         """First index and check of each unit, for passes after the first one."""
-        for start, stop in itertools.pairwise(self._borders):
+        for start, stop in itertools.pairwise(self._found.borders):
             yield start, self._judge.judge(self._source.read(start, stop), self._form, overfull)
 
     def _suspect_keys(self, suspects: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for start, judged in self._judge_again():
             rows = np.flatnonzero(judged.usable)
-            rows = rows[self._near.is_suspect(judged.keys[rows], suspects)]
+            rows = rows[self._found.near.is_suspect(judged.keys[rows], suspects)]
             yield judged.keys[rows], start + rows
 
     def _give(self, start: int, stop: int, wants: np.ndarray) -> None:
         points = self._source.read(start, stop)
-        entries = np.empty(len(wants), self._context.dtype)
+        entries = np.empty(len(wants), self._found.context.dtype)
         entries["index"], entries["record"] = wants["index"], take_whole_records(points, wants["index"] - start)
-        self._context.append(wants["unit"], entries)
+        self._found.context.append(wants["unit"], entries)
 
     def _vote_far(self) -> None:
         """Some units vote again with their context: in a shuffled strip only there the returns of a packet meet."""
-        units = len(self._borders) - 1
-        for unit in range(0, units, max(1, units // _FAR_SAMPLES)):
-            start, stop = self._borders[unit], self._borders[unit + 1]
-            context = unique_entries(self._context.read(unit))
+        for unit in range(0, self._units, max(1, self._units // _FAR_SAMPLES)):
+            start, stop = self._found.borders[unit], self._found.borders[unit + 1]
+            context = unique_entries(self._found.context.read(unit))
             points = np.concatenate([self._source.read(start, stop), context["record"]])
             index = np.concatenate([np.arange(start, stop), context["index"]])
             judged = self._judge.judge(points, self._form)
@@ -237,24 +309,25 @@ class _Scanner:
         for start, judged in self._judge_again(overfull):
             here = judged.reason == Reason.OVERFULL
             many = int(here.sum())
-            if many and self._tally.first[Reason.OVERFULL] < 0:
-                self._tally.first[Reason.OVERFULL] = start + int(np.argmax(here))
-            self._tally.reasons[Reason.OVERFULL] += many
-            self._tally.reasons[Reason.USABLE] -= many
+            if many and self._found.tally.first[Reason.OVERFULL] < 0:
+                self._found.tally.first[Reason.OVERFULL] = start + int(np.argmax(here))
+            self._found.tally.reasons[Reason.OVERFULL] += many
+            self._found.tally.reasons[Reason.USABLE] -= many
 
     def _finish(self, packets: int, reach: int, overfull: np.ndarray, most: int) -> StripScan:
         """most: how many times packets may claim the bytes that are there."""
-        tally, facts, points = self._tally, self._facts, self._facts.header.point_count
+        found, facts, points = self._found, self._facts, self._facts.header.point_count
+        tally = found.tally
         usable, missing = int(tally.reasons[Reason.USABLE]), int(tally.reasons[Reason.NO_WAVEFORM])
-        decision = decide_direction(self._votes, facts.direction_option, metres_per_unit(facts.units)[0])
+        decision = decide_direction(found.votes, facts.direction_option, metres_per_unit(facts.units)[0])
         reasons = tally.describe()
         problems = list(decision.problems)
         if not usable and missing < points:
             problems.insert(0, describe_hopeless(facts, reasons))
         low, high = facts.packets.offsets
-        if self._claimed > most * max(high - low, 0):
+        if found.claimed > most * max(high - low, 0):
             problems.append(
-                f"packets overlap: they claim {self._claimed:,} bytes of {high - low:,}; the strip is damaged, or its "
+                f"packets overlap: they claim {found.claimed:,} bytes of {high - low:,}; the strip is damaged, or its "
                 "packets belong to another one: get both again"
             )
         return StripScan(
@@ -268,13 +341,13 @@ class _Scanner:
             by_descriptor={i: int(tally.by_descriptor[i]) for i in np.flatnonzero(tally.by_descriptor).tolist()},
             reach=reach,
             vectors=decision,
-            borders=np.array(self._borders),
+            borders=np.array(found.borders or [0]),
             overfull=overfull,
-            context=self._context,
-            decoded=self._decoded,
+            context=found.context,
+            decoded=found.decoded,
             warnings=(*describe_oddities(reasons, tally.short), *decision.warnings),
             problems=tuple(problems),
-            forms=find_forms(facts.digitizers, self._packets, self._sample),
+            forms=find_forms(facts.digitizers, self._packets, found.sample),
         )
 
 
@@ -321,8 +394,9 @@ class _Parts:
         return take_whole_records(np.concatenate(taken), back)
 
 
-def _find_cut(before: np.ndarray, after: np.ndarray) -> int:
+def _find_cut(rest: np.ndarray, part: np.ndarray) -> int:
     """Number of points after a border that belong to the pulse before it, and so to the unit before it."""
+    before, after = rest["gps_time"][-LONGEST_RUN:], part["gps_time"][:LONGEST_RUN]
     time = before[-1]
     head = np.flatnonzero(after != time)
     tail = np.flatnonzero(before[::-1] != time)

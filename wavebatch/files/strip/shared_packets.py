@@ -88,6 +88,8 @@ class NearSharing:
         self._last = np.full(bins, -1, np.int64)
         self._new = np.zeros(bins, np.int32)
         self._context = context
+        self._lowest = 0
+        """First of the bins that are kept."""
         self.reach = 0
         self.overfull: list[np.ndarray] = []
 
@@ -138,6 +140,24 @@ class NearSharing:
 
     def _bin(self, keys: np.ndarray) -> np.ndarray:
         return (((keys >> INDEX_BITS) - self._low) // self._width).astype(np.int64)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Only bins that points refer to: a part of a strip has few of them."""
+        used = np.flatnonzero(self._first >= 0)
+        low, high = (int(used[0]), int(used[-1]) + 1) if len(used) else (0, 0)
+        bins = {name: getattr(self, name)[low:high] for name in ("_first", "_last", "_new")}
+        return {**self.__dict__, **bins, "_lowest": self._lowest + low, "_context": None}
+
+    def join(self, other: NearSharing) -> None:
+        """Add what another process found in the units that follow; it has compared them with those before them."""
+        here = slice(other._lowest, other._lowest + len(other._first))
+        for name, least in (("_first", True), ("_last", False)):
+            mine, theirs = getattr(self, name)[here], getattr(other, name)
+            change = (theirs >= 0) & ((mine < 0) if least else True)
+            mine[change] = theirs[change]
+        self._new[here] += other._new
+        self.reach = max(self.reach, other.reach)
+        self.overfull += other.overfull
 
     def suspects(self) -> np.ndarray:
         """Return for each bin whether its points lie too far apart for the window."""

@@ -10,8 +10,7 @@ import ctypes
 import numpy as np
 
 from wavebatch.kernels import library
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
-from wavebatch.kernels.fit.problem import Settings, Solution
+from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings, Solution
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape
 from wavebatch.kernels.library import Samples, call, place
 

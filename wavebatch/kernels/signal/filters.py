@@ -1,13 +1,20 @@
-"""Filters of the detectors, along the samples of arrays (s, n), and the noise that they let through.
+"""Filters of the detectors along the samples of arrays (s, n), the noise that they let through, and maxima.
 
-Used by stages/detect. A filter is given by half of its taps: the centre first.
+Used by stages/detect and the stage noise.pooled. A filter is given by half of its taps: the centre first. Quiet levels
+and maxima are found by the compiled library (kernels/c/signal.h). The B3-spline wavelet transform with holes is that
+of the stage detect.wavelet (Wang et al., docs/algorithms.md 1.2).
 """
 
 from __future__ import annotations
 
+import ctypes
+from functools import lru_cache
+
 import numpy as np
 
+from wavebatch.kernels import library
 from wavebatch.kernels.elementary import exp, log
+from wavebatch.kernels.library import Samples, call, place
 
 
 def gaussian_taps(width: float, reach: float = 3.0) -> np.ndarray:
@@ -118,3 +125,113 @@ def refine_peaks(filtered: np.ndarray, waveform: np.ndarray, sample: np.ndarray)
     shift = np.clip(shift, -0.5, 0.5)
     height = np.where(good, exp(b - 0.25 * (a - c) * shift), middle)
     return sample + shift, height
+
+
+def quiet_levels(samples: Samples, limit: float, reach: int, recovery: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of the samples of each waveform that are far from any signal.
+
+    Parameters
+    ----------
+    samples : Samples
+        Waveforms, with one level each.
+    limit : float, count
+        A smoothed sample beyond +-limit around the level is signal.
+    reach : int, samples
+        Samples this near to signal are not quiet.
+    recovery : int, samples
+        Nor are samples within this after a signal of three times the limit.
+
+    Returns
+    -------
+    mean : float32 (n,), count
+        Above the level; 0 where no sample is quiet.
+    number : int32 (n,)
+        Quiet samples.
+
+    References
+    ----------
+    docs/algorithms.md H10.
+    """
+    samples, n = samples.checked(), len(samples.counts)
+    mean, number = np.empty(n, np.float32), np.empty(n, np.int32)
+    sizes = ctypes.c_int64(n), ctypes.c_double(limit), ctypes.c_int64(reach), ctypes.c_int64(recovery)
+    call("quiet_levels", samples.as_block(), *sizes, mean, number)
+    return mean, number
+
+
+def find_maxima(
+    samples: Samples, threshold: float, width: float, broad: float = 0.0, taps: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Local maxima of smoothed waveforms, with starts for a fit.
+
+    Parameters
+    ----------
+    samples : Samples
+        Waveforms with their levels; missing samples count as 0.
+    threshold : float
+        Least height in the smoothed waveform [noise of one sample].
+    width : float, samples
+        Width of the system pulse.
+    broad : float, samples
+        Width of the Gaussian that smooths; 0 for [1 2 1]/4 twice.
+    taps : float (k,), optional
+        Half of that Gaussian, the centre first.
+
+    Returns
+    -------
+    waveform : int64 (m,)
+    time, amplitude, width : float64 (m,), samples, count, samples
+        From a log-parabola through five samples; constant waveforms have no maximum.
+
+    References
+    ----------
+    Wagner et al. (2007), max-detection; docs/algorithms.md 1.1, 4.1.
+    """
+    samples, n = samples.checked(), len(samples.counts)
+    half = np.ascontiguousarray(np.zeros(1) if taps is None else taps, np.float32)
+    detector = library.Detector(threshold, width, broad, place(half, np.float32), len(half) - 1)
+    room, done, parts = 2 * n + samples.counts.shape[1], 0, []
+    while done < n:
+        columns = np.empty(room, np.int64), np.empty(room), np.empty(room), np.empty(room)
+        out, found = library.CCandidates(room, *(column.ctypes.data for column in columns)), ctypes.c_int64()
+        sizes = ctypes.c_int64(n), detector, ctypes.c_int64(done)
+        done = call("find_maxima", samples.as_block(), *sizes, out, ctypes.byref(found))
+        parts.append([column[: found.value] for column in columns])
+        room *= 2
+    waveform, amplitude, time, wide = map(np.concatenate, zip(*parts, strict=True)) if parts else np.empty((4, 0))
+    return waveform.astype(np.int64, copy=False), time, amplitude, wide
+
+
+def smooth_b3(signal: np.ndarray, step: int) -> np.ndarray:
+    """Signal (s, n) filtered with [1 4 6 4 1]/16, taps `step` samples apart; the end samples are repeated outwards."""
+    s = len(signal)
+    padded = np.concatenate([np.repeat(signal[:1], 2 * step, axis=0), signal, np.repeat(signal[-1:], 2 * step, axis=0)])
+    inner = padded[step : step + s] + padded[3 * step : 3 * step + s]
+    inner *= 4
+    inner += padded[:s]
+    inner += padded[4 * step : 4 * step + s]
+    padded = padded[2 * step : 2 * step + s]
+    inner += 6 * padded
+    inner *= signal.dtype.type(1 / 16)
+    return inner
+
+
+def b3_detail(signal: np.ndarray, level: int) -> np.ndarray:
+    """Detail of signal (s, n) at a level, 1 or more: what the last of `level` smoothings removes."""
+    for step in range(level - 1):
+        signal = smooth_b3(signal, 1 << step)
+    return signal - smooth_b3(signal, 1 << (level - 1))
+
+
+@lru_cache(maxsize=16)
+def b3_gain(level: int) -> float:
+    """Standard deviation of the detail of white noise of standard deviation 1."""
+    reach = 2 * (1 << level)
+    impulse = np.zeros((2 * reach + 1, 1))
+    impulse[reach] = 1.0
+    return float(np.sqrt(np.sum(b3_detail(impulse, level) ** 2)))
+
+
+def b3_level(width: float) -> int:
+    """The level that separates echoes of a Gaussian width [samples] best: round(log2(width)) + 1, at least 1."""
+    return max(int(round(float(np.log2(width)))) + 1, 1)

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.no_data import SUFFIX, NoData, explain
+from wavebatch.core.no_data import SUFFIX, NoData, explain_no_data
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_2PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.physics import radiometry
-from wavebatch.stages.pulse_tables import BROADEST, describe_echoes, model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import BROADEST, describe_fitted, model_parameters, pulse_shape, shape_limits
 
 POSITION = ("x", "y", "z")
 
@@ -80,7 +80,7 @@ def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
         return amplitude * sigma * area_factor(system, echoes) / exp(0.5 * system.kappa**2)
     whole = np.stack([amplitude, np.zeros(len(sigma)), sigma / block.spacing], axis=1)
     height, _, width = model_parameters(shape, limits, whole).T
-    facing, _ = describe_echoes(shape, limits, np.array([[1.0, 0.0, limits.ref]]), np.ones((1, 3)), np.zeros((1, 2)))
+    facing, _ = describe_fitted(shape, limits, np.array([[1.0, 0.0, limits.ref]]), np.ones((1, 3)), np.zeros((1, 2)))
     return height * width * (facing[0, 0] * facing[0, 2] / limits.ref) * block.spacing
 
 
@@ -283,4 +283,4 @@ def add_column(
 
 def add_reason(echoes: EchoTable, name: str, *cases: tuple[NoData, np.ndarray | bool]) -> EchoTable:
     """Add the reason why values of a column are missing; arguments as for `add_column`."""
-    return echoes.with_attributes(**{f"{name}{SUFFIX}": explain(echoes.attributes[name], *cases)})
+    return echoes.with_attributes(**{f"{name}{SUFFIX}": explain_no_data(echoes.attributes[name], *cases)})

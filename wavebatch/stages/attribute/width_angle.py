@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.no_data import SUFFIX, NoData, explain
+from wavebatch.core.no_data import SUFFIX, NoData, explain_no_data
 from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW
@@ -140,7 +140,7 @@ def incidence_angle(
     )
     bad = np.logical_or.reduce([np.broadcast_to(where, len(echoes)) for _, where in cases])
     angle, error = (np.degrees(np.where(bad, np.nan, values)).astype(np.float32) for values in (angle, error))
-    columns = {"incidence_angle": angle, "incidence_angle_err": error, _REASON: explain(angle, *cases)}
+    columns = {"incidence_angle": angle, "incidence_angle_err": error, _REASON: explain_no_data(angle, *cases)}
     return echoes.with_attributes(**columns).with_flags(EchoFlag.NARROW, narrow)
 
 

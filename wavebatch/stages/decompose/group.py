@@ -6,8 +6,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, cluster_candidates
-from wavebatch.kernels.fit.problem import Settings
+from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings, cluster_candidates
 from wavebatch.kernels.fit.pulse_shape import pulse_tail, tail_at, tail_reach
 from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.pulse_tables import ShapeLimits, clip_level, model_parameters

@@ -12,8 +12,8 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
+from wavebatch.kernels.fit.cluster import Solution, choose
 from wavebatch.kernels.fit.decompose import decompose_clusters
-from wavebatch.kernels.fit.problem import Solution, choose
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import stage
 from wavebatch.stages.decompose.group import find_clusters

@@ -11,8 +11,8 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.cluster import Settings
 from wavebatch.kernels.fit.decompose import decompose_clusters
-from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import find_clusters

@@ -10,9 +10,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings, Solution
 from wavebatch.kernels.fit.decompose import decompose_clusters
-from wavebatch.kernels.fit.problem import Settings, Solution
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.kernels.fit.whole_pulse import keep_echoes
 from wavebatch.kernels.library import Samples

@@ -13,10 +13,10 @@ from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_energy,
     filter_symmetric,
+    find_maxima,
     gaussian_taps,
     refine_peaks,
 )
-from wavebatch.kernels.signal.maxima import find_maxima
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import make_table, samples_of, signal_above

@@ -10,10 +10,17 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
-from wavebatch.kernels.signal.filters import curvature_taps, filter_energy, filter_symmetric, refine_peaks
+from wavebatch.kernels.signal.filters import (
+    b3_detail,
+    b3_gain,
+    b3_level,
+    curvature_taps,
+    filter_energy,
+    filter_symmetric,
+    refine_peaks,
+)
 from wavebatch.kernels.signal.runs import list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
-from wavebatch.kernels.signal.wavelet import b3_detail, b3_gain, b3_level
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
 from wavebatch.stages.reference_pulse import reference_pulse

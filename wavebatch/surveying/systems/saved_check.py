@@ -130,7 +130,7 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     forms = {(float(block.digitizer.bits), float(block.spacing)) for block in blocks}
     if figures.look is not None:
         whole, kinds = read_flight(survey)
-        known = {kind[:2] for kind in kinds.values()}
+        known = {(kind.bits, kind.spacing_ns) for kind in kinds.values()}
     else:
         known = {(figures.bits, figures.spacing_ns)} if figures.bits and figures.spacing_ns else forms
     if not forms & known:
@@ -141,7 +141,7 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     if figures.look is None:
         reason = _compare_system(look, survey)
         return reason, bool(reason)
-    look = replace(look, level=look.level._replace(mean=whole.level.mean))
+    look = replace(look, level=replace(look.level, mean=whole.level.mean))
     surely = compare_looks(look, whole, survey.system, wider=LARGEST_WIDTH - 1)
     reason = surely or compare_looks(look, whole, survey.system)
     return reason.replace("the flight", "the survey"), bool(surely)

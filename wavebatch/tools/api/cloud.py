@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.echoes import COLUMNS
-from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.point_dtypes import STANDARD_DTYPES
 
 
@@ -62,7 +62,7 @@ class _TableReader(ColumnReader):
         names = self._name_columns()
         chosen = names if columns is None else columns
         try:
-            found = {name: self._find(names.get(name, name), stored=name in names) for name in chosen}
+            found = {name: self.find_column(names.get(name, name), stored=name in names) for name in chosen}
         except BaseException:
             self.close()
             raise

@@ -16,9 +16,9 @@ from wavebatch.batch.job import StripJob, choose_columns, list_column_names
 from wavebatch.batch.options import RunOptions, describe_options
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
-from wavebatch.batch.selection import build_selection
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
 from wavebatch.files.inputs import find_strips
 from wavebatch.files.pulse_energy import NONE
@@ -167,7 +167,8 @@ def plan_run(
         read_sensor(options),
         None if options.calibration is None else load_calibration(Path(options.calibration)),
         read_air(options),
-        build_selection(options),
+        PointFilter.build(drop_flags=options.drop_flags, classes=options.classes, bbox=options.bbox,
+                          polygon=options.polygon, where=options.where),
     )
     # A chain that the user wrote stays as it is; a shipped one gets the stages that the given files allow.
     asked = options.chain or options.profile

@@ -49,7 +49,7 @@ def load_chain(name: Path | str) -> Chain:
     """
     known = chain_file.list_profiles()
     if isinstance(name, Path) or Path(name).name != name or Path(name).suffix:
-        return chain_file.load_chain(name)
+        return chain_file.load_chain_file(name)
     if name not in known:
         raise ConfigError(f"profile {name!r} does not exist; {nearest(name, [AUTO, *known])}")
     return chain_file.load_profile(name)

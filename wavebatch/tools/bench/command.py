@@ -27,7 +27,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.shared_packets import expand
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.stages.chain_file import effective, load_chain, load_profile
+from wavebatch.stages.chain_file import effective, load_chain_file, load_profile
 from wavebatch.surveying import SAMPLE, Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.survey import pool_blocks
@@ -61,7 +61,7 @@ def load_chains(files: Sequence[Path]) -> dict[str, Chain]:
         name = path.stem if path.stem not in chains else str(path)
         if name in chains:
             raise ConfigError(f"{path}: given twice; give every chain file once")
-        chains[name] = load_chain(path)
+        chains[name] = load_chain_file(path)
     return chains
 
 

@@ -13,16 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import PASSED_THROUGH
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.files.cloud.column_reader import select_points
-from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
+from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.disk.buckets import count_buckets, spread_times
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
-from wavebatch.tools.return_stats.returns import pulses_told_apart
+from wavebatch.tools.return_stats import pulses_told_apart
 from wavebatch.tools.simulate.truth import TruthReader
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
@@ -33,19 +32,19 @@ PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
 """A pulse that counts even if neither side has an echo in it."""
 
 
-def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0, where: Condition | None = None) -> Comparison:
+def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0, chosen: PointFilter = EVERY) -> Comparison:
     """Compares the echoes of two clouds of one strip; b may be the strip itself, with the vendor's returns.
 
     Echoes of a pulse (equal GPS time) are the same if they are at most `tolerance_ns` apart along the ray, one to one,
     nearest first. If GPS times do not separate pulses, mutual nearest neighbours are the same. Points passed through
-    without an echo are ignored. where: only points that meet it are compared, in both clouds. Memory is bounded; large
+    without an echo are ignored. chosen: only these points are compared, in both clouds. Memory is bounded; large
     clouds need room in TMPDIR.
     Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance, an unknown column, or
     coordinates without a length.
     """
     with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns) as task:
         for reader, side in ((first, 0), (second, 1)):
-            select_points(reader, where)
+            reader.select(chosen)
             for rows in read_echoes(reader):
                 task.add(side, rows)
         found = task.finish(str(a), str(b))
@@ -69,13 +68,13 @@ def read_echoes(reader: CloudReader) -> Iterator[np.ndarray]:
         yield rows[(rows["flags"] & np.uint16(PASSED_THROUGH)) == 0]
 
 
-def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5, where: Condition | None = None) -> Comparison:
+def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5, chosen: PointFilter = EVERY) -> Comparison:
     """Compares the echoes of a cloud with the truth of its simulated strip; raises as compare_clouds does.
 
-    where: only points of the cloud that meet it; the truth is whole, so that true echoes of other points are missed.
+    chosen: only these points of the cloud; the truth is whole, so that true echoes of other points are missed.
     """
     with CloudReader(a) as cloud, TruthReader(truth) as reference:
-        select_points(cloud, where)
+        cloud.select(chosen)
         points = max(cloud.point_count, reference.meta.get("packets", 0))
         names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
         with CloudTask(True, check_tolerance(tolerance_ns), points, reference.meta) as task:

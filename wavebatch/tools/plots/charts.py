@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader
+from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader
 from wavebatch.files.figure_file import has_matplotlib, open_svg, plain_text
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.files.strip.reader import StripReader

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.cloud.cloud_reader import ColumnFacts
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.las.point_formats import CLASS_NAMES
 from wavebatch.tools.even_sample import EvenSample
-from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, shown_limits
+from wavebatch.tools.plots.values import Clouds, Tally, name_paths, shown_limits
 
 FEWEST, MOST_CHOSEN = 20, 120
 """Least and largest number of bins that are chosen if the user gives none."""
@@ -85,7 +86,8 @@ class FlagCounts:
 
 def count_values(
     paths: Sequence[Path],
-    selection: Selection,
+    column: str,
+    chosen: PointFilter = EVERY,
     *,
     bins: int | None = None,
     limits: tuple[float, float] | None = None,
@@ -99,7 +101,7 @@ def count_values(
     each: one series per cloud instead of one for all. by: one series per value of this column.
     Raises InputError without any value, ConfigError for a column of flags, and more than MOST_GROUPS groups.
     """
-    clouds = Clouds(paths, selection if by is None else replace(selection, others=(by,)))
+    clouds = Clouds(paths, (column,) if by is None else (column, by), chosen)
     if clouds.facts.is_flags:
         raise ConfigError(f"{paths[0]}: {clouds.facts.name} are bits: there is no histogram of their values")
     if by is not None and clouds.other_facts[0].is_flags:
@@ -219,10 +221,10 @@ def place_edges(sample: np.ndarray, low: float, high: float, step: float, bins: 
     return np.unique(np.linspace(low, high, number + 1))
 
 
-def count_points_by_flag(paths: Sequence[Path], selection: Selection) -> FlagCounts:
+def count_points_by_flag(paths: Sequence[Path], column: str, chosen: PointFilter = EVERY) -> FlagCounts:
     """Counts the points of the clouds per flag. Raises InputError without any point."""
     counts, clean, total = np.zeros(len(EchoFlag), np.int64), 0, Tally()
-    clouds = Clouds(paths, selection)
+    clouds = Clouds(paths, (column,), chosen)
     for _, rows, tally in clouds.read():
         total += tally
         flags = rows["values"][:, 0].astype(np.uint16)

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.order import even_places
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 
 FARTHEST = 1e-3
@@ -46,12 +46,10 @@ class Wanted:
     """Indices of points in the file."""
     times: tuple[float, ...] = ()
     """GPS times [s]; the nearest pulse of each."""
-    flags: int = 0
-    """EchoFlag bits: the first waveforms with an echo that has one of them."""
-    where: Condition | None = None
-    """The first waveforms with an echo that meets this."""
+    chosen: PointFilter = PointFilter()
+    """The first waveforms with an echo that it chooses."""
     most: int | None = None
-    """Most waveforms with flags, that meet `where`, or spread evenly; None: FEW of them, or a full sheet."""
+    """Most waveforms with such an echo, or spread evenly; None: FEW of them, or a full sheet."""
     random: int = 0
     """Number of packets to draw at random; 0: none."""
     seed: int = 0
@@ -66,7 +64,7 @@ class Wanted:
 
     @property
     def number(self) -> int:
-        """Most waveforms with flags, or spread evenly."""
+        """Most waveforms with chosen echoes, or spread evenly."""
         return self.most or (MOST_ON_SHEET if self.sheet else FEW)
 
 
@@ -94,7 +92,7 @@ def find_places(
         raise InputError(f"{path}: holds no waveform to draw; `wavebatch check` shows what it holds")
     if wanted.number > wanted.limit:
         raise _too_many(path, wanted)
-    if wanted.flags or wanted.where is not None:
+    if wanted.chosen:
         return _find_flagged(reader, scan, wanted, run)
     numbers = _list_numbers(scan, wanted, str(path))
     if len(numbers) + len(wanted.points) + len(wanted.times) > wanted.limit:
@@ -187,7 +185,8 @@ def _find_nearest(unit: Unit, time: float) -> tuple[int, float]:
 def _find_flagged(
     reader: StripReader, scan: StripScan, wanted: Wanted, run: Callable[[WaveformBlock], EchoTable]
 ) -> list[Place]:
-    """The first waveforms in the file with an echo that has one of the flags and meets the condition."""
+    """The first waveforms in the file with an echo that is chosen."""
+    keep: PlannedFilter | None = None
     found: list[Place] = []
     for unit, base in _read_units(reader, scan):
         rows = np.flatnonzero(unit.packets.owned)
@@ -195,24 +194,30 @@ def _find_flagged(
             hits = []
             for block, index in reader.read_rows(unit, rows[begin : begin + _BLOCK], _BLOCK):
                 table = run(block)
-                hits += index[np.unique(table.waveform[_is_wanted(table, len(block), wanted)])].tolist()
+                keep = keep or _plan(wanted.chosen, table)
+                kept = keep.test((table, len(block)), len(table)) == 0
+                hits += index[np.unique(table.waveform[kept])].tolist()
             found += [_place(unit, base, row) for row in sorted(hits)]
             if len(found) >= wanted.number:
                 return found[: wanted.number]
     if not found:
-        text = "has one of these flags" if wanted.where is None else f"meets {wanted.where.text!r}"
+        text = "has one of these flags" if wanted.chosen.where is None else f"meets {wanted.chosen.where.text!r}"
         raise InputError(f"{reader.facts.path}: no echo {text}: nothing to draw")
     return found
 
 
-def _is_wanted(table: EchoTable, n: int, wanted: Wanted) -> np.ndarray:
-    """Whether each echo of n waveforms has one of the flags, if any are wanted, and meets the condition."""
-    meets = (table.flags & np.uint16(wanted.flags)) != 0 if wanted.flags else np.ones(len(table), bool)
-    if wanted.where is None:
-        return meets
-    made = {"echo_time": table.time, "echo_flags": table.flags, "number_of_returns": table.count(n)[table.waveform]}
-    have = {**table.attributes, **made}
-    for name in wanted.where.columns:
+def _plan(chosen: PointFilter, some: EchoTable) -> PlannedFilter:
+    """The filter for tables of echoes like this one, given with their numbers of waveforms."""
+    made: dict[str, ReadColumn] = {
+        "echo_time": lambda rows: rows[0].time,
+        "echo_flags": lambda rows: rows[0].flags,
+        "number_of_returns": lambda rows: rows[0].count(rows[1])[rows[0].waveform],
+    }
+
+    def find(name: str) -> ReadColumn:
+        have = {**some.attributes, **made}
         if name not in have:
-            raise wanted.where.complain(name, f"echoes have no column {name!r}; {nearest(name, have)}")
-    return meets & wanted.where.choose({name: have[name] for name in wanted.where.columns})
+            raise ConfigError(f"echoes have no column {name!r}; {nearest(name, have)}")
+        return made.get(name) or (lambda rows: rows[0].attributes[name])
+
+    return chosen.plan(made, find, "echoes")

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.cloud.cloud_reader import ColumnFacts
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.files.las.crs import CrsWords, describe_crs
 from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots.values import (
     Clouds,
-    Selection,
     Tally,
     check_statistic,
     find_positions,
@@ -85,8 +85,9 @@ class Raster:
 
 def grid_values(
     paths: Sequence[Path],
-    selection: Selection,
+    column: str | None,
     statistic: str = "mean",
+    chosen: PointFilter = EVERY,
     *,
     size: float | None = None,
     bounds: Box | None = None,
@@ -101,9 +102,9 @@ def grid_values(
     if size is not None and not (LEAST_SIZE <= size <= LARGEST_SIZE):
         raise ConfigError(f"cells must be at least {LEAST_SIZE:g} and at most {LARGEST_SIZE:g} m long, got {size:g}")
     check_cells(statistic, bounds)
-    check_statistic(selection.column, statistic)
-    clouds = Clouds(paths, selection)
-    check_statistic(selection.column, statistic, clouds.facts, paths[0])
+    check_statistic(column, statistic)
+    clouds = Clouds(paths, (column,), chosen)
+    check_statistic(column, statistic, clouds.facts, paths[0])
     crs = check_crs(paths)
     total, sample, box = survey_places(clouds, bounds)
     if not sample.seen:

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.cloud.cloud_reader import ColumnFacts
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.las.crs import CrsWords
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
@@ -25,7 +26,6 @@ from wavebatch.tools.plots.raster import check_crs, survey_places
 from wavebatch.tools.plots.values import (
     MARGIN,
     Clouds,
-    Selection,
     Tally,
     check_statistic,
     name_paths,
@@ -49,12 +49,12 @@ _CHOSEN_BINS = 60
 """Bins of a profile, about, if their size is not given."""
 
 
-def open_heights(paths: Sequence[Path], selection: Selection) -> Clouds | VoxelFile:
+def open_heights(paths: Sequence[Path], column: str | None, chosen: PointFilter) -> Clouds | VoxelFile:
     """Clouds or one file of voxels, whose rows have the height as second value."""
     voxels = [path for path in paths if path.suffix.lower() == ".npz"]
     if voxels and len(paths) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
-    return VoxelFile(paths[0], selection) if voxels else Clouds(paths, replace(selection, others=("z",)))
+    return VoxelFile(paths[0], column, chosen) if voxels else Clouds(paths, (column, "z"), chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +86,8 @@ class Section:
 
 def cut_section(
     paths: Sequence[Path],
-    selection: Selection,
+    column: str | None,
+    chosen: PointFilter = EVERY,
     *,
     line: tuple[float, float, float, float] | None = None,
     width: float | None = None,
@@ -96,7 +97,7 @@ def cut_section(
     line: x0, y0, x1, y1; by default along the longer extent of the points, through their middle. width: by default a
     fiftieth of the line, for voxels at least one voxel. Raises InputError if no point lies there.
     """
-    clouds = open_heights(paths, selection)
+    clouds = open_heights(paths, column, chosen)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
     crs = _find_crs(clouds)
     if crs.unit == "deg":
@@ -209,16 +210,22 @@ class Profile:
 
 
 def measure_profile(
-    paths: Sequence[Path], selection: Selection, statistic: str, *, size: float | None = None, each: bool = False
+    paths: Sequence[Path],
+    column: str | None,
+    statistic: str,
+    chosen: PointFilter = EVERY,
+    *,
+    size: float | None = None,
+    each: bool = False,
 ) -> Profile:
     """The number of points, or the sum or mean of the column, per height.
 
     size: height of a bin, by default about a sixtieth of all. each: one series per cloud instead of one for all. Far
     outliers in height are left out and counted. Raises InputError without any value.
     """
-    clouds = open_heights(paths, selection)
+    clouds = open_heights(paths, column, chosen)
     crs = _find_crs(clouds)
-    check_statistic(selection.column, statistic, clouds.facts, paths[0])
+    check_statistic(column, statistic, clouds.facts, paths[0])
 
     def pick(_: int, rows: np.ndarray) -> np.ndarray:
         height = rows["values"][:, 1:]

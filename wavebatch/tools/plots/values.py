@@ -1,4 +1,4 @@
-"""Values of columns of clouds of any size, read piece by piece: selection of points, counts, samples, robust limits.
+"""Values of columns of clouds of any size, read piece by piece: chosen points, counts, samples, robust limits.
 
 `histogram`, `raster`, `sections` and `rasters.grid` read their clouds through `Clouds`.
 """
@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike, select_points
+from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader, check_alike
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.tools.even_sample import EvenSample
 
@@ -26,22 +26,6 @@ MOST = (5.0, 95.0)
 
 MARGIN = 0.25
 """Also shown on both sides of these percentiles, as a share of the distance between them."""
-
-
-@dataclass(frozen=True, slots=True)
-class Selection:
-    """Which points are used."""
-
-    column: str | None
-    """The column; None counts points."""
-    flags_with: int = 0
-    """Points must have one of these EchoFlag bits; 0: any point."""
-    flags_without: int = 0
-    """Points must have none of these EchoFlag bits."""
-    others: tuple[str, ...] = ()
-    """Further columns that are read with it."""
-    where: Condition | None = None
-    """Points must meet this."""
 
 
 @dataclass(slots=True)
@@ -74,11 +58,12 @@ def name_paths(paths: Sequence[Path]) -> tuple[str, ...]:
 class Clouds:
     """Several clouds that are read as one, as often as needed; only one is open at a time.
 
+    columns: read of each point; of the first one, None counts points. chosen: the points that are used.
     Raises InputError if a cloud cannot be read, ConfigError if it lacks the column or the flags or units differ.
     """
 
-    def __init__(self, paths: Sequence[Path], selection: Selection) -> None:
-        self.paths, self.selection = tuple(paths), selection
+    def __init__(self, paths: Sequence[Path], columns: Sequence[str | None], chosen: PointFilter = EVERY) -> None:
+        self.paths, self._columns, self.chosen = tuple(paths), tuple(columns), chosen
         found: list[list[tuple[Path, ColumnFacts]]] = []
         for path in self.paths:
             with self._open(path) as reader:
@@ -87,11 +72,10 @@ class Clouds:
         self.other_facts: tuple[ColumnFacts, ...] = tuple(others)
 
     def _open(self, path: Path) -> ColumnReader:
-        """A reader that gives the points of the selection."""
-        wanted = self.selection
-        reader = ColumnReader(path, wanted.column, *wanted.others)
+        """A reader that gives the chosen points."""
+        reader = ColumnReader(path, *self._columns)
         try:
-            select_points(reader, wanted.where, wanted.flags_with, wanted.flags_without)
+            reader.select(self.chosen)
         except BaseException:
             reader.close()
             raise
@@ -126,7 +110,7 @@ class Clouds:
             return InputError(f"{where}: holds no points: nothing to draw")
         reasons = []
         if tally.left_out:
-            by = "by --where" if self.selection.where is not None else "by their flags"
+            by = "by --where" if self.chosen.where is not None else "by their flags"
             reasons.append(f"{tally.left_out} of {tally.points} points are left out {by}")
         if tally.no_data:
             reasons.append(f"{tally.no_data} have no data in {self.facts.name}")

@@ -16,11 +16,12 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, check_options, option
-from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.cloud.cloud_reader import ColumnFacts
+from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
-from wavebatch.tools.plots.values import Clouds, Selection, check_statistic
+from wavebatch.tools.plots.values import Clouds, check_statistic
 from wavebatch.tools.rasters import forest
 from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, Placed, check_cells, compute_tiles, is_in_bounds
 
@@ -36,8 +37,10 @@ _EXACT = float(1 << 23)
 class GridOptions:
     """What is written of which points."""
 
-    selection: Selection
-    """A band for each of its columns; points are counted without one."""
+    columns: tuple[str, ...] = ()
+    """A band for each; points are counted without one."""
+    chosen: PointFilter = EVERY
+    """The points that are used."""
     statistic: Literal["mean", "median", "min", "max", "std", "count", "density"] = option(
         "mean", "Statistic of the values in a cell; density is points per area."
     )
@@ -78,12 +81,11 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     metrics = None
     if options.forest is not None:
         metrics = forest.Forest(paths, options.size, options.forest)
-        chosen = replace(options.selection, column=forest.COLUMNS[0], others=forest.COLUMNS[1:])
-        options = replace(options, selection=chosen)
+        options = replace(options, columns=tuple(forest.COLUMNS))
     _check(options)
     options = replace(options, bbox=_grow(options.bbox, options.size))
     crs, unit, unnamed = _find_crs(paths, options.crs)
-    clouds = Clouds(paths, options.selection)
+    clouds = Clouds(paths, options.columns or (None,), options.chosen)
     facts = (clouds.facts, *clouds.other_facts)
     for one in facts:
         check_statistic(one.name, options.statistic, one, paths[0])
@@ -115,7 +117,7 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
 
 def _check(options: GridOptions) -> None:
     check_cells(options.statistic, options.bbox)
-    check_statistic(options.selection.column, options.statistic)
+    check_statistic(next(iter(options.columns), None), options.statistic)
     check_options(options)
     if not (math.isnan(options.no_data) or abs(options.no_data) <= float(np.finfo(np.float32).max)):
         raise ConfigError(f"--no-data must be nan or a number that float32 holds, got {options.no_data:g}")
@@ -160,9 +162,9 @@ def _find_extent(clouds: Clouds, options: GridOptions) -> tuple[Box, int, np.nda
             largest = np.maximum(largest, np.nan_to_num(np.abs(rows["values"])).max(axis=0, initial=0.0))
             points += len(rows)
     if not points:
-        wanted, selection = ["a position within --bbox" if options.bbox else "a position"], options.selection
-        wanted += ["the chosen flags"] if selection.flags_with or selection.flags_without else []
-        wanted += ["what --where asks for"] if selection.where is not None else []
+        wanted, chosen = ["a position within --bbox" if options.bbox else "a position"], options.chosen
+        wanted += ["the chosen flags"] if chosen.flags or chosen.drop_flags else []
+        wanted += ["what --where asks for"] if chosen.where is not None else []
         raise InputError(f"{clouds.paths[0]}: no raster: no point has {' and '.join(wanted)}")
     return options.bbox or (*low.tolist(), *high.tolist()), points, largest
 

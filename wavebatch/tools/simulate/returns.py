@@ -18,7 +18,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
-from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 from wavebatch.tools.simulate.render import MOST_NOISE, PulseModel, Recording
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
-from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.tools.plots.sections import Profile, place_heights
 from wavebatch.tools.plots.values import Tally, check_statistic, name_paths
 from wavebatch.tools.slices.output import SEGMENT_SUFFIXES

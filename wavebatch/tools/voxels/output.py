@@ -1,6 +1,6 @@
 """Voxels as a sparse .npz, or as a point cloud with a point at the centre of each.
 
-`strip.voxelize_strip` calls `check_target` before it reads the strip, and `write_voxels` at the end.
+`strip.voxelize_strip` calls `check_voxel_target` before it reads the strip, and `write_voxels` at the end.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from wavebatch.files.las.header import (
 )
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.facts import StripFacts
-from wavebatch.files.wkt_repair import repair_records, repair_wkt
+from wavebatch.files.wkt import repair_records, repair_wkt
 from wavebatch.tools.voxels.grid import VoxelColumn
 
 SUFFIXES = (".npz", ".las", ".laz")
@@ -41,7 +41,7 @@ Piece = tuple[np.ndarray, Mapping[str, np.ndarray]]
 """Index (m, 3) and columns of some voxels."""
 
 
-def check_target(target: Path, strip: Path) -> None:
+def check_voxel_target(target: Path, strip: Path) -> None:
     """Raises ConfigError for an unknown suffix or where the output is the strip, InputError if it cannot be written."""
     if target.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{target}: voxels are written as {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")

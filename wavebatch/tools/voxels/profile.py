@@ -19,9 +19,12 @@ from wavebatch.kernels.signal.deconvolve import (
     deconvolve_gold,
     deconvolve_richardson_lucy,
     deconvolve_wiener,
+    fit_height,
+    keep_signal,
+    measure_offsets,
     wiener_taps,
+    window_signal,
 )
-from wavebatch.kernels.signal.profiles import fit_height, keep_signal, measure_offsets, window_signal
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121, widen
 from wavebatch.stages.detect.candidates import signal_above
 from wavebatch.stages.noise import pooled

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.files.cloud.point_filter import PlannedFilter
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit, read_scanner
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, group_times
@@ -39,7 +40,7 @@ def read_batches(
     *,
     numbers: Sequence[int] | None = None,
     choose: Callable[[np.ndarray], np.ndarray] | None = None,
-    keep: Callable[[np.ndarray], np.ndarray] | None = None,
+    keep: PlannedFilter | None = None,
     block_size: int | None = None,
 ) -> Iterator[Batch]:
     """Yield all packets of a strip, or of the units `numbers`, in batches.
@@ -105,10 +106,10 @@ def _match_lost(lost: np.ndarray, time: np.ndarray, owner: np.ndarray) -> np.nda
     return lost[(values[at] == lost["time"]) & (lost["time"] != 0) & (count[at] < LONGEST_PULSE)]
 
 
-def _choose_packets(unit: Unit, keep: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _choose_packets(unit: Unit, keep: PlannedFilter) -> np.ndarray:
     """Whether a point of each packet of the unit is kept, bool (packets,)."""
     chosen = np.zeros(len(unit.packets.owned) + 1, bool)
-    chosen[unit.packet_of_point[keep(unit.points)]] = True
+    chosen[unit.packet_of_point[keep.test(unit.points, len(unit.points)) == 0]] = True
     if len(unit.context):
-        chosen[unit.packet_of_context[keep(unit.context)]] = True
+        chosen[unit.packet_of_context[keep.test(unit.context, len(unit.context)) == 0]] = True
     return chosen[:-1]  # the last one is that of points without a packet, -1

@@ -16,13 +16,13 @@ from typing import Annotated, Any
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.order import even_places
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.cloud.column_reader import find_keep
+from wavebatch.files.cloud.cloud_reader import CloudReader
+from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter
 from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.pulse_energy import PulseEnergy
@@ -35,11 +35,10 @@ from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
-from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
-from wavebatch.tools.voxels.floor import Floor
+from wavebatch.tools.voxels.floor import Ceiling, Floor, find_ceiling
 from wavebatch.tools.voxels.grid import VoxelGrid, energy_unit
 from wavebatch.tools.voxels.light import find_rule
-from wavebatch.tools.voxels.output import Piece, VoxelSpace, check_target, write_voxels
+from wavebatch.tools.voxels.output import Piece, VoxelSpace, check_voxel_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
 from wavebatch.tools.voxels.profile_file import ProfileWriter
 from wavebatch.tools.voxels.pulses import Batch, read_batches
@@ -81,8 +80,8 @@ class VoxelOptions:
     reflectance_ratio: Annotated[float | None, Range(LOWEST, HIGHEST)] = option(
         None, "Reflectance of the canopy over that of the ground.", form="RATIO", unset="estimated from the strip"
     )
-    where: Condition | None = None
-    """Use only pulses of which a return meets this, with all of their signal."""
+    chosen: PointFilter = PointFilter()
+    """Use only pulses of which a return is chosen, with all of their signal."""
     energy: str | None = None
     """Energy of each emitted pulse, by which the signal is divided; see `find_pulse_energy`."""
 
@@ -172,8 +171,8 @@ def voxelize_strip(
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
-    check_target(target, strip)
-    keep = None if options.where is None else find_keep(strip, options.where)
+    check_voxel_target(target, strip)
+    keep = _plan(strip, options.chosen)
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: the voxels are written to this file; choose another name")
@@ -251,6 +250,14 @@ def voxelize_strip(
                 reflectance_ratio_source=rule.source,
                 hidden_light=rule.hidden_light,
             )
+
+
+def _plan(strip: Path, chosen: PointFilter) -> PlannedFilter | None:
+    """The filter for the points of the strip; None where it leaves none out."""
+    if not chosen:
+        return None
+    with CloudReader(strip) as reader:
+        return reader.plan(chosen)
 
 
 def _write_both(
@@ -369,7 +376,7 @@ def _describe(
         "all_crossed": options.all_crossed or options.forest,
         "forest": options.forest,
         "ground_height_m": options.ground_height,
-        "where": None if options.where is None else options.where.text,
+        "where": None if options.chosen.where is None else options.chosen.where.text,
         "deconvolution": asdict(deconvolution) | {"iterations": deconvolution.steps},
         "system": describe_system(pulse),
         "calibration": None if calibration is None else calibration.describe(),

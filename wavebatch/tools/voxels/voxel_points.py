@@ -10,10 +10,11 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
-from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.cloud.cloud_reader import ColumnFacts
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.npz_reader import read_npz, reading_npz
 from wavebatch.files.las.crs import name_crs
-from wavebatch.tools.plots.values import Selection, Tally
+from wavebatch.tools.plots.values import Tally
 from wavebatch.tools.voxels.grid import COLUMNS
 
 _PIECE = 1_000_000
@@ -29,9 +30,9 @@ class VoxelFile:
     column.
     """
 
-    def __init__(self, path: Path, selection: Selection) -> None:
-        self.paths, self.selection = (path,), selection
-        if selection.flags_with or selection.flags_without:
+    def __init__(self, path: Path, column: str | None, chosen: PointFilter) -> None:
+        self.paths, self._column = (path,), column
+        if chosen.flags or chosen.drop_flags:
             raise ConfigError(f"{path}: voxels have no echo_flags to select by")
         what, remedy = "voxels of `wavebatch voxelize`", "make them again"
         columns = {f"{column.name}?": ("fu", 1) for column in COLUMNS}
@@ -49,12 +50,11 @@ class VoxelFile:
             json.loads(str(self._data["meta"]))
         self.crs = name_crs(str(self._data["crs"])) if str(self._data["crs"]) else ""
         known = {column.name: column for column in COLUMNS if column.name in self._data}
-        name = selection.column
-        if name is not None and name not in known:
-            raise ConfigError(f"{path}: has no column {name!r}; {nearest(name, known)}")
-        drawn = known.get(name)
+        if column is not None and column not in known:
+            raise ConfigError(f"{path}: has no column {column!r}; {nearest(column, known)}")
+        drawn = known.get(column)
         unit, meaning = (drawn.unit, drawn.meaning) if drawn else ("-", "")
-        self.facts = ColumnFacts(name or "voxels", unit, meaning, 0.0)
+        self.facts = ColumnFacts(column or "voxels", unit, meaning, 0.0)
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
         """As Clouds.read, with the height of the centre as second value."""
@@ -64,7 +64,7 @@ class VoxelFile:
             place = self._origin + (self._index[part] + 0.5) * self.size
             rows = np.zeros(len(place), dtype)
             rows["x"], rows["y"], rows["values"][:, 1] = place.T
-            rows["values"][:, 0] = 1.0 if self.selection.column is None else self._data[self.selection.column][part]
+            rows["values"][:, 0] = 1.0 if self._column is None else self._data[self._column][part]
             good = rows[~np.isnan(rows["values"][:, 0])]
             yield 0, good, Tally(len(rows), 0, len(rows) - len(good), len(good))
 

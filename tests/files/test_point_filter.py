@@ -1,0 +1,94 @@
+"""PointFilter: every point that is left out counts for the first test that it does not meet."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.cloud.point_filter import EVERY, REASONS, PointFilter
+from wavebatch.files.geojson import Polygon
+
+ROWS = {
+    "x": np.array([0.0, 1.0, 2.0, 3.0, 4.0, np.nan]),
+    "y": np.zeros(6),
+    "echo_flags": np.array([0, 1, 2, 3, 0, 2], np.uint16),
+    "classification": np.array([2, 2, 2, 2, 6, 2]),
+    "amplitude": np.array([5.0, 9.0, 9.0, 9.0, 9.0, np.nan]),
+}
+
+
+def read(name):
+    return lambda rows: rows[name]
+
+
+def plan(chosen, *lacks):
+    def find(name):
+        if name not in ROWS:
+            raise ConfigError(f"there is no {name!r}")
+        return read(name)
+
+    return chosen.plan({name: read(name) for name in ROWS if name not in lacks}, find, "c.las")
+
+
+def reasons(chosen):
+    return [("", *REASONS)[number] for number in plan(chosen).test(ROWS, 6).tolist()]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "expected"),
+    [
+        (EVERY, [""] * 6),
+        (PointFilter(drop_flags=1), ["", "drop_flags", "", "drop_flags", "", ""]),
+        (PointFilter(flags=3), ["flags", "", "", "", "flags", ""]),
+        (PointFilter(classes=(2, 5)), ["", "", "", "", "classes", ""]),
+        (PointFilter(bbox=(1.0, -1.0, 3.0, 0.0)), ["bbox", "", "", "", "bbox", "bbox"]),
+        (PointFilter.build(where="amplitude > 6"), ["where", "", "", "", "", "where"]),
+        (PointFilter.build(where="not amplitude > 6"), ["", *["where"] * 5]),
+        (
+            PointFilter(drop_flags=1, classes=(2,), bbox=(0.0, 0.0, 2.5, 1.0), where=PointFilter.build(
+                where="amplitude > 6").where),
+            ["where", "drop_flags", "", "drop_flags", "classes", "bbox"],
+        ),
+    ],
+)  # fmt: skip
+def test_the_first_reason_counts(chosen, expected):
+    assert reasons(chosen) == expected
+    assert bool(chosen) == (chosen is not EVERY)
+
+
+def test_points_lie_in_one_of_the_polygons():
+    squares = [Polygon("", (np.array([(x, -1.0), (x + 1.5, -1.0), (x + 1.5, 1.0), (x, 1.0)]),)) for x in (0.5, 2.5)]
+    assert reasons(PointFilter(polygons=tuple(squares))) == ["polygon", "", "polygon", "", "polygon", "polygon"]
+
+
+def test_columns_that_are_missing_are_named():
+    with pytest.raises(ConfigError, match="--where: character 10: there is no 'high'"):
+        plan(PointFilter.build(where="x > 1 or high > 2"))
+    with pytest.raises(ConfigError, match=r"^c\.las: has no column echo_flags to select points by"):
+        plan(PointFilter(flags=1), "echo_flags")
+    assert plan(PointFilter(classes=(2,)), "echo_flags").test(ROWS, 6).any()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"classes": []}, "--classes"),
+        ({"classes": [256]}, "--classes"),
+        ({"bbox": (1.0, 0.0, 1.0, 2.0)}, "--bbox"),
+        ({"bbox": (0.0, 0.0, 1.0, np.inf)}, "--bbox"),
+        ({"drop_flags": "NOTHING"}, "--drop-flags"),
+        ({"where": "x >"}, "--where"),
+        ({"polygon": "none.geojson"}, "none.geojson"),
+    ],
+)
+def test_wrong_options_are_refused(options, words):
+    with pytest.raises(ConfigError, match=words):
+        PointFilter.build(**options)
+
+
+def test_a_filter_travels_between_processes():
+    chosen = PointFilter.build(where="x > 1", classes=[6, 2, 2], bbox=(0, 0, 1, 1), drop_flags="weak,SATURATED")
+    again = pickle.loads(pickle.dumps(chosen))
+    assert again == chosen and again.describe() == chosen.describe()
+    assert again.classes == (2, 6) and again.describe()["drop_flags"] == ["SATURATED", "WEAK"]

@@ -1,0 +1,121 @@
+"""A strip that several processes scan in parts: the scan is that of one process, for any parts and order of points."""
+
+import dataclasses
+import itertools
+import pickle
+
+import numpy as np
+import pytest
+
+from wavebatch.core.errors import InputError
+from wavebatch.files.disk.spool import Spool
+from wavebatch.files.strip import reader as strip_reader
+from wavebatch.files.strip import scanner, shared_packets
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.tools.simulate import simulate_strip
+
+UNIT, WINDOW = 700, 200
+
+
+@pytest.fixture(autouse=True)
+def small_units(monkeypatch):
+    monkeypatch.setattr(strip_reader, "UNIT_POINTS", UNIT)
+    monkeypatch.setattr(shared_packets, "WINDOW", WINDOW)
+    monkeypatch.setattr(scanner, "PART_UNITS", 1)
+
+
+@pytest.fixture(scope="module", params=["las", "laz"])
+def strip(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("scan") / f"a.{request.param}"
+    simulate_strip("forest", path, pulses=2500, seed=4)
+    return path
+
+
+def scan(path, edges=None):
+    """The scan of one process, or of one for all units between two edges each, which send it pickled."""
+    with StripReader(path) as reader:
+        if edges is None:
+            return reader.scan(tolerant=True)
+        parts = [reader.scan_units(*run) for run in itertools.pairwise(edges)]
+        for _ in range(2):  # they go through the process that writes
+            parts = pickle.loads(pickle.dumps(parts))
+        return reader.scan(tolerant=True, parts=parts)
+
+
+def contents(found):
+    """All that a scan holds, as plain values."""
+    values = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+    units = len(found.borders) - 1
+    for name, value in values.items():
+        if isinstance(value, Spool):
+            entries = [value.read(unit) for unit in range(units)]
+            if name == "context":
+                entries = [scanner.unique_entries(part) for part in entries]
+            values[name] = [part.tobytes() for part in entries]
+        elif isinstance(value, np.ndarray):
+            values[name] = value.tolist()
+    return values
+
+
+def check(path):
+    with StripReader(path) as reader:
+        units = reader.unit_count()
+    with scan(path) as whole:
+        expected = contents(whole)
+    assert units >= 6
+    for edges in (range(units + 1), [0, 1, units], [0, units - 1, units], [0, 3, 4, units], [0, units]):
+        with scan(path, edges) as parts:
+            assert contents(parts) == expected
+    return expected
+
+
+def test_parts_give_the_scan_of_one_process(strip):
+    assert check(strip)["with_waveform"]
+
+
+@pytest.mark.parametrize("distance", [30, 150, 10**6])
+def test_parts_of_shuffled_points_too(tmp_path, edit_points, distance):
+    """Returns of a packet lie in several units: within the window, and anywhere in the strip."""
+    draw = np.random.default_rng(2)
+    simulate_strip("forest", tmp_path / "a.las", pulses=2500, seed=4)
+
+    def move(points):
+        return points[np.argsort(np.arange(len(points)) + draw.uniform(0, distance, len(points)))]
+
+    edit_points(tmp_path / "a.las", tmp_path / "b.las", move)
+    assert any(check(tmp_path / "b.las")["context"])
+
+
+def test_a_part_of_few_points_before_a_border_is_not_cut_off(monkeypatch, strip):
+    with StripReader(strip) as reader:
+        units = reader.unit_count()
+        assert reader.cut_scan(3) == [(0, units // 3), (units // 3, 2 * units // 3), (2 * units // 3, units)]
+        monkeypatch.setattr(scanner, "PART_UNITS", 4)
+        assert len(reader.cut_scan(1000)) == units // 4
+        monkeypatch.setattr(shared_packets, "WINDOW", UNIT)  # a window of several units
+        assert reader.cut_scan(3) == [(0, units)]
+
+
+def test_a_strip_without_points_is_one_part():
+    assert scanner.cut_scan(0, 50_000, 8) == [(0, 0)]
+
+
+def test_parts_of_a_damaged_strip_fail_with_the_line_of_one_process(strip):
+    """Wherever the damage is: the first part that fails names the same points."""
+    content = strip.read_bytes()
+    with StripReader(strip) as reader:
+        units, start = reader.unit_count(), reader.facts.header.offset_to_points
+    bad = strip.with_name("bad" + strip.suffix)
+    if strip.suffix == ".las":
+        bad.write_bytes(content[: start + (len(content) - start) // 2])
+    else:
+        wrong = bytes(255 - byte for byte in content[start + 40 : start + 4000])
+        bad.write_bytes(content[: start + 40] + wrong + content[start + 4000 :])
+    lines = []
+    for edges in None, range(units + 1), [0, 2, units]:
+        try:
+            scan(bad, edges).close()
+            lines.append("")
+        except InputError as error:
+            lines.append(str(error))
+    assert len(set(lines)) == 1 and "\n" not in lines[0]

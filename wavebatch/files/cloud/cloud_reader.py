@@ -1,0 +1,368 @@
+"""Point clouds of any program, read in pieces: fields that are asked for, or columns by any of their names.
+
+All commands that read clouds use `CloudReader` with the fields that they need, or a ColumnReader for columns that a
+user names. Units and meanings come from the file; wavebatch's declarations are used only for its columns. All bytes are
+read and checked by wavebatch.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.echoes import COLUMNS
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
+from wavebatch.files.cloud.column_names import STYLES, name_standard, read_field, resolve
+from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
+from wavebatch.files.cloud.provenance import find_written
+from wavebatch.files.disk.closing import Closing
+from wavebatch.files.disk.raw_bytes import widen_integers
+from wavebatch.files.las.checked_header import read_checked_header
+from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
+from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.point_formats import ANGLE_UNIT, read_angles, read_classes, split_numbers
+from wavebatch.files.las.read_points import open_points
+from wavebatch.files.point_dtypes import STANDARD_DTYPES, field_names, list_dimensions
+
+CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
+"""Columns that are read if the cloud has them."""
+
+CLOUD_DTYPE = np.dtype(
+    [
+        ("gps_time", "<f8"),
+        ("xyz", "<f8", 3),
+        ("ray", "<f4", 3),
+        ("flags", "<u2"),
+        ("number", "u1"),
+        ("total", "u1"),
+        ("classification", "u1"),
+        ("intensity", "<u2"),
+        *((name, "<f4") for name in CLOUD_COLUMNS),
+    ]  # fmt: skip
+)
+"""One echo of a cloud, as the comparisons read it."""
+
+RETURN_DTYPE = np.dtype(
+    [
+        ("gps_time", "<f8"),
+        ("xyz", "<f8", 3),
+        ("number", "u1"),
+        ("total", "u1"),
+        ("intensity", "<u2"),
+        ("scan_angle", "<f4"),
+        ("echo_width", "<f4"),
+        ("flags", "<u2"),
+        ("source", "<u2"),
+    ]  # fmt: skip
+)
+"""One return of a cloud. Keep it small: statistics hold many of them in memory."""
+
+_PIECE = 250_000
+_PIECE_BYTES = 1 << 26
+
+_PLACE = np.dtype([("x", "<f8"), ("y", "<f8")])
+
+_UNITS = {
+    "x": "m", "y": "m", "z": "m", "gps_time": "s", "scan_angle": "deg", "scan_angle_rank": "deg",
+    "return_point_wave_location": "ps", "wavepacket_offset": "bytes", "wavepacket_size": "bytes",
+    "x_t": "m/ps", "y_t": "m/ps", "z_t": "m/ps",
+}  # fmt: skip
+"""Units of the standard fields that have one."""
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnFacts:
+    """Name, unit and meaning of a column, as the file or the LAS standard declares them."""
+
+    name: str
+    """Name in the file."""
+    unit: str
+    """`-` if it has none or the file does not give it."""
+    meaning: str
+    """Short description; empty if the file does not give one."""
+    step: float
+    """Difference between two neighbouring values that can be stored; 0 for floating-point numbers."""
+    is_flags: bool = False
+    """Whether values are EchoFlag bits, which have no mean."""
+    is_standard: bool = False
+    """Whether it is a field of the point format, not an extra dimension."""
+
+    @property
+    def label(self) -> str:
+        """Name, meaning and unit for an axis."""
+        title = f"{self.name}: {self.meaning}" if self.meaning else self.name
+        return f"{title} [{self.unit}]"
+
+
+class CloudReader(Closing):
+    """Reads a LAS or LAZ file in pieces. A context manager.
+
+    dtype: the fields to read. They are gps_time [s], xyz [m], ray (the stored packet vector, which may point either
+    way; 0: none), flags (EchoFlag bits), number and total (of returns), classification, intensity, scan_angle [deg],
+    source (point source id), and names of wavebatch columns (NaN: no data). With `ray`, points without a packet are
+    left out if the cloud has packets.
+    Raises InputError if the file is damaged, or compressed in a way that no installed library can read.
+    """
+
+    def __init__(self, path: Path, dtype: np.dtype = CLOUD_DTYPE) -> None:
+        self.path = Path(path)
+        self.dtype = dtype
+        checked = read_checked_header(self.path, waveforms=False)
+        self.point_count: int = checked.header.point_count
+        self.scales: tuple[float, ...] = checked.header.scales
+        self.offsets: tuple[float, ...] = checked.header.offsets
+        self._header = checked.header
+        units = read_crs(self.path, checked.header)[1]
+        self.metres = metres_per_unit(units)
+        """Metres of a step of 1 in x, y and z; NaN in degrees."""
+        self.unit = name_units(units)
+        self.bounds = checked.header.mins, checked.header.maxs
+        self.point_format: int = checked.header.point_format
+        fields = field_names(STANDARD_DTYPES[self.point_format])
+        self.has_gps_time = "gps_time" in fields
+        self.has_packets = "wavepacket_index" in fields
+        self.extra = {field: record for field, record in checked.extra.items() if not record.dtype.shape}
+        """The record of each extra dimension that is one number, by its field."""
+        self._point_length = checked.dtype.itemsize
+        written = find_written(checked.header, self.extra)
+        self.written = {column: name for column, name in written.items() if _may_hold(self.extra[name], column)}
+        """The file's name of each wavebatch column, by its provenance; empty without one. Columns that another
+        program has stored as several numbers, or flags as signed ones, are none."""
+        self._sources = self._find_ours((*field_names(dtype), "echo_flags"))
+        self.columns = tuple(name for name in field_names(dtype) if name in self._sources)
+        """The wavebatch columns among the fields that the cloud has."""
+        self.has_flags = "echo_flags" in self._sources
+        self.records = np.empty(0)
+        """The raw records of the last piece."""
+        self.left_out = 0
+        """Points that the filter of `select` has left out so far."""
+        self._filter: PlannedFilter | None = None
+        self._points = open_points(checked)
+
+    def measure_in_metres(self) -> None:
+        """Let positions be in metres; raises ConfigError for degrees, and for units of unknown length."""
+        if any(map(math.isnan, self.metres)):
+            raise ConfigError(f"{self.path}: coordinates are {self.unit}, which have no length; project it to metres")
+        self.scales = tuple(scale * one for scale, one in zip(self.scales, self.metres, strict=True))
+        self.offsets = tuple(offset * one for offset, one in zip(self.offsets, self.metres, strict=True))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._points.close()
+
+    def read_pieces(self, size: int = _PIECE, most: int = _PIECE_BYTES) -> Iterator[np.ndarray]:
+        """Yield the points of the file in order, at most `size`, and `most` bytes of records, at a time."""
+        size = max(min(size, most // self._point_length), 1)
+        for start in range(0, self.point_count, size):
+            raw = self._points.read(start, min(start + size, self.point_count))
+            if self._filter is not None:
+                kept = self._filter.test(raw, len(raw)) == 0
+                self.left_out += len(raw) - int(np.count_nonzero(kept))
+                raw = np.asarray(raw)[kept]
+            self.records = raw
+            yield self._convert(raw)
+
+    def plan(self, chosen: PointFilter) -> PlannedFilter:
+        """Return the filter for raw records of this file, which also works after the file is closed.
+
+        Raises ConfigError for a column that there is not, and for polygons that cannot be placed.
+        """
+        standard = {
+            "x": lambda raw: read_field(raw, self.point_format, "x", self._header),
+            "y": lambda raw: read_field(raw, self.point_format, "y", self._header),
+            "classification": read_classes,
+            **({"echo_flags": self.read_flags} if self.has_flags else {}),
+        }
+        return chosen.plan(standard, self.find_value, str(self.path))
+
+    def select(self, chosen: PointFilter) -> None:
+        """Let the reader give only the points that a filter chooses; raises as `plan`."""
+        self._filter = self.plan(chosen) if chosen else None
+
+    def read_flags(self, raw: np.ndarray) -> np.ndarray:
+        """Return the EchoFlag bits of raw records, u2 (n,); 0 where the cloud has no flags."""
+        if not self.has_flags:
+            return np.zeros(len(raw), np.uint16)
+        return raw[self._sources["echo_flags"]].astype(np.uint16)
+
+    def _find_ours(self, columns: Iterable[str], *, decibel: bool = False) -> dict[str, str]:
+        """The field of each wavebatch column that the cloud has; decibel: also of those that are written in dB."""
+        if not self.written:
+            return find_columns(self.extra, columns)
+        found = {name: self.written[name] for name in columns if name in self.written}
+        return {name: one for name, one in found.items() if decibel or not self.extra[one].description.endswith("[dB]")}
+
+    def read_extra(self, raw: np.ndarray, field: str) -> np.ndarray:
+        """Return the physical values (n,) of an extra dimension of raw records, with NaN for no data."""
+        return self.extra[field].read(raw[field])
+
+    def list_columns(self) -> list[str]:
+        """Return the names of all columns of the file."""
+        standard = [name for name in list_dimensions(self.point_format) if name not in ("X", "Y", "Z")]
+        return [*self.extra, "x", "y", "z", *standard]
+
+    def find_value(self, column: str) -> ReadColumn:
+        """Return the function from raw records (n,) to the values of a column (n,), NaN for no data.
+
+        Positions are in the unit of the file, also after `measure_in_metres`. It also works after the file is closed.
+        Raises ConfigError if there is no such column.
+        """
+        return self.find_column(column)[1]
+
+    def find_column(self, column: str | None, *, stored: bool = False) -> tuple[ColumnFacts, ReadColumn]:
+        """Return facts and reading function of a column; stored: its name is that in the file."""
+        if column is None:
+            return ColumnFacts("points", "-", "", 1.0), lambda raw: np.ones(len(raw))
+        known = self.list_columns()
+        ours = {} if stored else self._find_ours(COLUMNS, decibel=True)
+        written = {name: found for name, found in ours.items() if name in self.written}
+        standard = name_standard(self.point_format)
+        wanted, column = column, resolve(column, written, {name: name for name in self.extra} | standard, ours)
+        if column in self.extra:
+            return self._describe_extra(column), lambda raw: self.read_extra(raw, column)
+        if column in known:
+            return self._describe_standard(column), lambda raw: read_field(raw, self.point_format, column, self._header)
+        missing = resolve(wanted, {name: name for name in COLUMNS})
+        if missing:
+            raise ConfigError(
+                f"{self.path}: has no column {wanted!r}; `wavebatch run` writes {missing} into clouds"
+                + (f": add --columns +{missing}" if self.written else ", and this is none of them")
+            )
+        hint = nearest(wanted, known)
+        has = "" if hint.startswith("known") else f" Columns of the file: {', '.join(known)}"
+        raise ConfigError(f"{self.path}: has no column {wanted!r}; {hint}{has}")
+
+    def _describe_extra(self, field: str) -> ColumnFacts:
+        """Facts from the description in the file; for a wavebatch column from its declaration."""
+        record = self.extra[field]
+        text = record.description
+        found = re.search(r"\[([^\[\]]+)\]\s*$", text)
+        unit, meaning = (found[1], text[: found.start()].strip()) if found else ("-", text.strip())
+        stored = {stored: column for column, stored in self.written.items()}
+        name = stored.get(field) or re.sub(r"^wb\d*[ _]", "", field)
+        if name in COLUMNS and found and unit == COLUMNS[name].unit:
+            meaning = COLUMNS[name].meaning
+        step = 0.0 if record.dtype.kind == "f" else abs((record.scaling or (1.0,))[0])
+        return ColumnFacts(field, unit, meaning, step, self._sources.get("echo_flags") == field)
+
+    def _describe_standard(self, name: str) -> ColumnFacts:
+        fields = STANDARD_DTYPES[self.point_format]
+        step = 0.0 if name in field_names(fields) and fields[name].kind == "f" else 1.0
+        if name in "xyz":
+            step = abs(float(self.scales["xyz".index(name)]))
+        elif name == "scan_angle":
+            step = ANGLE_UNIT
+        return ColumnFacts(name, _UNITS.get(name, "-"), "", step, is_standard=True)
+
+    def _convert(self, raw: np.ndarray) -> np.ndarray:
+        if "ray" in field_names(self.dtype) and self.has_packets:
+            raw = raw[raw["wavepacket_index"] != 0]
+        rows = np.zeros(len(raw), self.dtype)
+        for name in field_names(self.dtype):
+            values = self._read_named(raw, name)
+            if values is not None:
+                rows[name] = values
+        return rows
+
+    def _read_named(self, raw: np.ndarray, name: str) -> np.ndarray | float | None:
+        """Values of a field of `dtype`; None where the file has none and they are 0."""
+        if name in COLUMNS:
+            return self.read_extra(raw, self._sources[name]) if name in self._sources else np.nan
+        if name == "ray" and self.has_packets:
+            ray = np.stack([widen_integers(raw[axis]) for axis in ("x_t", "y_t", "z_t")], axis=1)
+            ray[~np.isfinite(ray).all(axis=1)] = 0.0  # damaged: as if there were none
+            return ray
+        if name == "gps_time" and self.has_gps_time:
+            return widen_integers(raw["gps_time"])
+        readers = {
+            "xyz": lambda: np.stack([read_field(raw, self.point_format, axis, self) for axis in "xyz"], axis=1),
+            "flags": lambda: self.read_flags(raw),
+            "number": lambda: split_numbers(raw)[0],
+            "total": lambda: split_numbers(raw)[1],
+            "classification": lambda: read_classes(raw),
+            "intensity": lambda: raw["intensity"],
+            "scan_angle": lambda: read_angles(raw),
+            "source": lambda: raw["point_source_id"],
+        }
+        return readers[name]() if name in readers else None
+
+
+class ColumnReader(CloudReader):
+    """A CloudReader of columns for every point: rows have x, y [m] and `values`, f8 (k,) (NaN: no data).
+
+    columns: names of extra dimensions or standard fields, or wavebatch columns in the names of any style. If no name
+    fits exactly, case, spaces and underscores are ignored. None: the value is 1 for every point.
+    missing_ok: columns that the file does not have are left out.
+    `facts` describes the columns.
+    Raises InputError if the file cannot be read, ConfigError if it has no such column.
+    """
+
+    def __init__(self, path: Path, *columns: str | None, missing_ok: bool = False) -> None:
+        super().__init__(path, _PLACE)
+        found = []
+        try:
+            for name in columns:
+                try:
+                    found.append(self.find_column(name))
+                except ConfigError:
+                    if not missing_ok:
+                        raise
+        except BaseException:
+            self.close()
+            raise
+        self.facts: tuple[ColumnFacts, ...] = tuple(facts for facts, _ in found)
+        self._values = [read for _, read in found]
+
+    def _convert(self, raw: np.ndarray) -> np.ndarray:
+        rows = np.zeros(len(raw), [*_PLACE.descr, ("values", "<f8", (len(self._values),))])
+        rows["x"], rows["y"] = (read_field(raw, self.point_format, axis, self) for axis in "xy")
+        for place, read in enumerate(self._values):
+            rows["values"][:, place] = read(raw)
+        return rows
+
+
+def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> dict[str, str]:
+    """Return the field of each column that the cloud has, by the names of its extra dimensions alone.
+
+    For clouds without provenance, which other programs may drop. wavebatch's name is preferred to those of
+    other styles, and a name with the prefix `wb_` (`wb ` in old clouds) to one without. A dimension of another style
+    counts only if it is stored as that style stores it: RIEGL's Amplitude, for example, is in dB.
+    """
+    wanted = set(columns)
+    names: list[tuple[str, str, float | None]] = [(column, column, None) for column in COLUMNS if column in wanted]
+    for style in STYLES.values():
+        names += [(key, naming.name, naming.scale) for key, naming in style.items() if not naming.decibel]
+    found: dict[str, str] = {}
+    for column, name, scale in names:
+        for field in (f"wb_{name.replace(' ', '_')}", f"wb {name}", name):
+            record = extra.get(field) if column in wanted else None
+            if record is not None and (record.scaling is None) == (scale is None) and _may_hold(record, column):
+                found.setdefault(column, field)
+    return found
+
+
+def _may_hold(record: ExtraRecord, column: str) -> bool:
+    """Whether numbers of a dimension may be a column: flags are unsigned integers."""
+    return column != "echo_flags" or record.dtype.kind == "u"
+
+
+def check_alike(readers: Iterable[tuple[Path, ColumnFacts]]) -> ColumnFacts:
+    """Return the facts of a column that several clouds have; raises ConfigError if their units differ.
+
+    Its name is the shortest: one cloud may have `wb_amplitude` beside an `amplitude` of its strip.
+    """
+    readers = list(readers)
+    first_path, first = readers[0]
+    for path, facts in readers[1:]:
+        if (facts.unit, facts.is_flags) != (first.unit, first.is_flags):
+            raise ConfigError(
+                f"{path}: {facts.name} is in [{facts.unit}], {first.name} of {first_path} in [{first.unit}]; plot them "
+                "one by one"
+            )
+    return replace(first, name=min((facts.name for _, facts in readers), key=len))

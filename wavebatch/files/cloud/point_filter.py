@@ -1,0 +1,211 @@
+"""Which points are used: flags, classes, box, polygons and --where, tested and counted in one place.
+
+`run`, `plot`, `stats`, `compare`, `grid` and `voxelize` make a PointFilter of their options. `plan` looks up its
+columns in a file, once; `PlannedFilter.test` tests the rows of every piece.
+Before you change it: a row's values and its neighbours must not depend on what is written, only its return numbers do.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.core.condition import Condition, parse_condition, read_flags
+from wavebatch.core.echoes import COLUMNS, EchoFlag
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.area_crs import describe_miss
+from wavebatch.files.geojson import Polygon, find_inside, load_polygons
+from wavebatch.files.las.header import LasHeader
+
+REASONS = ("drop_flags", "flags", "classes", "bbox", "polygon", "where")
+"""Why a point is left out, in the order of the tests: it counts for the first one that it does not meet."""
+
+ReadColumn = Callable[[Any], np.ndarray]
+"""Gives the values (n,) of a column from rows, NaN for no data."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointFilter:
+    """Which points are used; picklable. By default all."""
+
+    drop_flags: int = 0
+    """EchoFlag bits that points must not have. A row of `run` with one of them is no echo of its pulse, whose return
+    numbers are counted without it.
+    """
+    flags: int = 0
+    """EchoFlag bits of which points must have one; 0: any point."""
+    classes: tuple[int, ...] = ()
+    """Classes that are used; empty: all."""
+    bbox: tuple[float, float, float, float] | None = None
+    """West, south, east, north in the coordinates of the points; the border belongs to it."""
+    polygons: tuple[Polygon, ...] = ()
+    """Points must lie in one of them; in the coordinates of their file, those of the points after `place`."""
+    polygon_file: Mapping[str, Any] | None = None
+    """Path, hash of the corners and CRS of the file of the polygons."""
+    where: Condition | None = None
+    """Points must meet this."""
+
+    def __bool__(self) -> bool:
+        return self != EVERY
+
+    @classmethod
+    def build(
+        cls,
+        *,
+        drop_flags: str | None = None,
+        classes: Sequence[int] | None = None,
+        bbox: Sequence[float] | None = None,
+        polygon: Path | str | None = None,
+        where: Condition | str | None = None,
+    ) -> PointFilter:
+        """Make a filter of the options of a run.
+
+        Returns
+        -------
+        PointFilter
+
+        Raises
+        ------
+        ConfigError
+            For whatever is wrong with them.
+        """
+        flags = 0 if drop_flags is None else read_flags([drop_flags], "--drop-flags")
+        chosen = () if classes is None else tuple(sorted({int(number) for number in classes}))
+        if classes is not None and not (chosen and 0 <= chosen[0] <= chosen[-1] <= 255):
+            raise ConfigError(f"--classes: {list(classes)} must be numbers from 0 to 255, e.g. 2,6")
+        box = None if bbox is None else tuple(map(float, bbox))
+        if box is not None and not (len(box) == 4 and box[0] < box[2] < math.inf and box[1] < box[3] < math.inf):
+            order = "must be west, south, east, north, with west < east and south < north"
+            raise ConfigError(f"--bbox: {list(bbox or ())} {order}")
+        polygons = () if polygon is None else tuple(load_polygons(polygon))
+        return cls(
+            drop_flags=flags,
+            classes=chosen,
+            bbox=box,
+            polygons=polygons,
+            polygon_file=None if polygon is None else _describe_polygons(str(polygon), polygons),
+            where=parse_condition(where) if isinstance(where, str) else where,
+        )
+
+    def place(self, path: Path, header: LasHeader) -> PointFilter:
+        """Return the filter with its polygons in the coordinates of a strip; raises as `Polygon.place`."""
+        return replace(self, polygons=tuple(one.place(path, header) for one in self.polygons))
+
+    def plan(self, standard: Mapping[str, ReadColumn], find: Callable[[str], ReadColumn], name: str) -> PlannedFilter:
+        """Look up the columns that the filter reads.
+
+        Parameters
+        ----------
+        standard : mapping of str to callable
+            The columns echo_flags (without it, no point can be chosen by flags), classification, x and y.
+        find : callable
+            Gives the column that a name of --where means; raises ConfigError where there is none.
+        name : str
+            Of the file, for messages.
+
+        Returns
+        -------
+        PlannedFilter
+
+        Raises
+        ------
+        ConfigError
+            For a column that there is not; with its place in the text of --where.
+        """
+        columns = {} if self.where is None else _find_columns(self.where, find)
+        if (self.flags or self.drop_flags) and "echo_flags" not in standard:
+            raise ConfigError(f"{name}: has no column echo_flags to select points by")
+        return PlannedFilter(self, standard, columns)
+
+    def describe(self) -> dict[str, Any]:
+        """Return plain values for the report and for --resume, with the polygons' corners as a hash and their CRS."""
+        file = self.polygon_file
+        return {
+            "drop_flags": [flag.name for flag in EchoFlag if self.drop_flags & flag],
+            "classes": list(self.classes),
+            "bbox": None if self.bbox is None else list(self.bbox),
+            "polygon": None if file is None else {**file, "file": Path(file["file"]).name},
+            "where": None if self.where is None else self.where.text,
+        }
+
+    def describe_extent(self, header: LasHeader) -> str:
+        """Say that box and placed polygons lie outside a strip by its header; empty where they do not."""
+        areas = [[ring for polygon in self.polygons for ring in polygon.rings]]
+        areas += [] if self.bbox is None else [[np.array(self.bbox).reshape(2, 2)]]
+        return next(filter(None, (describe_miss(area, header) for area in areas if area)), "")
+
+    def list_wanted(self) -> tuple[str, ...]:
+        """Return the wavebatch columns that --where names exactly, so that the chain gets their stages."""
+        named = () if self.where is None else self.where.columns
+        return tuple(name for name in named if name in COLUMNS and COLUMNS[name].extra_bytes)
+
+
+EVERY = PointFilter()
+"""All points."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedFilter:
+    """A filter whose columns are found, from `PointFilter.plan`; picklable if they are."""
+
+    chosen: PointFilter
+    standard: Mapping[str, ReadColumn]
+    columns: Mapping[str, ReadColumn]
+    """Those of --where by their names there."""
+
+    def test(self, rows: Any, n: int) -> np.ndarray:
+        """Test n rows.
+
+        Returns
+        -------
+        int8 (n,)
+            0 for rows that are used; for the others the number of the reason in REASONS, from 1.
+        """
+        left = np.zeros(n, np.int8)
+        for reason, meets in self._test(rows):
+            left[(left == 0) & ~meets] = 1 + REASONS.index(reason)
+        return left
+
+    def _test(self, rows: Any) -> Iterator[tuple[str, np.ndarray]]:
+        """Each test that is asked for, and whether the rows meet it, bool (n,)."""
+        chosen, read = self.chosen, self.standard
+        if chosen.drop_flags:
+            yield "drop_flags", (read["echo_flags"](rows) & np.uint16(chosen.drop_flags)) == 0
+        if chosen.flags:
+            yield "flags", (read["echo_flags"](rows) & np.uint16(chosen.flags)) != 0
+        if chosen.classes:
+            yield "classes", np.isin(read["classification"](rows), chosen.classes)
+        if chosen.bbox is not None or chosen.polygons:
+            x, y = read["x"](rows), read["y"](rows)
+            if chosen.bbox is not None:
+                west, south, east, north = chosen.bbox
+                yield "bbox", (x >= west) & (x <= east) & (y >= south) & (y <= north)
+            if chosen.polygons:
+                inside = [find_inside(one.rings, x, y) for one in chosen.polygons]
+                yield "polygon", np.logical_or.reduce(inside)
+        if chosen.where is not None:
+            yield "where", chosen.where.choose({name: column(rows) for name, column in self.columns.items()})
+
+
+def _find_columns(where: Condition, find: Callable[[str], ReadColumn]) -> dict[str, ReadColumn]:
+    """The columns of a condition by their names there."""
+    columns = {}
+    for column in where.columns:
+        try:
+            columns[column] = find(column)
+        except ConfigError as error:
+            raise where.complain(column, str(error)) from error
+    return columns
+
+
+def _describe_polygons(path: str, polygons: Sequence[Polygon]) -> dict[str, Any]:
+    """All that decides where they lie; the strip's part of it is in its header, which --resume compares too."""
+    corners = b"".join(ring.tobytes() + b"|" for polygon in polygons for ring in polygon.rings)
+    crs = next((polygon.file.crs for polygon in polygons if polygon.file is not None), None)
+    return {"file": path, "corners_sha256": hashlib.sha256(corners).hexdigest(), "crs": crs}
