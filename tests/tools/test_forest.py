@@ -1,5 +1,7 @@
 """Forest metrics of cells from voxels, against forests of discs whose leaf area is known."""
 
+import json
+
 import laspy
 import numpy as np
 import pytest
@@ -162,7 +164,7 @@ def test_the_command_says_what_it_wrote(even, tmp_path):
     pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     arguments = ["grid", even[1], "--forest", "--size", 10, "--bbox", "0,0,20,20", "-o", tmp_path / "f.tif"]
     result = CliRunner().invoke(main, list(map(str, arguments)))
-    assert result.exit_code == 0 and "2 x 2 cells of 10 m, 4 with metrics; 0 without data" in result.output
+    assert result.exit_code == 0 and "2 x 2 cells of 10 m: 4 with metrics, 0 with fewer" in result.output
     for more, words in (
         (["--forest", "--column", "share"], "--forest and --column exclude each other"),
         (["--forest", "--statistic", "max"], "exclude each other"),
@@ -170,3 +172,29 @@ def test_the_command_says_what_it_wrote(even, tmp_path):
     ):
         result = CliRunner().invoke(main, ["grid", str(even[1]), *more, "-o", str(tmp_path / "g.tif")])
         assert result.exit_code == 2 and words in result.output
+
+
+@pytest.mark.parametrize(("option", "words"), [
+    (["--where", "height > 3"], "metrics need all voxels of a cell"),
+    (["--crs", "EPSG:4326"], "coordinates are in degree"),
+])  # fmt: skip
+def test_parts_of_the_voxels_and_degrees_are_refused(even, tmp_path, option, words):
+    """Of voxels above 3 m all cells became no-data, of those below the ground cells had metrics; both in silence."""
+    pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
+    pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
+    arguments = ["grid", str(even[1]), "--forest", "--size", "10", *option, "-o", str(tmp_path / "f.tif")]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2 and words in result.output and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("facts", [
+    {}, {"size_m": "1", "reflectance_ratio": {"ratio": 1.0}}, {"size_m": 1.0, "reflectance_ratio": None},
+    {"size_m": 1.0, "reflectance_ratio": {"ratio": 0.0}},
+])  # fmt: skip
+def test_a_damaged_record_of_voxels_is_one_line(even, tmp_path, facts):
+    voxels = laspy.read(even[1])
+    (record,) = [vlr for vlr in voxels.vlrs if vlr.user_id == "wavebatch" and vlr.record_id == 1]
+    record.record_data = json.dumps({"forest": True} | facts).encode()
+    voxels.write(tmp_path / "v.laz")
+    with pytest.raises(ConfigError, match="its record of voxels is damaged"):
+        Forest([tmp_path / "v.laz"], 10.0, ForestOptions())

@@ -72,7 +72,8 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
         share = f"{100 * found.filled / cells:.1g} % of the cells have a value"
         talk(f"warning: {output}: only {share}: if clouds lie far apart, make a raster of each")
     tell(f"{output}: {_summarise(found, columns)}")
-    answer({"output": str(output), "clouds": [str(path) for path in paths], "statistic": options["statistic"],
+    statistic = None if forest else options["statistic"]
+    answer({"output": str(output), "clouds": [str(path) for path in paths], "statistic": statistic,
             **_describe(found, columns)})  # fmt: skip
 
 
@@ -82,8 +83,9 @@ def _summarise(found: GridResult, columns: Sequence[str]) -> str:
     if found.reasons:
         known, few, dark = found.reasons
         return (
-            f"{count(found.points, 'voxel')}, {layout.columns} x {layout.rows} cells of {layout.size:g} {layout.unit}, "
-            f"{known} with metrics; {few} without data: fewer than 10 rays; {dark}: no light on the ground"
+            f"{count(found.points, 'voxel')}, {found.outside} outside; {layout.columns} x {layout.rows} cells of "
+            f"{layout.size:g} {layout.unit}: {known} with metrics, {few} with fewer than 10 rays, "
+            f"{dark} without light on the ground"
         )
     parts = [f"{name or 'points'} {values} values, {used - values} without data"
              for name, values in zip(columns or ("",), found.values, strict=True)]  # fmt: skip

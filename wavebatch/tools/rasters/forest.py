@@ -278,9 +278,20 @@ def _read_facts(path: Path) -> dict:
         except ValueError:
             continue
         if isinstance(facts, dict) and facts.get("forest"):
-            return facts
+            return _check_facts(facts, path)
     raise ConfigError(f"{path}: --forest needs voxels: wavebatch voxelize STRIP --size 1 --forest -o voxels.laz")
 
 
+def _check_facts(facts: dict, path: Path) -> dict:
+    """The record, with a size and a ratio of reflectances that voxelize can have written; ConfigError for others."""
+    ratio = facts.get("reflectance_ratio")
+    ratio = ratio if isinstance(ratio, dict) else {}
+    numbers = facts.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
+    if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
+        raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it anew with "
+                          "wavebatch voxelize --forest")  # fmt: skip
+    return facts
+
+
 def _read_error(ratio: dict) -> float:
-    return ASSUMED_ERROR if ratio["source"] == "assumed" else (ratio["error"] or 0.0) / ratio["ratio"]
+    return ASSUMED_ERROR if ratio.get("source") == "assumed" else (ratio.get("error") or 0.0) / ratio["ratio"]

@@ -80,11 +80,17 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     """
     metrics = None
     if options.forest is not None:
+        if options.chosen:
+            raise ConfigError("--forest: metrics need all voxels of a cell: leave out --where, --class and flags; "
+                              "--bbox takes whole cells")  # fmt: skip
         metrics = forest.Forest(paths, options.size, options.forest)
         options = replace(options, columns=tuple(forest.COLUMNS))
     _check(options)
     options = replace(options, bbox=_grow(options.bbox, options.size))
     crs, unit, unnamed = _find_crs(paths, options.crs)
+    if metrics is not None and unit != "m":
+        raise ConfigError(f"{paths[0]}: --forest: voxels are measured in metres, and coordinates are in {unit}; "
+                          "project the strip to a CRS in metres first")  # fmt: skip
     clouds = Clouds(paths, options.columns or (None,), options.chosen)
     facts = (clouds.facts, *clouds.other_facts)
     for one in facts:
