@@ -153,7 +153,7 @@ def test_stages_after_it_see_its_columns_whatever_the_units(strips, clouds, tmp_
 
 
 def test_without_its_columns_there_is_no_second_pass(strips, tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.batch.strip_task.SecondPass", None)
+    monkeypatch.setattr("wavebatch.batch.neighbour_pass.SecondPass", None)
     report = run_strip(strips / "slope.las", tmp_path, columns="echo_flags")
     assert not report.no_data
     assert COLUMNS[0] not in laspy.read(tmp_path / "slope.laz").point_format.dimension_names

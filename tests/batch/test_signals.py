@@ -94,8 +94,8 @@ main()
 _COUNTING = """
 from wavebatch.batch import run
 begin = run.StripTask.start
-def count(self):
-    begin(self)
+def count(self, *parts):
+    begin(self, *parts)
     while True:
         pass
 run.StripTask.start = count
@@ -167,9 +167,9 @@ class Lost:
 
 start = run.StripTask.start
 
-def lose(self):
+def lose(self, *parts):
     Lost()
-    return start(self)
+    return start(self, *parts)
 
 run.StripTask.start = lose
 main()

@@ -46,7 +46,7 @@ def test_info_prints_text_and_json(tmp_path):
     path = make_raw().write(tmp_path / "a.las")
     text = run("info", path)
     assert text.exit_code == 0
-    for word in ("point format 4", "packets        40", "toward the sensor", "32 samples of 8 bits", "CRS"):
+    for word in ("point format 4", "packets           40", "toward the sensor", "32 samples of 8 bits", "CRS"):
         assert word in text.stdout
     result = run("info", path, "--json")
     facts = json.loads(result.stdout)  # with header and points, which every LAS file has

@@ -166,8 +166,8 @@ def test_a_part_of_the_strip_and_a_saved_survey(mixed, tmp_path):
 
 
 def test_text_has_every_table(mixed):
-    out = call("compare", "--strip", mixed / "s.las", "fast", mixed / "accurate" / "s.laz").stdout
-    for words in ("identical are", "more points", "missed, of B's", "extra, of A's", "return 1 of 2", "flag ",
+    out = " ".join(call("compare", "--strip", mixed / "s.las", "fast", mixed / "accurate" / "s.laz").stdout.split())
+    for words in ("identical, of all", "more points", "missed, of B's", "extra, of A's", "return 1 of 2", "flag ",
                   "/waveform", "mean E0", "A single", "B no-data"):  # fmt: skip
         assert words in out, words
     call("compare", "--strip", mixed / "s.las", "fast", "accurate", "--min-completeness", 1.0, code=1)

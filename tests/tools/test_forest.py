@@ -134,7 +134,7 @@ def test_voxels_have_what_forests_need(even, tmp_path):
     np.testing.assert_allclose(voxels["height"], voxels.z - 100.0, atol=0.1)
     assert (voxels["free_path"] <= voxels["path"] * (1 + 1e-6)).all()
     shown = CliRunner().invoke(main, ["info", str(even[1])]).output
-    assert "command        wavebatch voxelize s.las --size 1 --forest" in shown and "{" not in shown
+    assert "command           wavebatch voxelize s.las --size 1 --forest" in shown and "{" not in shown
 
 
 def test_other_clouds_sizes_and_cells_are_refused(even, tmp_path, forest_strip):
