@@ -77,6 +77,12 @@ def test_layout_with_comments():
     )
 
 
+def test_empty_comments_write_no_line():
+    document = {"x": 1, "rows": [1], "table": {"x": 2}, "many": [{"x": 3}]}
+    comments = dict.fromkeys(["x", "rows", "table", "table.x", "many", "many.x"], " ")
+    assert format_toml(document, comments=comments) == format_toml(document)
+
+
 def test_inline_tables_in_mixed_lists():
     document = {"a": [1, {"b": 2, "c d": []}], "e": [[{"f": "g"}]]}
     assert tomllib.loads(format_toml(document)) == document

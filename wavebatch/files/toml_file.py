@@ -61,8 +61,8 @@ def format_toml(document: Mapping[str, Any], *, heading: str = "", comments: Map
     heading : str
         Comment on the first line.
     comments : mapping of str to str
-        Comments by dotted key, for example "system.kappa". A comment stands after a plain value, and on the line
-        above an array or a table. All tables of an array share their comments.
+        Comments by dotted key, for example "system.kappa"; an empty one is none. A comment stands after a plain
+        value, and on the line above an array or a table. All tables of an array share their comments.
 
     Raises
     ------
@@ -113,8 +113,8 @@ def _format_table(table: Mapping[str, Any], prefix: str, comments: Mapping[str, 
     for path, value, is_tables in nested:
         for item in value if is_tables else [value]:
             yield ""
-            if path in comments:
-                yield f"# {_one_line(comments[path])}"
+            if comment := _one_line(comments.get(path, "")):
+                yield f"# {comment}"
             yield f"[[{path}]]" if is_tables else f"[{path}]"
             yield from _format_table(item, f"{path}.", comments)
 

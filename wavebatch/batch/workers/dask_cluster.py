@@ -1,7 +1,7 @@
 """Workers of an existing dask cluster, for `wavebatch run --scheduler`; files must be visible to all machines.
 
-`Cluster` has the same methods as `processes.Workers`. Work goes to workers that were asked whether they fit: those that
-are there when the run starts must, of those that join later the others get no work.
+`Cluster` has the same methods as `processes.Workers`. Work goes to workers that were asked whether they fit: those
+that are there when the run starts must fit; of those that join later, only workers that fit get work.
 Before you change it: calls and results travel as bytes, because dask takes tuples with functions for tasks and makes
 arrays read-only; and a cluster that is lost must end the run with a message, never hang it.
 """

@@ -1,7 +1,7 @@
 """Whether a worker of a cluster fits: same programs, same kind of processor, same files. Runs on the workers.
 
-`dask_cluster` asks all workers before anything starts; those that join later get no work. Before you change it: a
-worker that does not fit must never make a row of a cloud.
+`dask_cluster` asks all workers before anything starts, and each that joins later before it gets work. Before you change
+it: a worker that does not fit must never make a row of a cloud.
 """
 
 from __future__ import annotations
