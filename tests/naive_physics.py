@@ -7,7 +7,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq, curve_fit
 from scipy.special import log_ndtr
 
-from wavebatch.kernels.physics.angle_errors import RADIUS
+from wavebatch.kernels.physics.incidence import RADIUS
 
 LIGHT = 0.299792458
 

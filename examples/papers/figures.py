@@ -20,7 +20,7 @@ from wavebatch.files.figure_file import open_picture
 from wavebatch.kernels.physics.incidence import paper_table, pulse_table, spread_of_angle
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
-from wavebatch.stages.detect.wavelet import transform, wavelet
+from wavebatch.stages.detect.transformed import transform, wavelet
 from wavebatch.tools.simulate.from_returns import synthesize_strip
 from wavebatch.tools.simulate.returns import SynthesisOptions
 

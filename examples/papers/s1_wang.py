@@ -22,11 +22,10 @@ from wavebatch.kernels.signal.signal import find_peaks
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.loops import residual_loop
-from wavebatch.stages.decompose.rebuild import render_table
-from wavebatch.stages.decompose.skew import skewed
+from wavebatch.stages.decompose.models import render_table, skewed
 from wavebatch.stages.detect.candidates import signal_above
 from wavebatch.stages.detect.maximum import maximum
-from wavebatch.stages.detect.wavelet import wavelet
+from wavebatch.stages.detect.transformed import wavelet
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block

@@ -20,8 +20,7 @@ import wavebatch as wb
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse
-from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
-from wavebatch.kernels.physics.radiometry import transmit
+from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section, transmit
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.tools.return_stats import ReturnStats, count_returns

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry.bends import LEAST_POINTS, find_bend
+from wavebatch.kernels.geometry.slice_lines import LEAST_POINTS, find_bend
 
 
 def naive_gains(x, y):

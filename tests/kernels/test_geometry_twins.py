@@ -4,10 +4,16 @@ import naive_geometry
 import numpy as np
 
 from wavebatch.kernels.geometry import normals
-from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, find_pulses, find_rays, group_times
+from wavebatch.kernels.geometry.group_returns import (
+    LONGEST_PULSE,
+    find_pulses,
+    find_rays,
+    fit_rays,
+    group_pulses,
+    group_times,
+)
 from wavebatch.kernels.geometry.normals import thin_out
-from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
-from wavebatch.kernels.geometry.two_lines import LEAST_VARIETY, in_two_lines
+from wavebatch.kernels.geometry.planes import LEAST_VARIETY, in_two_lines
 from wavebatch.kernels.physics.radiometry import known_distance, slope_error
 
 

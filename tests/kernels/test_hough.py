@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from published import paint_slice
 
-from wavebatch.kernels.geometry.hough import THETA_STEP, _Accumulator, find_lines
-from wavebatch.kernels.geometry.scan_lines import LAG, find_sweeps
+from wavebatch.kernels.geometry.slice_lines import LAG, THETA_STEP, _Accumulator, find_lines, find_sweeps
 
 
 def detect(image, sigma=8.0, **options):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.physics.angle_errors import angles_above, angles_of_variance
 from wavebatch.kernels.physics.incidence import (
     angle_of_spread,
+    angles_above,
+    angles_of_variance,
     build_table,
     direct_width,
     paper_table,

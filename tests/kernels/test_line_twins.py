@@ -4,8 +4,7 @@ import naive_geometry
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry.hough import find_lines
-from wavebatch.kernels.geometry.scan_lines import LAG, find_sweeps
+from wavebatch.kernels.geometry.slice_lines import LAG, find_lines, find_sweeps
 from wavebatch.kernels.geometry.tiles import cut_tiles, is_inside, sort_into_tiles
 
 

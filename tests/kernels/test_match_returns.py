@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry.match_returns import match_returns
+from wavebatch.kernels.geometry.group_returns import match_returns
 
 
 def draw(rng, n, most, step=None):

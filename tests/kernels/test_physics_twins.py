@@ -8,9 +8,9 @@ import naive_signal
 import numpy as np
 import pytest
 
-from wavebatch.kernels.physics import angle_errors, incidence, radar, radiometry
+from wavebatch.kernels.physics import incidence, radiometry
 from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
-from wavebatch.kernels.physics.pulse_energies import judge_energies
+from wavebatch.kernels.physics.radiometry import judge_energies
 
 HOSTILE = [math.nan, math.inf, -math.inf, 0.0, -5.0, 1e-30, 1e30]
 BETA = 5e-4
@@ -73,9 +73,9 @@ def test_radiometry_is_that_of_single_echoes(echoes):
 def test_received_power_is_that_of_light_on_its_way(rng):
     distance, section = rng.uniform(10, 5000, 60), rng.uniform(1e-4, 10, 60)
     device = {"transmitted": 3.0, "aperture": 0.1, "divergence": BETA, "efficiency": 0.7, "attenuation": 0.4}
-    found = radar.receive_power(section, distance, **device)
+    found = radiometry.receive_power(section, distance, **device)
     assert_equal(found, one_by_one(naive_physics.receive_power, section, distance, *device.values()))
-    found = radar.spread_cross_section(0.3, distance, BETA)
+    found = radiometry.spread_cross_section(0.3, distance, BETA)
     assert_equal(found, one_by_one(naive_physics.spread_cross_section, 0.3, distance, BETA))
 
 
@@ -106,7 +106,7 @@ def test_angles_of_variances_are_those_of_single_echoes(rng):
     error, distance = mixed(rng, 0.01, 1.0), mixed(rng, 300, 900)
     variance = rng.normal(0, 1, 60) * rng.choice([0.03, 1.0, 40.0], 60)
     variance[rng.permutation(60)[:3]] = math.nan, math.inf, 1e7
-    found = angle_errors.angles_of_variance(variance, error, distance, 1.1e-3)
+    found = incidence.angles_of_variance(variance, error, distance, 1.1e-3)
     for row in range(60):
         expected = naive_physics.angle_of_variance(variance[row], error[row], distance[row], 1.1e-3)
         assert (found[0][row], found[1][row]) == pytest.approx(expected, nan_ok=True, rel=1e-9), row
@@ -116,7 +116,7 @@ def test_angles_of_variances_are_those_of_single_echoes(rng):
 def test_angles_above_a_threshold_are_those_of_the_conditional_law(rng, threshold):
     over, error = np.r_[0.01, 0.05, rng.uniform(0.1, 7.9, 20), 9.0, 40.0, 1e4], rng.uniform(0.1, 1.0, 25)
     variance, distance = error * (threshold + over), rng.uniform(300, 900, 25)
-    found = angle_errors.angles_above(variance, error, distance, 1.1e-3, threshold)
+    found = incidence.angles_above(variance, error, distance, 1.1e-3, threshold)
     for row in range(25):
         expected = naive_physics.angle_above(variance[row], error[row], distance[row], 1.1e-3, threshold)
         assert (found[0][row], found[1][row]) == pytest.approx(expected, nan_ok=True, rel=2e-3), row

@@ -7,15 +7,18 @@ from scipy.spatial import cKDTree
 
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.kernels.geometry.normals import MOST_PER_CELL, Gap, Surroundings, find_edges, measure_normals, thin_out
-from wavebatch.kernels.geometry.plane_halves import DOUBTFUL, SURE, compare_halves, misfit_of_angles
 from wavebatch.kernels.geometry.planes import (
+    DOUBTFUL,
     LEAST_SPREAD,
     OUTLYING,
     SMOOTH,
+    SURE,
     TIGHT,
+    compare_halves,
     fit_planes,
     is_flat,
     measure_angles,
+    misfit_of_angles,
 )
 from wavebatch.kernels.geometry.tiles import cut_tiles, is_inside, sort_into_tiles
 

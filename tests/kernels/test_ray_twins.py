@@ -4,8 +4,7 @@ import naive_geometry
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry.group_returns import number_returns
-from wavebatch.kernels.geometry.pulse_rays import fit_rays
+from wavebatch.kernels.geometry.group_returns import fit_rays, number_returns
 from wavebatch.kernels.geometry.ray_convergence import fit_best, fit_sensor, range_error, sensor_at
 
 

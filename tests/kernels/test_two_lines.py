@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wavebatch.kernels.geometry.normals import Gap, Surroundings, measure_normals
-from wavebatch.kernels.geometry.two_lines import in_two_lines
+from wavebatch.kernels.geometry.planes import in_two_lines
 
 DOWN = np.array([0.0, 0.0, -1.0])
 

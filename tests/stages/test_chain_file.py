@@ -144,6 +144,6 @@ def test_choices_are_checked(monkeypatch):
         """
 
     chain_module.stage("noise")(pick)
-    monkeypatch.setattr("wavebatch.stages.plugins.STAGES", chain_module.STAGES)
+    monkeypatch.setattr("wavebatch.stages.chain_file.STAGES", chain_module.STAGES)
     with pytest.raises(ConfigError, match='kind must be one of "a", "b", it is "c"'):
         parse_chain('[[chain]]\nstage = "noise.pick"\nkind = "c"\n', "x")

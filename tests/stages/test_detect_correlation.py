@@ -19,8 +19,8 @@ from wavebatch.kernels.signal.square_differences import (
     square_differences,
 )
 from wavebatch.stages.chain import STAGES
-from wavebatch.stages.detect.correlation import parabola_shift
-from wavebatch.stages.reference_pulse import reference_pulse
+from wavebatch.stages.detect.transformed import parabola_shift
+from wavebatch.stages.pulse_tables import reference_pulse
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.simulate import simulate_block
 

@@ -19,7 +19,7 @@ from wavebatch.kernels.signal.deconvolve import (
 )
 from wavebatch.kernels.signal.filters import b3_detail, b3_gain, b3_level
 from wavebatch.stages.chain import STAGES
-from wavebatch.stages.detect.wavelet import transform
+from wavebatch.stages.detect.transformed import transform
 
 GAUSS = np.exp(-0.5 * (np.arange(-6, 7) / 2) ** 2)
 SKEWED = np.exp(-0.5 * (np.log1p(0.12 * np.arange(-6, 7)) / 0.24) ** 2)

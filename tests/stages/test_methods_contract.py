@@ -10,6 +10,7 @@ from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.chain import STAGES
+from wavebatch.stages.detect import transformed
 from wavebatch.stages.pulse_tables import error_factors, pulse_shape
 
 PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
@@ -68,14 +69,13 @@ def test_variants_give_the_same_bits_for_any_block_size(name, parameters):
 
 def test_parts_of_a_block_do_not_show(monkeypatch):
     """More waveforms than are worked on at a time."""
-    from wavebatch.stages.detect import correlation, wavelet
 
     block = scene_blocks()["mixed"].rows(slice(0, 60))
     system = surveying.survey_block(block).system
     names = ("detect.asdf", "detect.correlation", "detect.richardson_lucy")
     whole = [call(name, {}, block, system) for name in names]
-    monkeypatch.setattr(correlation, "COLUMNS_AT_A_TIME", 7)
-    monkeypatch.setattr(wavelet, "AT_A_TIME", 7)
+    monkeypatch.setattr(transformed, "COLUMNS_AT_A_TIME", 7)
+    monkeypatch.setattr(transformed, "AT_A_TIME", 7)
     for name, table in zip(names, whole, strict=True):
         assert_same(call(name, {}, block, system), table)
         assert np.unique(table.waveform).size > 40

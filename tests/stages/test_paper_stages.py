@@ -16,7 +16,7 @@ from wavebatch.kernels.signal.filters import filter_antisymmetric, slope_taps
 from wavebatch.kernels.signal.runs import find_runs, run_moments
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import parse_chain
-from wavebatch.stages.decompose.rebuild import rebuild_waveforms
+from wavebatch.stages.decompose.models import rebuild_waveforms
 
 SYSTEM = known_system(fine_recording(1.0, SIGMA))
 

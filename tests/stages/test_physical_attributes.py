@@ -16,8 +16,8 @@ from wavebatch.files.cloud.column_names import describe
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.physics.incidence import spread_of_angle
-from wavebatch.kernels.physics.radar import receive_power
-from wavebatch.stages.attribute.light import echo_light
+from wavebatch.kernels.physics.radiometry import receive_power
+from wavebatch.stages.attribute.radiometry import echo_light
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits

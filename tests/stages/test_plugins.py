@@ -15,8 +15,7 @@ from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.stages import chain as chain_module
 from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import effective, parse_chain
-from wavebatch.stages.plugins import load_plugins
+from wavebatch.stages.chain_file import effective, load_plugins, parse_chain
 
 GOOD = '''
 from typing import Annotated

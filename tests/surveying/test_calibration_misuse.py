@@ -16,7 +16,7 @@ from tests.footprints import Flight, Plane
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.kernels.physics.pulse_energies import judge_energies
+from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions

@@ -13,8 +13,8 @@ from wavebatch.core.system import LevelWidths, ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.physics.angle_errors import angles_of_variance
-from wavebatch.stages.attribute.width_angle import added_variance
+from wavebatch.kernels.physics.incidence import angles_of_variance
+from wavebatch.stages.attribute.incidence_angle import added_variance
 from wavebatch.surveying.angle_limits import REFERENCE_ERROR, SLOPE, predict_angles
 from wavebatch.tools.compare.angle_table import ANGLES, format_angles, tabulate_angles
 

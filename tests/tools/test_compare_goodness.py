@@ -8,7 +8,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES, Step
-from wavebatch.stages.decompose.rebuild import fitted_pulse, rebuild_waveforms
+from wavebatch.stages.decompose.models import fitted_pulse, rebuild_waveforms
 from wavebatch.tools.compare.chains import FitQuality, measure_fit
 
 FINE = 100.0

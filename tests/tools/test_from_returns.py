@@ -11,9 +11,8 @@ from click.testing import CliRunner
 from wavebatch.cli.simulate import synthesize
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
-from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
-from wavebatch.kernels.physics.radiometry import transmit
+from wavebatch.kernels.geometry.group_returns import fit_rays, group_pulses
+from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section, transmit
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.compare.clouds import compare_clouds
 from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, returns, simulate_returns

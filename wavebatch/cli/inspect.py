@@ -239,7 +239,7 @@ def stages(name: str | None, as_json: bool, quiet: bool, debug: bool) -> None:
     Exit code: 0 done, 2 no stage has this name.
     """
     from wavebatch.stages.chain import KINDS, STAGES
-    from wavebatch.stages.plugins import load_plugins
+    from wavebatch.stages.chain_file import load_plugins
 
     for line in load_plugins() if name not in STAGES else ():
         talk(f"warning: {line}")

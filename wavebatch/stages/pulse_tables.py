@@ -1,16 +1,19 @@
-"""The strip's pulse in samples, as kernels need it, with tables that turn fitted widths into echo widths.
+"""The strip's pulse in samples and its tables: detectors, decomposers, attributes and the survey call it.
 
-A learned pulse is a sum of Gaussians: kernels fit its main component, echo tables describe the whole pulse. Kernels
-place a skewed pulse by its peak; echo tables place every pulse by its datum.
+Tables turn fitted widths into echo widths. A learned pulse is a sum of Gaussians: kernels fit its main component, echo
+tables describe the whole pulse. Kernels place a skewed pulse by its peak; echo tables place every pulse by its datum.
+
+`reference_pulse` gives what detectors and decomposers compare waveforms with: samples of unit height and their peak.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, interpolate, log, solve
@@ -24,6 +27,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     measure_pulse,
 )
 from wavebatch.kernels.fit.whole_pulse import NO_ROWS, STRETCHED, SUMMED, WholePulse, describe_whole
+from wavebatch.kernels.signal.filters import refine_peaks
 from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, coloured_variance, whitening_filter
 
 
@@ -445,3 +449,77 @@ def _invert(table: PulseMeasures, echoes: np.ndarray) -> np.ndarray:
     amplitude, time, sigma = echoes.T
     width = np.interp(sigma, table.half_width / FWHM_PER_SIGMA, table.width)
     return np.stack([amplitude / np.interp(width, table.width, table.peak), time, width], axis=1)
+
+
+ReferenceKind = Literal["gaussian", "system", "given"]
+
+
+class PulseReference(NamedTuple):
+    """Samples of a reference pulse."""
+
+    taps: np.ndarray
+    """float64 (k,), k odd; peak about 1."""
+    peak: float
+    """Place of the peak, of the survey's pulse that of its datum, among the samples; times of echoes refer to it."""
+
+    @property
+    def middle(self) -> int:
+        """Index of the middle sample."""
+        return (len(self.taps) - 1) // 2
+
+
+def reference_pulse(
+    system: SystemPulse, spacing: float, kind: ReferenceKind, reach: float = 5.0, pulse: str = ""
+) -> PulseReference:
+    """Sample the reference pulse: a Gaussian of the system's width, the pulse of the survey, or a given one.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+    kind : {"gaussian", "system", "given"}
+        Which pulse.
+    reach : float
+        Half of its length, in widths of the system pulse.
+    pulse : str
+        Samples of the given pulse, separated by spaces.
+
+    Returns
+    -------
+    Reference
+        Samples and peak.
+
+    Raises
+    ------
+    ConfigError
+        Where the given samples are no pulse.
+    """
+    if kind == "given":
+        return _read_pulse(pulse)
+    half = int(np.ceil(reach * system.sigma_ref / spacing))
+    x = np.arange(-half, half + 1, dtype=np.float64)
+    if kind == "gaussian":
+        return PulseReference(exp(-0.5 * (x * spacing / system.sigma_ref) ** 2), float(half))
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    flat = np.array([[1.0, 0.0, limits.ref]])
+    (peak, datum, _), *_ = describe_fitted(shape, limits, flat, np.ones((1, 3)), np.zeros((1, 2)))[0]
+    taps = evaluate_pulse(shape, x[:, None], np.full(1, -datum), np.full(1, limits.ref))[0][:, 0]
+    return PulseReference(taps / peak, float(half))
+
+
+@lru_cache(maxsize=8)
+def _read_pulse(text: str) -> PulseReference:
+    try:
+        samples = np.array([float(word) for word in text.split()])
+    except ValueError as error:
+        raise ConfigError(f"pulse must be numbers separated by spaces, it is {text!r}: {error}") from error
+    if len(samples) < 3 or not np.isfinite(samples).all() or not samples.max() > 0:
+        raise ConfigError(f"pulse must have at least three samples and a positive peak, it is {text!r}")
+    if len(samples) % 2 == 0:
+        samples = np.append(samples, 0.0)
+    samples = samples / samples.max()
+    top = np.array([int(np.argmax(samples))])
+    peak, height = refine_peaks(samples[:, None], np.zeros(1, np.int64), top)
+    return PulseReference(samples / height[0], float(peak[0]))

@@ -16,8 +16,7 @@ from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.physics.angle_errors import angles_of_variance
-from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
+from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import Decision, Part, Survey
 from wavebatch.surveying.choose_chain import sample_size

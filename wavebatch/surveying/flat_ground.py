@@ -23,8 +23,8 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.geometry.normals import Surroundings, grow_tree, measure_normals, thin_out
-from wavebatch.kernels.geometry.two_lines import in_two_lines
-from wavebatch.stages.attribute.width_angle import added_variance
+from wavebatch.kernels.geometry.planes import in_two_lines
+from wavebatch.stages.attribute.incidence_angle import added_variance
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
 from wavebatch.surveying.measuring.residuals import decompose_sample

@@ -14,7 +14,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.runs import find_stretches
 from wavebatch.stages.chain import Chain
-from wavebatch.stages.decompose.rebuild import rebuild_waveforms
+from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.choose_chain import sample_size

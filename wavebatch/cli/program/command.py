@@ -189,7 +189,7 @@ def complete_columns(context: click.Context, parameter: click.Parameter, incompl
 def complete_stages(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
     """Complete the names of stages, those of other packages too."""
     from wavebatch.stages.chain import STAGES
-    from wavebatch.stages.plugins import load_plugins
+    from wavebatch.stages.chain_file import load_plugins
 
     load_plugins()
     return sorted(name for name in STAGES if name.startswith(incomplete))

@@ -1,13 +1,19 @@
-"""Which points belong to one pulse, which return is nearest to an echo, and return numbers along the ray.
+"""Points, pulses and returns, which belong together: the writer of clouds, positions, voxels and the simulator call it.
 
-Used where clouds are written and compared. Nothing here may depend on other pulses than that of the point.
+Which points are one pulse, which return is nearest to an echo, and return numbers along the ray: nothing here may
+depend on other pulses than that of the point. `match_returns` pairs echoes and returns of a whole block, one to one,
+nearest in time (kernels/c/returns.h). `fit_rays` gives the rays of discrete returns: where each pulse came from.
 """
 
 from __future__ import annotations
 
+import ctypes
+
 import numpy as np
 
 from wavebatch.core.order import find_order
+from wavebatch.core.units import MAD_TO_STD
+from wavebatch.kernels.library import call
 
 LONGEST_PULSE = 64
 """From this many points of equal GPS time on, the time is a constant and not that of one pulse."""
@@ -201,3 +207,117 @@ def number_returns(
     number = np.empty(m, np.int64)
     number[order] = np.arange(m) - first[group[order]] + 1
     return number, np.bincount(group)[group], has_ray[head]
+
+
+def match_returns(
+    echo_waveform: np.ndarray,
+    echo_time: np.ndarray,
+    return_waveform: np.ndarray,
+    return_time: np.ndarray,
+    tolerance: float,
+) -> np.ndarray:
+    """The return that each echo is matched with.
+
+    Pairs are mutual nearest neighbours within one waveform. Taken pairs are removed and the rest is paired again, until
+    no pair is left.
+
+    Parameters
+    ----------
+    echo_waveform, echo_time : int (m,), float (m,), ns
+        Echoes, sorted by waveform.
+    return_waveform, return_time : int (k,), float (k,), ns
+        Returns, sorted by waveform.
+    tolerance : float, ns
+        Largest distance of a pair.
+
+    Returns
+    -------
+    int64 (m,)
+        Row of the return, -1 without one.
+    """
+    echo_waveform, return_waveform = (np.ascontiguousarray(w, np.int64) for w in (echo_waveform, return_waveform))
+    echo_time, return_time = (np.ascontiguousarray(time, np.float64) for time in (echo_time, return_time))
+    m, k = len(echo_waveform), len(return_waveform)
+    if echo_time.shape != (m,) or return_time.shape != (k,):
+        raise ValueError("an echo or a return has no time")
+    matched = np.empty(m, np.int64)
+    call("match_returns", ctypes.c_int64(m), echo_waveform, echo_time, ctypes.c_int64(k), return_waveform, return_time,
+         ctypes.c_double(tolerance), matched)  # fmt: skip
+    return matched
+
+
+OWN = 0.5
+"""Pulses whose first and last return are at least this far apart [m] have their own direction."""
+_SURE = 2.0
+"""Distance of first and last return [m] from which a direction is good enough to fit those of other pulses."""
+_ENOUGH = 20
+"""Smallest number of such pulses in a flight line."""
+_CLIP = 4.0
+"""Residuals above this many robust standard deviations are outliers."""
+
+
+def group_pulses(time: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """First point of every pulse: a pulse is a row of points of equal time whose return numbers rise.
+
+    Parameters
+    ----------
+    time, number : float (n,), int (n,)
+        GPS time and return number, in the order of the file.
+
+    Returns
+    -------
+    int64 (k,)
+    """
+    new = (time[1:] != time[:-1]) | (number[1:] <= number[:-1])
+    return np.flatnonzero(np.append(True, new)[: len(time)])
+
+
+def fit_rays(xyz: np.ndarray, starts: np.ndarray, angle: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Direction of each pulse, away from the sensor.
+
+    From the first to the last return where these are OWN apart. For other pulses a direction that is linear in the
+    tangent of the scan angle, fitted to the pulses of the same flight line with known directions; straight down where
+    fewer than 20 are.
+
+    Parameters
+    ----------
+    xyz : float64 (n, 3), m
+        In order of range within a pulse.
+    starts : int64 (k,)
+        First point of each pulse.
+    angle : float (n,), deg
+        Scan angle.
+    source : int (n,)
+        Flight line.
+
+    Returns
+    -------
+    float64 (k, 3)
+        Unit vectors.
+    """
+    last = np.append(starts[1:], len(xyz)) - 1
+    span = xyz[last] - xyz[starts]
+    length = np.linalg.norm(span, axis=1)
+    rays = np.tile([0.0, 0.0, -1.0], (len(starts), 1))
+    tangent = np.tan(np.radians(np.clip(angle[starts], -80, 80)))
+    for line in np.unique(source[starts]).tolist():
+        rows = np.flatnonzero(source[starts] == line)
+        down = -span[rows, 2]
+        sure = (length[rows] >= _SURE) & (down > 0.3 * length[rows])
+        if np.count_nonzero(sure) >= _ENOUGH:
+            slopes = span[rows[sure], :2] / down[sure, None]
+            rays[rows, :2] = _fit_slopes(tangent[rows[sure]], slopes, tangent[rows])
+    own = length >= OWN
+    rays[own] = span[own]
+    return rays / np.linalg.norm(rays, axis=1)[:, None]
+
+
+def _fit_slopes(tangent: np.ndarray, slopes: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Linear fit of slopes (m, 2) by tangent (m,), outliers clipped twice, evaluated at `wanted`."""
+    use = np.ones(len(tangent), bool)
+    for _ in range(3):
+        terms = np.stack([np.ones(len(tangent)), tangent], axis=1)
+        factors = np.linalg.lstsq(terms[use], slopes[use], rcond=None)[0]
+        off = np.linalg.norm(slopes - terms @ factors, axis=1)
+        use = off <= _CLIP * max(MAD_TO_STD * float(np.median(off)), 1e-6)
+    return factors[0] + wanted[:, None] * factors[1]

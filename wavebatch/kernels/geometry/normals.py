@@ -11,9 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wavebatch.kernels.geometry.plane_halves import compare_halves, misfit_of_angles
-from wavebatch.kernels.geometry.planes import Planes, fit_planes, is_flat, measure_angles
-from wavebatch.kernels.geometry.two_lines import in_two_lines
+from wavebatch.kernels.geometry.planes import (
+    Planes,
+    compare_halves,
+    fit_planes,
+    in_two_lines,
+    is_flat,
+    measure_angles,
+    misfit_of_angles,
+)
 from wavebatch.kernels.physics.incidence import STEEPEST
 
 if TYPE_CHECKING:

@@ -1,7 +1,16 @@
-"""Robust planes through many sets of points at once, and the angle at which rays meet them.
+"""Planes through many sets of points: `normals`, the ground, tie cells of a calibration and voxels call them.
 
-Used by `normals` and by the calibration targets. A set is a run of rows with the same `group`. Sums run over the rows
-of a set in their order and over nothing else, so that a plane does not depend on the other sets.
+A set is a run of rows with the same `group`. Sums run over the rows of a set in their order and over nothing else, so
+that a plane does not depend on the other sets. `measure_angles` gives the angle at which rays meet a plane. Two checks
+say whether a set is one plane:
+
+`in_two_lines`: points on two lines only, as those of two sweeps of a scanner. A plane goes through any two parallel
+lines: on both sides of a ridge it is level, and nothing is left that would show it. Three lines are the least that can
+contradict a plane.
+
+`compare_halves`: a ridge, a valley, a step. The plane through both sides of a shallow ridge leaves so little that none
+of its points is an outlier, but its angle is that of neither side. So each neighbourhood is cut in two through its
+middle, in six directions, and planes through the two halves are compared with the plane through both.
 """
 
 from __future__ import annotations
@@ -213,3 +222,191 @@ def _medians(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.nda
     table[np.arange(width) < below[:, None]] = -np.inf
     table[group, np.arange(len(values)) - start[group] + below[group]] = values
     return np.partition(table, width // 2, axis=1)[:, width // 2]
+
+
+DIRECTIONS = 24
+"""Directions in which the lines are looked for: they are at most 3.75 degrees off one of them."""
+
+LEAST_VARIETY = 0.1
+"""Two lines have a variety of 0, three equal ones 0.5, points without any order 0.8. Ten points at random lie below
+this in one case of 300, eight in one of 50."""
+
+_POWERS = [(p, q) for order in (1, 2, 3, 4) for p in range(order, -1, -1) for q in [order - p]]
+
+
+def in_two_lines(u: np.ndarray, v: np.ndarray, group: np.ndarray, n: int) -> np.ndarray:
+    """Find the sets whose points lie on two parallel lines.
+
+    Parameters
+    ----------
+    u, v : float64 (k,), m
+        Places of the points in the plane of their set, near its middle.
+    group : int64 (k,)
+        Set of each point.
+    n : int
+        Number of sets.
+
+    Returns
+    -------
+    bool (n,)
+
+    Notes
+    -----
+    Of the coordinates across any direction, kurtosis >= skewness^2 + 1, and equal only if they have two values (Pearson
+    1916). The difference, their variety, is computed in DIRECTIONS; sums of products give it for all of them.
+    """
+    number = np.maximum(np.bincount(group, minlength=n), 1).astype(np.float64)
+    u = u - (np.bincount(group, u, minlength=n) / number)[group]
+    v = v - (np.bincount(group, v, minlength=n) / number)[group]
+    powers = {1: (u, v), 2: (u * u, v * v)}
+    powers[3], powers[4] = (u * powers[2][0], v * powers[2][1]), (powers[2][0] ** 2, powers[2][1] ** 2)
+    moments = {}
+    for p, q in _POWERS[2:]:
+        product = powers[p][0] if p else powers[q][1]
+        if p and q:
+            product = product * powers[q][1]
+        moments[p, q] = np.bincount(group, product, minlength=n) / number
+    least = np.full(n, np.inf)
+    for angle in np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
+        a, b = np.cos(angle), np.sin(angle)
+        second = a * a * moments[2, 0] + 2 * a * b * moments[1, 1] + b * b * moments[0, 2]
+        third = a**3 * moments[3, 0] + b**3 * moments[0, 3]
+        third += 3 * a * b * (a * moments[2, 1] + b * moments[1, 2])
+        fourth = a**4 * moments[4, 0] + b**4 * moments[0, 4] + 6 * a * a * b * b * moments[2, 2]
+        fourth += 4 * a * b * (a * a * moments[3, 1] + b * b * moments[1, 3])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variety = fourth / second**2 - third**2 / second**3 - 1.0
+        least = np.fmin(least, variety)
+    return least < LEAST_VARIETY
+
+
+CUTS = 6
+"""Directions in which a neighbourhood is cut: a ridge is at most 15 degrees off one of them."""
+
+LEAST_IN_HALF = 4
+"""Smallest number of points of a half: three are always in a plane."""
+
+SURE, DOUBTFUL = 0.05, 0.2
+"""Chances below which a neighbourhood counts as two planes, and above which as one. With lower ones, ridges of a dozen
+points keep errors that are too small; with higher ones, the errors of single planes grow."""
+
+_SECTORS = 2 * CUTS
+_SINGULAR = 1e-6
+"""Points of a half whose variances differ by more than this are in line: they have no plane."""
+
+
+class Halves(NamedTuple):
+    """The cut of each neighbourhood whose two planes fit best."""
+
+    chance: np.ndarray
+    """Chance that one plane with noise shows two planes that fit so much better, float64 (n,); 1 without a cut."""
+    tilts: np.ndarray
+    """Slopes of the plane of each half against the plane of all, along its longer and its shorter axis, float64
+    (n, 2, 2); 0 without a cut."""
+
+
+def compare_halves(offset: np.ndarray, point: np.ndarray, planes: Planes) -> Halves:
+    """Fit planes to both halves of neighbourhoods, and judge whether they fit better than one.
+
+    Parameters
+    ----------
+    offset : float64 (k, 3), m
+        From the middle of a neighbourhood to its points.
+    point : int64 (k,)
+        Number of the neighbourhood, ascending.
+    planes : Planes
+        n planes through the neighbourhoods; points beyond their limits do not count.
+
+    Returns
+    -------
+    Halves
+
+    Notes
+    -----
+    An F test of the sums of squares, three parameters against six; the chance is that of the best of six cuts
+    (docs/algorithms.md 1.4). A half without a plane (fewer than four points, or in line) makes its cut impossible.
+    """
+    n = len(planes.kept)
+    flat = [_project(offset, planes.axes[:, :, axis], point) for axis in (2, 1, 0)]
+    flat[2] -= np.einsum("ni,ni->n", planes.centre, planes.normal)[point]
+    near = np.abs(flat[2]) <= planes.limit[point]
+    u, v, r = (part[near] for part in flat)
+    sector = ((np.arctan2(v, u) + np.pi) * (_SECTORS / (2 * np.pi))).astype(np.int64) % _SECTORS
+    cell = point[near] * _SECTORS + sector
+    sums = np.empty((n * _SECTORS, 9))
+    sums[:, 0] = np.bincount(cell, minlength=len(sums))
+    for number, values in enumerate((u, v, r, u * u, u * v, v * v, u * r, v * r), 1):
+        sums[:, number] = np.bincount(cell, values, minlength=len(sums))
+    squares = np.bincount(point[near], r * r, minlength=n)
+    return _choose_cut(sums.reshape(n, _SECTORS, 9), squares)
+
+
+def misfit_of_angles(halves: Halves, planes: Planes, ray: np.ndarray) -> np.ndarray:
+    """How far angles between rays and planes may be off because the points are two planes.
+
+    Parameters
+    ----------
+    halves : Halves
+    planes : Planes
+        n planes.
+    ray : float64 (n, 3)
+        Unit vectors.
+
+    Returns
+    -------
+    float64 (n,), rad
+        The larger difference to the angles of the two halves; less of it where their chance lies between SURE and
+        DOUBTFUL, nothing above.
+    """
+    facing, short, long = (np.einsum("ni,ni->n", ray, planes.axes[:, :, axis]) for axis in range(3))
+    angle = _angle_of(facing)
+    off = np.zeros(len(ray))
+    for b, c in (halves.tilts[:, side].T for side in range(2)):
+        off = np.maximum(off, np.abs(_angle_of((facing - b * long - c * short) / np.sqrt(1.0 + b * b + c * c)) - angle))
+    with np.errstate(divide="ignore"):
+        share = (np.log(DOUBTFUL) - np.log(halves.chance)) / np.log(DOUBTFUL / SURE)
+    return off * np.sqrt(np.clip(share, 0.0, 1.0))
+
+
+def _angle_of(cosine: np.ndarray) -> np.ndarray:
+    return np.arccos(np.minimum(np.abs(cosine), 1.0))
+
+
+def _project(offset: np.ndarray, axis: np.ndarray, point: np.ndarray) -> np.ndarray:
+    return offset[:, 0] * axis[point, 0] + offset[:, 1] * axis[point, 1] + offset[:, 2] * axis[point, 2]
+
+
+def _choose_cut(sums: np.ndarray, squares: np.ndarray) -> Halves:
+    """The best cut from sums over sectors (n, 12, 9) and the sums of squared distances (n,)."""
+    ring = np.concatenate([sums, sums[:, : CUTS - 1]], axis=1)
+    window = np.stack([ring[:, start : start + CUTS].sum(axis=1) for start in range(_SECTORS)], axis=1)
+    explained, tilts = _fit(window)
+    both = explained[:, :CUTS] + explained[:, CUTS:]
+    whole, _ = _fit(window[:, 0] + window[:, CUTS])
+    count = sums[:, :, 0].sum(axis=1)
+    rows = np.arange(len(sums))
+    best = np.argmax(both, axis=1)
+    known = np.isfinite(both[rows, best]) & np.isfinite(whole) & (count > 6)
+    both, whole = np.where(known, both[rows, best], 0.0), np.where(known, whole, 0.0)
+    left = np.maximum(squares - both, 0.0) + count * LEAST_SPREAD**2
+    freedom = np.maximum(count - 6.0, 1.0)
+    ratio = np.maximum(both - whole, 0.0) / 3.0 * freedom / np.maximum(left, LEAST_SPREAD**2)
+    import scipy.special  # here, because most runs need none of it
+
+    chance = scipy.special.fdtrc(3.0, freedom, ratio)
+    chance = np.where(known, np.minimum(CUTS * chance, 1.0), 1.0)
+    pair = np.stack([tilts[rows, best], tilts[rows, best + CUTS]], axis=1)
+    return Halves(chance, np.where(known[:, None, None], pair, 0.0))
+
+
+def _fit(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a plane r = a + b u + c v explains of the squares of r, (...,), -inf without a plane; b and c (..., 2)."""
+    number, u, v, r, uu, uv, vv, ur, vr = np.moveaxis(sums, -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uu, uv, vv = uu - u * u / number, uv - u * v / number, vv - v * v / number
+        ur, vr = ur - u * r / number, vr - v * r / number
+        size = uu * vv - uv * uv
+        b, c = (ur * vv - vr * uv) / size, (vr * uu - ur * uv) / size
+        explained = r * r / number + b * ur + c * vr
+        known = (number >= LEAST_IN_HALF) & (size > _SINGULAR * (uu + vv) ** 2)
+    return np.where(known, explained, -np.inf), np.stack([b, c], axis=-1)

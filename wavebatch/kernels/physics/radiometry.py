@@ -1,7 +1,10 @@
-"""From amplitude and width to backscatter: calibration, cross section, reflectance and their errors.
+"""The light of an echo: the stages of radiometry, the calibration, the voxels and the simulator call it.
 
-Used by the stages attribute.cross_section and others and by the calibration (docs/algorithms.md 5). Everything is
-float64, because the range enters with its fourth power (docs/algorithms.md H13). Unknown inputs are NaN and give NaN.
+From amplitude and width to backscatter: calibration, cross section, reflectance and their errors (docs/algorithms.md
+5). Everything is float64, because the range enters with its fourth power (docs/algorithms.md H13). Unknown inputs are
+NaN and give NaN. `receive_power` is the lidar equation: the power that a pulse returns (docs/algorithms.md 1.5,
+equation 3). `judge_energies` says whether the light of a strip follows the energies of `--energy`;
+`matching.strip_energies` asks it.
 """
 
 from __future__ import annotations
@@ -281,3 +284,111 @@ def known_distance(distance: np.ndarray) -> np.ndarray:
 def _positive(values: np.ndarray) -> np.ndarray:
     values = np.asarray(values, np.float64)
     return np.where(values > 0, values, np.nan)
+
+
+def receive_power(
+    cross_section: np.ndarray,
+    distance: np.ndarray,
+    *,
+    transmitted: float,
+    aperture: float,
+    divergence: float,
+    efficiency: float,
+    attenuation: float,
+) -> np.ndarray:
+    """Received power P = P_t D^2 Q T^2 sigma / (4 pi beta^2 R^4).
+
+    Parameters
+    ----------
+    cross_section : float (m,), m2
+        sigma.
+    distance : float (m,), m
+        R, from the sensor.
+    transmitted : float
+        P_t, in any unit.
+    aperture : float, m
+        Diameter D of the receiver.
+    divergence : float, rad
+        Full angle beta of the beam.
+    efficiency : float
+        Q of the optics, 0 to 1.
+    attenuation : float, dB/km
+        Of the air; T is the share left after one way.
+
+    Returns
+    -------
+    float64 (m,), unit of `transmitted`
+    """
+    whole = transmitted * aperture**2 * efficiency * transmit(distance, attenuation) * cross_section
+    return whole / (4.0 * np.pi * divergence**2 * distance**4)
+
+
+def spread_cross_section(reflectance: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
+    """Cross section of a diffuse surface that fills the footprint: 4 rho pi R^2 beta^2 / 4.
+
+    Parameters
+    ----------
+    reflectance : float
+        rho.
+    distance : float (m,), m
+        R, from the sensor.
+    divergence : float, rad
+        Full angle beta of the beam.
+
+    Returns
+    -------
+    float64 (m,), m2
+    """
+    return 4.0 * reflectance * np.pi * (distance * divergence) ** 2 / 4.0
+
+
+LEAST_SLOPE = 0.5
+"""Light grows with the energy itself, slope 1; a shuffled log has 0, one that is off by a pulse -0.5."""
+
+MOST_ERROR = 0.15
+"""Slopes less certain than this say nothing: energies that hardly scatter, or plants."""
+
+
+def judge_energies(light: np.ndarray, energy: np.ndarray) -> str:
+    """Find what contradicts the energies of pulses.
+
+    Parameters
+    ----------
+    light : float (n,)
+        Light that each pulse returned, in any unit, in the order of the pulses.
+    energy : float (n,)
+        Energy of each pulse; NaN where it is not known.
+
+    Returns
+    -------
+    str
+        Empty where light follows the energies, or where nothing shows it.
+
+    Notes
+    -----
+    Neighbouring pulses mostly hit one surface, so that the logarithm of their light differs by that of their energies.
+    The slope of the one over the other is fitted with steps between surfaces clipped, also for energies of the next
+    pulse and of the one before.
+    """
+    slope, error = _fit_slope(light, energy)
+    if not error <= MOST_ERROR or slope + 3.0 * error > LEAST_SLOPE:
+        return ""
+    early, late = (_fit_slope(light, np.roll(energy, shift))[0] > LEAST_SLOPE for shift in (1, -1))
+    cause = "come one pulse too early" if early else "come one pulse too late" if late else "are of other pulses"
+    return f"light follows them with a slope of {slope:.2f} +- {error:.2f} where 1 is right; they {cause}"
+
+
+def _fit_slope(light: np.ndarray, energy: np.ndarray) -> tuple[float, float]:
+    """Slope of the steps of the logarithms from pulse to pulse, and its error; (0, inf) where nothing is known."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rise, step = np.diff(np.log(light))[1:-1], np.diff(np.log(energy))[1:-1]
+    known = np.isfinite(rise) & np.isfinite(step)
+    rise, step = rise[known], step[known]
+    whole = float(np.sum(step * step))
+    if not whole > 0:
+        return 0.0, np.inf
+    limit = 4.0 * float(np.median(np.abs(rise)))
+    rise = np.clip(rise, -limit, limit)
+    slope = float(np.sum(rise * step)) / whole
+    # Steps of neighbours share a pulse, which makes the error larger by up to sqrt(2) than that of independent ones.
+    return slope, float(np.sqrt(2.0 * np.mean((rise - slope * step) ** 2) / whole))

@@ -1,6 +1,6 @@
 """Deconvolution of many waveforms with one pulse: Wiener, Richardson-Lucy, Gold (docs/algorithms.md 2.5).
 
-Used by the stages of detect/wavelet.py and by the voxel tool. Arrays are (s, n); a pulse is given by its taps (k,), k
+Used by detect/transformed.py and by the voxel tool. Arrays are (s, n); a pulse is given by its taps (k,), k
 odd, of any height, centred on its middle tap. The sum of the result around an echo is its amplitude in units of the
 pulse's height. Columns do not influence each other, bit for bit. For voxels: which part of the result is signal, and
 how it lies against known returns.

@@ -13,8 +13,8 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.hermite import residual_moments
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes
-from wavebatch.kernels.geometry.match_returns import match_returns
-from wavebatch.stages.attribute.light import area_factor, light_error
+from wavebatch.kernels.geometry.group_returns import match_returns
+from wavebatch.stages.attribute.radiometry import area_factor, light_error
 from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 

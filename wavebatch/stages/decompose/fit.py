@@ -1,6 +1,6 @@
 """Decomposers that fit the strip's pulse or Gaussians to clusters of candidates, with or without growth.
 
-Path of a block: candidates in ns, clusters in samples (`group`), fits (kernels), flagged table in ns (`solve`).
+Path of a block: candidates in ns, clusters in samples, fits (kernels), flagged table in ns (`solve`).
 """
 
 from __future__ import annotations

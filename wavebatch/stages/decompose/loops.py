@@ -17,9 +17,7 @@ from wavebatch.kernels.signal.signal import smooth_121
 from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.merge import join_tables
-from wavebatch.stages.decompose.models import generalized_gaussian, reference
-from wavebatch.stages.decompose.rebuild import render_table
-from wavebatch.stages.decompose.skew import skew_system, skewed
+from wavebatch.stages.decompose.models import generalized_gaussian, reference, render_table, skew_system, skewed
 from wavebatch.stages.decompose.solve import EchoLimits, fit_gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
 from wavebatch.stages.detect.maximum import maximum

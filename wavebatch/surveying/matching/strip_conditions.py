@@ -17,7 +17,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.stages.attribute.light import AIR_DOUBT
+from wavebatch.stages.attribute.radiometry import AIR_DOUBT
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.matching.setting import (
     MOST_ZONES,

@@ -16,7 +16,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.order import even_places
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
-from wavebatch.kernels.physics.pulse_energies import judge_energies
+from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.matching.setting import SCANNERS, sum_light
 

@@ -23,7 +23,7 @@ from wavebatch.files.figure_file import check_picture, open_picture, plain_text
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
-from wavebatch.stages.attribute.width_angle import added_variance
+from wavebatch.stages.attribute.incidence_angle import added_variance
 from wavebatch.surveying.angle_limits import REFERENCE_ERROR
 from wavebatch.tools.plots.draw_cloud import SERIES
 from wavebatch.tools.plots.labels import set_head

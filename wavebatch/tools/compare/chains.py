@@ -20,7 +20,7 @@ from wavebatch.files.strip.packets import MAX_SAMPLES
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import list_profiles
-from wavebatch.stages.decompose.rebuild import rebuild_waveforms
+from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import widest_chain

@@ -20,7 +20,7 @@ from wavebatch.files.las.crs import describe_crs
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
 from wavebatch.stages.chain import Chain
-from wavebatch.stages.decompose.rebuild import rebuild_waveforms
+from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.systems.shown import full_width, sample_pulse

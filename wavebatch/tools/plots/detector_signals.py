@@ -34,8 +34,8 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.detect.candidates import signal_above
 from wavebatch.stages.detect.classic import INFLECTED
 from wavebatch.stages.detect.maximum import LEAST_BLUR, choose_smoothing
-from wavebatch.stages.detect.wavelet import BACKGROUND, spike_reach, transform
-from wavebatch.stages.reference_pulse import reference_pulse
+from wavebatch.stages.detect.transformed import BACKGROUND, spike_reach, transform
+from wavebatch.stages.pulse_tables import reference_pulse
 
 
 @dataclass(frozen=True, slots=True, eq=False)

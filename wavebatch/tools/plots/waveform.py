@@ -20,7 +20,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.stages.decompose.rebuild import echo_pulses, fitted_pulse
+from wavebatch.stages.decompose.models import echo_pulses, fitted_pulse
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.sensor import SensorRequest, find_sensor
 from wavebatch.tools.plots.detector_signals import DetectorSignal, choose_step, describe_step, see_block

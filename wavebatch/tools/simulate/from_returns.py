@@ -23,7 +23,7 @@ from wavebatch.files.las.header import is_projection, read_header
 from wavebatch.files.point_dtypes import field_names
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.files.wkt import repair_records
-from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
+from wavebatch.kernels.geometry.group_returns import fit_rays, group_pulses
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
 from wavebatch.tools.simulate.returns import LightCounts, LightModel, ReturnLight, SynthesisOptions, fill_packets
 

@@ -19,7 +19,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
 from wavebatch.files.cloud.cloud_reader import ColumnReader
-from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
+from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section
 from wavebatch.tools.simulate.render import MOST_NOISE, PulseModel, Recording
 
 EQUAL = "equal"
@@ -37,7 +37,7 @@ _TOLERANCE = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Radar:
-    """Parameters of the lidar equation besides range and reflectance, see kernels.physics.radar."""
+    """Parameters of the lidar equation besides range and reflectance, see kernels.physics.radiometry."""
 
     height: Annotated[float, Range(-1e6, 1e6)] = option(
         MISSING, "Reflectance: height of the sensor, in the heights of CLOUD [m].", form="M", name="sensor-height"

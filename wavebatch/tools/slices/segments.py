@@ -2,7 +2,7 @@
 
 A line ends where the scan angle turns or jumps back, or at a pause. Pulses must be in the order of time. The last line
 of a unit is joined with the next unit, so that no line is cut between units. A slice is either a vertical plane, in
-metres, or an image of pulses by time. Segments are found by a Hough transform (`kernels.geometry.hough`) of the samples
+metres, or an image of pulses by time. Segments are found by a Hough transform of the samples
 above a threshold.
 """
 
@@ -22,8 +22,7 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.strip.shared_packets import expand
 from wavebatch.kernels.geometry.group_returns import find_pulses
-from wavebatch.kernels.geometry.hough import HoughLine, find_lines
-from wavebatch.kernels.geometry.scan_lines import find_sweeps
+from wavebatch.kernels.geometry.slice_lines import HoughLine, find_lines, find_sweeps
 
 LEAST_PULSES = 8
 """Shorter lines are left out: they hold no surface to find."""

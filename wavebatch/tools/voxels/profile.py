@@ -28,8 +28,7 @@ from wavebatch.kernels.signal.deconvolve import (
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121, widen
 from wavebatch.stages.detect.candidates import signal_above
 from wavebatch.stages.noise import pooled
-from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.stages.reference_pulse import reference_pulse
+from wavebatch.stages.pulse_tables import clip_level, reference_pulse
 from wavebatch.surveying.measuring.learn_pulse import AFTER, BEFORE
 
 ITERATIONS = {"richardson_lucy": 40, "gold": 100}

@@ -1,4 +1,7 @@
-"""Detectors that compare the waveform with a reference pulse: correlation and average square difference (ASDF)."""
+"""Detectors that search a transformed waveform: chains call them, `plot waveform` draws what they search.
+
+Wavelets and deconvolution, and comparison with a reference pulse: correlation and average square difference (ASDF).
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,22 @@ from typing import Annotated, Literal
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.elementary import log as logarithm
-from wavebatch.kernels.signal.filters import refine_peaks
-from wavebatch.kernels.signal.signal import find_peaks
+from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
+from wavebatch.kernels.signal.filters import (
+    b3_detail,
+    b3_gain,
+    b3_level,
+    curvature_taps,
+    filter_energy,
+    filter_symmetric,
+    refine_peaks,
+)
+from wavebatch.kernels.signal.runs import list_samples
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.kernels.signal.square_differences import (
     COLUMNS_AT_A_TIME,
     Minima,
@@ -27,7 +41,164 @@ from wavebatch.kernels.signal.square_differences import (
 )
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
-from wavebatch.stages.reference_pulse import reference_pulse
+from wavebatch.stages.pulse_tables import reference_pulse
+
+HAT_WIDTH = 0.75
+"""Width of the Mexican hat that separates echoes as the B3 wavelet does [system widths] (docs/algorithms.md 1.2)."""
+
+COARSEST = 15
+"""Level of the B3 transform that spans the longest waveforms."""
+
+BACKGROUND = 3
+"""Added to waveforms for the iteration, which needs positive values [standard deviations of the noise]."""
+
+AT_A_TIME = 1024
+"""Waveforms whose arrays stay in the cache together."""
+
+
+@stage("detect")
+def wavelet(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
+    wavelet: Literal["b3", "mexican_hat"] = "b3",
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
+    scale: Annotated[float, Range(0.0, 100.0)] = 0.0,
+) -> EchoTable:  # fmt: skip
+    """Echoes at the maxima of one scale of a wavelet transform.
+
+    The B3-spline transform with holes separates echoes from a distance of about one full width at half maximum on; its
+    level follows the width of the system pulse.
+
+    Parameters
+    ----------
+    wavelet : {"b3", "mexican_hat"}
+        `b3` for the B3-spline transform, `mexican_hat` for the second derivative of a Gaussian.
+    threshold : float
+        Least value at a maximum [standard deviations of the transformed noise]; the paper's is 3.
+    scale : float
+        Level of the B3 transform (1, 2, ...), or width of the Mexican hat [ns]; 0 chooses by the system pulse.
+
+    References
+    ----------
+    Wang, Wang and Tseng; docs/algorithms.md 1.2.
+    """
+    ref = system.sigma_ref / block.spacing
+    signal = signal_above(block, noise)
+    detail, gain = transform(signal, ref, wavelet, scale, block.spacing)
+    waveform, sample = find_peaks(detail, np.float32(threshold * gain) * noise.std)
+    time, _ = refine_peaks(detail, waveform, sample)
+    amplitude = smooth_121(signal)[sample, waveform]
+    return candidate_table(block, system, waveform, time, amplitude)
+
+
+def transform(signal: np.ndarray, ref: float, wavelet: str, scale: float, spacing: float) -> tuple[np.ndarray, float]:
+    """Transform waveforms at one scale.
+
+    Parameters
+    ----------
+    signal : float array, shape (s, n)
+        Waveforms above their baselines [count].
+    ref : float
+        Width of the system pulse [samples].
+    wavelet : {"b3", "mexican_hat"}
+    scale : float
+        As for stage detect.wavelet.
+    spacing : float
+        Of the samples [ns].
+
+    Returns
+    -------
+    detail : float array, shape (s, n)
+        Coefficients.
+    gain : float
+        Standard deviation of unit white noise in them.
+
+    Raises
+    ------
+    ConfigError
+        For a level of the B3 transform that is too coarse.
+    """
+    if wavelet != "b3":
+        taps = curvature_taps(max(scale / spacing if scale > 0 else HAT_WIDTH * ref, 0.5))
+        return filter_symmetric(signal, taps), float(np.sqrt(filter_energy(taps)))
+    level = max(round(scale), 1) if scale > 0 else b3_level(ref)
+    if level > COARSEST:
+        raise ConfigError(f"scale is the level of the b3 wavelet, at most {COARSEST}, it is {scale:g}")
+    return b3_detail(signal, level), b3_gain(level)
+
+
+@stage("detect")
+def richardson_lucy(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
+    reference: Literal["gaussian", "system", "given"] = "system",
+    iterations: Annotated[int, Range(1, 10_000)] = 16,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.27,
+    reach: Annotated[float, Range(0.5, 20.0)] = 3.0,
+    pulse: str = "",
+) -> EchoTable:  # fmt: skip
+    """Echoes at the peaks of the waveform deconvolved by Richardson and Lucy's iteration with the pulse.
+
+    Each iteration starts from an extrapolation of the earlier ones. Separates echoes of the system's width that are 2
+    widths apart (1.5 with 40 iterations), but draws close ones together.
+
+    Parameters
+    ----------
+    reference : {"gaussian", "system", "given"}
+        A Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
+    iterations : int
+        More iterations separate closer echoes, and split more broad ones.
+    threshold : float
+        Least amplitude of an echo [standard deviations that the amplitude of an isolated echo would have].
+    reach : float
+        Half of the reference's length [widths of the system pulse].
+    pulse : str
+        Samples of the given pulse, separated by spaces, with the spacing of the waveform.
+
+    References
+    ----------
+    Richardson (1972), Lucy (1974); docs/algorithms.md 2.5.
+    """
+    given = reference_pulse(system, block.spacing, reference, reach, pulse)
+    signal = signal_above(block, noise)
+    busy = np.flatnonzero((smooth_121(signal) > np.float32(2.0 * SMOOTH_GAIN) * noise.std).any(axis=0))
+    least = threshold / np.sqrt(np.sum(given.taps**2))
+    half = spike_reach(system.sigma_ref / block.spacing)
+    found = [(busy[:0], np.empty(0), np.empty(0))]
+    for begin in range(0, len(busy), AT_A_TIME):
+        rows = busy[begin : begin + AT_A_TIME]
+        std = noise.std[rows]
+        profile = deconvolve_richardson_lucy(
+            np.ascontiguousarray(signal[:, rows]), given.taps, BACKGROUND * std, iterations
+        )
+        waveform, time, amplitude = _find_spikes(profile, half, np.float32(least) * std)
+        found.append((rows[waveform], time + (given.peak - given.middle), amplitude))
+    return candidate_table(block, system, *(np.concatenate(fields) for fields in zip(*found, strict=True)))
+
+
+def spike_reach(ref: float) -> int:
+    """Return how many samples a spike reaches to each side, for a system pulse of width `ref` [samples]."""
+    return max(int(round(ref)), 1)
+
+
+def _find_spikes(profile: np.ndarray, half: int, least: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Waveform, centre and sum of the spikes in deconvolved waveforms (s, n) whose sum is at least `least` (n,).
+
+    A spike reaches `half` samples around its peak, or halfway to the next peak.
+    """
+    s = len(profile)
+    waveform, sample = find_peaks(profile, 0.1 * least / half)
+    low, high = np.maximum(sample - half, 0), np.minimum(sample + half + 1, s)
+    same = waveform[1:] == waveform[:-1]
+    middle = (sample[1:] + sample[:-1] + 1) // 2
+    low[1:] = np.where(same, np.maximum(low[1:], middle), low[1:])
+    high[:-1] = np.where(same, np.minimum(high[:-1], middle), high[:-1])
+    spike, place = list_samples(waveform * s + low, waveform * s + high)
+    at = place % s
+    value = profile[at, place // s].astype(np.float64)
+    amplitude = np.bincount(spike, value, minlength=len(sample))
+    time = np.bincount(spike, value * at, minlength=len(sample)) / np.where(amplitude > 0, amplitude, 1.0)
+    keep = amplitude >= least[waveform]
+    return waveform[keep], time[keep], amplitude[keep]
+
 
 CorrelationPeaks = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Waveform, time [samples], amplitude."""

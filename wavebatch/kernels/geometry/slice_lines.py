@@ -1,6 +1,14 @@
-"""Straight lines in a slice of intensities: weighted Hough transform, refined by weighted total least squares.
+"""Scan lines, and the straight lines in slices of them: called by tools/slices/segments.
 
-Used by the slices tool (Jutzi and Stilla, docs/algorithms.md 1.3). A pixel belongs to one line at most.
+`find_sweeps`: a scan line ends where the mirror turns, jumps back or pauses, seen in the angles of consecutive pulses.
+Oscillating and rotating mirrors look different: the first turn, the second jump.
+
+`find_lines`: straight lines in a slice of intensities, by a weighted Hough transform, refined by weighted total least
+squares (Jutzi and Stilla, docs/algorithms.md 1.3). A pixel belongs to one line at most.
+
+`find_bend`: where a row of points that was fitted by one line is two lines: the ridge of a shallow roof, a break of
+slope. A bend must show in the residuals far beyond their noise, and a smooth curve must fit them worse: a hill stays
+one line.
 """
 
 from __future__ import annotations
@@ -8,8 +16,151 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
-from wavebatch.kernels.geometry.bends import find_bend
+LAG = 16
+"""Pulses over which the direction of the mirror is judged: turns closer together than that are noise."""
+_JUMP = 20.0
+"""Steps of the angle above this many usual ones ..."""
+_JUMP_SHARE = 0.25
+"""... and above this share of its range are jumps."""
+_PAUSE = 20.0
+"""Times between pulses above this many usual ones are pauses."""
+
+
+def find_sweeps(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """First pulse of every scan line.
+
+    Parameters
+    ----------
+    angle : float (n,)
+        Across the flight direction, in any unit.
+    time : float (n,), s
+        Of the pulses.
+
+    Returns
+    -------
+    int64 (k,)
+        0 included; empty for no pulses. A line begins after a jump of the angle (a quarter of its range and 20 usual
+        steps), after a pause (20 usual intervals, or a time that runs backwards), and where the angle turns.
+    """
+    n = len(angle)
+    if n < 2:
+        return np.arange(min(n, 1))
+    step, interval = np.abs(np.diff(angle)), np.diff(time)
+    usual = np.median(step[step > 0]) if (step > 0).any() else np.inf
+    pause = _PAUSE * np.median(interval[interval > 0]) if (interval > 0).any() else np.inf
+    jump = step > max(_JUMP * usual, _JUMP_SHARE * np.ptp(angle))
+    cuts = np.flatnonzero(jump | (interval > pause) | (interval < 0)) + 1
+    edges = np.concatenate([[0], cuts, [n]])
+    parts = [a + _find_turns(angle[a:b]) for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)]
+    return np.unique(np.concatenate([edges[:-1], *parts]))
+
+
+def _find_turns(angle: np.ndarray) -> np.ndarray:
+    """Pulses at which the angle turns, within one run without jumps."""
+    if len(angle) <= 2 * LAG:
+        return np.empty(0, np.int64)
+    rising = angle[LAG:] > angle[:-LAG]
+    changes = np.flatnonzero(rising[1:] != rising[:-1]) + 1
+    edges = _drop_short(np.concatenate([[0], changes, [len(rising)]]))[1:-1]
+    turns = []
+    for edge in edges.tolist():
+        low, high = max(edge - LAG, 0), min(edge + 2 * LAG, len(angle))
+        part = angle[low:high]
+        turns.append(low + int(np.argmax(part) if rising[edge - 1] else np.argmin(part)))
+    return np.array(turns, np.int64)
+
+
+def _drop_short(edges: np.ndarray) -> np.ndarray:
+    """Edges without those of runs shorter than LAG: the shortest run is joined with its two neighbours first."""
+    while len(edges) > 2:
+        lengths = np.diff(edges)
+        shortest = int(np.argmin(lengths))
+        if lengths[shortest] >= LAG:
+            break
+        gone = [number for number in (shortest, shortest + 1) if 0 < number < len(edges) - 1]
+        edges = np.delete(edges, gone)
+    return edges
+
+
+LEAST_POINTS, LEAST_BEYOND = 8, 2
+"""Smallest number of points, and of those beyond a bend on each side."""
+
+LEAST_BEND = np.radians(2.0)
+"""Smallest change of direction [rad]: both sides of a road whose middle is 2 % higher differ by 2.3 degrees."""
+
+LARGEST_CHANCE = 1e-4
+"""Largest chance that noise about one line looks like the bend. Roughness of neighbouring points is alike, so that the
+test is less strict than it looks.
+"""
+
+LEAST_SHARE = 0.5
+"""Smallest share of the squared residuals that a bend must explain: a wavy surface is not cut at each wave."""
+
+
+def find_bend(place: np.ndarray, off: np.ndarray) -> float | None:
+    """Where points near a line bend.
+
+    Parameters
+    ----------
+    place : float (n,)
+        Positions along the line.
+    off : float (n,)
+        Distances across it, in the same unit.
+
+    Returns
+    -------
+    float or None
+        The place of the bend; None where one line, or a smooth curve, does as well.
+
+    Notes
+    -----
+    Least squares of a + b x + c max(x - t, 0) for every t at a point, against a + b x by an F test, and against
+    a + b x + c x^2 (docs/algorithms.md 1.3).
+    """
+    n = len(place)
+    if n < LEAST_POINTS:
+        return None
+    order = np.argsort(place, kind="stable")
+    middle = 0.5 * float(place[order[0]] + place[order[-1]])
+    half = 0.5 * float(place[order[-1]] - place[order[0]])
+    if half <= 0:
+        return None
+    x, y = (place[order] - middle) / half, off[order] / half
+    centre = x.mean()
+    x, y = x - centre, y - y.mean()
+    square = float(x @ x)
+    y = y - x * (x @ y / square)
+    gains, changes = _try_bends(x, y, square)
+    at = LEAST_BEYOND + int(np.argmax(gains[LEAST_BEYOND : n - LEAST_BEYOND]))
+    whole, gain = float(y @ y), float(gains[at])
+    left = max(whole - gain, 1e-12 * n)
+    chance = scipy.special.fdtrc(2.0, n - 4.0, gain / 2.0 * (n - 4.0) / left)
+    bent = chance < LARGEST_CHANCE and gain >= LEAST_SHARE * whole
+    bent &= abs(np.arctan(changes[at])) >= LEAST_BEND and gain > _gain(x * x, x, y, square)
+    return middle + half * float(x[at] + centre) if bent else None
+
+
+def _try_bends(x: np.ndarray, y: np.ndarray, square: float) -> tuple[np.ndarray, np.ndarray]:
+    """What a bend at each x takes off the sum of squares of y, and its change of slope; y has no slope and no mean."""
+    number, sum_x, sum_xx, sum_y, sum_xy = (
+        np.cumsum(values[::-1])[::-1] for values in (np.ones(len(x)), x, x * x, y, x * y)
+    )
+    total = sum_x - x * number
+    along = sum_xx - x * sum_x
+    size = sum_xx - 2 * x * sum_x + x * x * number - total**2 / len(x) - along**2 / square
+    size = np.maximum(size, 1e-12)
+    with_y = sum_xy - x * sum_y
+    return with_y**2 / size, with_y / size
+
+
+def _gain(curve: np.ndarray, x: np.ndarray, y: np.ndarray, square: float) -> float:
+    """What a curve takes off the sum of squares of y, which has no slope and no mean."""
+    curve = curve - curve.mean()
+    curve = curve - x * (x @ curve / square)
+    return float((curve @ y) ** 2 / max(curve @ curve, 1e-12))
+
 
 THETA_STEP = 0.5
 """Step of the accumulator [deg]; the step of rho is one pixel."""
