@@ -143,23 +143,23 @@ def test_spooled_packets_travel_through_the_output_folder(dask, strips, tmp_path
 
 def _spool_everything():
     """Makes a worker spool to disk, and note where."""
-    from wavebatch.files.disk import spool, temp_folders
+    from wavebatch.files.disk import temp_store
 
-    spool.made, spool.kept, spool.KEPT = [], spool.KEPT, 0
+    make, temp_store.made, temp_store.kept = temp_store.make_folder, [], temp_store.SPOOL_KEPT
 
     def make_folder():
-        spool.made.append(str(temp_folders.make_folder()))
-        return temp_folders.Path(spool.made[-1])
+        temp_store.made.append(str(make()))
+        return temp_store.Path(temp_store.made[-1])
 
-    spool.make_folder = make_folder
+    temp_store.unwatched, temp_store.make_folder, temp_store.SPOOL_KEPT = make, make_folder, 0
 
 
 def _spool_as_ever():
     """Takes that back; the folders that were made."""
-    from wavebatch.files.disk import spool, temp_folders
+    from wavebatch.files.disk import temp_store
 
-    spool.KEPT, spool.make_folder = spool.kept, temp_folders.make_folder
-    return spool.made
+    temp_store.SPOOL_KEPT, temp_store.make_folder = temp_store.kept, temp_store.unwatched
+    return temp_store.made
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.disk import spool
+from wavebatch.files.disk import temp_store
 from wavebatch.kernels.geometry.normals import Gap
 from wavebatch.stages.chain import STAGES, Stage, Step
 from wavebatch.stages.chain_file import parse_chain
@@ -110,8 +110,8 @@ def test_the_same_bytes_for_any_tiles(strips, clouds, tmp_path, monkeypatch):
     monkeypatch.setattr(neighbour_pass, "TILE_POINTS", 900)
     monkeypatch.setattr(neighbour_pass, "PART_POINTS", 400)
     monkeypatch.setattr(neighbour_pass, "SAMPLE", 5000)
-    monkeypatch.setattr(spool, "MEMORY", 1 << 18)
-    monkeypatch.setattr(spool, "KEPT", 1 << 16)
+    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 1 << 18)
+    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 1 << 16)
     run_strip(strips / "urban.las", tmp_path)
     assert (tmp_path / "urban.laz").read_bytes() == (clouds[0] / "urban.laz").read_bytes()
 
@@ -288,9 +288,9 @@ def test_any_tiles_give_the_same_bits_on_any_points(tmp_path, monkeypatch, seed)
 def test_very_many_points_in_one_place_take_no_more_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(neighbour_pass, "PART_POINTS", 2000)
     monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)
-    monkeypatch.setattr(spool, "MEMORY", 1 << 16)
-    monkeypatch.setattr(spool, "KEPT", 1 << 12)
-    monkeypatch.setattr("wavebatch.files.disk.row_file.RowStore.pieces.__defaults__", (2000,))
+    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 1 << 16)
+    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 1 << 12)
+    monkeypatch.setattr("wavebatch.files.disk.temp_store.RowStore.pieces.__defaults__", (2000,))
     rng, peaks = np.random.default_rng(3), []
     for n in (8000, 40_000):
         parts = [make_rows(rng.normal(0, 0.05, (2000, 3))) for _ in range(n // 2000)]
@@ -309,7 +309,7 @@ def test_very_many_points_in_one_place_take_no_more_memory(tmp_path, monkeypatch
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_strip(tmp_path, monkeypatch):
     monkeypatch.setattr(neighbour_pass, "SAMPLE", 4000)
-    monkeypatch.setattr(spool, "MEMORY", 1 << 20)
+    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 1 << 20)
     peaks = []
     for n in (60_000, 240_000):
         rng = np.random.default_rng(3)

@@ -9,7 +9,7 @@ from strips import cut_strip
 
 from wavebatch.cli import main
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.stages.chain_file import load_chain_file
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import chain_text, decide

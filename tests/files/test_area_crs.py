@@ -13,9 +13,8 @@ from strips import add_record
 import wavebatch
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.area_crs import AreaFile, describe_miss, place_rings, read_area_file
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.geojson import load_polygons
+from wavebatch.files.geojson import AreaFile, describe_miss, load_polygons, place_rings, read_area_file
 from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import build_wkt, read_header
 from wavebatch.tools.simulate import simulate_strip
@@ -89,7 +88,7 @@ def test_a_long_edge_is_straight_in_degrees_as_the_standard_says():
 
 
 def _place(file, rings, header):
-    import wavebatch.files.area_crs as module
+    import wavebatch.files.geojson as module
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "read_crs_definition", lambda path, header: ZONE)
@@ -196,7 +195,7 @@ def test_a_strip_without_a_crs_takes_no_small_coordinates_of_a_named_one(plain):
 
 def test_degrees_of_a_strip_in_degrees_stay(plain, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyproj", None)
-    monkeypatch.setattr("wavebatch.files.area_crs.read_crs_definition", lambda path, header: "EPSG:4326")
+    monkeypatch.setattr("wavebatch.files.geojson.read_crs_definition", lambda path, header: "EPSG:4326")
     file = read_area_file("a.geojson", {"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}, [_square(10, 80)])
     assert place_rings(file, [_square(10, 80)], plain, _local(plain))[0].tolist() == _square(10, 80).tolist()
 

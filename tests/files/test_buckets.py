@@ -5,7 +5,7 @@ import pytest
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.buckets import MOST_BUCKETS, count_buckets, spread_keys, spread_times, time_keys
-from wavebatch.files.disk.spool import Spool
+from wavebatch.files.disk.temp_store import Spool
 
 ROW = np.dtype([("gps_time", "<f8"), ("number", "<i4")])
 
@@ -48,7 +48,7 @@ def test_no_room_for_buckets_is_one_line(monkeypatch):
     def full(*args, **options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("wavebatch.files.disk.spool.make_folder", full)
-    monkeypatch.setattr("wavebatch.files.disk.spool.MEMORY", 1)
+    monkeypatch.setattr("wavebatch.files.disk.temp_store.make_folder", full)
+    monkeypatch.setattr("wavebatch.files.disk.temp_store.SPOOL_MEMORY", 1)
     with pytest.raises(InputError, match="No space left on device.*TMPDIR"), Spool(2, ROW) as buckets:
         buckets.append(spread_times(np.zeros(3), 2), np.zeros(3, ROW))

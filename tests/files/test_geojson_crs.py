@@ -8,7 +8,7 @@ import pytest
 from writer_tools import data_file
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.geojson_crs import plan_crs
+from wavebatch.files.geojson import plan_crs
 from wavebatch.files.las.crs import read_crs, read_crs_definition
 from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import read_header

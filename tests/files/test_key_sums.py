@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.key_sums import KeyedSums
+from wavebatch.files.disk.temp_store import KeyedSums
 
 
 def slow_sums(parts):

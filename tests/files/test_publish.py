@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk import locks, publish
+from wavebatch.files.disk import publish
 from wavebatch.files.disk.publish import Draft, is_stream, publish_together, refuse_existing, remove_stale
 from wavebatch.files.text_file import write_text
 
@@ -129,7 +129,7 @@ def test_file_systems_without_links_still_never_replace(tmp_path, monkeypatch, n
 
 
 def test_works_where_files_cannot_be_locked(tmp_path, monkeypatch):
-    monkeypatch.setattr(locks, "fcntl", None)
+    monkeypatch.setattr(publish, "fcntl", None)
     write(tmp_path / "a", b"one").publish()
     assert names(tmp_path) == ["a"]
     (tmp_path / ".wavebatch-1-a.tmp").write_bytes(b"")
@@ -178,7 +178,7 @@ def test_stale_files_go_and_those_being_written_stay(tmp_path):
 
 
 def test_a_file_taken_before_it_was_locked_is_made_again(tmp_path, monkeypatch):
-    flock, calls = locks.fcntl.flock, []
+    flock, calls = publish.fcntl.flock, []
 
     def steal(descriptor, how):
         calls.append(descriptor)
@@ -187,7 +187,7 @@ def test_a_file_taken_before_it_was_locked_is_made_again(tmp_path, monkeypatch):
             path.unlink()
         flock(descriptor, how)
 
-    monkeypatch.setattr(locks.fcntl, "flock", steal)
+    monkeypatch.setattr(publish.fcntl, "flock", steal)
     write(tmp_path / "a", b"one").publish()
     assert len(calls) == 2 and (tmp_path / "a").read_bytes() == b"one"
 

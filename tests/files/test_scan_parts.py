@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.spool import Spool
+from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.strip import reader as strip_reader
 from wavebatch.files.strip import scanner, shared_packets
 from wavebatch.files.strip.reader import StripReader

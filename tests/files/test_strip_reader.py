@@ -11,8 +11,8 @@ from writer_tools import data_file, read_raw
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.disk import spool, temp_folders
-from wavebatch.files.disk.protect import protecting, refuse_input
+from wavebatch.files.disk import temp_store
+from wavebatch.files.disk.publish import protecting, refuse_input
 from wavebatch.files.las import laz_decode
 from wavebatch.files.strip import scanner, shared_packets
 from wavebatch.files.strip.reader import LONG_SAMPLES, StripReader
@@ -117,8 +117,8 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
     monkeypatch.setattr(shared_packets, "WINDOW", window)
     monkeypatch.setattr(shared_packets, "BINS", 64)
     monkeypatch.setattr(shared_packets, "_PER_BUCKET", 500)
-    monkeypatch.setattr(spool, "MEMORY", 3000)
-    monkeypatch.setattr(spool, "KEPT", 100)
+    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 3000)
+    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 100)
     assert_same(read_all(path, size=50, unit_points=128), plain)
     assert_same(read_all(path, size=50, owned_only=False, unit_points=128), plain)
     with StripReader(path, unit_points=128) as reader, reader.scan() as scan:
@@ -336,7 +336,7 @@ def test_a_strip_without_points_and_one_without_waveforms(tmp_path):
 
 
 def test_facts_scans_and_units_travel_between_processes(tmp_path, monkeypatch):
-    monkeypatch.setattr(spool, "KEPT", 0)
+    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 0)
     raw = make_raw(64, most_returns=1)
     raw.points = np.concatenate([raw.points, raw.points])
     with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
@@ -359,11 +359,11 @@ def test_compressed_points_are_decoded_once(tmp_path, monkeypatch, case):
         calls.append(len(rows))
         decode(points, rows)
 
-    monkeypatch.setattr(spool, "KEPT", 0)
+    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 0)
     if case == "beyond the limit":
         monkeypatch.setattr(scanner, "_KEPT_BYTES", 150 * 57)
     if case == "no room":
-        monkeypatch.setattr(temp_folders.tempfile, "mkdtemp", refuse)
+        monkeypatch.setattr(temp_store.tempfile, "mkdtemp", refuse)
     raw = make_raw(200, most_returns=1)
     plain, path = raw.write(tmp_path / "a.las"), raw.write(tmp_path / "b.laz")
     readers = StripReader(plain, unit_points=64), StripReader(path, unit_points=64)

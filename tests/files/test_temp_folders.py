@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk import temp_folders
-from wavebatch.files.disk.spool import Spool
-from wavebatch.files.disk.temp_folders import make_folder, owning_scratch, remove_orphans, use_scratch
+from wavebatch.files.disk import temp_store
+from wavebatch.files.disk.temp_store import Spool, make_folder, owning_scratch, remove_orphans, use_scratch
 from wavebatch.tools.simulate import simulate_strip
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="file locks of POSIX systems")
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="file locks of P
 HOLD = """
 import sys
 from pathlib import Path
-from wavebatch.files.disk.temp_folders import owning_scratch
+from wavebatch.files.disk.temp_store import owning_scratch
 with owning_scratch(Path(sys.argv[1])) as folder:
     (folder / "data").write_bytes(bytes(1000))
     print(folder, flush=True)
@@ -34,7 +33,7 @@ with owning_scratch(Path(sys.argv[1])) as folder:
 LIVE_AND_LET_LIVE = """
 import sys
 from pathlib import Path
-from wavebatch.files.disk.temp_folders import owning_scratch, remove_orphans
+from wavebatch.files.disk.temp_store import owning_scratch, remove_orphans
 for turn in range(60):
     with owning_scratch(Path(sys.argv[1])) as folder:
         (folder / "data").write_text("mine")
@@ -107,7 +106,7 @@ def test_a_place_given_by_another_process_is_this_thread_s_only(tmp_path):
     found = []
     use_scratch(tmp_path)
     try:
-        thread = threading.Thread(target=lambda: found.append(temp_folders.scratch_place()))
+        thread = threading.Thread(target=lambda: found.append(temp_store.scratch_place()))
         thread.start()
         thread.join()
         assert make_folder().parent == tmp_path and found != [tmp_path]
@@ -118,12 +117,12 @@ def test_a_place_given_by_another_process_is_this_thread_s_only(tmp_path):
 def test_without_a_place_the_spool_says_so(tmp_path, monkeypatch):
     with owning_scratch(tmp_path / "missing") as folder:
         assert folder is None
-    monkeypatch.setattr("wavebatch.files.disk.spool.KEPT", 0)
+    monkeypatch.setattr("wavebatch.files.disk.temp_store.SPOOL_KEPT", 0)
 
     def refuse(*args, **options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(temp_folders.tempfile, "mkdtemp", refuse)
+    monkeypatch.setattr(temp_store.tempfile, "mkdtemp", refuse)
     spool = Spool(2, np.dtype("<i8"))
     spool.append(np.array([0, 1]), np.array([5, 6]))
     with pytest.raises(InputError, match="No space left.*set TMPDIR"):
@@ -133,9 +132,9 @@ def test_without_a_place_the_spool_says_so(tmp_path, monkeypatch):
 EVERY_PROCESS = """
 import os, signal
 from wavebatch.batch import strip_task
-from wavebatch.files.disk import spool
+from wavebatch.files.disk import temp_store
 from wavebatch.files.strip import reader
-spool.KEPT, reader.UNIT_POINTS = 0, 500
+temp_store.SPOOL_KEPT, reader.UNIT_POINTS = 0, 500
 
 def kill(task, *arguments):
     os.kill(os.getpid(), signal.SIGKILL)

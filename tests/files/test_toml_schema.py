@@ -8,8 +8,7 @@ import pytest
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.schema import Key, Range
-from wavebatch.files.toml_file import format_toml, parse_toml
-from wavebatch.files.toml_schema import describe_record, list_comments, list_keys, read_record
+from wavebatch.files.toml_file import describe_record, format_toml, list_comments, list_keys, parse_toml, read_record
 
 Share = Annotated[float, Range(0.0, 1.0)]
 

@@ -14,7 +14,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.system import Defects, LevelWidths, Radiometry, ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.text_file import write_text
-from wavebatch.files.toml_schema import list_entries, list_keys
+from wavebatch.files.toml_file import list_entries, list_keys
 from wavebatch.surveying import Decision, Survey, survey_block
 from wavebatch.surveying.system_file import (
     SYSTEM_SCHEMA,

@@ -13,7 +13,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.process import Seconds
-from wavebatch.files.disk.row_parcel import RowParcel
+from wavebatch.files.disk.temp_store import RowParcel
 from wavebatch.files.las.laz_encode import CHUNK_POINTS, Chunk, compress_rows
 
 Part = tuple[RowParcel, int, int]

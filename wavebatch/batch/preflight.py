@@ -17,7 +17,7 @@ from wavebatch.batch.options import RunOptions
 from wavebatch.batch.report_file import cloud_path, report_path
 from wavebatch.batch.strip_task import StripTask
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.disk.protect import protecting, refuse_input
+from wavebatch.files.disk.publish import protecting, refuse_input
 from wavebatch.surveying.flight import read_flight
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
 

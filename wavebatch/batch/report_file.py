@@ -21,7 +21,7 @@ from wavebatch.batch.job import StripJob
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import without_nan
 from wavebatch.core.process import Seconds
-from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey

@@ -25,8 +25,7 @@ from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.workers.processes import WorkerDied, Workers, refuse_import
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.protect import protecting
-from wavebatch.files.disk.publish import remove_stale, reporting
+from wavebatch.files.disk.publish import protecting, remove_stale, reporting
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.library import load as load_kernels
 from wavebatch.surveying import Survey

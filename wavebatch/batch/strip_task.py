@@ -29,9 +29,8 @@ from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError, StageError
 from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.writer import CloudWriter
-from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target
+from wavebatch.files.disk.raw_bytes import Closing, take_fingerprint
 from wavebatch.files.las.laz_encode import Chunk
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.scanner import ScanPart

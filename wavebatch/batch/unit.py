@@ -24,7 +24,7 @@ from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
-from wavebatch.files.disk.row_parcel import RowParcel
+from wavebatch.files.disk.temp_store import RowParcel
 from wavebatch.files.las.laz_encode import Chunk
 from wavebatch.files.las.point_formats import split_numbers
 from wavebatch.files.las.write_points import Statistics

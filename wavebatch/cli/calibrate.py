@@ -14,7 +14,7 @@ import click
 from wavebatch.batch.options import RunOptions
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, format_json, talk, tell
-from wavebatch.files.disk.protect import protecting, refuse_input
+from wavebatch.files.disk.publish import protecting, refuse_input
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 
 if TYPE_CHECKING:

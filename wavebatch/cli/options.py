@@ -25,7 +25,7 @@ from wavebatch.cli.program.command import complete_files, complete_flags, comple
 from wavebatch.cli.program.settings import READ
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
-from wavebatch.files.disk.protect import protecting, refuse_input
+from wavebatch.files.disk.publish import protecting, refuse_input
 from wavebatch.files.inputs import find_files
 
 _Options = TypeVar("_Options")

@@ -34,7 +34,7 @@ from wavebatch.cli.program.progress import Progress
 from wavebatch.core.errors import WARNINGS, ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.units import count
-from wavebatch.files.disk.protect import refuse_input
+from wavebatch.files.disk.publish import refuse_input
 
 EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
 """All strips are written, but --report, --html or stdout could not be; some strips failed or lack packets; all failed.

@@ -21,7 +21,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.figure_file import check_picture
-from wavebatch.files.geojson_crs import GEOJSON_CRS, GeoJsonCrs, plan_crs
+from wavebatch.files.geojson import GEOJSON_CRS, GeoJsonCrs, plan_crs
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import survey_blocks

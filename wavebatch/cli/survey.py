@@ -100,7 +100,7 @@ def survey(
 
 def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
     """The survey, and what else is shown of the strip."""
-    from wavebatch.files.disk.fingerprint import take_fingerprint
+    from wavebatch.files.disk.raw_bytes import take_fingerprint
     from wavebatch.surveying.inspect_strip import doubt_files
     from wavebatch.surveying.system_file import SavedSurvey
     from wavebatch.tools.api.strip import open_strip

@@ -41,7 +41,7 @@ class Above(Range):
 
 
 class Key(NamedTuple):
-    """How a field of a dataclass stands in files and reports: `files.toml_schema` writes and reads them."""
+    """How a field of a dataclass stands in files and reports: `files.toml_file` writes and reads them."""
 
     name: str = ""
     """With the unit; empty: the name of the field. `{}` in it stands for the number of each item of a mapping. Of a

@@ -16,8 +16,8 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
-from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.publish import Draft, check_target
+from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.wkt import read_wkt
 
 TILE = 256

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.disk.protect import protect, real_name
+from wavebatch.files.disk.publish import protect, real_name
 from wavebatch.files.text_file import MOST_LIST, read_text
 
 SUFFIXES = (".las", ".laz")

@@ -23,7 +23,7 @@ from wavebatch.core.order import quantile
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.auto_chain import decide
 from wavebatch.surveying.choose_chain import sample_size

@@ -22,9 +22,8 @@ from wavebatch.batch.workers.futures import end_future, wait_uninterrupted
 from wavebatch.batch.workers.worker_check import compare_workers, describe_worker, list_sizes
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
-from wavebatch.files.disk.protect import list_packet_files
-from wavebatch.files.disk.publish import Draft, reporting
-from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
+from wavebatch.files.disk.publish import Draft, list_packet_files, reporting
+from wavebatch.files.disk.temp_store import owning_scratch, use_scratch
 
 PATIENCE = 60.0
 """Seconds without a worker, or without an answer of the scheduler, after which a cluster counts as lost."""

@@ -31,7 +31,7 @@ from wavebatch.batch.workers.serve import PATIENCE, serve_calls
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.core.process import CHILD, keep_freed_memory
-from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
+from wavebatch.files.disk.temp_store import owning_scratch, use_scratch
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""

@@ -21,8 +21,7 @@ from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_names import STYLES, name_standard, read_field, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.cloud.provenance import find_written
-from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.raw_bytes import widen_integers
+from wavebatch.files.disk.raw_bytes import Closing, widen_integers
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord

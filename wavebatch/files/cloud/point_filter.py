@@ -19,8 +19,7 @@ import numpy as np
 from wavebatch.core.condition import Condition, parse_condition, read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.area_crs import describe_miss
-from wavebatch.files.geojson import Polygon, find_inside, load_polygons
+from wavebatch.files.geojson import Polygon, describe_miss, find_inside, load_polygons
 from wavebatch.files.las.header import LasHeader
 
 REASONS = ("drop_flags", "flags", "classes", "bbox", "polygon", "where")

@@ -21,8 +21,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.cloud.provenance import USER_ID
-from wavebatch.files.disk.protect import protecting
-from wavebatch.files.disk.publish import Draft, reporting
+from wavebatch.files.disk.publish import Draft, protecting, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,

@@ -1,7 +1,12 @@
-"""Output files that appear whole or not at all: written under a temporary name in the same folder, then renamed.
+"""Output files that appear whole or not at all, and never in place of an input of the same call.
 
-All outputs of wavebatch are written through `Draft`. A killed run leaves only temporary files, which the next run
-removes; a lock shows which of them are still in use.
+All outputs of wavebatch are written through `Draft`: under a temporary name in the same folder, then renamed. A killed
+run leaves only temporary files, which the next run removes; a lock shows which of them are still in use (`temp_store`
+locks its folders too). Nothing else shows whether a process of another run is still alive.
+
+No output replaces a file that is read in the same call, whatever --overwrite says. `protecting` begins a call: the
+command line does it for every command, `run_batch` and the other functions that write do it for programs. `Draft` looks
+at the rule, so every output obeys it; `refuse_input` checks before long work.
 """
 
 from __future__ import annotations
@@ -15,16 +20,159 @@ import os
 import secrets
 import stat
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextvars import ContextVar
 from io import BufferedRandom
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.interrupts import uninterrupted
-from wavebatch.files.disk import locks
-from wavebatch.files.disk.protect import refuse_input
 from wavebatch.files.disk.raw_bytes import in_one_line
+
+_FORMAT_BYTE, _ENCODING_BYTE = 104, 6
+_WAVEFORM_FORMATS, _WAVES_INTERNAL = (4, 5, 9, 10), 2
+
+
+class _Inputs:
+    """Files by name and by number, so that links and hard links are found too."""
+
+    def __init__(self) -> None:
+        self.names: set[str] = set()
+        self.numbers: set[tuple[int, int]] = set()
+
+    def add(self, path: Path) -> None:
+        for one in (path, *_packet_files(path)):
+            self.names.add(real_name(one))
+            self.numbers |= _number(one)
+
+    def has(self, target: Path) -> bool:
+        return real_name(target) in self.names or bool(_number(target) & self.numbers)
+
+
+_inputs: ContextVar[_Inputs | None] = ContextVar("wavebatch_inputs", default=None)
+
+
+@contextlib.contextmanager
+def protecting(paths: Iterable[Path | str | None] = ()) -> Iterator[None]:
+    """A call that reads these files: no output inside may replace one of them; inside another call, it adds to that."""
+    token = _inputs.set(_Inputs()) if _inputs.get() is None else None
+    try:
+        protect(paths)
+        yield
+    finally:
+        if token is not None:
+            _inputs.reset(token)
+
+
+def protect(paths: Iterable[Path | str | None]) -> None:
+    """Add files to the inputs of the call, with the packet files of strips; does nothing outside `protecting`."""
+    inputs = _inputs.get()
+    if inputs is not None:
+        for path in paths:
+            if path is not None:
+                inputs.add(Path(path))
+
+
+def refuse_input(target: Path) -> None:
+    """Raise ConfigError if the output would replace an input of the call, also through a link."""
+    inputs = _inputs.get()
+    if inputs is not None and inputs.has(Path(target)):
+        raise ConfigError(f"{target}: the output would replace this input; choose another output")
+
+
+def real_name(path: Path) -> str:
+    """The file that a name leads to, links resolved."""
+    try:
+        return os.path.realpath(path)
+    except (OSError, ValueError):  # no file can have this name
+        return os.path.abspath(path)
+
+
+def _number(path: Path) -> set[tuple[int, int]]:
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return set()
+    return {(found.st_dev, found.st_ino)}
+
+
+def _packet_files(path: Path) -> list[Path]:
+    """The files in which the packets of a strip may be; none for other files and for strips that hold their packets."""
+    if path.suffix.lower() not in (".las", ".laz") or not os.path.isfile(path):  # a pipe would block for ever
+        return []
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_FORMAT_BYTE + 1)
+    except (OSError, ValueError):
+        return []
+    if len(head) <= _FORMAT_BYTE or head[_FORMAT_BYTE] & 63 not in _WAVEFORM_FORMATS:
+        return []
+    if head[_ENCODING_BYTE] & _WAVES_INTERNAL:
+        return []
+    return list_packet_files(path)
+
+
+def list_packet_files(path: Path, suffixes: Iterable[str] = (".wdp", ".WDP", ".wdz", ".WDZ")) -> list[Path]:
+    """Where the packets of a strip may be: beside it, then beside the file to which it is a link."""
+    places = dict.fromkeys((path, Path(real_name(path))))
+    return [place.with_suffix(suffix) for place in places for suffix in suffixes]
+
+
+fcntl: Any
+try:
+    import fcntl
+except ImportError:  # Windows has no fcntl: what killed processes left then stays until the user removes it
+    fcntl = None
+
+LOCK_FLAGS = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+
+
+def make_locked(make: Callable[[], tuple[Path, int]]) -> tuple[Path, int]:
+    """Return a new path and the descriptor of its lock file, locked.
+
+    make: makes both; it is called again if `remove_unlocked` of another process took them before they were locked.
+    """
+    while True:
+        path, descriptor = make()
+        with contextlib.suppress(BlockingIOError):
+            if hold(descriptor):
+                return path, descriptor
+        os.close(descriptor)
+
+
+def hold(descriptor: int) -> bool:
+    """Lock an open file; False if it was removed meanwhile. Raises BlockingIOError if another process has locked it."""
+    try:
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.fstat(descriptor).st_nlink > 0
+    except BlockingIOError:
+        raise
+    except OSError:  # a file system without locks
+        return True
+
+
+def remove_unlocked(
+    paths: Iterable[Path], open_lock: Callable[[Path], int], remove: Callable[[Path], None]
+) -> list[Path]:
+    """Remove those of the paths that no process has locked, and return them.
+
+    open_lock: returns the descriptor of a path's lock file; a path for which it raises OSError stays. On systems
+    without file locks nothing is removed.
+    """
+    removed: list[Path] = []
+    for path in sorted(paths) if fcntl is not None else ():
+        with contextlib.suppress(OSError):
+            descriptor = open_lock(path)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                remove(path)
+                removed.append(path)
+            finally:
+                os.close(descriptor)
+    return removed
+
 
 _PREFIX, _SUFFIX = ".wavebatch-", ".tmp"
 _CLAIM_PATIENCE = 0.5
@@ -66,7 +214,7 @@ class Draft(contextlib.AbstractContextManager):
             _cleared.add(self.target.parent)
             remove_stale(self.target.parent)
         with uninterrupted(), reporting(self.target):
-            self.path, descriptor = locks.make_locked(lambda: _create(self.target.parent))
+            self.path, descriptor = make_locked(lambda: _create(self.target.parent))
             self.file = cast(BufferedRandom, os.fdopen(descriptor, "w+b", buffering=1 << 20))
             self.published = False
             _open.add(self)
@@ -82,7 +230,7 @@ class Draft(contextlib.AbstractContextManager):
         with uninterrupted(), reporting(self.target):
             self.file.flush()
             os.fsync(self.file.fileno())
-            if locks.fcntl is None:  # Windows cannot rename an open file
+            if fcntl is None:  # Windows cannot rename an open file
                 self.file.close()
             try:
                 if self.overwrite:
@@ -190,7 +338,7 @@ class Claim:
 
     def __init__(self, folder: Path, name: str) -> None:
         self._descriptor: int | None = None
-        if locks.fcntl is None:
+        if fcntl is None:
             return
         digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
         self._path = folder / f"{_PREFIX}lock-{digest}{_SUFFIX}"
@@ -218,9 +366,9 @@ class Claim:
 
 def _lock(path: Path) -> int | None:
     """A descriptor of the locked file; None if it was removed meanwhile. BlockingIOError if another process has it."""
-    descriptor, held = os.open(path, locks.FLAGS | os.O_CREAT, 0o666), False
+    descriptor, held = os.open(path, LOCK_FLAGS | os.O_CREAT, 0o666), False
     try:
-        held = locks.hold(descriptor)
+        held = hold(descriptor)
     finally:
         if not held:
             os.close(descriptor)
@@ -233,7 +381,7 @@ def remove_stale(folder: Path) -> list[Path]:
     A locked file is still being written and stays. On systems without file locks nothing is removed.
     """
     found = Path(folder).glob(f"{_PREFIX}*{_SUFFIX}")
-    return locks.remove_unlocked(found, lambda path: os.open(path, locks.FLAGS), os.unlink)
+    return remove_unlocked(found, lambda path: os.open(path, LOCK_FLAGS), os.unlink)
 
 
 def _no_file(target: Path) -> str:
@@ -249,7 +397,7 @@ def _exists(target: Path) -> str:
 def _create(folder: Path) -> tuple[Path, int]:
     """A new file, open for reading and writing."""
     path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}{_SUFFIX}"
-    return path, os.open(path, locks.FLAGS | os.O_CREAT | os.O_EXCL, 0o666)
+    return path, os.open(path, LOCK_FLAGS | os.O_CREAT | os.O_EXCL, 0o666)
 
 
 def _link(path: Path, target: Path) -> None:

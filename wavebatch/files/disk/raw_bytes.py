@@ -1,23 +1,40 @@
 """Bytes read at a place of a file, and the errors of damaged files, each as one clear line.
 
 All readers of LAS files, packets and temporary files use this module. Input may be hostile: read no byte without a
-check that it is there.
+check that it is there. `Closing` is the base of the classes that hold files; writers abort instead (see `PointFile`).
+Reports, system files and calibrations hold the fingerprint of a strip: a change of it makes runs with `--resume` start
+again.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import stat
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
+
+
+class Closing:
+    """A context manager that calls `close` at its end."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close what is open. Harmless twice."""
+        raise NotImplementedError
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -161,3 +178,33 @@ def _release_stderr(kept: int, memory: int, *, drop: bool) -> None:
         with contextlib.suppress(OSError):  # as for all messages: a full disk does not stop the work
             os.write(2, os.pread(memory, size, 0))
     os.close(memory)
+
+
+_ENDS = 1 << 20
+_PIECE = 1 << 14
+_PIECES = 128
+
+
+def take_fingerprint(path: Path, packet_file: Path | None = None) -> dict[str, Any]:
+    """Return size and sampled SHA-256 of a strip, and of its packet file if that is another file.
+
+    The first and the last MiB and 128 pieces of 16 KiB between them are read; names and times of files do not count.
+    """
+    fingerprint = _sample(Path(path))
+    if packet_file is not None and Path(packet_file) != Path(path):
+        fingerprint["packets"] = _sample(Path(packet_file))
+    return fingerprint
+
+
+def _sample(path: Path) -> dict[str, Any]:
+    with reporting_reads(path), open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        digest = hashlib.sha256(size.to_bytes(8, "little"))
+        digest.update(file.read(_ENDS))
+        between = max(size - 2 * _ENDS, 0)
+        for piece in range(_PIECES if between else 0):
+            file.seek(_ENDS + between * piece // _PIECES)
+            digest.update(file.read(_PIECE))
+        file.seek(max(size - _ENDS, 0))
+        digest.update(file.read(_ENDS))
+    return {"size": size, "sha256_sampled": digest.hexdigest()}

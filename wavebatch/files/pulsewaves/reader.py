@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core import interrupts
-from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.raw_bytes import damaged, open_regular, read_exactly, reporting_reads
+from wavebatch.files.disk.raw_bytes import Closing, damaged, open_regular, read_exactly, reporting_reads
 from wavebatch.files.pulsewaves.header import MOST_SEGMENTS, WAVES_HEADER_SIZE, Descriptor, PulseHeader, Sampling
 from wavebatch.files.strip.packets import MAX_SAMPLES
 

@@ -17,7 +17,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.disk.protect import list_packet_files
+from wavebatch.files.disk.publish import list_packet_files
 from wavebatch.files.disk.raw_bytes import damaged, open_regular, read_exactly, reporting_reads
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.header import (

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.spool import Spool
+from wavebatch.files.disk.raw_bytes import Closing
+from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Reason
 from wavebatch.files.strip.packet_vectors import VectorDecision

@@ -14,9 +14,8 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.order import distinct
-from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.raw_bytes import take_whole_records
-from wavebatch.files.disk.spool import Spool
+from wavebatch.files.disk.raw_bytes import Closing, take_whole_records
+from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.las.crs import metres_per_unit
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import PointSource

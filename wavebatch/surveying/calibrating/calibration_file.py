@@ -17,8 +17,15 @@ from pathlib import Path
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.text_file import read_text
-from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml, shorten
-from wavebatch.files.toml_schema import describe_record, list_comments, read_record
+from wavebatch.files.toml_file import (
+    TomlTable,
+    describe_record,
+    format_toml,
+    list_comments,
+    parse_toml,
+    read_record,
+    shorten,
+)
 from wavebatch.surveying.calibration import Calibration
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"

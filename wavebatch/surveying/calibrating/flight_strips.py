@@ -16,7 +16,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.system import angle_across, angle_to_vertical
-from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, EchoSource, open_source
 from wavebatch.surveying.calibrating.target_file import Target

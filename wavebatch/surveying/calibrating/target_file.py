@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.area_crs import AreaFile, place_rings
-from wavebatch.files.geojson import FARTHEST, find_inside, read_features
+from wavebatch.files.geojson import FARTHEST, AreaFile, find_inside, place_rings, read_features
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.text_file import MOST_LIST, read_text
 
@@ -55,7 +54,7 @@ class Target:
     """Where the coordinates of a GeoJSON file lie; None: in the CRS of the strip."""
 
     def place(self, strip: Path, header: LasHeader) -> Target:
-        """Return the target in the coordinates of a strip; raises as `area_crs.place_rings`."""
+        """Return the target in the coordinates of a strip; raises as `place_rings`."""
         (corners,) = place_rings(self.file, [self.corners], strip, header)
         return replace(self, corners=corners, file=None)
 

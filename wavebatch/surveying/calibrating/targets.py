@@ -15,8 +15,8 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.files.area_crs import describe_miss
-from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.disk.raw_bytes import take_fingerprint
+from wavebatch.files.geojson import describe_miss
 from wavebatch.files.las.header import decode_text
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource

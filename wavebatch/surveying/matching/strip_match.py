@@ -17,7 +17,7 @@ from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Digitizer, SystemPulse, WaveformBlock
-from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import sample_reference

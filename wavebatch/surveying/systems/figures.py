@@ -13,8 +13,7 @@ from typing import Annotated
 
 from wavebatch.core.schema import Key, Range
 from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.files.toml_file import TomlTable, check_number
-from wavebatch.files.toml_schema import describe_record, read_record
+from wavebatch.files.toml_file import TomlTable, check_number, describe_record, read_record
 
 MOST_FIGURE = 1e30
 """Largest figure of a survey: far above counts and times, far below what overflows when it is squared."""

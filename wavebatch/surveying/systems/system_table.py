@@ -11,8 +11,7 @@ from typing import Any
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.toml_file import TomlTable
-from wavebatch.files.toml_schema import describe_record, list_comments, read_record
+from wavebatch.files.toml_file import TomlTable, describe_record, list_comments, read_record
 
 MOST_COMPONENTS = 16
 """Gaussians that a pulse in a file may have."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
-from wavebatch.files.disk.closing import Closing
+from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan

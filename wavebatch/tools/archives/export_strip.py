@@ -13,8 +13,8 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.npz import NpzWriter
+from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
 from wavebatch.files.las.header import STANDARD_TIME, Vlr, decode_text, has_record, is_projection
 from wavebatch.files.strip.header_check import audit_header

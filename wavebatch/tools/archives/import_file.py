@@ -15,8 +15,8 @@ from typing import Any, Literal
 from wavebatch import __version__
 from wavebatch.core.errors import InputError
 from wavebatch.core.schema import option
-from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
+from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.header import Vlr, read_header
 from wavebatch.files.pulsewaves.header import RETURNING, PulseHeader, read_pulse_header
 from wavebatch.files.pulsewaves.reader import PulseReader

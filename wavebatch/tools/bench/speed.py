@@ -24,7 +24,7 @@ from wavebatch.batch.run import run_batch
 from wavebatch.core.errors import StageError
 from wavebatch.core.process import CHILD, Seconds
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.disk.closing import Closing
+from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.stages.chain import Chain
 
 _START = "from wavebatch.tools.bench.speed import serve; serve()"

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.disk.spool import Spool
+from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.tools.plots.values import Clouds
 

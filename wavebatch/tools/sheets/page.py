@@ -20,8 +20,7 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.core.optional import advise_install
-from wavebatch.files.disk.protect import refuse_input
-from wavebatch.files.disk.publish import Draft, reporting
+from wavebatch.files.disk.publish import Draft, refuse_input, reporting
 from wavebatch.files.figure_file import has_matplotlib
 from wavebatch.tools.sheets.sheet import NO_VALUE, Cell, Code, Fact, Later, Note, Part, Picture, Table
 

@@ -18,7 +18,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
-from wavebatch.files.disk.protect import protecting
+from wavebatch.files.disk.publish import protecting
 from wavebatch.files.las.header import is_projection, read_header
 from wavebatch.files.point_dtypes import field_names
 from wavebatch.files.strip.writer import FullwaveWriter

@@ -15,10 +15,9 @@ from typing import IO, Any
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.npz import NpzWriter
-from wavebatch.files.disk.npz_reader import read_array_header, read_array_text, reading_npz
+from wavebatch.files.disk.npz import NpzWriter, read_array_header, read_array_text, reading_npz
 from wavebatch.files.disk.publish import Draft
+from wavebatch.files.disk.raw_bytes import Closing
 
 ECHO_COLUMNS: dict[str, str] = {
     "waveform": "<u8",

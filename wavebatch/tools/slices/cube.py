@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.disk.npz_reader import read_npz
+from wavebatch.files.disk.npz import read_npz
 from wavebatch.files.disk.publish import Draft, reporting
 from wavebatch.tools.slices.segments import ScanLine, align_times, find_main_axis
 

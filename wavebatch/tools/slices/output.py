@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
+from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.files.geojson_crs import GeoJsonCrs
+from wavebatch.files.geojson import GeoJsonCrs
 from wavebatch.tools.plots.labels import set_head, space_ticks
 from wavebatch.tools.slices.cube import CubeSlice
 from wavebatch.tools.slices.segments import Segment, Slice

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.key_sums import HELD, KeyedSums
+from wavebatch.files.disk.raw_bytes import Closing
+from wavebatch.files.disk.temp_store import HELD, KeyedSums
 from wavebatch.kernels.geometry.voxels import (
     KEY_BITS,
     Crossings,

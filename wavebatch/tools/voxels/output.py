@@ -16,8 +16,7 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.npz import NpzWriter
-from wavebatch.files.disk.protect import protecting
-from wavebatch.files.disk.publish import Draft, publish_together
+from wavebatch.files.disk.publish import Draft, protecting, publish_together
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import (
     PROJECTION,

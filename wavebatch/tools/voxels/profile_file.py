@@ -15,8 +15,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.npz import NpzWriter
-from wavebatch.files.disk.protect import protecting
-from wavebatch.files.disk.publish import Draft
+from wavebatch.files.disk.publish import Draft, protecting
 from wavebatch.tools.voxels.rays import Rays
 
 PULSE_COLUMNS = {

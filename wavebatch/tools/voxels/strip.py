@@ -23,8 +23,8 @@ from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter
-from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.disk.temp_store import HELD
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys

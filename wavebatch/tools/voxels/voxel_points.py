@@ -12,7 +12,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.disk.npz_reader import read_npz, reading_npz
+from wavebatch.files.disk.npz import read_npz, reading_npz
 from wavebatch.files.las.crs import name_crs
 from wavebatch.tools.plots.values import Tally
 from wavebatch.tools.voxels.grid import COLUMNS

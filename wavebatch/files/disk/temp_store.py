@@ -1,0 +1,455 @@
+"""Data that does not fit into memory, or that travels between processes: temporary files and their folders.
+
+The strip scan, the second pass, the voxel grid and all that compares clouds use it. Folders are removed when their
+process ends, or by the next run if it was killed: a folder is in use as long as it is locked. `Spool` sorts entries
+into numbered buckets (`buckets` has the usual ones), `RowParcel` takes rows from one process to another past the one
+that writes the cloud, `RowStore` keeps the rows of a cloud for the second pass, `KeyedSums` sums integers by key.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import functools
+import os
+import re
+import shutil
+import socket
+import tempfile
+from collections.abc import Iterator
+from contextvars import ContextVar
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+
+from wavebatch.core.errors import InputError
+from wavebatch.files.disk.publish import LOCK_FLAGS, Draft, make_locked, remove_unlocked, reporting
+from wavebatch.files.disk.raw_bytes import Closing, in_one_line, read_exactly, take_whole_records
+
+_LOCK = "lock"
+_place: ContextVar[Path | None] = ContextVar("wavebatch_scratch", default=None)
+_own: list[_Owned] = []
+
+
+def make_folder() -> Path:
+    """Return a new folder for temporary files, in the folder of `use_scratch` or in one of this process.
+
+    Raises OSError if there is no room for it.
+    """
+    place = _place.get()
+    if place is None:
+        if not _own:
+            _own.append(_Owned(Path(tempfile.gettempdir()), ""))
+            atexit.register(_own[0].close)
+        place = _own[0].folder
+    return Path(tempfile.mkdtemp(dir=place))
+
+
+def scratch_place() -> Path:
+    """Return the folder in which `make_folder` makes folders, for messages."""
+    return _place.get() or Path(tempfile.gettempdir())
+
+
+def reporting_scratch() -> contextlib.AbstractContextManager[None]:
+    """Turn an error of the operating system with a temporary file into one InputError line."""
+    remedy = "free space or set TMPDIR to another folder"
+    return in_one_line(lambda _, why: f"{scratch_place()}: no temporary file can be used there ({why}); {remedy}")
+
+
+def use_scratch(folder: Path | None) -> None:
+    """Let `make_folder` of this thread work in a folder of another process."""
+    _place.set(folder)
+
+
+@contextlib.contextmanager
+def owning_scratch(parent: Path | None = None) -> Iterator[Path | None]:
+    """Make a folder in `parent` (default: TMPDIR) for `make_folder` of this thread, and remove it at the end.
+
+    In a folder of the user its name is hidden. Gives None if it cannot be made: whoever needs it reports the error.
+    """
+    try:
+        owned = _Owned(Path(parent or tempfile.gettempdir()), "." if parent else "")
+    except OSError:
+        yield None
+        return
+    token = _place.set(owned.folder)
+    try:
+        yield owned.folder
+    finally:
+        _place.reset(token)
+        owned.close()
+
+
+def remove_orphans(parent: Path) -> list[Path]:
+    """Remove the folders of killed processes from `parent` and return their names.
+
+    Only folders of this user and this machine: a locked folder is in use, and whether a process of another machine is
+    alive cannot be known. On systems without file locks nothing is removed.
+    """
+    found = [*parent.glob(f"{_prefix()}*"), *parent.glob(f".{_prefix()}*")]
+    return remove_unlocked(found, _open_lock, functools.partial(shutil.rmtree, ignore_errors=True))
+
+
+class _Owned:
+    """A new folder with a lock that this process holds until it ends."""
+
+    def __init__(self, parent: Path, hidden: str) -> None:
+        remove_orphans(parent)
+        self._lock: int | None
+        self.folder, self._lock = make_locked(lambda: _make_folder(parent, hidden))
+
+    def close(self) -> None:
+        """Remove the folder with its content; may be called twice."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _make_folder(parent: Path, hidden: str) -> tuple[Path, int]:
+    """A new folder and the descriptor of its lock file."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=f"{hidden}{_prefix()}{os.getpid()}-", dir=parent))
+        with contextlib.suppress(FileNotFoundError):  # another process removed it as left over
+            return folder, os.open(folder / _LOCK, LOCK_FLAGS | os.O_CREAT, 0o600)
+
+
+def _open_lock(folder: Path) -> int:
+    """The descriptor of a folder's lock file; OSError for links and folders of other users."""
+    if folder.is_symlink() or folder.lstat().st_uid != os.getuid():
+        raise FileNotFoundError(folder)
+    return os.open(folder / _LOCK, LOCK_FLAGS | os.O_CREAT, 0o600)
+
+
+def _prefix() -> str:
+    """Start of the names of this machine's folders."""
+    return f"wavebatch-{re.sub('[^A-Za-z0-9.]', '_', socket.gethostname())}-"
+
+
+SPOOL_MEMORY = 1 << 24
+"""Bytes of entries in memory before they are written to disk."""
+SPOOL_KEPT = 1 << 20
+"""Bytes of entries that a sealed spool keeps in memory: it is pickled for other processes."""
+
+
+class Spool(Closing):
+    """Entries of one dtype in buckets 0..n-1: `append` all, then `read`; sealed it can be pickled. A context manager.
+
+    The temporary file holds segments, each sorted by bucket, after a table of where its buckets begin. `close` removes
+    the file; copies in other processes only read it.
+    """
+
+    def __init__(self, buckets: int, dtype: np.dtype) -> None:
+        self.buckets = buckets
+        self.dtype = np.dtype(dtype)
+        self.path: Path | None = None
+        """The temporary file; None while all entries are in memory."""
+        self.count = 0
+        self._pending: list[tuple[np.ndarray, np.ndarray]] = []
+        self._held = 0
+        self._segments: list[int] = []
+        self._memory: tuple[np.ndarray, np.ndarray] | None = None
+        self._sealed = False
+        self._joined: list[Spool] = []
+
+    def join(self, other: Spool) -> None:
+        """Read, and close, with this one the entries of another sealed spool of as many buckets, before its own."""
+        self._joined.append(other)
+
+    def append(self, bucket: np.ndarray, entries: np.ndarray) -> None:
+        """Add entries (k,) to buckets (k,)."""
+        if not len(entries):
+            return
+        self._pending.append((bucket.astype(np.int64), entries))
+        self._held += entries.nbytes + 8 * len(bucket)
+        self.count += len(entries)
+        if self._held >= SPOOL_MEMORY:
+            self._flush()
+
+    def seal(self) -> Spool:
+        """End the writing, as the first reading does; may be called twice."""
+        if self._sealed:
+            return self
+        self._sealed = True
+        if self._segments or self._held > SPOOL_KEPT:
+            self._flush()
+        else:
+            self._memory = self._take_pending()
+        return self
+
+    def read(self, bucket: int) -> np.ndarray:
+        """Return the entries of a bucket in the order in which they were added."""
+        parts = list(self.pieces(bucket))
+        if not parts:
+            return np.empty(0, self.dtype)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def pieces(self, bucket: int) -> Iterator[np.ndarray]:
+        """Yield the same entries in parts, one per segment."""
+        self.seal()
+        for other in self._joined:
+            yield from other.pieces(bucket)
+        if self._memory is not None:
+            starts, entries = self._memory
+            if starts[bucket + 1] > starts[bucket]:
+                yield entries[starts[bucket] : starts[bucket + 1]]
+            return
+        if self.path is None:
+            return
+        with reporting_scratch(), open(self.path, "rb", buffering=0) as file:
+            for at in self._segments:
+                edges = np.empty(2, np.int64)
+                read_exactly(file.fileno(), edges.view(np.uint8), at + 8 * bucket)
+                part = np.empty(int(edges[1] - edges[0]), self.dtype)
+                begin = at + 8 * (self.buckets + 1) + int(edges[0]) * self.dtype.itemsize
+                read_exactly(file.fileno(), part.view(np.uint8).reshape(-1), begin)
+                if len(part):
+                    yield part
+
+    def close(self) -> None:
+        """Remove the temporary file; may be called twice."""
+        for other in self._joined:
+            other.close()
+        if self.path is not None:
+            shutil.rmtree(self.path.parent, ignore_errors=True)
+        self._pending, self._memory = [], None
+
+    def _take_pending(self) -> tuple[np.ndarray, np.ndarray]:
+        """Start of every bucket, i8 (buckets + 1,), and the entries sorted by bucket."""
+        pending, self._pending, self._held = self._pending, [], 0
+        if not pending:
+            return np.zeros(self.buckets + 1, np.int64), np.empty(0, self.dtype)
+        bucket = np.concatenate([part for part, _ in pending])
+        entries = np.concatenate([part for _, part in pending])
+        if np.any(bucket[1:] < bucket[:-1]):
+            order = np.argsort(bucket, kind="stable")
+            bucket, entries = bucket[order], take_whole_records(entries, order)
+        return np.searchsorted(bucket, np.arange(self.buckets + 1)).astype(np.int64), entries
+
+    def _flush(self) -> None:
+        starts, entries = self._take_pending()
+        with reporting_scratch():
+            if self.path is None:
+                self.path = make_folder() / "spool"
+            with open(self.path, "ab") as file:
+                self._segments.append(file.tell())
+                file.write(starts.data)
+                file.write(entries.view(np.uint8).data)
+
+
+PARCEL_KEPT = 1 << 16
+"""Bytes that travel themselves: a file costs more."""
+
+
+class RowParcel(Closing):
+    """Rows (m,), in memory or in a file; the last to use them calls `close`."""
+
+    def __init__(self, rows: np.ndarray) -> None:
+        self.count, self._dtype = len(rows), rows.dtype
+        self._rows: np.ndarray | Path = np.ascontiguousarray(rows)
+        """Or the file that has them."""
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Move the rows to a file; without room for it they travel themselves."""
+        if isinstance(self._rows, np.ndarray) and self._rows.nbytes > PARCEL_KEPT:
+            with contextlib.suppress(OSError):
+                path = make_folder() / "rows"
+                self._rows.tofile(path)
+                self._rows = path
+        return self.__dict__
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Return rows [start, stop)."""
+        if isinstance(self._rows, np.ndarray):
+            return self._rows[start:stop]
+        rows = np.empty(stop - start, self._dtype)
+        with reporting_scratch(), open(self._rows, "rb", buffering=0) as file:
+            read_exactly(file.fileno(), rows.view(np.uint8), start * rows.itemsize)
+        return rows
+
+    def close(self) -> None:
+        """Remove the file; may be called twice."""
+        if isinstance(self._rows, Path):
+            shutil.rmtree(self._rows.parent, ignore_errors=True)
+
+
+STORE_PIECE = 1 << 16
+"""Rows read at a time."""
+
+
+class RowStore:
+    """Rows of `dtype` in one temporary file, which is locked so that no other run removes it as left over.
+
+    target: the output that the rows are for. Raises InputError if its folder cannot be written.
+    """
+
+    def __init__(self, target: Path, dtype: np.dtype) -> None:
+        self.dtype = dtype
+        self.count = 0
+        self._draft = Draft(target, overwrite=True)
+
+    def add(self, rows: np.ndarray) -> None:
+        """Append rows (m,) of `dtype`."""
+        with reporting(self._draft.target):
+            self._draft.file.write(np.ascontiguousarray(rows).view(np.uint8).data if len(rows) else b"")
+            self._draft.file.flush()  # else a worker forked now would inherit the buffer and write it again
+        self.count += len(rows)
+
+    def extend(self, count: int) -> None:
+        """Set the length to `count` rows; new rows are zeros."""
+        with reporting(self._draft.target):
+            self._draft.file.truncate(count * self.dtype.itemsize)
+        self.count = count
+
+    def put(self, index: np.ndarray, rows: np.ndarray) -> None:
+        """Write rows (m,) at the ascending places `index` (m,)."""
+        if not len(rows):
+            return
+        size = self.dtype.itemsize
+        content = np.ascontiguousarray(rows).view(np.uint8).data
+        starts = np.flatnonzero(np.concatenate([[True], np.diff(index) != 1]))
+        ends = np.append(starts[1:], len(index))
+        with reporting(self._draft.target):
+            for place, start, end in zip(index[starts].tolist(), starts.tolist(), ends.tolist(), strict=True):
+                self._draft.file.seek(place * size)
+                self._draft.file.write(content[start * size : end * size])
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Return rows [start, stop)."""
+        rows = np.empty(stop - start, self.dtype)
+        with reporting(self._draft.target):
+            self._draft.file.seek(start * self.dtype.itemsize)
+            if self._draft.file.readinto(rows.view(np.uint8).data) != rows.nbytes:
+                raise InputError(f"{self._draft.target}: its temporary file was cut by another program; run again")
+        return rows
+
+    def pieces(self, size: int = STORE_PIECE) -> Iterator[np.ndarray]:
+        """Yield all rows, at most `size` at a time; the arrays are writable."""
+        for start in range(0, self.count, size):
+            yield self.read(start, min(start + size, self.count))
+
+    def close(self) -> None:
+        """Remove the file; may be called twice."""
+        self._draft.discard()
+
+
+HELD = 1 << 18
+"""Rows in memory before they are sorted and written to disk."""
+
+STRIDE = 256
+"""One key of so many rows on disk stays in memory, to find ranges of keys without reading."""
+
+
+class KeyedSums(Closing):
+    """Sums of `columns` integers per key: `add` any number of times, then `pieces`, then `close`.
+
+    held: rows in memory; more rows go to a temporary file. stride: rows between two keys that mark places in it.
+    A context manager.
+    """
+
+    def __init__(self, columns: int, *, held: int = HELD, stride: int = STRIDE) -> None:
+        self._held, self._stride = held, stride
+        self._dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
+        self._parts: list[tuple[np.ndarray, np.ndarray]] = []
+        self._number = 0
+        self._file: IO[bytes] | None = None
+        self._runs: list[_Run] = []
+
+    def close(self) -> None:
+        """Remove the temporary file."""
+        self._parts = []
+        if self._file is not None:
+            self._file.close()
+
+    def add(self, key: np.ndarray, value: np.ndarray) -> None:
+        """Add rows: key u8 (m,), value i8 (m, columns)."""
+        if not len(key):
+            return
+        self._parts.append(_sum([(key, value)]))
+        self._number += len(self._parts[-1][0])
+        if self._number > self._held:
+            self._shrink()
+            if self._number > self._held // 2:
+                self._spill()
+
+    def pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield keys, ascending and each once, with their sums, some at a time."""
+        if not self._runs:
+            self._shrink()
+            yield from self._parts
+            return
+        self._spill()
+        for low, high in self._cut_ranges():
+            yield _sum([self._read_range(run, low, high) for run in self._runs if run.touches(low, high)])
+
+    def _cut_ranges(self) -> Iterator[tuple[int, int]]:
+        """Ascending ranges of keys with about `held` rows each; none is empty."""
+        marks = np.sort(np.concatenate([run.marks for run in self._runs]))
+        borders = np.unique(marks[:: max(self._held // self._stride, 1)]).tolist()
+        yield from zip(borders, [*borders[1:], 1 << 64], strict=True)
+
+    def _shrink(self) -> None:
+        """Sums up the rows in memory."""
+        if len(self._parts) > 1:
+            self._parts = [_sum(self._parts)]
+        self._number = sum(len(key) for key, _ in self._parts)
+
+    def _spill(self) -> None:
+        self._shrink()
+        with reporting_scratch():
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(dir=scratch_place())  # noqa: SIM115 - closed by close()
+            for key, value in self._parts:
+                rows = np.empty(len(key), self._dtype)
+                rows["key"], rows["value"] = key, value
+                first = self._file.seek(0, 2) // self._dtype.itemsize
+                self._file.write(rows.data)
+                self._runs.append(_Run(first, len(key), key[::self._stride].copy(), int(key[-1])))
+        self._parts, self._number = [], 0
+
+    def _read_range(self, run: _Run, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+        """Keys and values of the rows of a run with keys in [low, high)."""
+        begin = max(int(np.searchsorted(run.marks, np.uint64(low), side="right")) - 1, 0) * self._stride
+        end = run.number
+        if high <= run.last:
+            end = min(int(np.searchsorted(run.marks, np.uint64(high))) * self._stride, end)
+        size = self._dtype.itemsize
+        if self._file is None:
+            raise ValueError("the sums are closed")
+        with reporting_scratch():
+            self._file.seek((run.first + begin) * size)
+            data = self._file.read((end - begin) * size)
+        if len(data) != (end - begin) * size:
+            raise InputError(f"{scratch_place()}: a temporary file was cut by another program; run again")
+        rows = np.frombuffer(data, self._dtype)
+        last = len(rows) if high > run.last else int(np.searchsorted(rows["key"], np.uint64(high)))
+        rows = rows[int(np.searchsorted(rows["key"], np.uint64(low))) : last]
+        return rows["key"], rows["value"]
+
+
+class _Run(NamedTuple):
+    """Rows in the file that are sorted by key."""
+
+    first: int
+    number: int
+    marks: np.ndarray
+    """Keys of its rows 0, STRIDE, 2 STRIDE ..., u8."""
+    last: int
+    """The largest key."""
+
+    def touches(self, low: int, high: int) -> bool:
+        """Whether keys of the run may lie in [low, high)."""
+        return int(self.marks[0]) < high and self.last >= low
+
+
+def _sum(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Keys of all parts, ascending and each once, with the sums of their rows; there must be at least one row."""
+    key, value = parts[0] if len(parts) == 1 else (np.concatenate(one) for one in zip(*parts, strict=True))
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+    return key[first], np.add.reduceat(np.take(value, order, axis=0), first, axis=0)
