@@ -246,7 +246,8 @@ def test_decomposers_find_the_same_echoes_as_without_a_gap(whole, tmp_path, name
     position = tables[1].time / block.spacing
     width = tables[1].sigma / block.spacing
     distance = gap_distance(block.missing, tables[1].waveform, position)
-    assert (distance >= -0.5 * width - 1e-3).all() or name == "decompose.asdf_only"
+    # Between two recorded samples an echo is known, however narrow it is.
+    assert (distance >= -np.maximum(0.5 * width, 1.0) - 1e-3).all() or name == "decompose.asdf_only"
     close = distance < width
     flagged = (tables[1].flags & int(EchoFlag.NEAR_EDGE)) != 0
     assert flagged[close].all()
