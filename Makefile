@@ -69,11 +69,11 @@ readers: $(VENV)/.test
 PYTEST := LC_ALL=C.UTF-8 PYTHONUTF8=1 $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.test
-	@echo "The fast tests: about 3 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
+	@echo "The fast tests: about 5 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
 	$(PYTEST) -m 'not slow'
 
 slow: $(VENV)/.test
-	@echo "The slow tests: about 12 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
+	@echo "The slow tests: about 20 minutes on 2 cores. A dot is a test; the share that is done stands at the right."
 	$(PYTEST) -m slow
 
 test-all: test slow
