@@ -7,7 +7,7 @@ that it was not learned from are shorter to describe with it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -21,18 +21,11 @@ from wavebatch.stages.pulse_tables import clip_level, shape_limits
 from wavebatch.surveying.measuring.joint_pulse import learn_jointly
 from wavebatch.surveying.measuring.judge import (
     SURE,
-    Explained,
-    Laws,
     count_errors,
-    describe_echoes,
-    describe_residual,
     describe_waveforms,
     explain,
-    find_changed,
-    find_laws,
     find_own_width,
     measure_change,
-    replace_rows,
 )
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
@@ -65,10 +58,6 @@ FEWEST = 48
 MISFITS = 0.0005 * 2.0 ** np.arange(9)
 """Misfits of the chosen pulse that are tried: half a noise at 1,000 noises up to an eighth of the pulse, beyond which
 it is no pulse of this strip."""
-
-BY_CHANCE = 2.0
-"""Standard errors up to which a description without misfit may be longer: three waveforms that agree have no more, and
-chance has more once in forty strips."""
 
 FALSE_QUIET = 0.0075
 """Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
@@ -302,81 +291,44 @@ def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0) -> tupl
 
 
 def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> float:
-    """Return the misfit that describes waveforms shortest; none where that is hardly longer.
+    """Return the least misfit whose description is longer than the shortest by at most one standard error.
 
     It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
-    much of it neighbours are not found, and both lengthen the description. The lengths of its neighbours say where
-    between them the shortest one lies: halves of a strip then agree.
+    much of it neighbours are not found, and both lengthen the description. Between two misfits that are tried it is
+    found by their standard errors: halves of a strip then agree.
     """
     # What clipped echoes hide is no misfit.
     whole = np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1))
     block = block.rows(whole) if len(whole) >= FEWEST else block
-    tried = _TriedMisfits(block, system, [change for change in CHANGES if change <= STEP_OF_CHANGES * seen])
-    last = len(MISFITS) - 1
-    for place in (4, last, 6):
-        tried.look(place)
-    # Less than what misses the echoes for sure only costs time.
-    if tried.longer(4) < HOPELESS:
-        tried.look(0)
-        if tried.longer(0) <= BY_CHANCE:
-            return 0.0
-        tried.look(2)
-    for place in (tried.best - 1, tried.best + 1):
-        if 0 <= place <= last:
-            tried.look(place)
-    # Those that a description cannot tell apart: half the logarithm of the waveforms is what a parameter costs.
-    alike = 0.5 * log(len(block))
-    best = min(place for place in tried.known if tried.exceed(place) <= alike)
-    further = 0.0
-    if best - 1 in tried.known and best + 1 in tried.known and tried.exceed(best + 1) > alike:
-        before, after = tried.exceed(best - 1), tried.exceed(best + 1)
-        further = 0.5 * (before - after) / (before + after)
-    return float(MISFITS[0] * 2.0 ** (best + further))
+    changes = [change for change in CHANGES if change <= STEP_OF_CHANGES * seen]
+    lengths: dict[int, list[np.ndarray]] = {}
 
+    def look(places: Iterable[int]) -> tuple[int, list[float]]:
+        """The best place of those tried, and by how many standard errors each of them is longer, by the best change."""
+        for place in places:
+            if place not in lengths:
+                explained = explain(block, replace(system, misfit=float(MISFITS[place])))
+                lengths[place] = [describe_waveforms(block, system, explained, change) for change in changes]
+        tried = product(sorted(lengths), range(len(changes)))
+        best, change = min(tried, key=lambda one: lengths[one[0]][one[1]].mean())
+        least = lengths[best][change]
+        return best, [count_errors(lengths[place][change] - least) for place in sorted(lengths)]
 
-class _TriedMisfits:
-    """Descriptions of a block with some of MISFITS, by their places."""
-
-    def __init__(self, block: WaveformBlock, system: SystemPulse, changes: list[float]) -> None:
-        self._block, self._system, self._changes = block, system, changes
-        self.known: dict[int, tuple[Explained, list[np.ndarray]]] = {}
-        """Echoes, and the length of what they leave, for each change of the pulse."""
-        self._lengths: dict[int, list[np.ndarray]] = {}
-        self.best, self._change = 0, 0
-        self._laws: Laws | None = None
-
-    def look(self, place: int) -> None:
-        """Try a misfit. What the next smaller and the next larger one explain alike, it does too."""
-        if place in self.known:
-            return
-        block, borne = self._block, replace(self._system, misfit=float(MISFITS[place]))
-        below = max((one for one in self.known if one < place), default=None)
-        above = min((one for one in self.known if one > place), default=None)
-        if below is None or above is None:
-            explained = explain(block, borne)
-            left = [describe_residual(self._system, explained, change) for change in self._changes]
-        else:
-            before, left = self.known[below]
-            rows = find_changed(before, self.known[above][0])
-            some = explain(block.rows(rows), borne)
-            explained, left = replace_rows(before, rows, some), [length.copy() for length in left]
-            for length, change in zip(left, self._changes, strict=True):
-                length[rows] = describe_residual(self._system, some, change)
-        self.known[place] = explained, left
-        # By common laws: else each waveform is longer or shorter by what echoes of others change in them.
-        self._laws = self._laws or find_laws(block, self._system, explained)
-        echoes = describe_echoes(block, self._system, explained, self._laws)
-        self._lengths[place] = [echoes + length for length in left]
-        tried = product(sorted(self._lengths), range(len(self._changes)))
-        self.best, self._change = min(tried, key=lambda one: self._lengths[one[0]][one[1]].mean())
-
-    def longer(self, place: int) -> float:
-        """Standard errors by which the description is longer than with the best misfit, by the best change."""
-        return count_errors(self._lengths[place][self._change] - self._lengths[self.best][self._change])
-
-    def exceed(self, place: int) -> float:
-        """How much longer it is [nats]."""
-        return float(np.sum(self._lengths[place][self._change] - self._lengths[self.best][self._change]))
+    best, longer = look(range(0, 4, 2))
+    # From coarse to fine, and no further up than echoes are lost for sure.
+    while longer[-1] < HOPELESS and max(lengths) + 2 < len(MISFITS):
+        best, longer = look([max(lengths) + 2])
+    if longer[0] > 1:
+        best, longer = look(place for place in (best - 1, best + 1) if place < len(MISFITS))
+        first = next(place for place, errors in zip(sorted(lengths), longer, strict=True) if errors <= 1)
+        best, longer = look([first - 1])
+    if longer[0] <= 1:
+        return 0.0
+    places = sorted(lengths)
+    first = next(place for place, errors in enumerate(longer) if errors <= 1)
+    before, after = MISFITS[places[first - 1]], MISFITS[places[first]]
+    share = (longer[first - 1] - 1) / (longer[first - 1] - longer[first])
+    return float(before * (after / before) ** share)
 
 
 def _bound(share: float, number: int) -> float:
