@@ -7,7 +7,7 @@ that it was not learned from are shorter to describe with it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -21,11 +21,14 @@ from wavebatch.stages.pulse_tables import clip_level, shape_limits
 from wavebatch.surveying.measuring.joint_pulse import learn_jointly
 from wavebatch.surveying.measuring.judge import (
     SURE,
+    Explained,
     count_errors,
     describe_waveforms,
     explain,
+    find_changed,
     find_own_width,
     measure_change,
+    replace_rows,
 )
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
@@ -210,7 +213,7 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     gaussians = max(len(system.components), 1)
     used = max(int(np.count_nonzero(explained.sums.used)), 1)
     written = 0.0 if known else 3 * gaussians * 0.5 * log(used) / len(block)
-    length = describe_waveforms(block, borne, explained, change) + written
+    length = describe_waveforms(block, borne, explained, [change])[0] + written
     return Candidate(
         name, system, change, length, len(explained.echoes), known, 2 if known else gaussians,
         measure_change(borne, explained),
@@ -301,27 +304,28 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> fl
     whole = np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1))
     block = block.rows(whole) if len(whole) >= FEWEST else block
     changes = [change for change in CHANGES if change <= STEP_OF_CHANGES * seen]
-    lengths: dict[int, list[np.ndarray]] = {}
+    found: dict[int, Explained] = {}
+    lengths: dict[int, np.ndarray] = {}
 
-    def look(places: Iterable[int]) -> tuple[int, list[float]]:
+    def look(*places: int) -> tuple[int, list[float]]:
         """The best place of those tried, and by how many standard errors each of them is longer, by the best change."""
         for place in places:
-            if place not in lengths:
-                explained = explain(block, replace(system, misfit=float(MISFITS[place])))
-                lengths[place] = [describe_waveforms(block, system, explained, change) for change in changes]
+            if place not in found:
+                found[place] = _explain_between(block, replace(system, misfit=float(MISFITS[place])), found, place)
+                lengths[place] = describe_waveforms(block, system, found[place], changes)
         tried = product(sorted(lengths), range(len(changes)))
         best, change = min(tried, key=lambda one: lengths[one[0]][one[1]].mean())
         least = lengths[best][change]
         return best, [count_errors(lengths[place][change] - least) for place in sorted(lengths)]
 
-    best, longer = look(range(0, 4, 2))
     # From coarse to fine, and no further up than echoes are lost for sure.
-    while longer[-1] < HOPELESS and max(lengths) + 2 < len(MISFITS):
-        best, longer = look([max(lengths) + 2])
+    best, longer = look(0, 4, 2)
+    while longer[-1] < HOPELESS and max(lengths) + 4 < len(MISFITS):
+        best, longer = look(max(lengths) + 4, max(lengths) + 2)
     if longer[0] > 1:
-        best, longer = look(place for place in (best - 1, best + 1) if place < len(MISFITS))
+        best, longer = look(*(place for place in (best - 1, best + 1) if place < len(MISFITS)))
         first = next(place for place, errors in zip(sorted(lengths), longer, strict=True) if errors <= 1)
-        best, longer = look([first - 1])
+        best, longer = look(first - 1)
     if longer[0] <= 1:
         return 0.0
     places = sorted(lengths)
@@ -329,6 +333,16 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> fl
     before, after = MISFITS[places[first - 1]], MISFITS[places[first]]
     share = (longer[first - 1] - 1) / (longer[first - 1] - longer[first])
     return float(before * (after / before) ** share)
+
+
+def _explain_between(block: WaveformBlock, system: SystemPulse, found: dict[int, Explained], place: int) -> Explained:
+    """Echoes of a block with a misfit. What the next smaller and the next larger one explain alike, it does too."""
+    below = max((one for one in found if one < place), default=None)
+    above = min((one for one in found if one > place), default=None)
+    if below is None or above is None:
+        return explain(block, system)
+    rows = find_changed(found[below], found[above])
+    return replace_rows(found[below], rows, explain(block.rows(rows), system)) if len(rows) else found[below]
 
 
 def _bound(share: float, number: int) -> float:

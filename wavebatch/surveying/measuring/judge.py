@@ -6,7 +6,8 @@ only for what shortens the description of waveforms that nothing was learned fro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,6 +80,31 @@ def explain(block: WaveformBlock, system: SystemPulse, **options: float) -> Expl
     return Explained(echoes, Sums(shape, count_echoes(echoes.waveform, n), main, left, model, used))
 
 
+def find_changed(one: Explained, other: Explained) -> np.ndarray:
+    """Rows of waveforms that two decompositions explain with other echoes."""
+    n = len(one.sums.left)
+    changed = np.zeros(n, bool)
+    for values in (None, "time", "amplitude"):
+        sums = (
+            np.bincount(each.echoes.waveform, None if values is None else getattr(each.echoes, values), minlength=n)
+            for each in (one, other)
+        )
+        changed |= np.not_equal(*sums)
+    return np.flatnonzero(changed)
+
+
+def replace_rows(explained: Explained, rows: np.ndarray, other: Explained) -> Explained:
+    """Explained waveforms, but `rows` of them as in `other`, which has only these."""
+    kept, sums = ~np.isin(explained.echoes.waveform, rows), explained.sums
+    new = replace(other.echoes, waveform=rows[other.echoes.waveform].astype(explained.echoes.waveform.dtype))
+    echoes = EchoTable.concatenate((explained.echoes.take(kept), new))
+    order = np.argsort(echoes.waveform, kind="stable")
+    echoes, main = echoes.take(order), np.concatenate([sums.main[kept], other.sums.main])[order]
+    left, model, first = sums.left.copy(), sums.model.copy(), count_echoes(echoes.waveform, len(sums.left))
+    left[rows], model[rows] = other.sums.left, other.sums.model
+    return Explained(echoes, sums._replace(first=first, main=main, left=left, model=model))
+
+
 def sample_noise(system: SystemPulse) -> SampleNoise:
     """Return the noise of a quiet sample."""
     return SampleNoise(system.noise.quiet, system.noise.gain, system.noise.correlation)
@@ -104,7 +130,7 @@ def measure_change(system: SystemPulse, explained: Explained) -> float:
 
 
 def describe_waveforms(
-    block: WaveformBlock, system: SystemPulse, explained: Explained, change: float = 0.0
+    block: WaveformBlock, system: SystemPulse, explained: Explained, changes: Sequence[float]
 ) -> np.ndarray:
     """Measure how long the description of each waveform is: its echoes, and what they leave.
 
@@ -114,12 +140,12 @@ def describe_waveforms(
     system : SystemPulse
     explained : Explained
         The block decomposed with this system.
-    change : float
-        Of the pulse from shot to shot, as a share of its amplitude (`describe_left`).
+    changes : sequence of float, k of them
+        Of the pulse from shot to shot, as shares of its amplitude (`describe_left`).
 
     Returns
     -------
-    float64 array, shape (n,)
+    float64 array, shape (k, n)
         [nats].
 
     Notes
@@ -131,7 +157,7 @@ def describe_waveforms(
     """
     echoes, sums = explained.echoes, explained.sums
     n, s = sums.left.shape
-    length, volume = describe_left(sums, sample_noise(system), change)
+    length, volume = describe_left(sums, sample_noise(system), changes)
     ratio, error, known = _measure_widths(explained, shape_limits(system, block.spacing).ref)
     amplitude = echoes.amplitude.astype(np.float64)
     typical = max(float(np.mean(amplitude)), 1.0) if len(amplitude) else 1.0
