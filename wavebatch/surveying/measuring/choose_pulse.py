@@ -55,6 +55,9 @@ HOPELESS = 5.0
 """Standard errors by which a description is longer where a pulse is not looked at any further: chance makes so many
 once in three million times."""
 
+HINT = 1.0
+"""Standard errors by which a description with fewer echoes must be shorter: echoes are claims too."""
+
 FEWEST = 48
 """Waveforms on which each candidate is judged first."""
 
@@ -87,6 +90,11 @@ class Candidate:
     """Of the pulse, as far as they had to be learned: 2 for one that is known, so that a plain Gaussian goes first."""
     seen: float
     """Change of the shape that the median of the strongest echoes shows."""
+
+    @property
+    def missed(self) -> float:
+        """What its model misses of the stacked echoes, as a share of the amplitude; one from elsewhere has no stack."""
+        return 0.0 if self.known else self.system.misfit
 
     @property
     def typical(self) -> float:
@@ -256,14 +264,16 @@ def _decide(found: list[Candidate]) -> Choice:
     ordered = sorted(found, key=lambda one: (one.gaussians, one.echoes, one.name))
     best = ordered[0]
     for one in ordered[1:]:
-        if best.exceeds(one) > SURE:
+        if best.exceeds(one) > (HINT if one.echoes < best.echoes and not best.known else SURE):
             best = one
+    if not best.known:
+        best = min((one for one in ordered if one.exceeds(best) < HINT), key=lambda one: one.echoes)
     tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
     doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
 
 
-def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0) -> tuple[SystemPulse, Mirror]:
+def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0, missed: float = 0.0) -> tuple[SystemPulse, Mirror]:
     """Choose the misfit that describes waveforms shortest, then raise the significance until noise adds no echoes.
 
     Parameters
@@ -274,6 +284,8 @@ def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0) -> tupl
         With the pulse that the judge chose.
     seen : float
         Change of the pulse from shot to shot that its strongest echoes show, as a share of the amplitude.
+    missed : float
+        What the pulse is known to miss of the strip's stacked echoes, as a share of the amplitude: the least misfit.
 
     Returns
     -------
@@ -283,7 +295,7 @@ def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0) -> tupl
         Echoes of mirrored residuals that are left.
     """
     part = thin_block(block, int(np.clip(4 * SAMPLES // block.samples.shape[1], 2 * LEAST, 2048)))
-    system = replace(system, misfit=_choose_misfit(part, system, seen))
+    system = replace(system, misfit=max(_choose_misfit(part, system, seen), missed))
     harder = np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER)
     tried = []
     for significance, mirror in look_in_mirror(part, system, [0.0, *map(float, harder)]):
