@@ -133,8 +133,8 @@ def _explain_tails(
 ) -> tuple[Candidates, np.ndarray | None]:
     """Candidates that after-pulses of stronger echoes do not explain, and how far tails reach (docs/algorithms.md H7).
 
-    Growth finds a dropped candidate again if the fit of the stronger echo leaves a residual there. `ref` is the width of
-    the system pulse [samples].
+    Growth finds a dropped candidate again if the fit of the stronger echo leaves a residual there. `ref` is the width
+    of the system pulse [samples].
     """
     tail = pulse_tail(settings.shape, settings.width_ref)
     if tail is None:
@@ -336,8 +336,10 @@ def _leave_out_unknown(
 
 
 def _leave_out_explained(table: EchoTable, solution: Solution) -> EchoTable:
-    """The table, whose own columns go, without echoes alone in their cluster that are no higher than what a stronger
-    one leaves beside it: their errors say so."""
+    """The table without echoes alone in their cluster that are no higher than what a stronger one leaves beside it.
+
+    Their errors say so. The columns of the decomposer go.
+    """
     alone = solution.number[table.attributes[CLUSTER]] == 1
     alone &= (table.flags & np.uint16(EchoFlag.SATURATED)) == 0
     explained = alone & (table.attributes[FACTOR] > ROOM) & (table.amplitude < table.amplitude_err)

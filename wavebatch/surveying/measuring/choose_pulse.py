@@ -273,7 +273,9 @@ def _decide(found: list[Candidate]) -> Choice:
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
 
 
-def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0, missed: float = 0.0) -> tuple[SystemPulse, Mirror]:
+def settle(
+    block: WaveformBlock, system: SystemPulse, seen: float = 1.0, missed: float = 0.0
+) -> tuple[SystemPulse, Mirror]:
     """Choose the misfit that describes waveforms shortest, then raise the significance until noise adds no echoes.
 
     Parameters
