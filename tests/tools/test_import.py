@@ -11,7 +11,7 @@ from pulse_files import Pulse, PulseFile, Sampling, bell
 
 from wavebatch.cli import main
 from wavebatch.core.errors import InputError
-from wavebatch.files.pulsewaves import reader as pulse_reader
+from wavebatch.files import pulsewaves_file as pulse_reader
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.tools.archives.frame import find_utm_zone, project_utm

@@ -18,16 +18,14 @@ import numpy as np
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
-from wavebatch.files.cloud.column_names import STYLES, name_standard, read_field, resolve
+from wavebatch.files.cloud.column_names import STYLES, find_written, name_standard, read_field, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
-from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.raw_bytes import Closing, widen_integers
-from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.header import STANDARD_DTYPES, field_names, list_dimensions
 from wavebatch.files.las.point_formats import ANGLE_UNIT, read_angles, read_classes, split_numbers
-from wavebatch.files.las.read_points import open_points
-from wavebatch.files.point_dtypes import STANDARD_DTYPES, field_names, list_dimensions
+from wavebatch.files.las.read_points import open_points, read_checked_header
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
 """Columns that are read if the cloud has them."""

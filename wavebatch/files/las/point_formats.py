@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.las.header import STANDARD_DTYPES, LasHeader
-from wavebatch.files.point_dtypes import field_names
+from wavebatch.files.las.header import STANDARD_DTYPES, LasHeader, field_names
 
 WITHOUT_WAVES = {4: 1, 5: 3, 9: 6, 10: 8}
 """For each waveform format the format with the same fields except the waveform fields."""

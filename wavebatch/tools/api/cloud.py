@@ -10,7 +10,7 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.files.cloud.cloud_reader import ColumnReader
-from wavebatch.files.point_dtypes import STANDARD_DTYPES
+from wavebatch.files.las.header import STANDARD_DTYPES
 
 
 def read_cloud(path: Path | str, columns: Sequence[str] | None = None) -> np.ndarray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from wavebatch.files.pulsewaves.reader import PulsePiece, Segments
+from wavebatch.files.pulsewaves_file import PulsePiece, Segments
 
 SATURATED = 0.8
 """Share of the sensitive channel's largest counts from which the other channel is used: receivers bend before they

@@ -13,8 +13,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.pulsewaves.header import OUTGOING, RETURNING
-from wavebatch.files.pulsewaves.reader import PulsePiece, PulseReader
+from wavebatch.files.pulsewaves_file import OUTGOING, RETURNING, PulsePiece, PulseReader
 from wavebatch.kernels.signal.outgoing import OutgoingReference, find_reference, measure_outgoing
 from wavebatch.surveying.outgoing import STACKED, OutgoingShape, learn_shape
 from wavebatch.tools.archives.channels import Overlaps, code_segments, decode, find_partners, group_rows

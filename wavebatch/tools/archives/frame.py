@@ -12,7 +12,7 @@ import numpy as np
 
 from wavebatch.files.las.geo_keys import GeoKeys, build_utm
 from wavebatch.files.las.header import GEOTIFF_ID, Vlr
-from wavebatch.files.pulsewaves.reader import PulsePiece, PulseReader
+from wavebatch.files.pulsewaves_file import PulsePiece, PulseReader
 
 SCALE = 0.001
 """Largest unit of stored coordinates [m]: coarser ones would shift samples by as much."""

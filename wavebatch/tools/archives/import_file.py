@@ -18,8 +18,7 @@ from wavebatch.core.schema import option
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.header import Vlr, read_header
-from wavebatch.files.pulsewaves.header import RETURNING, PulseHeader, read_pulse_header
-from wavebatch.files.pulsewaves.reader import PulseReader
+from wavebatch.files.pulsewaves_file import RETURNING, PulseHeader, PulseReader, read_pulse_header
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.surveying.outgoing import SYSTEM_SUFFIX, save_outgoing
 from wavebatch.surveying.system_file import format_survey

@@ -8,8 +8,7 @@ import numpy as np
 
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.pulsewaves.header import OUTGOING, RETURNING, PulseHeader
-from wavebatch.files.pulsewaves.reader import PulsePiece, Segments
+from wavebatch.files.pulsewaves_file import OUTGOING, RETURNING, PulseHeader, PulsePiece, Segments
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.signal.outgoing import measure_outgoing

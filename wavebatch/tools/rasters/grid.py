@@ -19,8 +19,8 @@ from wavebatch.core.schema import Above, check_options, option
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
-from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
+from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.tools.plots.values import Clouds, check_statistic
 from wavebatch.tools.rasters import forest
 from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, Placed, check_cells, compute_tiles, is_in_bounds

@@ -17,6 +17,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.publish import Draft, protecting, publish_together
+from wavebatch.files.las.crs import repair_records, repair_wkt
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import (
     PROJECTION,
@@ -30,8 +31,7 @@ from wavebatch.files.las.header import (
     read_header,
 )
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.files.strip.facts import StripFacts
-from wavebatch.files.wkt import repair_records, repair_wkt
+from wavebatch.files.strip.packets import StripFacts
 from wavebatch.tools.voxels.grid import VoxelColumn
 
 SUFFIXES = (".npz", ".las", ".laz")
