@@ -21,8 +21,17 @@ from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.las.crs import name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.header import LasHeader, decode_text, field_names, find_evlrs
-from wavebatch.files.las.point_formats import WITHOUT_WAVES, locate, read_angles, read_classes, split_numbers
+from wavebatch.files.las.header import (
+    WITHOUT_WAVES,
+    LasHeader,
+    decode_text,
+    field_names,
+    find_evlrs,
+    locate,
+    read_angles,
+    read_classes,
+    split_numbers,
+)
 from wavebatch.files.las.read_points import CheckedHeader, read_checked_header
 from wavebatch.files.strip.describe import describe_strip
 

@@ -28,17 +28,19 @@ from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype, choose_no_
 from wavebatch.files.las.geo_keys import convert_geotiff
 from wavebatch.files.las.header import (
     GEOTIFF_ID,
+    MODERN,
     PROJECTION,
     STANDARD_DTYPES,
     WAVEFORM_RECORD_ID,
     WKT_ID,
     Evlr,
     LasHeader,
+    choose_format,
+    copy_standard,
     field_names,
     find_evlrs,
     has_record,
 )
-from wavebatch.files.las.point_formats import MODERN, choose_format, copy_standard
 from wavebatch.files.las.read_points import CheckedHeader
 from wavebatch.files.strip.packets import PacketPlace, StripFacts
 

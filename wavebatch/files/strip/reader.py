@@ -17,8 +17,7 @@ from wavebatch.core.order import distinct, even_places
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing, reading, take_whole_records, widen_integers
-from wavebatch.files.las.header import field_names
-from wavebatch.files.las.point_formats import locate
+from wavebatch.files.las.header import field_names, locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.packet_check import (
     INDEX_BITS,

@@ -18,7 +18,7 @@ from wavebatch.core.order import distinct
 from wavebatch.files.disk.raw_bytes import Closing, take_whole_records
 from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.las.crs import metres_per_unit
-from wavebatch.files.las.point_formats import locate
+from wavebatch.files.las.header import locate
 from wavebatch.files.las.read_points import PointSource
 from wavebatch.files.strip import shared_packets
 from wavebatch.files.strip.packet_check import (

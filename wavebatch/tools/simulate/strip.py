@@ -20,8 +20,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.extra_bytes import build_dtype
-from wavebatch.files.las.header import LasHeader, field_names
-from wavebatch.files.las.point_formats import WITHOUT_WAVES
+from wavebatch.files.las.header import WITHOUT_WAVES, LasHeader, field_names
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated_echoes
