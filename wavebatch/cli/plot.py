@@ -1,7 +1,7 @@
 """`wavebatch plot`: pictures of waveforms, histograms, maps, side views, heights, slices of a cube; `wavebatch grid`.
 
-Reads options, calls `wavebatch.tools.plots` or `wavebatch.tools.rasters` and prints one line. The modules that draw are imported only after all
-else has succeeded: matplotlib takes long to import and may be missing.
+Reads options, calls `wavebatch.tools.plots` or `wavebatch.tools.rasters` and prints one line. The modules that draw are
+imported only after all else has succeeded: matplotlib takes long to import and may be missing.
 """
 
 from __future__ import annotations
