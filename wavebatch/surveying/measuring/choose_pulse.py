@@ -55,8 +55,9 @@ HOPELESS = 5.0
 """Standard errors by which a description is longer where a pulse is not looked at any further: chance makes so many
 once in three million times."""
 
-HINT = 1.0
-"""Standard errors by which a description with fewer echoes must be shorter: echoes are claims too."""
+HINT = 1.5
+"""Standard errors by which a learned pulse that needs fewer echoes must describe shorter, in place of SURE: each echo
+is a claim too. Chance makes so many once in fifteen times."""
 
 FEWEST = 48
 """Waveforms on which each candidate is judged first."""
@@ -167,7 +168,7 @@ def choose_pulse(
     Pulses are learned on one half of the waveforms and judged on the other, where the pulse has to be written down too:
     half the logarithm of the samples for each of its parameters; one from elsewhere is known. Of those that cost the
     same, by SURE standard errors, the simplest pulse is taken, then the one with the fewest echoes: what is claimed
-    must be proven.
+    must be proven. In place of a learned pulse one with fewer echoes is taken by HINT.
     """
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
     part = thin_block(block, 2 * number)
@@ -266,8 +267,6 @@ def _decide(found: list[Candidate]) -> Choice:
     for one in ordered[1:]:
         if best.exceeds(one) > (HINT if one.echoes < best.echoes and not best.known else SURE):
             best = one
-    if not best.known:
-        best = min((one for one in ordered if one.exceeds(best) < HINT), key=lambda one: one.echoes)
     tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
     doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
@@ -276,7 +275,7 @@ def _decide(found: list[Candidate]) -> Choice:
 def settle(
     block: WaveformBlock, system: SystemPulse, seen: float = 1.0, missed: float = 0.0
 ) -> tuple[SystemPulse, Mirror]:
-    """Choose the misfit that describes waveforms shortest, then raise the significance until noise adds no echoes.
+    """Choose the misfit by the length of descriptions, then raise the significance until noise adds no echoes.
 
     Parameters
     ----------
