@@ -10,7 +10,7 @@ import sys
 
 import click
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
 import wavebatch as wb
 from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
@@ -25,7 +25,7 @@ from wavebatch.tools.voxels.profile import Deconvolution
 
 
 def invoke(*arguments, **environment):
-    return CliRunner().invoke(main, list(map(str, arguments)), prog_name="wavebatch", env=environment)
+    return run_command(*arguments, prog_name="wavebatch", env=environment)
 
 
 def _commands():

@@ -3,15 +3,14 @@
 import json
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import effective, parse_chain
 
 
 def _invoke(*arguments):
-    return CliRunner().invoke(main, ["stages", *arguments])
+    return run_command("stages", *arguments)
 
 
 def test_the_list_has_every_stage_with_its_summary():

@@ -3,13 +3,13 @@
 import json
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
 from wavebatch.cli import COMMANDS, main
 
 
 def invoke(*arguments):
-    return CliRunner().invoke(main, arguments, prog_name="wavebatch")
+    return run_command(*arguments, prog_name="wavebatch")
 
 
 @pytest.mark.parametrize(
@@ -94,5 +94,5 @@ def test_numbers_of_options_must_be_finite(value):
     """NaN passes every limit: it is neither below nor above."""
     for words in (["run", "a.las", "-o", "x", "--attenuation"], ["plot", "section", "a.las", "-o", "x", "--aspect"],
                   ["stats", "a.las", "--area"], ["simulate", "flat", "-o", "x", "--noise"]):  # fmt: skip
-        done = CliRunner().invoke(main, [*words, value])
+        done = run_command(*words, value)
         assert done.exit_code == 2 and "is not" in done.stderr and done.stderr.count("\n") == 1, done.stderr

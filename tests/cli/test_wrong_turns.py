@@ -7,10 +7,9 @@ import subprocess
 import sys
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from strips import cut_strip
 
-from wavebatch.cli import main
 from wavebatch.files.inputs import find_files
 
 
@@ -24,7 +23,7 @@ def place(tmp_path, tiny_strip, monkeypatch):
 
 def _say(*words, code=None):
     """The only line on stderr."""
-    result = CliRunner().invoke(main, [str(word) for word in words])
+    result = run_command(*words)
     assert result.exit_code == code if code is not None else result.exit_code in (1, 2, 3, 4), result.output
     (line,) = result.stderr.splitlines()
     return line
@@ -57,7 +56,7 @@ def test_options_that_are_nearly_right(place, words, advice):
 
 
 def test_a_column_that_the_run_left_out_names_the_option_that_adds_it(place):
-    assert CliRunner().invoke(main, ["run", "strip.las", "-o", "o", "--profile", "fast", "-q"]).exit_code == 0
+    assert run_command("run", "strip.las", "-o", "o", "--profile", "fast", "-q").exit_code == 0
     line = _say("grid", next((place / "o").glob("strip.la?")), "--column", "cross_section", "-o", "x.tif")
     assert "writes cross_section into clouds: add --columns +cross_section" in line or "rasterio" in line
 
@@ -80,7 +79,7 @@ def test_files_of_other_kinds_say_what_to_give(place):
 def test_simulate_and_bench_have_the_same_scenes(place):
     for words in (("simulate", "opne", "-o", "s.las"), ("bench", "--scene", "opne")):
         assert "did you mean 'open'?" in _say(*words)
-    done = CliRunner().invoke(main, ["simulate", "open", "-o", "open.las", "--pulses", "50"])
+    done = run_command("simulate", "open", "-o", "open.las", "--pulses", "50")
     assert done.exit_code == 0, done.output
 
 
@@ -105,7 +104,7 @@ def test_the_home_folder_is_found_in_lists_and_quotes(place, monkeypatch):
 
 
 def test_stages_lists_those_of_a_kind():
-    result = CliRunner().invoke(main, ["stages", "decompose"])
+    result = run_command("stages", "decompose")
     names = [line.split()[0] for line in result.stdout.splitlines()]
     assert result.exit_code == 0 and "decompose.residual_loop" in names
     assert all(name.startswith("decompose.") for name in names)
@@ -115,9 +114,9 @@ def test_clouds_without_an_echo_in_common_are_doubted(place):
     content = bytearray((place / "strip.las").read_bytes())
     struct.pack_into("<d", content, 155, struct.unpack_from("<d", content, 155)[0] + 1e5)  # x of all points
     (place / "moved.las").write_bytes(content)
-    result = CliRunner().invoke(main, ["compare", "strip.las", "moved.las"])
+    result = run_command("compare", "strip.las", "moved.las")
     assert result.exit_code == 0 and "warning: A and B have no echo in common" in result.stderr
-    result = CliRunner().invoke(main, ["compare", "strip.las", "strip.las"])
+    result = run_command("compare", "strip.las", "strip.las")
     assert "in common" not in result.stderr
 
 
@@ -125,16 +124,16 @@ def test_strips_that_share_their_times_only_are_doubted(place):
     """Other scenes have the GPS times of the strip: one echo in a hundred agrees by chance."""
     for scene in ("urban", "mixed"):
         words = ["simulate", scene, "-o", f"{scene}.las", "--pulses", "500", "-q"]
-        assert CliRunner().invoke(main, words).exit_code == 0
-    result = CliRunner().invoke(main, ["compare", "urban.las", "mixed.las"])
+        assert run_command(*words).exit_code == 0
+    result = run_command("compare", "urban.las", "mixed.las")
     assert result.exit_code == 0 and "echoes in common; are they results of one strip" in result.stderr
-    result = CliRunner().invoke(main, ["compare", "urban.las", "mixed.las", "--within", "0.5"])
+    result = run_command("compare", "urban.las", "mixed.las", "--within", "0.5")
     assert "echoes in common" not in result.stderr
 
 
 def test_a_file_of_another_kind_names_its_option(place):
     words = ["survey", "strip.las", "-o", "system.toml", "--chain", "chain.toml"]
-    assert CliRunner().invoke(main, words).exit_code == 0
+    assert run_command(*words).exit_code == 0
     (place / "cal.toml").write_text('schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0.1\n')
     kinds = {"chain": "a chain file", "system": "a survey", "calibration": "a calibration"}
     files = {"chain": "chain.toml", "system": "system.toml", "calibration": "cal.toml"}
@@ -154,7 +153,7 @@ def test_points_are_shown_where_the_packets_are_missing(place):
     content = bytearray((place / "strip.las").read_bytes())
     content[6:8] = struct.pack("<H", 0b101)  # global encoding: packets in a .wdp
     (place / "lost.las").write_bytes(content)
-    shown = CliRunner().invoke(main, ["info", "lost.las"])
+    shown = run_command("info", "lost.las")
     assert shown.exit_code == 1 and "points         " in shown.stdout and "classes " in shown.stdout
     assert shown.stderr == "error: lost.las: its packets are missing: put lost.wdp next to the strip\n"
     assert shown.stdout.splitlines()[-1].split(maxsplit=1) == [
@@ -165,14 +164,14 @@ def test_points_are_shown_where_the_packets_are_missing(place):
 def test_strips_without_points_pass_through_every_stage(place):
     empty = cut_strip(place / "strip.las", place / "empty.las", 0)
     columns = "+range,+incidence_angle_normals,+amplitude_normalized"
-    done = CliRunner().invoke(main, ["run", str(empty), "-o", "o", "--columns", columns])
+    done = run_command("run", empty, "-o", "o", "--columns", columns)
     assert done.exit_code == 0, done.stderr
-    quiet = CliRunner().invoke(main, ["run", str(empty), "-o", "q", "-q"])
+    quiet = run_command("run", empty, "-o", "q", "-q")
     assert "warning: the strip has no points, so its cloud has none" in quiet.stderr and quiet.exit_code == 0
-    assert CliRunner().invoke(main, ["check", str(empty)]).stdout.endswith("ok (0 points, 0 packets)\n")
+    assert run_command("check", empty).stdout.endswith("ok (0 points, 0 packets)\n")
     one = cut_strip(place / "strip.las", place / "one.las", 1)
-    assert "ok (1 point, 1 packet, " in CliRunner().invoke(main, ["check", str(one)]).stdout
-    shown = CliRunner().invoke(main, ["compare", "o/empty.laz", str(empty)]).stdout
+    assert "ok (1 point, 1 packet, " in run_command("check", one).stdout
+    shown = run_command("compare", "o/empty.laz", empty).stdout
     assert "nan" not in shown and "completeness      no-data\ncorrectness       no-data\n" in shown
 
 
@@ -190,5 +189,5 @@ def test_a_cloud_without_permission_is_one_of_those_that_cannot_be_read(place, m
     """Not wrong usage: the others are counted. Root may read everything, so click's question is answered with no."""
     monkeypatch.setattr(os, "access", lambda *_, **__: False)
     (place / "other.las").write_bytes(b"no permission")
-    result = CliRunner().invoke(main, ["stats", "strip.las", "other.las"])
+    result = run_command("stats", "strip.las", "other.las")
     assert result.exit_code == 1 and "strip.las" in result.stdout and "not a LAS or LAZ file" in result.stderr

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from strips import add_record
 
 import wavebatch
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.geojson import AreaFile, describe_miss, load_polygons, place_rings, read_area_file
@@ -250,7 +249,7 @@ def test_resume_sees_another_crs_of_the_same_corners(strip, tmp_path):
     said = []
     for crs in ("EPSG:32633", "urn:ogc:def:crs:EPSG::32633", "EPSG:23033", "EPSG:23033"):
         _write(file, _box(strip), crs)
-        result = CliRunner().invoke(main, list(map(str, [*words, "--resume"])))
+        result = run_command(*words, "--resume")
         assert result.exit_code == 0, result.output
         report = json.loads((tmp_path / "o" / "utm.report.json").read_text())
         said.append(("skipped" in result.stderr, report["request"]["selection"]["polygon"]["crs"]))
@@ -264,13 +263,13 @@ def test_run_stats_and_calibrate_use_placed_areas(strip, tmp_path):
     own = _write(tmp_path / "own.geojson", box)
     numbers, counted = [], []
     for name, file in (("a", degrees), ("b", own)):
-        result = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / name), "--polygon", str(file), "-q"])
+        result = run_command("run", strip, "-o", tmp_path / name, "--polygon", file, "-q")
         assert result.exit_code == 0, result.output
         numbers.append(read_header(tmp_path / name / "utm.laz").point_count)
-        result = CliRunner().invoke(main, ["stats", str(strip), "--polygon", str(file), "--json"])
+        result = run_command("stats", strip, "--polygon", file, "--json")
         counted.append([area["points"] for area in json.loads(result.stdout)["files"][0]["areas"]])
         again = ["run", str(strip), "-o", str(tmp_path / name), "--polygon", str(file), "--resume"]
-        assert "skipped" in CliRunner().invoke(main, again).stderr  # the report has the corners of the file
+        assert "skipped" in run_command(*again).stderr  # the report has the corners of the file
     # An edge that is straight in degrees bends by a centimetre in UTM.
     assert 20 < numbers[0] < read_header(strip).point_count and abs(numbers[0] - numbers[1]) < 5
     assert len(counted[0]) == len(counted[1]) == 2 and abs(counted[0][0] - counted[1][0]) < 5
@@ -279,15 +278,15 @@ def test_run_stats_and_calibrate_use_placed_areas(strip, tmp_path):
             _project(_box(strip, (-0.2, 1.2)), "EPSG:32633", "EPSG:4326").tolist()]}}]}  # fmt: skip
     (tmp_path / "t.geojson").write_text(json.dumps(targets))
     words = ["calibrate", strip, "--targets", tmp_path / "t.geojson", "-o", tmp_path / "cal.toml"]
-    result = CliRunner().invoke(main, list(map(str, words)))
+    result = run_command(*words)
     assert "lies outside" not in result.output and "0 clean single echoes" not in result.output
 
 
 def test_an_area_that_misses_the_strip_is_named_with_both_extents(strip, tmp_path):
     away = _write(tmp_path / "away.geojson", _box(strip) + 1e4)
-    result = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "o"), "--polygon", str(away), "-q"])
+    result = run_command("run", strip, "-o", tmp_path / "o", "--polygon", away, "-q")
     assert "no point is written" in result.stderr and "lies outside the strip (x " in result.stderr
-    result = CliRunner().invoke(main, ["stats", str(strip), "--polygon", str(away)])
+    result = run_command("stats", strip, "--polygon", away)
     assert "lies outside the strip (x " in result.output
 
 
@@ -300,7 +299,7 @@ def test_a_selection_keeps_the_corners_of_its_file_for_the_report(strip, tmp_pat
 
 def test_help_says_in_which_coordinates_areas_are():
     for command, more in (("run", ""), ("stats", ""), ("calibrate", "in the coordinates of the strips only")):
-        result = CliRunner().invoke(main, [command, "--help"])
+        result = run_command(command, "--help")
         text = " ".join(result.output.split())
         assert "in WGS 84, in the CRS that the file names, or in the coordinates of the" in text and more in text
     assert "in the CRS that the file names" in wavebatch.run.__doc__

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from hypothesis import given
 from hypothesis import strategies as st
 from strips import descriptor, make_raw, vlr
 
-from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -55,7 +54,7 @@ def parse_geotiff(*records):
         (GEOG, CrsUnits("geographic")),
         (f'COMPD_CS["both",{UTM},{HEIGHT}]', CrsUnits("projected", 1.0, 0.3048)),
         (f'COMPD_CS["both",{GEOG},{HEIGHT}]', CrsUnits("geographic", None, 0.3048)),
-        (f'BOUNDCRS[SOURCECRS[{FEET}],TARGETCRS[{GEOG}]]', CrsUnits("projected", 0.3048006096012192)),
+        (f"BOUNDCRS[SOURCECRS[{FEET}],TARGETCRS[{GEOG}]]", CrsUnits("projected", 0.3048006096012192)),
         (WKT2, CrsUnits("projected", 0.3048)),
         (THREE, CrsUnits("projected", 1.0, 0.3048)),
         (GEODETIC.format("ellipsoidal,2"), CrsUnits("geographic")),
@@ -212,13 +211,13 @@ def test_strips_that_are_not_in_metres_get_no_physics(tmp_path, records, message
     with StripReader(strip) as reader:
         assert len(reader.facts.units) == len(records)
     arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
-    done = CliRunner().invoke(main, [*arguments, "--flight-height", "500"])
+    done = run_command(*arguments, "--flight-height", "500")
     if message is None:
         assert done.exit_code == 0, done.output
         return
     assert done.exit_code == 4
     assert message in done.stderr and "project the strip to metres" in done.stderr
-    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert run_command(*arguments).exit_code == 0
 
 
 @pytest.mark.parametrize("scale", [1.0, 1 / 0.3048, 1e-5])
@@ -250,7 +249,7 @@ def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
     stages = ("noise.pooled", "detect.maximum", "decompose.closed_form", "attribute.position", "attribute.range")
     chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
     done = {
-        strip.stem: CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "out"), "--chain", str(chain)])
+        strip.stem: run_command("run", strip, "-o", tmp_path / "out", "--chain", chain)
         for strip in (tmp_path / "m.las", feet)
     }
     assert done["m"].exit_code == 0 and "in feet" not in done["m"].stderr
@@ -296,9 +295,9 @@ def test_geocentric_strips_without_a_crs_get_no_ranges(tmp_path, records):
     struct.pack_into("<6d", content, 179, 4_195e3, 4_193e3, 1_163e3, 1_161e3, 4_648e3, 4_646e3)
     strip.write_bytes(content)
     arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
-    done = CliRunner().invoke(main, [*arguments, "--flight-height", "500"])
+    done = run_command(*arguments, "--flight-height", "500")
     assert done.exit_code == 4 and "coordinates are geocentric" in done.stderr
-    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert run_command(*arguments).exit_code == 0
 
 
 def test_degrees_with_metric_vectors_get_no_new_echoes(tmp_path):
@@ -308,6 +307,6 @@ def test_degrees_with_metric_vectors_get_no_new_echoes(tmp_path):
     struct.pack_into("<6d", content, 179, 15.7, 15.6, 48.7, 48.6, 400.0, 300.0)
     strip.write_bytes(content)
     arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
-    done = CliRunner().invoke(main, arguments)
+    done = run_command(*arguments)
     assert done.exit_code == 4 and "coordinates are degrees, packet vectors metres" in done.stderr
-    assert CliRunner().invoke(main, [*arguments, "--points", "returns"]).exit_code == 0
+    assert run_command(*arguments, "--points", "returns").exit_code == 0

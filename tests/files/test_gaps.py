@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from batch_tools import run_one
+from commands import run_command
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.system import ReceiverNoise
@@ -313,9 +314,6 @@ def test_tools_leave_gaps_out(whole, tmp_path):
 @pytest.mark.slow
 def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
     pytest.importorskip("matplotlib")
-    from click.testing import CliRunner
-
-    from wavebatch.cli import main
 
     strip = cut(whole, tmp_path / "gaps.las", 0, 7)
     assert run_one(strip, tmp_path).status == "written"
@@ -324,9 +322,9 @@ def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
     for options in ([], ["--sheet"]):
         target = tmp_path / f"a{len(options)}.png"
         arguments = ["plot", "waveform", str(strip), "--random", "2", "-o", str(target), *options]
-        result = CliRunner().invoke(main, arguments)
+        result = run_command(*arguments)
         assert result.exit_code == 0, result.output
-    text = CliRunner().invoke(main, ["info", str(strip)]).stdout
+    text = run_command("info", strip).stdout
     assert "with fill between recordings" in text
 
 

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from writer_tools import data_file
 
-from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader
 
@@ -31,7 +30,7 @@ def strips(tmp_path_factory):
     made = {scene: folder / f"{scene}.las" for scene in SCENES}
     for seed, (scene, path) in enumerate(made.items()):
         options = ["--pulses", "600", "--external", "-q", "--seed", str(seed), *SCENES[scene]]
-        assert CliRunner().invoke(main, ["simulate", scene, "-o", str(path), *options]).exit_code == 0
+        assert run_command("simulate", scene, "-o", path, *options).exit_code == 0
     return made
 
 
@@ -91,6 +90,7 @@ def test_own_packets_are_never_refused(strips, tmp_path, edit_points, how):
 
 def test_own_packets_of_the_weakest_returns_alone_are_not_refused(strips, tmp_path, edit_points):
     """Only the ground of a high canopy, say: its echoes are the lowest of their packets."""
+
     def weaken(points):
         order = np.lexsort((points["intensity"], points["wavepacket_offset"]))
         weakest = order[np.unique(points["wavepacket_offset"][order], return_index=True)[1]]

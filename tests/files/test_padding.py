@@ -6,9 +6,8 @@ import struct
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.signal import LEAST_LEVEL, LEAST_PADDING, LEAST_RECORDED, recorded_lengths
@@ -59,7 +58,7 @@ def test_padded_strips_lose_nothing_of_what_was_recorded(tmp_path, kind):
     simulate_strip("mixed", whole, pulses=3000, seed=11, options=StripOptions(point_format=4))
     rng = np.random.default_rng(12)
     ends = pad(whole, padded, lambda n: np.full(n, 64) if kind == "one length" else rng.integers(50, 81, n))
-    result = CliRunner().invoke(main, ["run", str(padded), "-o", str(tmp_path), "--points", "returns", "-q"])
+    result = run_command("run", padded, "-o", tmp_path, "--points", "returns", "-q")
     assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "padded.report.json").read_text("utf-8"))
     recorded = laspy.read(padded).return_point_wave_location / 1000 < ends - 8

@@ -5,10 +5,9 @@ import json
 import numpy as np
 import pytest
 from batch_tools import run_one
-from click.testing import CliRunner
+from commands import run_command
 from strips import descriptor, make_raw, read_all
 
-from wavebatch.cli import main
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.sample_form import packed_bytes, unpack_samples
@@ -66,7 +65,7 @@ def test_packed_strips_are_read_in_the_order_that_is_smoother(tmp_path, rng, bit
         assert block.digitizer.bits == bits and block.samples.dtype == np.uint16
         assert f"packed, {'lowest' if little else 'highest'} bit first" in scan.notes[0]
     for command in ("info", "check"):
-        assert f"samples of {bits} bits are packed" in CliRunner().invoke(main, [command, str(path)]).stdout
+        assert f"samples of {bits} bits are packed" in run_command(command, path).stdout
 
 
 def mirror(source, target):
@@ -100,9 +99,9 @@ def test_inverted_waveforms_give_the_echoes_of_upright_ones(upright, tmp_path):
         reports.append(json.loads((tmp_path / f"{strip.stem}.report.json").read_text("utf-8")))
     assert reports[0]["counts"] == reports[1]["counts"] and reports[1]["counts"]["echoes"] > 2000
     assert any("the signal goes down" in line for line in reports[1]["remarks"])
-    text = CliRunner().invoke(main, ["survey", str(down)]).stdout
+    text = run_command("survey", down).stdout
     assert "inverted waveforms" in text
-    info = json.loads(CliRunner().invoke(main, ["info", str(down), "--json"]).stdout)
+    info = json.loads(run_command("info", down, "--json").stdout)
     assert info["packets"]["descriptors"][0]["inverted"] is True and not info["warnings"]
 
 

@@ -5,11 +5,10 @@ import struct
 
 import pytest
 from batch_tools import run_one
-from click.testing import CliRunner
+from commands import run_command
 from strips import add_record
 from writer_tools import plan_output, write_source
 
-from wavebatch.cli import main
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.las.crs import parse_wkt, read_crs_definition, repair_records, repair_wkt
 from wavebatch.files.las.geo_keys import build_utm
@@ -162,7 +161,7 @@ def test_las_1_3_has_no_wrong_wkt_beside_its_keys(tmp_path):
 
 def test_so_do_synthetic_strips(strip, tmp_path):
     words = ["synthesize", strip, "-o", tmp_path / "s.las"]
-    result = CliRunner().invoke(main, list(map(str, words)))
+    result = run_command(*words)
     assert result.exit_code == 0, result.output
     definition = read_crs_definition(tmp_path / "s.las", read_header(tmp_path / "s.las"))
     assert definition == repair_wkt(RIPROCESS)
@@ -174,7 +173,7 @@ def test_so_do_rasters_and_voxels(strip, tmp_path):
     rasterio = pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     for words in (["grid", strip, "--statistic", "count", "--size", 5, "-o", tmp_path / "x.tif"],
                   ["voxelize", strip, "--size", 5, "-o", tmp_path / "v.las"]):  # fmt: skip
-        result = CliRunner().invoke(main, list(map(str, words)))
+        result = run_command(*words)
         assert result.exit_code == 0, result.output
     with rasterio.open(tmp_path / "x.tif") as raster:
         assert raster.crs.is_projected and _longitude(raster.crs) == pytest.approx(15.6567, abs=1e-3)

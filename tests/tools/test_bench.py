@@ -20,10 +20,9 @@ from bench.promises import SPEEDS, judge
 from bench.release import SCENES, format_release, measure_cases, read_options
 from bench.stability import FAILURES, count_changes, count_failures
 from bench_tools import time_here
-from click.testing import CliRunner
+from commands import run_command
 
 import wavebatch
-from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.core.system import ReceiverNoise
@@ -145,7 +144,7 @@ def test_command_writes_what_it_prints(tmp_path, monkeypatch):
     chain.write_text(
         "".join(f'[[chain]]\nstage = "{s}"\n' for s in ("noise.pooled", "detect.maximum", "decompose.none"))
     )
-    result = CliRunner().invoke(main, ["bench", str(chain), "-o", str(tmp_path / "out"), *options.split()])
+    result = run_command("bench", chain, "-o", tmp_path / "out", *options.split())
     assert result.exit_code == 0, result.output
     document = json.loads((tmp_path / "out" / "bench.json").read_text())
     assert json.loads(result.stdout) == document
@@ -173,12 +172,12 @@ def test_plot_is_written_where_matplotlib_is(tmp_path, document):
     ],
 )
 def test_wrong_usage(words, message):
-    result = CliRunner().invoke(main, ["bench", *words])
+    result = run_command("bench", *words)
     assert result.exit_code == 2 and message in result.stderr
 
 
 def test_strip_that_is_none(tmp_path):
-    result = CliRunner().invoke(main, ["bench", str(tmp_path / "none.las")])
+    result = run_command("bench", tmp_path / "none.las")
     assert result.exit_code == 1 and "none.las" in result.stderr
 
 

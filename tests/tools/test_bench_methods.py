@@ -1,4 +1,3 @@
-
 """`bench --all-methods`: one row for every detector and decomposer."""
 
 import json
@@ -7,9 +6,8 @@ import pytest
 from bench.cases import list_cases
 from bench.stability import FAILURES, measure_stability
 from bench.stability_tables import format_stability
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.tools.bench.command import list_methods
@@ -29,7 +27,7 @@ def test_every_method_has_a_chain():
 @pytest.mark.slow
 def test_all_methods_stand_in_one_table(timed_here):
     options = "--scene flat --waveforms 600 --pulses 0 --repeat 1 --all-methods --json"
-    result = CliRunner().invoke(main, ["bench", *options.split()])
+    result = run_command("bench", *options.split())
     assert result.exit_code == 0, result.output
     rows = {row["name"]: row for row in json.loads(result.stdout)["scenes"][0]["rows"]}
     assert set(list_methods()) | {"fast", "balanced", "accurate"} <= set(rows)

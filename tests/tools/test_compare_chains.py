@@ -5,9 +5,8 @@ import json
 import naive
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -36,7 +35,7 @@ def mixed(tmp_path_factory):
 
 
 def call(*arguments, code=0):
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    result = run_command(*arguments)
     assert result.exit_code == code, result.output
     return result
 

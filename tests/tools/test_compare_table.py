@@ -4,14 +4,13 @@ import csv
 import json
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.tools.sheets.compare import HEAD, format_comparison
 
 
 def run(*words):
-    return CliRunner().invoke(main, ["compare", *map(str, words)])
+    return run_command("compare", *words)
 
 
 def read(path):

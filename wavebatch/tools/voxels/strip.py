@@ -204,7 +204,9 @@ def voxelize_strip(
         tracer = _Tracer(reader, source, pulse, options, floor.finish(), ceiling, energy, calibration is not None)
         numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
         each = -(-SAMPLED // max(len(numbers), 1))  # about SAMPLED pulses, spread evenly over the strip
-        batches = read_batches(reader, scan, numbers=numbers.tolist(), choose=lambda one: one[even_places(len(one), each)])
+        batches = read_batches(
+            reader, scan, numbers=numbers.tolist(), choose=lambda rows: rows[even_places(len(rows), each)]
+        )
         rule = find_rule(map(tracer.trace, batches), options.reflectance_ratio)
         with (
             _open_grid(reader, middle, options, calibration is not None, tracer.floor, held) as grid,
