@@ -5,10 +5,9 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from plot_tools import PULSE, make_chain, simulate, write_cloud
 
-from wavebatch.cli import main
 from wavebatch.files import figure_file
 from wavebatch.files.figure_file import open_picture
 from wavebatch.kernels.fit.pulse_shape import PulseShape
@@ -22,7 +21,7 @@ LONG = "a_very_long_name_of_a_strip_as_flight_campaigns_give_them_" * 3 + ".las"
 
 
 def run_plot(*words):
-    return CliRunner().invoke(main, ["plot", *map(str, words)])
+    return run_command("plot", *words)
 
 
 @pytest.fixture
@@ -115,7 +114,7 @@ def test_maps_of_any_shape(texts, tmp_path, shape):
 def test_slices_and_cubes(texts, tmp_path, riegl):
     words = ["slice", riegl, "--lines", "0:6", "--shortest", "10", "--png", tmp_path / "a.png"]
     words += ["--overview", tmp_path / "b.png", "--cube", tmp_path / "c.npz"]
-    result = CliRunner().invoke(main, [str(word) for word in words])
+    result = run_command(*words)
     assert result.exit_code == 0, result.output
     assert run_plot("cube", tmp_path / "c.npz", "-o", tmp_path / "c.png").exit_code == 0
     check(texts)
@@ -127,7 +126,7 @@ def test_axes_in_metres_have_equal_scales(tmp_path, riegl, monkeypatch):
     kept = []
     save = figure_file._save
     monkeypatch.setattr(figure_file, "_save", lambda figure, *rest: (kept.append(figure), save(figure, *rest)))
-    CliRunner().invoke(main, ["slice", str(riegl), "--lines", "2", "--png", str(tmp_path / "a.png")])
+    run_command("slice", riegl, "--lines", "2", "--png", tmp_path / "a.png")
     run_plot("section", riegl, "-o", tmp_path / "s.png")
     run_plot("map", riegl, "--column", "z", "-o", tmp_path / "m.png")
     assert len(kept) == 3

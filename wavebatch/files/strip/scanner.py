@@ -361,7 +361,12 @@ class _Scanner:
             for unit in range(len(borders) - 1):
                 wants = far.wants.read(unit)
                 if len(wants):
-                    self._give(int(borders[unit]), int(borders[unit + 1]), wants)
+                    start, context = int(borders[unit]), self._found.context
+                    points = self._source.read(start, int(borders[unit + 1]))
+                    entries = np.empty(len(wants), context.dtype)
+                    entries["index"] = wants["index"]
+                    entries["record"] = take_whole_records(points, wants["index"] - start)
+                    context.append(wants["unit"], entries)
         finally:
             far.wants.close()
         return far.packets, far.reach, far.overfull
@@ -376,12 +381,6 @@ class _Scanner:
             rows = np.flatnonzero(judged.usable)
             rows = rows[self._found.near.is_suspect(judged.keys[rows], suspects)]
             yield judged.keys[rows], start + rows
-
-    def _give(self, start: int, stop: int, wants: np.ndarray) -> None:
-        points = self._source.read(start, stop)
-        entries = np.empty(len(wants), self._found.context.dtype)
-        entries["index"], entries["record"] = wants["index"], take_whole_records(points, wants["index"] - start)
-        self._found.context.append(wants["unit"], entries)
 
     def _vote_far(self) -> None:
         """Some units vote again with their context: in a shuffled strip only there the returns of a packet meet."""

@@ -71,7 +71,9 @@ def build_cube(lines: Sequence[ScanLine], name: str) -> dict[str, np.ndarray]:
     spacing = lines[0].spacing
     if any(abs(line.spacing - spacing) > 1e-6 * spacing for line in lines):
         raise InputError(f"{name}: scan lines differ in their spacing of samples; choose --lines of one digitizer")
-    starts = _find_starts(lines)
+    # Time from the common plane to the first sample of each pulse [ns]; 0 where it is not known.
+    origin, direction = (np.concatenate([getattr(line, name) for line in lines]) for name in ("origin", "direction"))
+    starts = _split(align_times(origin, direction), lines)
     shift = [np.rint(start / spacing).astype(np.int64) for start in starts]
     columns = align_pulses(lines)
     pulses = 1 + max(int(column.max()) for column in columns)
@@ -100,17 +102,22 @@ def align_pulses(lines: Sequence[ScanLine]) -> list[np.ndarray]:
     A line whose angles descend is turned; then it is shifted as a whole to the angles of the longest line, because
     mirrors repeat their motion from line to line.
     """
-    angles = _scan_angles(lines)
+    direction = np.concatenate([line.direction for line in lines])
+    unit = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
+    apart = unit - unit.mean(axis=0)
+    # Across the flight [rad], from the rays: 0 for the mean ray.
+    angles = _split(np.arcsin(np.clip(apart @ find_main_axis(apart), -1.0, 1.0)), lines)
     longest = max(range(len(lines)), key=lambda i: len(lines[i]))
-    found = [_turn(angle) for angle in angles]
+    # Order of the pulses of each line in which their angles ascend.
+    found = [np.arange(len(angle))[:: -1 if len(angle) > 1 and angle[-1] < angle[0] else 1] for angle in angles]
     model = np.maximum.accumulate(angles[longest][found[longest]])
     step = max((model[-1] - model[0]) / max(len(model) - 1, 1), 1e-12)
     shifts = []
     for angle, order in zip(angles, found, strict=True):
-        angles = angle[order]
-        inside = (angles >= model[0]) & (angles <= model[-1])
-        at = np.where(inside, np.interp(angles, model, np.arange(len(model))), (angles - model[0]) / step)
-        off = (at - np.arange(len(angles)))[inside if inside.any() else slice(None)]
+        turned = angle[order]
+        inside = (turned >= model[0]) & (turned <= model[-1])
+        at = np.where(inside, np.interp(turned, model, np.arange(len(model))), (turned - model[0]) / step)
+        off = (at - np.arange(len(turned)))[inside if inside.any() else slice(None)]
         shifts.append(round(float(np.median(off))) if model[-1] > model[0] else 0)
     columns = []
     for order, shift in zip(found, shifts, strict=True):
@@ -118,26 +125,6 @@ def align_pulses(lines: Sequence[ScanLine]) -> list[np.ndarray]:
         column[order] = np.arange(len(order)) + shift - min(shifts)
         columns.append(column)
     return columns
-
-
-def _turn(angle: np.ndarray) -> np.ndarray:
-    """Order of the pulses of a line in which their angles ascend."""
-    order = np.arange(len(angle))
-    return order[::-1] if len(angle) > 1 and angle[-1] < angle[0] else order
-
-
-def _scan_angles(lines: Sequence[ScanLine]) -> list[np.ndarray]:
-    """Angle of each pulse across the flight [rad], from the rays: 0 for the mean ray."""
-    direction = np.concatenate([line.direction for line in lines])
-    unit = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
-    apart = unit - unit.mean(axis=0)
-    return _split(np.arcsin(np.clip(apart @ find_main_axis(apart), -1.0, 1.0)), lines)
-
-
-def _find_starts(lines: Sequence[ScanLine]) -> list[np.ndarray]:
-    """Time from the common plane to the first sample of each pulse [ns]; 0 where it is not known."""
-    origin, direction = (np.concatenate([getattr(line, name) for line in lines]) for name in ("origin", "direction"))
-    return _split(align_times(origin, direction), lines)
 
 
 def _split(values: np.ndarray, lines: Sequence[ScanLine]) -> list[np.ndarray]:

@@ -272,8 +272,11 @@ def read_segments(path: Path, column: str | None) -> tuple[np.ndarray, np.ndarra
         raise ConfigError(f"{path}: has no column {column!r}; {nearest(column, _COLUMNS)}")
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            rows = _read_features(json.load(file)) if path.suffix.lower() == ".geojson" else csv.DictReader(file)
-            found = [_read_row(row, column) for row in rows]
+            rows: Iterable[dict] = csv.DictReader(file)
+            if path.suffix.lower() == ".geojson":
+                features = [(one["properties"], one["geometry"]["coordinates"]) for one in json.load(file)["features"]]
+                rows = ({**values, "z1": start[2], "z2": end[2]} for values, (start, end) in features)
+            found = [(float(row["z1"]), float(row["z2"]), float(row[column]) if column else 1.0) for row in rows]
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}; check the name and the access") from error
     except KeyError as error:
@@ -285,17 +288,6 @@ def read_segments(path: Path, column: str | None) -> tuple[np.ndarray, np.ndarra
         bad = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0]) + 1
         raise InputError(f"{path}: segment {bad} holds a value that is no finite number; {REMEDY}")
     return values[:, :2], values[:, 2]
-
-
-def _read_row(row: dict[str, str], column: str | None) -> tuple[float, float, float]:
-    return float(row["z1"]), float(row["z2"]), 1.0 if column is None else float(row[column])
-
-
-def _read_features(document: dict) -> Iterable[dict]:
-    """Segments of a GeoJSON file as rows of the table."""
-    for feature in document["features"]:
-        start, end = feature["geometry"]["coordinates"]
-        yield {**feature["properties"], "z1": start[2], "z2": end[2]}
 
 
 def profile_segments(

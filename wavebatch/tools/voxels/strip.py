@@ -7,7 +7,7 @@ output must not depend on batches, so nothing here may mix pulses of a batch.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import MISSING, asdict, dataclass, field, replace
 from pathlib import Path
@@ -202,7 +202,12 @@ def voxelize_strip(
         floor = Floor(middle)
         ceiling = find_ceiling(reader, scan, middle, options.size, floor)
         tracer = _Tracer(reader, source, pulse, options, floor.finish(), ceiling, energy, calibration is not None)
-        rule = find_rule(map(tracer.trace, _sample_batches(reader, scan)), options.reflectance_ratio)
+        numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
+        each = -(-SAMPLED // max(len(numbers), 1))  # about SAMPLED pulses, spread evenly over the strip
+        batches = read_batches(
+            reader, scan, numbers=numbers.tolist(), choose=lambda rows: rows[even_places(len(rows), each)]
+        )
+        rule = find_rule(map(tracer.trace, batches), options.reflectance_ratio)
         with (
             _open_grid(reader, middle, options, calibration is not None, tracer.floor, held) as grid,
             (
@@ -315,13 +320,6 @@ def _open_grid(
         floor=floor if options.forest else None,
         held=held,
     )
-
-
-def _sample_batches(reader: StripReader, scan: StripScan) -> Iterator[Batch]:
-    """Pulses spread evenly over the strip, about SAMPLED."""
-    numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
-    share = -(-SAMPLED // max(len(numbers), 1))
-    return read_batches(reader, scan, numbers=numbers.tolist(), choose=lambda some: some[even_places(len(some), share)])
 
 
 @dataclass(frozen=True, slots=True)
