@@ -55,9 +55,11 @@ HOPELESS = 5.0
 """Standard errors by which a description is longer where a pulse is not looked at any further: chance makes so many
 once in three million times."""
 
-HINT = 1.5
-"""Standard errors by which a learned pulse that needs fewer echoes must describe shorter, in place of SURE: each echo
-is a claim too. Chance makes so many once in fifteen times."""
+HINT, FEWER = 1.5, 0.95
+"""Standard errors by which another pulse must describe shorter, in place of SURE, where it needs at most this share of
+a learned pulse's echoes, or where that is known to miss the stacked echoes by more than the change from shot to shot.
+Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes so many errors once in fifteen times.
+"""
 
 FEWEST = 48
 """Waveforms on which each candidate is judged first."""
@@ -168,7 +170,7 @@ def choose_pulse(
     Pulses are learned on one half of the waveforms and judged on the other, where the pulse has to be written down too:
     half the logarithm of the samples for each of its parameters; one from elsewhere is known. Of those that cost the
     same, by SURE standard errors, the simplest pulse is taken, then the one with the fewest echoes: what is claimed
-    must be proven. In place of a learned pulse one with fewer echoes is taken by HINT.
+    must be proven. By HINT one is taken in place of a learned pulse that needs more echoes or misses the stacked ones.
     """
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
     part = thin_block(block, 2 * number)
@@ -265,7 +267,8 @@ def _decide(found: list[Candidate]) -> Choice:
     ordered = sorted(found, key=lambda one: (one.gaussians, one.echoes, one.name))
     best = ordered[0]
     for one in ordered[1:]:
-        if best.exceeds(one) > (HINT if one.echoes < best.echoes and not best.known else SURE):
+        doubtful = one.echoes <= FEWER * best.echoes or best.missed > max(COVERED * best.change, one.missed)
+        if best.exceeds(one) > (HINT if doubtful and not best.known else SURE):
             best = one
     tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
     doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
