@@ -32,6 +32,7 @@ from wavebatch.cli.messages import (
 )
 from wavebatch.cli.program.progress import Progress
 from wavebatch.core.errors import WARNINGS, ConfigError, InputError
+from wavebatch.core.process import importing
 from wavebatch.core.suggest import nearest
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_input
@@ -84,7 +85,8 @@ def run(**options: Any) -> None:
     _check_options(options)
     try:
         _start_processes(options)
-        from wavebatch.tools.api.run import plan_run
+        with importing():
+            from wavebatch.tools.api.run import plan_run
 
         jobs, batch_options = plan_run(options["strips"], shared.from_options(RunOptions, options), shared.note_input)
         if options["report"] not in (None, "-"):
