@@ -111,6 +111,8 @@ class ChannelConstant:
     """Light of its strongest waveforms [DN m2]: see `setting.Setting`."""
     scene: Annotated[tuple[Annotated[float, Range(-100.0, 100.0)], ...], Key(blank=True)] = ()
     """Quantiles of the light of its waveforms, logarithms: see `setting.Setting`."""
+    places: Annotated[tuple[Annotated[float, Range(-1e9, 1e9)], ...], Key(blank=True)] = ()
+    """Ground that other strips may see again: east, north, logarithm of that light, and so on."""
 
     @property
     def is_described(self) -> bool:
@@ -258,7 +260,7 @@ class Calibration:
             "section_constant": self.section_constant,
             **({"scan_angle_terms": list(self.swath)} if self.swath else {}),
             **{name: getattr(self, name) for name in _REPORTED},
-            "channels": [asdict(row) for row in self.channels],
+            "channels": [{**asdict(row), "places": len(row.places) // 3} for row in self.channels],
             "strips": self._describe_strips(),
         }
 

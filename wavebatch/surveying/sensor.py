@@ -352,7 +352,7 @@ def _find_lag(known: Trajectory, path: Trajectory) -> tuple[float | None, float 
 def _compare_ranges(
     distance: np.ndarray, rays: RaySample, path: SensorSource | None
 ) -> tuple[float | None, float, float | None]:
-    """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, root mean square, and
+    """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, mean with scatter, and
     the error of the latter; None, 0 and None where the vectors give no position."""
     if path is None or path.trajectory is None:
         return None, 0.0, None
@@ -360,7 +360,7 @@ def _compare_ranges(
     longer = longer[np.isfinite(longer)]
     if not len(longer):
         return None, 0.0, None
-    error = float(np.sqrt(np.mean(longer**2)))
+    error = float(abs(np.mean(longer)) + np.std(longer))  # what all rays share holds for each of them
     # A contradiction is known no better than the vectors are.
     error = float(np.hypot(error, path.error)) if error > path.error else error
     return round(float(np.median(longer)), 3), error, round(path.error, 6)

@@ -197,12 +197,12 @@ def _assemble(
     for channel in np.unique(of[known]):
         mine = np.flatnonzero(known & (of == channel))
         some = [sources[k] for k in mine.tolist()]
-        mean, trials = float(adjusted.value[mine].mean()), adjusted.trials[:, mine]
+        trials = adjusted.trials[:, mine]
         # A channel of one strip says nothing of its drift: it is credited with that of the others.
         apart = float(np.std(adjusted.value[mine], ddof=1)) if len(mine) > 1 else scatter
         ranging = float(np.mean([source.strip.ranging for source in some]))
         error = float(np.sqrt(np.std(trials.mean(axis=1), ddof=1) ** 2 + shared**2 + apart**2 + ranging**2))
-        channels.append(_describe_row(some, math.exp(mean), error))
+        channels.append(_describe_row(some, adjusted.value[mine], error))
         rows += _list_strips(some, mine, adjusted, shared)
     constants = np.array([row.constant for row in channels])
     error = float(np.hypot(np.std(constants) / constants.mean(), max(row.relative_error for row in channels)))
@@ -262,8 +262,9 @@ def _list_targets(strips: Sequence[FlightStrip]) -> Iterator[TargetResult]:
                 yield replace(row, name=f"{row.name} on {strip.path.name}")
 
 
-def _describe_row(some: Sequence[Source], constant: float, error: float) -> ChannelConstant:
-    """The row of a channel with how it records, and what targets say of its scatter; InputError for two recordings."""
+def _describe_row(some: Sequence[Source], values: np.ndarray, error: float) -> ChannelConstant:
+    """The row of a channel with how it records, what targets say of its scatter, and the ground as its mean constant
+    sees it; values: logarithms of the constants of its strips. InputError for two recordings."""
     first = some[0].row
     for path, row in ((source.strip.path, source.row) for source in some):
         if (row.bits, row.spacing_ns, row.gain) != (first.bits, first.spacing_ns, first.gain):
@@ -272,10 +273,14 @@ def _describe_row(some: Sequence[Source], constant: float, error: float) -> Chan
                 f"{some[0].strip.path.name}: another sensor or other settings; calibrate these strips separately"
             )
     seen = [source.given for source in some if source.given is not None]
+    parts = [np.reshape(source.row.places, (-1, 3)) for source in some]
+    offs = values - values.mean()
+    places = np.concatenate([part + [0.0, 0.0, off] for part, off in zip(parts, offs, strict=True)])[:: len(some)]
     return replace(
         first,
-        constant=constant,
+        constant=math.exp(values.mean()),
         relative_error=error,
+        places=tuple(places.ravel().tolist()),
         spread=max((row.spread for row in seen), default=0.0),
         echoes=sum(row.echoes for row in seen),
         shot_energy=max((row.shot_energy for row in seen), default=0.0),

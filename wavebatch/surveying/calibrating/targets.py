@@ -30,7 +30,7 @@ from wavebatch.surveying.calibrating.target_constants import (
 )
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
-from wavebatch.surveying.matching.setting import SCANNERS, read_day, read_sensor_name
+from wavebatch.surveying.matching.setting import SCANNERS, keep_places, read_day, read_sensor_name
 from wavebatch.surveying.sensor import SensorSource
 
 MOST_ECHOES = 200_000
@@ -162,6 +162,7 @@ def describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstan
         noise_dn=system.noise.std,
         brightest=source.setting.brightest.get(row.digitizer),
         scene=source.setting.scenes.get(row.digitizer, ()),
+        places=keep_places(source.setting.places.get(row.digitizer)),
         bits=digitizer.bits,
         samples=digitizer.n_samples,
         spacing_ns=digitizer.spacing,

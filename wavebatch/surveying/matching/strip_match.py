@@ -24,12 +24,12 @@ from wavebatch.surveying.angle_limits import sample_reference
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.matching.setting import measure_setting, see_channels
 from wavebatch.surveying.matching.strip_conditions import (
-    LIKELY,
     compare_air,
     compare_divergence,
     compare_setting,
     doubt_calibration,
     find_growth,
+    judge_fading,
     refuse_zone,
 )
 from wavebatch.surveying.sensor import SensorSource
@@ -104,14 +104,9 @@ def match_strip(
     if own_strip not in measured:
         more, lines = compare_setting(calibration, setting, system)
         growth, reasons = math.hypot(growth, more), [*reasons, *lines]
-    fades = setting.fades
-    if fades.chance > LIKELY and energy is None:
-        growth = math.hypot(growth, math.expm1(abs(fades.shift)))
-        reasons.append(
-            f"calibration: the second half of the strip is {100 * math.expm1(fades.shift):+.0f} % brighter, though "
-            "both are like one scene: a laser that fades, or haze? The error of the constant grows by "
-            f"{100 * math.expm1(abs(fades.shift)):.0f} %; calibrate shorter strips"
-        )
+    if energy is None:
+        more, lines = judge_fading(calibration, setting, other=own_strip not in measured)
+        growth, reasons = math.hypot(growth, more), [*reasons, *lines]
     warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows: list[ChannelConstant] = []
