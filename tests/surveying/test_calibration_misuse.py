@@ -254,6 +254,10 @@ def test_what_scenes_do_not_show_of_another_gain_or_energy_is_in_the_error():
     assert compare_scenes(scene + 0.3, scene).error > 0.25
 
 
+def keep(places):
+    return np.reshape(keep_places({1: places}), (-1, 4))[:, 1:]
+
+
 def see_ground(rng, known=None, factor=1.0, fade=0.0, move=0.0, pattern=0.0):
     """Places of a strip over fields of 30 m: 2,000 waveforms on 400 m x 200 m."""
     if known is None:
@@ -268,7 +272,7 @@ def see_ground(rng, known=None, factor=1.0, fade=0.0, move=0.0, pattern=0.0):
 def test_ground_that_a_calibrated_strip_saw_shows_another_energy(rng, factor):
     ground, places = see_ground(rng)
     _, later = see_ground(rng, ground, factor, move=150.0)
-    level, growth = compare_ground(later, keep_places(places))
+    level, growth = compare_ground(later, keep(places))
     assert level.shift == pytest.approx(np.log(factor), abs=0.03)
     assert (level.chance > 0.5) == (factor != 1.0) and growth.chance < 0.5
     assert factor != 1.0 or level.error < 0.02
@@ -277,14 +281,14 @@ def test_ground_that_a_calibrated_strip_saw_shows_another_energy(rng, factor):
 @pytest.mark.parametrize("fade", [-0.3, 0.0, 0.4])
 def test_ground_that_a_calibrated_strip_saw_shows_a_laser_that_fades(rng, fade):
     ground, places = see_ground(rng)
-    _, growth = compare_ground(see_ground(rng, ground, fade=fade)[1], keep_places(places))
+    _, growth = compare_ground(see_ground(rng, ground, fade=fade)[1], keep(places))
     assert growth.shift == pytest.approx(0.5 * np.log1p(fade), abs=0.04) and (growth.chance > 0.5) == bool(fade)
 
 
 @pytest.mark.parametrize("other", [{"move": 500.0}, {"move": 390.0}, {"pattern": 300.0}])
 def test_other_ground_and_ground_that_has_changed_show_no_energy(rng, other):
     ground, places = see_ground(rng)
-    assert compare_ground(see_ground(rng, ground, 0.75, **other)[1], keep_places(places)) is None
+    assert compare_ground(see_ground(rng, ground, 0.75, **other)[1], keep(places)) is None
 
 
 @pytest.mark.slow
@@ -548,7 +552,8 @@ def test_air_that_is_not_given_thins_with_the_height_above_sea(tmp_path, monkeyp
     off = np.nanmedian((cloud["level_reflectance"] / fields(x, y))[inside]) - 1
     stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
     # Fields seen along other lines leave a change of the energy of some 10 % open.
-    assert abs(off) < stated < 0.12 and (abs(off) < 0.03 or fall != 2000)
+    # A strip of one second over fields of 20 m does not show whether its laser fades: a tenth of error holds that.
+    assert abs(off) < stated < 0.17 and (abs(off) < 0.03 or fall != 2000)
 
 
 def test_an_attenuation_per_metre_is_refused(tmp_path, calibrated):

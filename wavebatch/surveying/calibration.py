@@ -111,8 +111,6 @@ class ChannelConstant:
     """Light of its strongest waveforms [DN m2]: see `setting.Setting`."""
     scene: Annotated[tuple[Annotated[float, Range(-100.0, 100.0)], ...], Key(blank=True)] = ()
     """Quantiles of the light of its waveforms, logarithms: see `setting.Setting`."""
-    places: Annotated[tuple[Annotated[float, Range(-1e9, 1e9)], ...], Key(blank=True)] = ()
-    """Ground that other strips may see again: east, north, logarithm of that light, and so on."""
 
     @property
     def is_described(self) -> bool:
@@ -214,12 +212,14 @@ class Calibration:
     """Standard deviation of these energies from shot to shot, relative."""
     energy_source: Annotated[str, Key()] = ""
     energy_unit: Annotated[str, Key()] = ""
+    places: Annotated[tuple[Annotated[float, Range(-1e9, 1e9)], ...], Key(blank=True)] = ()
+    """Ground that other strips may see again: digitizer, east, north, logarithm of its light, and so on."""
     swath: tuple[float, ...] = ()
     """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
     right: tuple[float, float] = (0.0, 0.0)
     """Of the strip's flight, as `Radiometry.right`; not kept in the file."""
     notes: tuple[str, ...] = ()
-    """What is doubtful about it, one line each; not kept in the file."""
+    """What is doubtful about it, or would not show in the strip that it is used for; not kept in the file."""
 
     @property
     def section_constant(self) -> float | None:
@@ -260,7 +260,7 @@ class Calibration:
             "section_constant": self.section_constant,
             **({"scan_angle_terms": list(self.swath)} if self.swath else {}),
             **{name: getattr(self, name) for name in _REPORTED},
-            "channels": [{**asdict(row), "places": len(row.places) // 3} for row in self.channels],
+            "channels": [asdict(row) for row in self.channels],
             "strips": self._describe_strips(),
         }
 

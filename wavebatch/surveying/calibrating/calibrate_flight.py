@@ -197,12 +197,12 @@ def _assemble(
     for channel in np.unique(of[known]):
         mine = np.flatnonzero(known & (of == channel))
         some = [sources[k] for k in mine.tolist()]
-        trials = adjusted.trials[:, mine]
+        mean, trials = float(adjusted.value[mine].mean()), adjusted.trials[:, mine]
         # A channel of one strip says nothing of its drift: it is credited with that of the others.
         apart = float(np.std(adjusted.value[mine], ddof=1)) if len(mine) > 1 else scatter
         ranging = float(np.mean([source.strip.ranging for source in some]))
         error = float(np.sqrt(np.std(trials.mean(axis=1), ddof=1) ** 2 + shared**2 + apart**2 + ranging**2))
-        channels.append(_describe_row(some, adjusted.value[mine], error))
+        channels.append(_describe_row(some, math.exp(mean), error))
         rows += _list_strips(some, mine, adjusted, shared)
     constants = np.array([row.constant for row in channels])
     error = float(np.hypot(np.std(constants) / constants.mean(), max(row.relative_error for row in channels)))
@@ -215,6 +215,7 @@ def _assemble(
         targets=tuple(_list_targets(strips)),
         channels=tuple(channels),
         strips=tuple(rows),
+        places=_join_places(good, rows),
         notes=tuple(
             note if len(strips) == 1 else f"{strip.path.name}: {note}"
             for strip in strips
@@ -222,6 +223,17 @@ def _assemble(
             for note in strip.found.notes
         ),
     )
+
+
+def _join_places(good: Sequence[Calibration], rows: Sequence[StripConstant]) -> tuple[float, ...]:
+    """Ground of the strips with targets, as bright as it is by the mean constants of their channels."""
+    drift = {(row.sha256, row.digitizer): math.log1p(row.drift) for row in rows}
+    parts = []
+    for found in good:
+        part = np.reshape(found.places, (-1, 4))
+        part[:, 3] += [drift.get((found.fingerprint["sha256_sampled"], digitizer), 0.0) for digitizer in part[:, 0]]
+        parts.append(part[:: len(good)])
+    return tuple(np.concatenate(parts).ravel().tolist())
 
 
 def _list_strips(
@@ -262,9 +274,8 @@ def _list_targets(strips: Sequence[FlightStrip]) -> Iterator[TargetResult]:
                 yield replace(row, name=f"{row.name} on {strip.path.name}")
 
 
-def _describe_row(some: Sequence[Source], values: np.ndarray, error: float) -> ChannelConstant:
-    """The row of a channel with how it records, what targets say of its scatter, and the ground as its mean constant
-    sees it; values: logarithms of the constants of its strips. InputError for two recordings."""
+def _describe_row(some: Sequence[Source], constant: float, error: float) -> ChannelConstant:
+    """The row of a channel with how it records, and what targets say of its scatter; InputError for two recordings."""
     first = some[0].row
     for path, row in ((source.strip.path, source.row) for source in some):
         if (row.bits, row.spacing_ns, row.gain) != (first.bits, first.spacing_ns, first.gain):
@@ -273,14 +284,10 @@ def _describe_row(some: Sequence[Source], values: np.ndarray, error: float) -> C
                 f"{some[0].strip.path.name}: another sensor or other settings; calibrate these strips separately"
             )
     seen = [source.given for source in some if source.given is not None]
-    parts = [np.reshape(source.row.places, (-1, 3)) for source in some]
-    offs = values - values.mean()
-    places = np.concatenate([part + [0.0, 0.0, off] for part, off in zip(parts, offs, strict=True)])[:: len(some)]
     return replace(
         first,
-        constant=math.exp(values.mean()),
+        constant=constant,
         relative_error=error,
-        places=tuple(places.ravel().tolist()),
         spread=max((row.spread for row in seen), default=0.0),
         echoes=sum(row.echoes for row in seen),
         shot_energy=max((row.shot_energy for row in seen), default=0.0),

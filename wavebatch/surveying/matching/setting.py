@@ -6,7 +6,7 @@ makes another sensor of it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
@@ -40,7 +40,7 @@ USUAL_CHANGE = 0.35
 SUNLIGHT = 0.1
 """By how much sunlight changes the noise of one gain (standard deviation of the logarithm)."""
 
-PLACES, NEAR, LEAST_COMMON, SPAN, BORDER = 320, 20.0, 20, 0.25, 4.0
+PLACES, NEAR, LEAST_COMMON, SPAN, BORDER = 256, 20.0, 20, 0.25, 4.0
 """Places that a calibration keeps; distance up to which a waveform of another strip sees the same ground [m], since
 fields are larger; fewest of these that show a change; how far they spread along the strip to show that it fades
 (standard deviation, in half of its time); and standard deviations of their differences from which they lie apart."""
@@ -194,7 +194,7 @@ def compare_scenes(one: Sequence[float], other: Sequence[float], noise: float | 
 
 
 def compare_ground(
-    places: np.ndarray, known: Sequence[float], noise: float | None = None
+    places: np.ndarray, known: np.ndarray, noise: float | None = None
 ) -> tuple[Change, Change | None] | None:
     """Weigh by how much the ground that a calibrated strip saw too is brighter, and how that grows along the strip.
 
@@ -202,8 +202,8 @@ def compare_ground(
     ----------
     places : float array, shape (4, k)
         As `Setting.places`.
-    known : sequence of float
-        East, north, logarithm of the light, and so on: of places of the calibration.
+    known : float array, shape (m, 3)
+        East, north and logarithm of the light of places of the calibration.
     noise : float, optional
         As for `weigh_change`.
 
@@ -213,7 +213,7 @@ def compare_ground(
         Growth is that from the first half of the strip to the second; None where common ground is at one end. None
         instead of both for too little common ground, or where its pattern is not the same.
     """
-    there = np.reshape(known[: len(known) // 3 * 3], (-1, 3)).T
+    there = known.T
     if not (there.size and places.size):
         return None
     apart = np.hypot(*(there[:2, :, None] - places[:2, None]))
@@ -317,12 +317,14 @@ def _is_whole(zones: np.ndarray) -> np.ndarray:
     return (number != 0) & (np.abs(number) <= MOST_ZONES) & (np.abs(zones - number) < MOST_BEND)
 
 
-def keep_places(places: np.ndarray | None) -> tuple[float, ...]:
-    """Return a part of `Setting.places` of one digitizer as a calibration keeps it, spread evenly over the strip."""
-    if places is None:
-        return ()
-    east, north, light = places[:3, even_places(places.shape[1], PLACES)]
-    return tuple(np.stack([east.round(1), north.round(1), light.round(3)], axis=1).ravel().tolist())
+def keep_places(places: Mapping[int, np.ndarray]) -> tuple[float, ...]:
+    """Return a part of `Setting.places` as `Calibration.places`, spread evenly over the strip."""
+    parts = [
+        np.column_stack([np.full(part.shape[1], index), *part[:2].round(1), part[2].round(3)])
+        for index, part in places.items()
+    ]
+    joined = np.concatenate([np.empty((0, 4)), *parts])
+    return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
 
 
 def _list_places(east: np.ndarray, north: np.ndarray, light: np.ndarray, time: np.ndarray) -> np.ndarray:

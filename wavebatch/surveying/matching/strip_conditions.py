@@ -24,6 +24,7 @@ from wavebatch.surveying.matching.setting import (
     OTHER_PULSE,
     PRIORS,
     SUNLIGHT,
+    Change,
     Setting,
     compare_ground,
     compare_scenes,
@@ -149,9 +150,11 @@ def refuse_zone(calibration: Calibration, found: Setting, distance: float | None
             )
 
 
-def compare_setting(calibration: Calibration, found: Setting, system: SystemPulse) -> tuple[float, list[str]]:
-    """Error that another pulse rate or gain adds to the constant, relative, and the warnings."""
-    growth, lines = 0.0, []
+def compare_setting(
+    calibration: Calibration, found: Setting, system: SystemPulse
+) -> tuple[float, list[str], list[str]]:
+    """Error that another pulse rate or gain adds to the constant, relative, the warnings, and what would not show."""
+    growth, lines, notes = 0.0, [], []
 
     def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
         nonlocal growth
@@ -174,15 +177,16 @@ def compare_setting(calibration: Calibration, found: Setting, system: SystemPuls
         if not scene or len(row.scene) != len(scene):
             continue
         louder = math.log(noise / row.noise_dn) if noise and row.noise_dn else None
-        ground = compare_ground(found.places[row.digitizer], row.places, louder)
+        ground = _compare_places(calibration, found, row.digitizer, louder)
         seen, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
         change = change or compare_scenes(scene, row.scene, louder)
         more = math.expm1(abs(change.shift) if change.chance > LIKELY else change.error)
         growth = max(growth, more)
         if change.chance <= LIKELY and more > HIDDEN:
-            lines.append(
+            notes.append(
                 f"calibration: surfaces {which} differ and no ground is common, so that another energy under the same "
-                f"header would not show (taken as {PRIORS[1][0]:.0%} likely; a strip that overlaps this one shows it)"
+                f"header would not show: {100 * more:.0f} % of error hold it, by an assumed chance of "
+                f"{PRIORS[1][0]:.0%}; calibrate a strip that overlaps this one"
             )
         elif change.chance > LIKELY:
             lines.append(
@@ -190,15 +194,26 @@ def compare_setting(calibration: Calibration, found: Setting, system: SystemPuls
                 f"factor of {math.exp(change.shift):.2f}, "
                 + ("and noise with them" if abs(louder or 0.0) > SUNLIGHT else f"though {seen} alike")
             )
-    return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines]
+    return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines], notes
 
 
-def judge_fading(calibration: Calibration, found: Setting, *, other: bool) -> tuple[float, list[str]]:
-    """Error of the constant by light that changes along the strip, relative, and the warnings; other: a strip that was
-    not calibrated, so that ground in common shows it."""
+def _compare_places(
+    calibration: Calibration, found: Setting, digitizer: int, noise: float | None = None
+) -> tuple[Change, Change | None] | None:
+    known = np.reshape(calibration.places[: len(calibration.places) // 4 * 4], (-1, 4))
+    seen = found.places.get(digitizer, np.empty((4, 0)))
+    return compare_ground(seen, known[known[:, 0] == digitizer, 1:], noise)
+
+
+def judge_fading(calibration: Calibration, found: Setting, *, other: bool) -> tuple[float, list[str], list[str]]:
+    """Error of the constant by light that changes along the strip, relative, the warnings, and what would not show.
+
+    other: a strip that was not calibrated, so that ground in common shows it. Of strips that were calibrated together
+    their overlaps do.
+    """
     fades, hidden = found.fades, "surfaces in large patches"
     for row in calibration.channels if other else ():
-        ground = compare_ground(found.places.get(row.digitizer, np.empty((4, 0))), row.places)
+        ground = _compare_places(calibration, found, row.digitizer)
         if ground and ground[1]:
             fades, hidden = ground[1], "the scatter of the ground in common"
     if fades.chance > LIKELY:
@@ -207,13 +222,13 @@ def judge_fading(calibration: Calibration, found: Setting, *, other: bool) -> tu
             f"calibration: the second half of the strip is {100 * math.expm1(fades.shift):+.0f} % brighter, though "
             "both are like one scene: a laser that fades, or haze? The error of the constant grows by "
             f"{100 * growth:.0f} %; calibrate shorter strips"
-        ]
+        ], []
     growth = math.expm1(fades.error)
-    if growth < HIDDEN:
-        return 0.0, []
-    return growth, [
-        f"calibration: {hidden} hide whether the laser fades along the strip: the error of the constant grows by "
-        f"{100 * growth:.0f} %; calibrate strips that overlap it, or log energies"
+    if growth < HIDDEN or not other and len(calibration.strips) > 1:
+        return 0.0, [], []
+    return growth, [], [
+        f"calibration: {hidden} hide whether the laser fades along the strip: {100 * growth:.0f} % of error hold it; "
+        "calibrate strips that overlap this one"
     ]
 
 

@@ -100,13 +100,14 @@ def match_strip(
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
     setting = measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0)
     refuse_zone(calibration, setting, sensor.distance, reader.facts.path)
+    notes: list[str] = []
     measured = {calibration.fingerprint.get("sha256_sampled"), *(row.sha256 for row in calibration.strips)}
     if own_strip not in measured:
-        more, lines = compare_setting(calibration, setting, system)
+        more, lines, notes = compare_setting(calibration, setting, system)
         growth, reasons = math.hypot(growth, more), [*reasons, *lines]
     if energy is None:
-        more, lines = judge_fading(calibration, setting, other=own_strip not in measured)
-        growth, reasons = math.hypot(growth, more), [*reasons, *lines]
+        more, lines, hidden = judge_fading(calibration, setting, other=own_strip not in measured)
+        growth, reasons, notes = math.hypot(growth, more), [*reasons, *lines], [*notes, *hidden]
     warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows: list[ChannelConstant] = []
@@ -135,7 +136,9 @@ def match_strip(
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
     air = compare_air(calibration, reader, sensor, attenuation, warnings)
-    fitted = replace(calibration, right=setting.right, constant=math.nan, channels=tuple(rows), strips=())
+    fitted = replace(
+        calibration, right=setting.right, constant=math.nan, channels=tuple(rows), strips=(), notes=tuple(notes)
+    )
     return fitted.widened(air), tuple(dict.fromkeys(warnings))
 
 
