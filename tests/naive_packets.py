@@ -2,8 +2,7 @@
 
 import math
 
-from wavebatch.files.strip.packet_check import MAX_LOCATION, Reason
-from wavebatch.files.strip.packet_vectors import RANGE_RATIO
+from wavebatch.files.strip.packet_check import MAX_LOCATION, RANGE_RATIO, Reason
 
 
 def judge_packet(point, kinds, form, unit, data):

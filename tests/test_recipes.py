@@ -16,8 +16,8 @@ import pytest
 
 import wavebatch
 from wavebatch.core.echoes import COLUMNS
-from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
+from wavebatch.files.las.read_points import read_checked_header
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "recipes.md").read_text("utf-8")
 BLOCKS = dict(re.findall(r'(?ms)^```\w+ title="([^"]+)"\n(.*?)^```$', PAGE))

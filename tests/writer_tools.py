@@ -13,11 +13,11 @@ from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud import layout
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.disk.publish import publish_together
-from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.extra_bytes import build_dtype
 from wavebatch.files.las.header import LasHeader, Vlr, encode_evlr_header, read_header
+from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.packets import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.writer import FullwaveWriter
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from wavebatch.core.echoes import COLUMNS, Column, EchoFlag, EchoTable
     from wavebatch.core.errors import ConfigError, InputError, StageError
     from wavebatch.core.waveforms import Digitizer, Noise, ReturnTable, SystemPulse, WaveformBlock
+    from wavebatch.files.cloud.cloud_reader import read_cloud
     from wavebatch.stages.chain import Chain, Range, Step, stage
     from wavebatch.surveying.survey import Decision, Survey
-    from wavebatch.tools.api.cloud import read_cloud
     from wavebatch.tools.api.run import run
     from wavebatch.tools.api.strip import Strip, auto_chain, load_chain, open_strip, survey
 
@@ -37,10 +37,10 @@ _MODULES = {
     "core.echoes": ("COLUMNS", "Column", "EchoFlag", "EchoTable"),
     "core.errors": ("ConfigError", "InputError", "StageError"),
     "core.waveforms": ("Digitizer", "Noise", "ReturnTable", "SystemPulse", "WaveformBlock"),
+    "files.cloud.cloud_reader": ("read_cloud",),
     "stages.chain": ("Chain", "Range", "Step", "stage"),
     "batch.options": ("RunOptions",),
     "surveying.survey": ("Decision", "Survey"),
-    "tools.api.cloud": ("read_cloud",),
     "tools.api.run": ("run",),
     "tools.api.strip": ("Strip", "auto_chain", "load_chain", "open_strip", "survey"),
 }

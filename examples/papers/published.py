@@ -13,9 +13,8 @@ from given_echoes import FINE, fine_recording, simulate_echoes
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.tools.simulate.draws import FoldedWidth, LogNormal, WithinDepth
 from wavebatch.tools.simulate.render import PulseModel, Recording
-from wavebatch.tools.simulate.scenes import Scene
+from wavebatch.tools.simulate.scenes import FoldedWidth, LogNormal, Scene, WithinDepth
 
 WAGNER = Scene(
     "wagner",

@@ -29,7 +29,7 @@ from wavebatch.stages.detect.maximum import TWICE_SMOOTHED_GAIN, maximum
 from wavebatch.stages.detect.transformed import asdf
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.simulate import simulate_block
-from wavebatch.tools.simulate.draws import LogNormal
+from wavebatch.tools.simulate.scenes import LogNormal
 
 PAPER_RULE = {"rule": "paper", "interpolation": "parabola"}
 RESOLUTION = {1.0: (3.58, 3.43, 3.24, 3.14), 0.5: (4.76, 4.34, 3.95, 3.74), 0.35: (5.75, 4.97, 4.33, 4.00)}

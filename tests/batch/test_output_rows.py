@@ -11,7 +11,7 @@ from wavebatch.batch.output_rows import assemble_echoes, assemble_returns, gathe
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.echoes import COLUMNS, PASSED_THROUGH, Column, EchoFlag
 from wavebatch.core.errors import StageError
-from wavebatch.files.las.point_formats import split_numbers
+from wavebatch.files.las.header import split_numbers
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE
 

@@ -115,15 +115,15 @@ def test_a_run_that_reaches_its_limit_of_processor_time_leaves_nothing(strip, tm
 
 _IN_COMPRESSOR = """
 import os, signal
-from wavebatch.files.las import laz_encode
+from wavebatch.files.las import write_points
 from wavebatch.__main__ import main
 
-class File(laz_encode.BytesIO):
+class File(write_points.BytesIO):
     def write(self, data):
         os.kill(os.getpid(), signal.{name})
         return super().write(data)
 
-laz_encode.BytesIO = File
+write_points.BytesIO = File
 main()
 """
 
@@ -138,14 +138,14 @@ def test_a_signal_inside_the_compressor_is_not_taken_for_a_failed_write(strip, t
 
 
 def test_ctrl_c_inside_the_compressor_reaches_a_program_that_uses_the_library(strip, tmp_path, monkeypatch):
-    from wavebatch.files.las import laz_encode
+    from wavebatch.files.las import write_points
 
-    class File(laz_encode.BytesIO):
+    class File(write_points.BytesIO):
         def write(self, data):
             os.kill(os.getpid(), signal.SIGINT)
             return super().write(data)
 
-    monkeypatch.setattr(laz_encode, "BytesIO", File)
+    monkeypatch.setattr(write_points, "BytesIO", File)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):

@@ -14,8 +14,16 @@ import numpy as np
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.tools.simulate import PulseModel, Recording, Scene
-from wavebatch.tools.simulate.draws import Drawn, tabulate_echoes
-from wavebatch.tools.simulate.scenes import Draw, draw_broad, draw_constant, draw_contrast, draw_crowd, draw_huge
+from wavebatch.tools.simulate.scenes import (
+    Draw,
+    Drawn,
+    draw_broad,
+    draw_constant,
+    draw_contrast,
+    draw_crowd,
+    draw_huge,
+    tabulate_echoes,
+)
 
 SIGMA = 2.0
 """Width of the system pulse in all cases [ns]."""

@@ -22,7 +22,7 @@ from wavebatch.surveying import Survey, survey_block
 from wavebatch.tools.bench.accuracy import AccuracyTally, Group, derive_seed, describe_found, make_group
 from wavebatch.tools.bench.command import AUTO, find_twin
 from wavebatch.tools.simulate import Recording, Scene, find_scene, simulate_blocks
-from wavebatch.tools.simulate.draws import LogUniform, Mixture
+from wavebatch.tools.simulate.scenes import LogUniform, Mixture
 
 GROUPS = 5
 """Groups of every case; each has a survey of an ordinary scene with the same receiver."""

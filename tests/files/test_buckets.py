@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.buckets import MOST_BUCKETS, count_buckets, spread_keys, spread_times, time_keys
-from wavebatch.files.disk.temp_store import Spool
+from wavebatch.files.disk.temp_store import MOST_BUCKETS, Spool, count_buckets, spread_keys, spread_times, time_keys
 
 ROW = np.dtype([("gps_time", "<f8"), ("number", "<i4")])
 

@@ -25,13 +25,12 @@ from writer_tools import (
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.cloud_reader import CloudReader, ColumnReader
+from wavebatch.files.cloud.cloud_reader import CloudReader, ColumnReader, read_cloud
 from wavebatch.files.cloud.column_names import STYLES
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.publish import remove_stale
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, read_header
-from wavebatch.tools.api.cloud import read_cloud
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 LEICA = "leica-als/simple1_3_full_internal.las"

@@ -10,9 +10,8 @@ import pytest
 from strips import make_raw
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader, ColumnReader
+from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader, ColumnReader, read_cloud
 from wavebatch.files.las.header import STANDARD_DTYPES
-from wavebatch.tools.api.cloud import read_cloud
 
 
 def write_cloud(path, point_format, n=300, extra=()):

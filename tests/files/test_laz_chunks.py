@@ -20,11 +20,10 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.disk import raw_bytes
 from wavebatch.files.disk.raw_bytes import hiding_panics
-from wavebatch.files.las import laz_decode
+from wavebatch.files.las import read_points
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import LasHeader, read_header
-from wavebatch.files.las.laz_encode import CHUNK_POINTS, compress_rows
-from wavebatch.files.las.write_points import PointFile, Statistics
+from wavebatch.files.las.write_points import CHUNK_POINTS, PointFile, Statistics, compress_rows
 
 RECORDS = [ExtraRecord.build("width", "<f4", "a test", no_data=-9999.0)]
 
@@ -160,7 +159,7 @@ def test_a_panic_of_the_decoder_is_one_line_and_says_nothing_itself(tmp_path, mo
     with open_file(path, 1) as file:
         file.write(make_rows(1, 10))
         file.commit()
-    monkeypatch.setattr(laz_decode.LazPoints, "_decode", _panic)
+    monkeypatch.setattr(read_points.LazPoints, "_decode", _panic)
     with CloudReader(path) as reader, pytest.raises(InputError, match="cannot be decompressed .index out of bounds.;"):
         list(reader.read_pieces())
     assert capfd.readouterr().err == ""

@@ -7,7 +7,7 @@ import sys
 import laspy
 import pytest
 
-from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
+from wavebatch.files.las.header import STANDARD_DTYPES, list_dimensions
 
 
 @pytest.mark.parametrize("number", range(11))

@@ -9,9 +9,8 @@ from strips import make_raw, vlr
 from writer_tools import data_file, read_raw
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.las import laz_decode
-from wavebatch.files.las.checked_header import read_checked_header
-from wavebatch.files.las.read_points import open_points
+from wavebatch.files.las import read_points
+from wavebatch.files.las.read_points import open_points, read_checked_header
 from wavebatch.files.strip.reader import StripReader
 
 
@@ -163,7 +162,7 @@ def test_cut_laz_files(tmp_path, cut, point_format):
 
 
 def test_a_chunk_that_does_not_fit_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(laz_decode, "MAX_CHUNK_BYTES", 100)
+    monkeypatch.setattr(read_points, "MAX_CHUNK_BYTES", 100)
     refused(laz_of(tmp_path)[1], "chunks are too large|table of LAZ chunks")
 
 

@@ -8,8 +8,7 @@ import pytest
 from pulse_files import Pulse, PulseFile, Sampling, bell
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.pulsewaves.header import read_pulse_header
-from wavebatch.files.pulsewaves.reader import PulseReader
+from wavebatch.files.pulsewaves_file import PulseReader, read_pulse_header
 
 VARIED = (
     Sampling(kind=1, duration_bits=32, scale=0.25, length_bits=8),

@@ -13,7 +13,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.publish import protecting, refuse_input
-from wavebatch.files.las import laz_decode
+from wavebatch.files.las import read_points
 from wavebatch.files.strip import scanner, shared_packets
 from wavebatch.files.strip.reader import LONG_SAMPLES, StripReader
 
@@ -355,7 +355,7 @@ def test_compressed_points_are_decoded_once(tmp_path, monkeypatch, case):
 
     calls = []
 
-    def decode(points, rows, decode=laz_decode.LazPoints._decode):
+    def decode(points, rows, decode=read_points.LazPoints._decode):
         calls.append(len(rows))
         decode(points, rows)
 
@@ -368,7 +368,7 @@ def test_compressed_points_are_decoded_once(tmp_path, monkeypatch, case):
     plain, path = raw.write(tmp_path / "a.las"), raw.write(tmp_path / "b.laz")
     readers = StripReader(plain, unit_points=64), StripReader(path, unit_points=64)
     with readers[0] as one, readers[1] as two, one.scan() as expected, two.scan() as scan:
-        monkeypatch.setattr(laz_decode.LazPoints, "_decode", decode)
+        monkeypatch.setattr(read_points.LazPoints, "_decode", decode)
         for number in range(one.unit_count()):
             units = one.read_unit(number, expected), two.read_unit(number, scan)
             assert len({unit.points.tobytes() for unit in units}) == 1

@@ -11,10 +11,9 @@ from writer_tools import plan_output, write_source
 
 from wavebatch.cli import main
 from wavebatch.files.cloud.writer import CloudWriter
-from wavebatch.files.las.crs import parse_wkt, read_crs_definition
+from wavebatch.files.las.crs import parse_wkt, read_crs_definition, repair_records, repair_wkt
 from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, is_projection, read_header
-from wavebatch.files.wkt import repair_records, repair_wkt
 from wavebatch.tools.simulate import simulate_strip
 
 METRE = 'UNIT["Meter",1.00000000000000000000,AUTHORITY["EPSG","9001"]]'

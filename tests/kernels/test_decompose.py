@@ -204,6 +204,22 @@ def test_a_window_wider_than_the_most_echoes_side_by_side_does_not_grow(length, 
     assert decompose(y, start, grow=True, width_high=8.0, max_echoes=6).number.tolist() == [number]
 
 
+@pytest.mark.parametrize("stretch", [20, 33, 100])
+def test_a_wide_pulse_finds_the_echoes_of_a_narrow_one(stretch):
+    """From 32 samples on new echoes are looked for in sums of samples; noise of each is `stretch` times stronger."""
+    times, amplitudes = np.array([12.0, 16.5, 31.0, 35.0]), np.array([150.0, 60.0, 90.0, 120.0])
+    noise = np.random.default_rng(stretch).standard_normal((1, LENGTH * stretch))
+    middle = stretch * (times + 0.5) - 0.5
+    bells = np.exp(-0.5 * ((np.arange(LENGTH * stretch)[:, None] - middle) / (2.0 * stretch)) ** 2)
+    y = bells @ amplitudes + noise
+    start = np.array([[[150.0], [middle[0]], [2.0 * stretch]]])
+    found = decompose(y, start, grow=True, width_ref=2.0 * stretch, width_low=stretch, width_high=8.0 * stretch)
+    order = np.argsort(found.parameters[:, 1])
+    assert found.number.tolist() == [4]
+    np.testing.assert_allclose(found.parameters[order, 1], middle, atol=5 * found.errors[:, 1].max())
+    assert found.errors[:, 1].max() < 0.1 * stretch
+
+
 def test_a_cluster_alone_gives_the_same_bits_as_among_others():
     rng = np.random.default_rng(8)
     truth = np.stack([draw_random(rng)[:, :1] for _ in range(40)])

@@ -5,9 +5,8 @@ import pytest
 from naive_packets import judge_packet
 
 from wavebatch.core.units import HALF_C, PS_PER_NS
-from wavebatch.files.point_dtypes import STANDARD_DTYPES
-from wavebatch.files.strip.packet_check import MAX_LOCATION, Reason
-from wavebatch.files.strip.packet_vectors import RANGE_RATIO
+from wavebatch.files.las.header import STANDARD_DTYPES
+from wavebatch.files.strip.packet_check import MAX_LOCATION, RANGE_RATIO, Reason
 from wavebatch.kernels.packets import FIELDS, Geometry, PacketRules, judge_packets
 
 NAMES = ("wavepacket_index", "wavepacket_offset", "wavepacket_size", "return_point_wave_location", "x_t", "y_t", "z_t")

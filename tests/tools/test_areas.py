@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from wavebatch.cli.stats import SHOWN, stats
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.disk import buckets
+from wavebatch.files.disk import temp_store
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.tools import return_stats as module
 from wavebatch.tools import return_stats as returns
@@ -84,7 +84,7 @@ def check_sum(areas, total):
 @pytest.mark.parametrize("bucket", [400_000, 150])
 def test_cells_as_a_loop_over_pulses_counts_them(tmp_path, monkeypatch, size, bucket):
     points = make_cloud(tmp_path / "c.las")
-    monkeypatch.setattr(buckets, "BUCKET_ROWS", bucket)
+    monkeypatch.setattr(temp_store, "BUCKET_ROWS", bucket)
     (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(size)])
     naive = count_naively(*points, lambda x, y: (math.floor(x / size) * size, math.floor(y / size) * size))
     check_areas(one.areas, naive, lambda area: (area.x, area.y))

@@ -9,7 +9,7 @@ import pytest
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
-from wavebatch.files.disk import buckets
+from wavebatch.files.disk import temp_store
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.tools.compare import pairing
 from wavebatch.tools.compare.clouds import compare_clouds, compare_truth
@@ -80,7 +80,7 @@ def test_many_points_without_a_time_are_matched_in_bounded_memory(tmp_path, monk
 
 @pytest.mark.parametrize("rows", [400_000, 100])
 def test_time_zero_is_one_pulse_whatever_its_sign(tmp_path, monkeypatch, rows):
-    monkeypatch.setattr(buckets, "BUCKET_ROWS", rows)
+    monkeypatch.setattr(temp_store, "BUCKET_ROWS", rows)
     _, times, xyz, _ = make_pulses()
     times -= times[0]
     write_cloud(tmp_path / "a.las", times, xyz)
@@ -139,7 +139,7 @@ def test_without_useful_times_nearest_neighbours_are_matched(tmp_path, times_are
     _, times, xyz, ray = make_pulses(3000)
     given = {"missing": None, "zero": np.zeros(len(times)), "of another day": times + 86400}[times_are]
     form = 0 if times_are == "missing" else 6
-    monkeypatch.setattr(buckets, "BUCKET_ROWS", 1500)
+    monkeypatch.setattr(temp_store, "BUCKET_ROWS", 1500)
     write_cloud(tmp_path / "a.las", given, xyz + 0.3 * SPEED * ray, point_format=form)
     write_cloud(tmp_path / "b.las", times[:-20], xyz[:-20])
     result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
@@ -175,7 +175,7 @@ def test_buckets_do_not_change_the_result(tmp_path, monkeypatch, by):
     write_cloud(tmp_path / "a.las", times, xyz + (jitter * SPEED)[:, None] * ray)
     write_cloud(tmp_path / "b.las", times[keep], xyz[keep])
     whole = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
-    monkeypatch.setattr(buckets, "BUCKET_ROWS", 700)
+    monkeypatch.setattr(temp_store, "BUCKET_ROWS", 700)
     parts = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
     assert parts.differences["time"].rms == pytest.approx(whole.differences["time"].rms)
     assert parts.differences["time"].median == pytest.approx(whole.differences["time"].median)
@@ -239,7 +239,7 @@ def test_vendor_returns_against_truth_and_against_the_result(strip, monkeypatch)
     assert both.missed <= 3
     assert both.extra == pytest.approx(vendor.missed, abs=5)
     assert abs(both.differences["time"].median) < 0.01
-    monkeypatch.setattr(buckets, "BUCKET_ROWS", 500)
+    monkeypatch.setattr(temp_store, "BUCKET_ROWS", 500)
     assert compare_truth(folder / "s.laz", folder / "t.npz").matched == vendor.matched
 
 
@@ -356,7 +356,7 @@ def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatc
         cloud.intensity = np.full(these.sum(), 9)
         cloud.classification = kinds[these]
         cloud.write(tmp_path / name)
-    monkeypatch.setattr(buckets, "BUCKET_ROWS", 900)
+    monkeypatch.setattr(temp_store, "BUCKET_ROWS", 900)
     result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
     missed, extra = far | ~keep, far & keep
     naive = {"return": {}, "amplitude": {}, "flag": {}, "class": {}}

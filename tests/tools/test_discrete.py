@@ -10,7 +10,7 @@ from wavebatch.cli.simulate import simulate
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, find_scene, simulate_block, simulate_returns
-from wavebatch.tools.simulate.draws import CANOPIES
+from wavebatch.tools.simulate.scenes import CANOPIES
 
 
 def fire_slowly(receiver, pulse, distance, amplitude):

@@ -11,11 +11,10 @@ from pulse_files import Pulse, PulseFile, Sampling, bell
 
 from wavebatch.cli import main
 from wavebatch.core.errors import InputError
-from wavebatch.files.pulsewaves import reader as pulse_reader
+from wavebatch.files import pulsewaves_file as pulse_reader
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.system_file import load_survey
-from wavebatch.tools.archives.frame import find_utm_zone, project_utm
-from wavebatch.tools.archives.import_file import ImportOptions, import_file
+from wavebatch.tools.archives.import_file import ImportOptions, find_utm_zone, import_file, project_utm
 
 SENT, ECHO = Sampling(kind=1, channel=3, scale=0.01), Sampling(scale=0.5, duration_bits=32)
 C = 0.149896

@@ -20,12 +20,12 @@ from wavebatch.files.cloud import cloud_reader as io_cloud
 from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.even_sample import EvenSample
-from wavebatch.tools.plots import raster, values
+from wavebatch.tools.plots import values
 from wavebatch.tools.plots.histogram import count_points_by_flag, count_values, place_edges
-from wavebatch.tools.plots.raster import grid_values
 from wavebatch.tools.plots.sections import cut_section
 from wavebatch.tools.plots.values import robust_limits
 from wavebatch.tools.rasters import cells
+from wavebatch.tools.rasters.cells import grid_values
 
 
 @pytest.fixture(scope="module")
@@ -335,7 +335,7 @@ def test_map_is_that_of_a_loop_over_cells(cloud, monkeypatch, statistic):
 
 def test_chosen_cells_hold_a_few_points_each(cloud):
     found = grid_values([cloud], None, "count")
-    assert 2 < np.nanmean(found.values) < 4 * raster.POINTS_PER_CELL
+    assert 2 < np.nanmean(found.values) < 4 * cells.POINTS_PER_CELL
     assert np.nansum(found.values) == POINTS and found.label == "points per cell [-]"
 
 
@@ -377,7 +377,7 @@ def test_wrong_options_of_a_map(cloud, change, message):
 
 def test_the_size_that_is_proposed_does(cloud):
     found = grid_values([cloud], "amplitude", size=0.02)
-    assert found.grid.rows * found.grid.columns <= raster.MOST_CELLS
+    assert found.grid.rows * found.grid.columns <= cells.MOST_CELLS
 
 
 @pytest.mark.parametrize("kind", ["histogram", "map"])

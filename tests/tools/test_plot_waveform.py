@@ -29,8 +29,16 @@ from wavebatch.tools.bench.report import _draw_panel
 from wavebatch.tools.compare.chains import ChainRun, measure_fit
 from wavebatch.tools.plots.charts import measure_view_residuals
 from wavebatch.tools.plots.draw_waveform import _draw_panels, draw_waveform_panels, draw_waveform_sheet
-from wavebatch.tools.plots.packets import MOST, Place, Wanted, find_places
-from wavebatch.tools.plots.waveform import add_ranges, build_views, list_echoes, read_views
+from wavebatch.tools.plots.waveform import (
+    MOST,
+    Place,
+    Wanted,
+    add_ranges,
+    build_views,
+    find_places,
+    list_echoes,
+    read_views,
+)
 
 KAPPA = 0.15
 

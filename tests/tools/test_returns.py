@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from wavebatch.cli.stats import stats
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk import buckets
+from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import LasHeader
@@ -94,7 +94,7 @@ def test_points_without_a_time_are_not_one_pulse(tmp_path, missing, monkeypatch)
     (found,), _ = count_returns([write_cloud(tmp_path / "a.las", **parts)])
     assert (found.pulses, found.pulses_by) == (40, "gps_time") and found.by_count[3] == pytest.approx(0.25)
     assert found.warnings[0].startswith("points without GPS time (0 or NaN): 30;")
-    monkeypatch.setattr(buckets, "BUCKET_ROWS", 5)
+    monkeypatch.setattr(temp_store, "BUCKET_ROWS", 5)
     (again,), _ = count_returns([tmp_path / "a.las"])
     assert again.by_count == found.by_count
 
@@ -103,7 +103,7 @@ def test_buckets_and_pieces_change_nothing(tmp_path, monkeypatch):
     receiver = DiscreteReceiver(most=3)
     simulate_returns("canopy.orion-22", tmp_path / "c.laz", pulses=3000, receiver=receiver)
     whole = count_returns([tmp_path / "c.laz"])[1]
-    monkeypatch.setattr(buckets, "BUCKET_ROWS", 500)
+    monkeypatch.setattr(temp_store, "BUCKET_ROWS", 500)
     parts = count_returns([tmp_path / "c.laz"])[1]
     assert parts.by_count == whole.by_count and parts.incomplete == whole.incomplete == 0
     assert parts.separations["1-2"].least == whole.separations["1-2"].least

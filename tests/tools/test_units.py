@@ -15,7 +15,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.files.las.crs import metres_per_unit, parse_wkt
 from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import build_wkt
-from wavebatch.files.strip.packet_vectors import DirectionTally, decide_direction
+from wavebatch.files.strip.packet_check import DirectionTally, decide_direction
 from wavebatch.tools.plots.charts import picture_cloud
 from wavebatch.tools.plots.sections import cut_section, measure_profile
 from wavebatch.tools.simulate import simulate_strip

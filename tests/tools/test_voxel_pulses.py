@@ -10,8 +10,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey
-from wavebatch.tools.voxels.pulses import LOST, read_batches
-from wavebatch.tools.voxels.rays import PACKET, SAMPLE, join_packets
+from wavebatch.tools.voxels.rays import LOST, PACKET, SAMPLE, join_packets, read_batches
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 NOISE = ReceiverNoise(baseline=12.0, baseline_spread=0.1, std=0.58)

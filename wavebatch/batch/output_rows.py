@@ -21,7 +21,7 @@ from wavebatch.core.order import find_order
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import take_whole_records, widen_integers
-from wavebatch.files.las.point_formats import locate, split_numbers
+from wavebatch.files.las.header import locate, split_numbers
 from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, number_returns
 
 if TYPE_CHECKING:

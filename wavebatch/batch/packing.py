@@ -14,7 +14,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.process import Seconds
 from wavebatch.files.disk.temp_store import RowParcel
-from wavebatch.files.las.laz_encode import CHUNK_POINTS, Chunk, compress_rows
+from wavebatch.files.las.write_points import CHUNK_POINTS, Chunk, compress_rows
 
 Part = tuple[RowParcel, int, int]
 """Rows [start, stop) of a unit."""

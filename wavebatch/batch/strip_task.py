@@ -31,8 +31,8 @@ from wavebatch.core.process import Seconds
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.publish import Claim, check_target
 from wavebatch.files.disk.raw_bytes import Closing, take_fingerprint
-from wavebatch.files.las.laz_encode import Chunk
-from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.las.write_points import Chunk
+from wavebatch.files.strip.packets import StripFacts
 from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.files.text_file import draft_text
 

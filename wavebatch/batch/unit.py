@@ -25,9 +25,8 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
 from wavebatch.files.disk.temp_store import RowParcel
-from wavebatch.files.las.laz_encode import Chunk
-from wavebatch.files.las.point_formats import split_numbers
-from wavebatch.files.las.write_points import Statistics
+from wavebatch.files.las.header import split_numbers
+from wavebatch.files.las.write_points import Chunk, Statistics
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.files.strip.scanner import ScanPart

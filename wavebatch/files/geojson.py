@@ -22,10 +22,9 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import need
-from wavebatch.files.las.crs import CrsUnits, find_epsg, parse_wkt, read_crs_definition
+from wavebatch.files.las.crs import CrsUnits, drop_empty_codes, find_epsg, parse_wkt, read_crs_definition
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.text_file import MOST_LIST, read_text
-from wavebatch.files.wkt import drop_empty_codes
 
 WGS84 = "OGC:CRS84"
 """Longitude and latitude, in this order."""

@@ -18,7 +18,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.publish import Draft, check_target
 from wavebatch.files.disk.raw_bytes import Closing
-from wavebatch.files.wkt import read_wkt
+from wavebatch.files.las.crs import read_wkt
 
 TILE = 256
 """Cells along a side of a tile: usual for web viewers and cloud storage."""

@@ -20,7 +20,7 @@ from wavebatch.core.order import even_places
 from wavebatch.core.system import LevelWidths
 from wavebatch.core.units import SQUARED_NORMAL_MEDIAN, C, format_measure
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.las.point_formats import locate
+from wavebatch.files.las.header import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.geometry.normals import Surroundings, grow_tree, measure_normals, thin_out
 from wavebatch.kernels.geometry.planes import in_two_lines

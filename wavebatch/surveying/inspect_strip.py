@@ -14,8 +14,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError, StripWarning
 from wavebatch.core.no_data import without_nan
-from wavebatch.files.strip.describe import describe_samples
-from wavebatch.files.strip.header_check import audit_header
+from wavebatch.files.strip.describe import audit_header, describe_samples
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
 
 _MATCHED = 1024

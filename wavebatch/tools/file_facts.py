@@ -18,13 +18,21 @@ from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.cloud.cloud_reader import CloudReader
-from wavebatch.files.cloud.provenance import read_provenance
-from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
+from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.las.crs import name_units, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
-from wavebatch.files.las.point_formats import WITHOUT_WAVES, locate, read_angles, read_classes, split_numbers
-from wavebatch.files.point_dtypes import field_names
+from wavebatch.files.las.header import (
+    WITHOUT_WAVES,
+    LasHeader,
+    decode_text,
+    field_names,
+    find_evlrs,
+    locate,
+    read_angles,
+    read_classes,
+    split_numbers,
+)
+from wavebatch.files.las.read_points import CheckedHeader, read_checked_header
 from wavebatch.files.strip.describe import describe_strip
 
 _GPS_EPOCH = datetime(1980, 1, 6)

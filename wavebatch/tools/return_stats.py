@@ -21,8 +21,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.disk.buckets import count_buckets, spread_keys, tell_pulses_apart, time_keys
-from wavebatch.files.disk.temp_store import Spool
+from wavebatch.files.disk.temp_store import Spool, count_buckets, spread_keys, tell_pulses_apart, time_keys
 from wavebatch.files.geojson import Polygon, describe_miss, find_inside
 from wavebatch.files.las.header import read_header
 

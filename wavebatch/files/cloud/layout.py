@@ -23,25 +23,26 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.column_names import WrittenColumn, style_columns
-from wavebatch.files.las.checked_header import CheckedHeader
+from wavebatch.files.las.crs import repair_evlr, repair_records
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype, choose_no_data, tell_apart
 from wavebatch.files.las.geo_keys import convert_geotiff
 from wavebatch.files.las.header import (
     GEOTIFF_ID,
+    MODERN,
     PROJECTION,
     STANDARD_DTYPES,
     WAVEFORM_RECORD_ID,
     WKT_ID,
     Evlr,
     LasHeader,
+    choose_format,
+    copy_standard,
+    field_names,
     find_evlrs,
     has_record,
 )
-from wavebatch.files.las.point_formats import MODERN, choose_format, copy_standard
-from wavebatch.files.point_dtypes import field_names
-from wavebatch.files.strip.facts import StripFacts
-from wavebatch.files.strip.packets import PacketPlace
-from wavebatch.files.wkt import repair_evlr, repair_records
+from wavebatch.files.las.read_points import CheckedHeader
+from wavebatch.files.strip.packets import PacketPlace, StripFacts
 
 LAS_VERSIONS = ("1.4", "1.3", "keep")
 """Values of --las-version."""

@@ -19,9 +19,10 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.cloud.column_names import USER_ID
 from wavebatch.files.cloud.layout import OutputLayout
-from wavebatch.files.cloud.provenance import USER_ID
 from wavebatch.files.disk.publish import Draft, protecting, reporting
+from wavebatch.files.las.crs import repair_evlr
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
@@ -43,7 +44,6 @@ from wavebatch.files.las.header import (
     has_record,
 )
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
-from wavebatch.files.wkt import repair_evlr
 
 _DESCRIPTORS = range(100, 356)
 MOST_PAYLOAD = 65535

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.files.disk.raw_bytes import widen_integers
-from wavebatch.files.las.header import STANDARD_DTYPES
-from wavebatch.files.point_dtypes import field_names
+from wavebatch.files.las.header import STANDARD_DTYPES, field_names
 
 RECORD_SIZE = 192
 EXTRA_BYTES_RECORD_ID = 4

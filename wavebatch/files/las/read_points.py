@@ -1,15 +1,341 @@
-"""Point records of LAS and LAZ files, read by index; a read never loads the whole file.
+"""The header of a LAS or LAZ file, checked before anything else in it is believed, and its points, read by index.
 
-The strip reader and the cloud readers open their points here. Add a new kind of compression in `laz_decode.py`.
+The strip reader, the cloud readers and the output's layout start with `read_checked_header`; points come from
+`open_points`, and a read never loads the whole file. Every check is there because later code relies on it: allocations
+by counts, offsets into the file, indices of descriptors.
+
+lazrs trusts its input: a wrong size can make it crash, hang or allocate without limit. So all sizes of LAZ chunks are
+checked before it gets any bytes, and each chunk is passed on as a small file in memory.
 """
 
 from __future__ import annotations
 
+import struct
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import lazrs
 import numpy as np
 
-from wavebatch.files.disk.raw_bytes import guarded, read_exactly, reading
-from wavebatch.files.las.checked_header import CheckedHeader
-from wavebatch.files.las.laz_decode import LazPoints, open_laz
+from wavebatch.core.errors import InputError
+from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_panics, read_exactly, reading
+from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord, build_dtype, read_records
+from wavebatch.files.las.header import (
+    EVLR_HEADER_SIZE,
+    STANDARD_DTYPES,
+    WAVES_EXTERNAL,
+    WAVES_INTERNAL,
+    LasHeader,
+    field_names,
+    has_record,
+    read_header,
+)
+
+WAVEFORM_FORMATS = (4, 5, 9, 10)
+LEAST_SCALE, LARGEST_SCALE, LARGEST_OFFSET = 1e-12, 1e6, 1e12
+"""Scales and offsets of coordinates outside these limits [m] are damage: no survey needs them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedHeader:
+    """A header whose claims fit the size of the file."""
+
+    path: Path
+    size: int
+    """Bytes of the file."""
+    header: LasHeader
+    dtype: np.dtype
+    """One point record with laspy's field names, extra bytes included."""
+    records: tuple[ExtraRecord, ...]
+    points_end: int
+    """Byte at which the points end: exact for LAS; for LAZ the start of what follows them."""
+    warnings: tuple[str, ...]
+
+    @property
+    def version(self) -> str:
+        """The LAS version, for example 1.4."""
+        return "{}.{}".format(*self.header.version)
+
+    @property
+    def extra(self) -> dict[str, ExtraRecord]:
+        """The record of each extra dimension by its field of `dtype`, in order."""
+        names = field_names(self.dtype)
+        return dict(zip(names[len(names) - len(self.records) :], self.records, strict=True))
+
+
+def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
+    """Return the checked header of a full-waveform strip; its VLRs are read, its points and EVLRs are not.
+
+    waveforms: False accepts any LAS or LAZ file, of any version and point format.
+    Raises InputError if it is not a LAS or LAZ file with waveforms, or contradicts itself.
+    """
+    header = read_header(path, (1, 3) if waveforms else (1, 0))
+    if waveforms:
+        _check_waveforms(path, header)
+    _check_format(path, header)
+    _check_numbers(path, header)
+    payloads = [vlr.payload for vlr in header.vlrs if has_record([vlr], "LASF_Spec", EXTRA_BYTES_RECORD_ID)]
+    extra = header.point_length - STANDARD_DTYPES[header.point_format].itemsize
+    records = tuple(read_records(payloads[0] if payloads else b"", extra))
+    dtype = build_dtype(header.point_format, records)
+    points_end = _find_points_end(path, header)
+    return CheckedHeader(path, header.file_size, header, dtype, records, points_end, _find_warnings(header))
+
+
+def _check_waveforms(path: Path, header: LasHeader) -> None:
+    number = header.point_format
+    if any(vlr.user == "lascompatible" for vlr in header.vlrs):
+        restore = f"laszip -i {path.name} -o {path.stem}_restored.las"
+        raise InputError(f"{path}: written in LAStools' LAS 1.4 compatibility mode; restore it first: {restore}")
+    if number not in WAVEFORM_FORMATS:
+        raise InputError(f"{path}: point format {number} has no waveforms; wavebatch needs format 4, 5, 9 or 10")
+    both = WAVES_INTERNAL | WAVES_EXTERNAL
+    if header.global_encoding & both == both:
+        raise InputError(
+            f"{path}: the header claims packets both in the file and in a .wdp (global encoding bits 1 and 2); clear "
+            "the wrong bit in byte 6 of the file"
+        )
+
+
+def _check_format(path: Path, header: LasHeader) -> None:
+    number = header.point_format
+    if number not in STANDARD_DTYPES:
+        raise damaged(path, f"point format {number} is not known")
+    if number >= 6 and header.version < (1, 4):
+        major, minor = header.version
+        raise damaged(path, f"point format {number} needs LAS 1.4, but the header has version {major}.{minor}")
+    least = STANDARD_DTYPES[number].itemsize
+    if header.point_length < least:
+        raise damaged(path, f"point records of {header.point_length} bytes are too short for format {number} ({least})")
+
+
+def _check_numbers(path: Path, header: LasHeader) -> None:
+    for axis, scale, offset in zip("xyz", header.scales, header.offsets, strict=True):
+        if not (LEAST_SCALE <= abs(scale) <= LARGEST_SCALE and abs(offset) <= LARGEST_OFFSET):
+            raise damaged(path, f"scale {scale} and offset {offset} of {axis} give no usable coordinates")
+
+
+def _find_warnings(header: LasHeader) -> tuple[str, ...]:
+    legacy, count = header.counts
+    if header.version < (1, 4) or not legacy or legacy == count:
+        return ()
+    used = "64-bit" if count else "legacy"
+    return (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
+
+
+def _find_points_end(path: Path, header: LasHeader) -> int:
+    """Byte at which the points end; raises InputError if the claimed points do not fit before what follows them."""
+    start = header.offset_to_points
+    room, limit = header.file_size, "it ends"
+    followers = {"its EVLRs begin": header.evlr_start if header.evlr_count else 0}
+    if not header.global_encoding & WAVES_EXTERNAL:
+        followers["its waveform record begins"] = header.waveform_start
+    for what, at in followers.items():
+        if start <= at <= header.file_size - EVLR_HEADER_SIZE and at < room:
+            room, limit = at, what
+    if header.compressed:
+        return room
+    end = start + header.point_count * header.point_length
+    if end > room:
+        raise damaged(
+            path,
+            f"the header claims {header.point_count} points of {header.point_length} bytes from byte {start} on, but "
+            f"{limit} at byte {room}, which leaves room for {(room - start) // header.point_length}",
+        )
+    return end
+
+
+LASZIP_USER, LASZIP_ID = "laszip encoded", 22204
+MAX_CHUNKS = 2_000_000
+"""Most chunks of a file: 10^11 points in chunks of 50,000, the usual size."""
+MAX_CHUNK_POINTS = 5_000_000
+MAX_CHUNK_BYTES = 1 << 28
+"""Largest chunk: it is kept in memory, compressed and decompressed."""
+MAX_POINTS_PER_BYTE = 1000
+"""More points per byte of file than any compression reaches; real files have fewer than one."""
+_PIECE = 50_000
+_LASZIP = struct.Struct("<HHBBHIIqqH")
+_ITEM = struct.Struct("<HHH")
+_VARIABLE = 2**32 - 1
+_ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
+_FORMAT_ITEMS = {
+    0: (6,), 1: (6, 7), 2: (6, 8), 3: (6, 7, 8), 4: (6, 7, 9), 5: (6, 7, 8, 9),
+    6: (10,), 7: (10, 11), 8: (10, 12), 9: (10, 13), 10: (10, 12, 13),
+}  # fmt: skip
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers per item of the layered coding (point formats 6 to 10); extra bytes have one layer per byte."""
+_BYTES = {0, 14}
+"""Items of extra bytes."""
+
+
+NEWEST = 3
+"""Highest version of an item that lazrs decodes; the compression of LAS 1.5 has version 4."""
+
+
+def open_laz(checked: CheckedHeader) -> LazPoints:
+    """Return a reader of the points.
+
+    Raises InputError if the records of the compression are damaged, or are those of LAS 1.5.
+    """
+    coding = _read_coding(checked.path, checked.header)
+    total = checked.header.point_count
+    if total > checked.size * MAX_POINTS_PER_BYTE:  # a scan of points that cannot be there would never end
+        raise damaged(checked.path, f"the header claims {total} points in {checked.size} bytes")
+    if coding.newest > NEWEST:
+        raise InputError(
+            f"{checked.path}: has the compression of LAS 1.5, which wavebatch does not read; "
+            "decompress it first: laszip -i IN.laz -o OUT.las"
+        )
+    return LazPoints(checked, coding)
+
+
+class _Coding(NamedTuple):
+    """The checked content of the "laszip encoded" record."""
+
+    payload: bytes
+    chunk_points: int
+    newest: int
+    """Highest version of its items."""
+    layers: int
+    """Layers of a chunk; 0 in point formats 0 to 5."""
+
+
+def _read_coding(path: Path, header: LasHeader) -> _Coding:
+    payload = next((vlr.payload for vlr in header.vlrs if has_record([vlr], LASZIP_USER, LASZIP_ID)), b"")
+    broken = damaged(path, 'its "laszip encoded" record is missing or wrong')
+    if len(payload) < _LASZIP.size:
+        raise broken
+    compressor, coder, *_, chunk_points, _, _, n_items = _LASZIP.unpack_from(payload)
+    if len(payload) < _LASZIP.size + n_items * _ITEM.size or not n_items:
+        raise broken
+    payload = payload[: _LASZIP.size + n_items * _ITEM.size]
+    items = list(_ITEM.iter_unpack(payload[_LASZIP.size :]))
+    kinds = tuple(kind for kind, _, _ in items if kind not in _BYTES)
+    good = all(size == _ITEM_SIZES[kind] if kind in _ITEM_SIZES else kind in _BYTES for kind, size, _ in items)
+    length = sum(size for _, size, _ in items)
+    if not good or kinds != _FORMAT_ITEMS[header.point_format] or length != header.point_length or coder != 0:
+        raise broken
+    if [kind for kind, _, _ in items if kind in _BYTES] not in ([], [14 if header.point_format > 5 else 0]):
+        raise broken
+    remedy = "run laszip -i IN.laz -o OUT.las first"
+    if compressor != (3 if header.point_format > 5 else 2) or not 0 < chunk_points <= _VARIABLE:
+        raise InputError(f"{path}: compressed without chunks; {remedy}")
+    if MAX_CHUNK_POINTS < chunk_points < _VARIABLE:
+        raise InputError(f"{path}: LAZ chunks of {chunk_points} points do not fit into memory; {remedy}")
+    layers = (size if kind in _BYTES else _LAYERS[kind] for kind, size, _ in items) if kinds[0] == 10 else ()
+    return _Coding(payload, chunk_points, max(version for _, _, version in items), sum(layers))
+
+
+class LazPoints:
+    """Reads with lazrs, one chunk in memory at a time; points of a chunk before the wanted ones are decoded too."""
+
+    def __init__(self, checked: CheckedHeader, coding: _Coding) -> None:
+        self._checked, self._coding = checked, coding
+        self._file = open(checked.path, "rb", buffering=0)  # noqa: SIM115 - closed by close()
+        try:
+            self._first, self._place = _read_chunk_table(self._file.fileno(), checked, coding)
+        except BaseException:
+            self._file.close()
+            raise
+        self._chunk, self._next = -1, 0
+        self._decoder: Any = None
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        rows = np.empty(stop - start, self._checked.dtype)
+        done = 0
+        with guarded(self._checked.path, start, stop), hiding_panics():
+            while done < len(rows):
+                chunk = int(np.searchsorted(self._first, start + done, "right")) - 1
+                count = min(len(rows) - done, int(self._first[chunk + 1]) - start - done)
+                self._seek(chunk, start + done)
+                self._decode(rows[done : done + count])
+                done += count
+        return rows
+
+    def _seek(self, chunk: int, point: int) -> None:
+        if chunk != self._chunk or point < self._next:
+            self._open_chunk(chunk)
+        while self._next < point:
+            self._decode(np.empty(min(_PIECE, point - self._next), self._checked.dtype))
+
+    def _decode(self, rows: np.ndarray) -> None:
+        self._decoder.decompress_many(rows.view(np.uint8).reshape(-1))
+        self._next += len(rows)
+
+    def _open_chunk(self, chunk: int) -> None:
+        """Passes this chunk to lazrs as a small file in memory, so that lazrs cannot read beyond it."""
+        start, end = int(self._place[chunk]), int(self._place[chunk + 1])
+        data = np.empty(end - start + 8, np.uint8)
+        data[:8] = np.frombuffer(struct.pack("<q", len(data)), np.uint8)
+        read_exactly(self._file.fileno(), data[8:], start)
+        self._check_layers(data[8:])
+        count = int(self._first[chunk + 1] - self._first[chunk])
+        small = BytesIO(data.data)
+        small.seek(0, 2)
+        lazrs.write_chunk_table(small, [(count, end - start)], lazrs.LazVlr(self._coding.payload))
+        small.seek(0)
+        self._decoder = lazrs.LasZipDecompressor(small, self._coding.payload)
+        self._chunk, self._next = chunk, int(self._first[chunk])
+
+    def _check_layers(self, chunk: np.ndarray) -> None:
+        if not self._coding.layers:
+            return
+        at = self._checked.dtype.itemsize + 4
+        sizes = chunk[at : at + 4 * self._coding.layers]
+        total = at + 4 * self._coding.layers
+        if len(sizes) == 4 * self._coding.layers:
+            total += int(sizes.view("<u4").sum(dtype=np.uint64))
+        if total > len(chunk):
+            raise damaged(self._checked.path, f"a LAZ chunk of {len(chunk)} bytes claims {total} bytes")
+
+    def close(self) -> None:
+        self._file.close()
+        self._decoder = None
+
+
+def _read_chunk_table(fd: int, checked: CheckedHeader, coding: _Coding) -> tuple[np.ndarray, np.ndarray]:
+    """First point and first byte of every chunk, i8, both with one more entry for the end."""
+    start, total = checked.header.offset_to_points, checked.header.point_count
+    if not total:
+        return np.zeros(1, np.int64), np.zeros(1, np.int64)
+    broken = damaged(checked.path, "the table of LAZ chunks is missing or wrong")
+    if start + 8 > checked.size:
+        raise broken
+    table = _read_number(fd, start, "<i8")
+    if table == -1:  # written as a stream: the last 8 bytes hold the place of the table
+        table = _read_number(fd, checked.size - 8, "<i8")
+    if not start + 8 <= table <= checked.size - 8:
+        raise broken
+    version, count = _read_number(fd, table, "<u4"), _read_number(fd, table + 4, "<u4")
+    if version != 0 or not 0 < count <= min(MAX_CHUNKS, table - start - 8):
+        raise broken
+    with open(checked.path, "rb") as file, guarded(checked.path, 0, total), hiding_panics():
+        file.seek(table)
+        chunks = np.array(lazrs.read_chunk_table_only(file, lazrs.LazVlr(coding.payload)), np.uint64)
+    if len(chunks) != count or (chunks > np.uint64(max(MAX_CHUNK_BYTES, MAX_CHUNK_POINTS))).any():
+        raise broken
+    counts, sizes = chunks.astype(np.int64).T
+    if coding.chunk_points != _VARIABLE:
+        counts = np.full(count, coding.chunk_points)
+    counts[-1] = min(counts[-1], total - counts[:-1].sum())
+    if counts.min() < 0 or counts.max() > MAX_CHUNK_POINTS or counts.sum() != total or sizes.max() > MAX_CHUNK_BYTES:
+        raise InputError(
+            f"{checked.path}: {count} LAZ chunks hold {counts.clip(0).sum()} points, the header claims {total}; the "
+            "file is damaged or its chunks are too large: see what laszip -i IN.laz -o OUT.las reports"
+        )
+    first = np.concatenate([[0], np.cumsum(counts)])
+    place = start + 8 + np.concatenate([[0], np.cumsum(sizes)])
+    if place[-1] > table or (sizes < checked.dtype.itemsize)[counts > 0].any():
+        raise broken
+    return first, place
+
+
+def _read_number(fd: int, at: int, dtype: str) -> int:
+    data = np.empty(1, dtype)
+    read_exactly(fd, data.view(np.uint8), at)
+    return int(data[0])
 
 
 def open_points(checked: CheckedHeader) -> PointSource:

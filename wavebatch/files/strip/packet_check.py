@@ -2,22 +2,299 @@
 
 The scan and the reader judge each piece of points. After this check packets are read without any further one, so a
 packet is usable only if all its bytes lie inside the waveform data.
+
+Direction and length of packet vectors are decided from the points, never assumed: vendors understood the LAS text in
+two ways (docs/las-waveforms.md 1.4). Returns that share a packet show which: the position of sample 0 must be equal for
+all of them; it is P + L v if v points toward the sensor, P - L v if away. Heights are the second evidence: an airborne
+sensor is above its returns. The scan collects the votes.
+
+A .wdp of another strip, under the right name, looks like any other: nothing in it names its strip. But in a strip's own
+packets echoes lie where its returns say, or are as strong as these (`is_strange`). Before you change it: only packets
+that are certainly strange are refused. Locations that are wrong, in another unit or all zero are no proof;
+`doubt_packets` in surveying/inspect_strip.py warns of them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.order import distinct
+from wavebatch.core.order import distinct, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
-from wavebatch.files.strip.facts import StripFacts
-from wavebatch.files.strip.packet_vectors import RANGE_RATIO, VECTORS
-from wavebatch.files.strip.packets import BLOCK_BYTES, COMPRESSED, MAX_SAMPLES, PacketFile, refuse_compressed
+from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.disk.raw_bytes import widen_integers
+from wavebatch.files.strip.packets import (
+    BLOCK_BYTES,
+    COMPRESSED,
+    MAX_SAMPLES,
+    PacketFile,
+    StripFacts,
+    refuse_compressed,
+)
 from wavebatch.kernels.packets import FIELDS, Geometry, PacketRules, judge_packets
+
+OPTIONS = ("auto", "toward", "away")
+VECTORS = ("x_t", "y_t", "z_t")
+LEAST_RATIO, LARGEST_RATIO = 0.7, 1.02
+"""Outside these limits the length of vectors over c/2 gives a warning; usual files have 0.96 to 1.00."""
+RANGE_RATIO = 100.0
+"""Longer vectors, over c/2, are not speeds: Optech wrote the whole path from sample 0 to the return."""
+_APART = 2.0 * PS_PER_NS
+"""Least difference of return locations of a pair [ps]; closer returns give no evidence."""
+_PER_CALL = 256
+"""Most votes of one part, so that each part of the strip counts about the same."""
+_CLEAR, _MOSTLY = 0.95, 0.8
+"""Share of votes that decides: of heights, which terrestrial strips break, and of pairs."""
+_ENOUGH = 3
+"""Fewer pairs than this decide nothing if heights do."""
+
+
+@dataclass(frozen=True, slots=True)
+class VectorDecision:
+    """Meaning of the packet vectors of a strip."""
+
+    direction: str
+    """`toward` or `away` from the sensor (for the form `range`: after division by minus the location)."""
+    form: str
+    """`stored`: metres per picosecond; `range`: the whole path, to be divided by minus the location."""
+    ratio: float
+    """Median length over c/2; NaN without waveforms."""
+    evidence: str
+    warnings: tuple[str, ...]
+    problems: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class DirectionTally:
+    """Votes for both directions, collected in parts; each part counts with at most a few hundred points."""
+
+    form: str
+    """See `VectorDecision`."""
+    pairs: list[int] = field(default_factory=lambda: [0, 0])
+    """Pairs of returns that vote for toward, for away."""
+    heights: list[int] = field(default_factory=lambda: [0, 0])
+    """Vectors that point up, down."""
+    ratios: list[np.ndarray] = field(default_factory=list)
+    """Lengths over c/2."""
+
+    def join(self, other: DirectionTally) -> None:
+        """Add the votes of further points."""
+        self.pairs = [mine + more for mine, more in zip(self.pairs, other.pairs, strict=True)]
+        self.heights = [mine + more for mine, more in zip(self.heights, other.heights, strict=True)]
+        self.ratios += other.ratios
+
+    def add_points(self, points: np.ndarray) -> None:
+        """Add the votes of usable points (n,): length and height of their vectors."""
+        some = points[:: max(1, len(points) // _PER_CALL)]
+        height = read_toward(some, "toward", self.form)[:, 2]
+        self.heights[0] += int((height > 0).sum())
+        self.heights[1] += int((height < 0).sum())
+        self.ratios.append(measure_ratio(some, self.form))
+
+    def add_pairs(self, xyz: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
+        """Add the votes of pairs of usable points that share a packet: xyz f8 (2, n, 3) [m], records (n,)."""
+        a, b = widen_integers(first["return_point_wave_location"]), widen_integers(second["return_point_wave_location"])
+        use = np.flatnonzero(np.abs(a - b) > _APART)
+        use = use[:: max(1, len(use) // _PER_CALL)]
+        if not len(use):
+            return
+        step = xyz[0, use] - xyz[1, use]
+        paths = read_toward(first[use], "toward", self.form) * a[use, None]
+        paths -= read_toward(second[use], "toward", self.form) * b[use, None]
+        toward = np.sqrt(((step + paths) ** 2).sum(axis=1))
+        away = np.sqrt(((step - paths) ** 2).sum(axis=1))
+        large, small = np.maximum(toward, away), np.minimum(toward, away)
+        clear = (large > 0.1) & (small < 0.5 * large)
+        self.pairs[0] += int((clear & (toward < away)).sum())
+        self.pairs[1] += int((clear & (away < toward)).sum())
+
+
+def find_form(points: np.ndarray) -> str:
+    """Return the form of the vectors, `stored` or `range`, from the first points of a strip."""
+    ratio = measure_ratio(points, "stored")
+    ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+    return "range" if len(ratio) and quantile(ratio, 0.5) > RANGE_RATIO else "stored"
+
+
+def measure_ratio(points: np.ndarray, form: str) -> np.ndarray:
+    """Return the length of the vectors over c/2, f8 (n,); not finite if it cannot be computed."""
+    vectors = stack_vectors(points)
+    length = np.sqrt((vectors * vectors).sum(axis=1)) * (PS_PER_NS / HALF_C)
+    if form == "range":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            length = length / np.abs(widen_integers(points["return_point_wave_location"]))
+    return length
+
+
+def stack_vectors(points: np.ndarray) -> np.ndarray:
+    """Return the vectors of records (n,) as stored, f8 (n, 3)."""
+    return np.stack([widen_integers(points[name]) for name in VECTORS], axis=1)
+
+
+def read_toward(points: np.ndarray, direction: str, form: str) -> np.ndarray:
+    """Return vectors toward the sensor [m/ps], f8 (n, 3), with the length of the file."""
+    vectors = stack_vectors(points)
+    if form == "range":
+        vectors /= -widen_integers(points["return_point_wave_location"])[:, None]
+    return vectors if direction == "toward" else -vectors
+
+
+def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) -> VectorDecision:
+    """Return the decision by the votes; with `auto`, contradicting or missing votes are a problem of the strip.
+
+    metres: of a unit of the coordinates, in which vectors may be, too.
+    """
+    if not any(len(part) for part in tally.ratios):
+        chosen = "toward" if option == "auto" else option
+        return VectorDecision(chosen, tally.form, float("nan"), "no waveform to decide from", (), ())
+    ratio = quantile(np.concatenate(tally.ratios), 0.5)
+    warnings, problems = list(_judge_length(ratio, tally.form, metres)), []
+    (toward, away), (up, down) = tally.pairs, tally.heights
+    pairs, heights = _verdict(toward, away, _MOSTLY), _verdict(up, down, _CLEAR)
+    evidence = f"{toward} of {toward + away} pairs that share a packet and {up} of {up + down} heights say toward"
+    if toward + away < _ENOUGH and heights:
+        pairs = ""
+    chosen = pairs or heights or "toward"
+    if pairs and heights and pairs != heights:
+        problems.append(f"packet vectors contradict each other: {evidence}; pass --direction toward or away")
+    elif not (pairs or heights):
+        problems.append(f"the direction of packet vectors is not clear: {evidence}; pass --direction toward or away")
+    if option != "auto":
+        if chosen != option or problems:
+            warnings.append(f"--direction {option} overrides the evidence of the file: {evidence}")
+        chosen, problems, evidence = option, [], f"given; {evidence}"
+    return VectorDecision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
+
+
+def _judge_length(ratio: float, form: str, metres: float) -> Iterator[str]:
+    if form == "range":
+        yield (
+            f"packet vectors are more than {RANGE_RATIO:g} times c/2 long; they are read as whole paths (as Optech "
+            "wrote them) and divided by minus the return location"
+        )
+    if not any(LEAST_RATIO <= length <= LARGEST_RATIO for length in (ratio, metres * ratio)):
+        yield f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"
+
+
+def _verdict(toward: int, away: int, share: float) -> str:
+    total = toward + away
+    if total and toward >= share * total:
+        return "toward"
+    return "away" if total and away >= share * total else ""
+
+
+_WAVEFORMS, _SAMPLES = 1024, 1 << 20
+"""Most waveforms that are compared with their returns, and about the most samples of them."""
+
+_SHORTEST = 64
+"""Waveforms that are read even if they are long."""
+
+LEAST_PACKETS = 50
+"""Fewer returns prove nothing: the error of a rank correlation is 0.14."""
+
+MOST_GAIN = 0.3
+"""Share of the largest possible gain in height, of a return's own packet over those of others, that must be excluded.
+Own packets gain .4 to 1.0, or .05 to .3 where only weak returns or mostly noise are there: then a gain of four standard
+errors still shows. Those of other strips gain -.05 to .07 (real strips in every wrong combination)."""
+
+MOST_ALIKE = 0.4
+"""Largest rank correlation, in packets of another strip, of location and place of the highest sample, and of intensity
+and height. At least one of them is .5 to 1.0 in own packets. Scenes and scanners that are alike bring others to .3,
+rarely .5: these are left to the warning."""
+
+_SHIFTS = np.arange(1, 5) / 5
+"""How far away the returns are, as a share of all of them, at whose locations a return's packet is looked at too."""
+
+_HIGHEST, _WHERE, _LOCATION, _INTENSITY, _OWN, _OTHERS, _DEPTH = range(7)
+"""Columns of a table of returns."""
+
+
+def size_of_sample(longest: int) -> int:
+    """Return how many waveforms are looked at where the longest has so many samples."""
+    return int(np.clip(_SAMPLES // max(longest, 1), _SHORTEST, _WAVEFORMS))
+
+
+def is_strange(table: np.ndarray) -> bool:
+    """Return whether nothing ties returns, f8 (m, 7) of `compare_returns`, to their packets, though own ones would."""
+    # In a packet of noise the highest sample is as far above the median as the lowest one below it.
+    table = table[table[:, _HIGHEST] > 2.0 * np.median(table[:, _DEPTH])] if len(table) else table
+    if len(table) < LEAST_PACKETS:
+        return False
+    # Where all returns lie at one place, own packets would look the same; intensities alone may be scaled.
+    low, high = np.quantile(table[:, _LOCATION], (0.25, 0.75))
+    if high - low < 1.0:
+        return False
+    gains, possible = table[:, _OWN] - table[:, _OTHERS], 1.0 - table[:, _OTHERS].mean()
+    error = 4.0 * gains.std() / np.sqrt(len(gains))
+    if gains.mean() > error or gains.mean() + error > MOST_GAIN * possible:
+        return False
+    pairs = (_LOCATION, _WHERE), (_INTENSITY, _HIGHEST)
+    return all(abs(_correlate(table[:, one], table[:, other])) < MOST_ALIKE for one, other in pairs)
+
+
+def _correlate(a: np.ndarray, b: np.ndarray) -> float:
+    """Rank correlation of values (m,); 0 where one of them is always the same."""
+    ranks = []
+    for values in (a, b):
+        _, which, counts = np.unique(values, return_inverse=True, return_counts=True)
+        ranks.append((np.cumsum(counts) - 0.5 * counts)[which] - 0.5 * len(values))
+    scale = np.sqrt((ranks[0] ** 2).sum() * (ranks[1] ** 2).sum())
+    return float(ranks[0] @ ranks[1] / scale) if scale > 0 else 0.0
+
+
+def compare_returns(blocks: Iterable[tuple[WaveformBlock, np.ndarray]]) -> np.ndarray:
+    """Compare packets with their strongest returns.
+
+    Parameters
+    ----------
+    blocks : iterable of WaveformBlock and array
+        A sample of the strip, with the intensities of the returns of each block.
+
+    Returns
+    -------
+    f8 (m, 7)
+        A row per packet with signal: height above the median and place of its highest sample; location, in samples, and
+        intensity of the return; how high the packet is there, as a share of its highest sample, and at the locations of
+        the returns of others; depth of its lowest sample below the median.
+    """
+    groups: dict[int, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
+    for block, strength in blocks:
+        returns = block.returns
+        if returns is None:
+            continue
+        order = np.lexsort((-strength, returns.waveform))
+        strongest = order[np.unique(returns.waveform[order], return_index=True)[1]]
+        part = block.samples, returns.time[strongest] / block.spacing, strength[strongest]
+        groups.setdefault(block.digitizer.index, []).append(part)
+    return np.concatenate([np.empty((0, 7)), *(part for group in groups.values() for part in _compare(group))])
+
+
+def _compare(group: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Iterator[np.ndarray]:
+    """Tables of the blocks of one digitizer: samples (n, s), place (n,) and intensity (n,) of the strongest returns."""
+    places = np.concatenate([place for _, place, _ in group])
+    sets = [places, *(np.roll(places, int(share * len(places))) for share in _SHIFTS)]
+    first = 0
+    for samples, place, strength in group:
+        last = first + len(samples)
+        height, level = samples.max(axis=1).astype(float), np.median(samples, axis=1)
+        height -= level
+        found = np.stack([_read_height(samples, at[first:last]) - level for at in sets]) / np.maximum(height, 1.0)
+        table = [height, samples.argmax(axis=1), place, strength, found[0], found[1:].mean(axis=0)]
+        yield np.column_stack([*table, level - samples.min(axis=1)])[height > 0]
+        first = last
+
+
+def _read_height(samples: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """The highest of three samples (n, s) at a place (n,) of each; one beyond the end has that of the end."""
+    end = samples.shape[1] - 1
+    middle = np.rint(np.clip(place, 0, end)).astype(np.int64)
+    near = [np.clip(middle + step, 0, end) for step in (-1, 0, 1)]
+    return np.maximum.reduce([samples[np.arange(len(samples)), at] for at in near])
+
 
 INDEX_BITS = np.uint64(8)
 """Bits of the descriptor index in a key; see `Judged.keys`."""
@@ -124,7 +401,7 @@ class Judge:
         points : structured array (n,)
             Point records with waveform fields.
         form : {"stored", "range"}
-            How vectors are stored; see `packet_vectors.Decision`.
+            How vectors are stored; see `Decision`.
         overfull : u8 (k,) or None
             Sorted keys of packets that too many points refer to.
 

@@ -13,8 +13,8 @@ import numpy as np
 from wavebatch.core.order import even_places, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.files.disk.raw_bytes import widen_integers
-from wavebatch.files.las.point_formats import locate
-from wavebatch.files.strip.packet_vectors import read_toward
+from wavebatch.files.las.header import locate
+from wavebatch.files.strip.packet_check import read_toward
 from wavebatch.files.strip.reader import StripReader, StripScan
 
 MOST_SLICES = 4096

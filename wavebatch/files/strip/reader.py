@@ -17,17 +17,21 @@ from wavebatch.core.order import distinct, even_places
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing, reading, take_whole_records, widen_integers
-from wavebatch.files.las.point_formats import locate
+from wavebatch.files.las.header import field_names, locate
 from wavebatch.files.las.read_points import open_points
-from wavebatch.files.point_dtypes import field_names
-from wavebatch.files.strip.facts import StripFacts, find_facts
-from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
-from wavebatch.files.strip.packet_owner import compare_returns, is_strange, size_of_sample
-from wavebatch.files.strip.packet_vectors import OPTIONS, VectorDecision, read_toward
-from wavebatch.files.strip.packets import PacketFile, block_rows
+from wavebatch.files.strip.packet_check import (
+    INDEX_BITS,
+    OPTIONS,
+    Judge,
+    VectorDecision,
+    compare_returns,
+    is_strange,
+    read_toward,
+    size_of_sample,
+)
+from wavebatch.files.strip.packets import PacketFile, StripFacts, block_rows, find_facts
 from wavebatch.files.strip.sample_form import PLAIN, SampleForm, read_packet_samples
-from wavebatch.files.strip.scan_result import StripScan
-from wavebatch.files.strip.scanner import ScanPart, cut_scan, scan_strip, scan_units, unique_entries
+from wavebatch.files.strip.scanner import ScanPart, StripScan, cut_scan, scan_strip, scan_units, unique_entries
 from wavebatch.files.strip.shared_packets import expand, group_keys
 from wavebatch.kernels.signal.signal import find_fill, quiet_fill, recorded_lengths
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.files.disk.buckets import spread_keys
-from wavebatch.files.disk.temp_store import Spool
+from wavebatch.files.disk.temp_store import Spool, spread_keys
 from wavebatch.files.strip.packet_check import INDEX_BITS
 
 WINDOW = 16_384

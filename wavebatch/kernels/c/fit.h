@@ -15,6 +15,7 @@ static const double UNDETERMINED = 1e30;       /* pivot of an unknown that the d
 static const int MOST_IDLE = 2;                /* iterations with an echo of no amplitude, whose time then drifts: it is
                                                   left out before the others are fitted on (decompose.h) */
 static const int CENSORED = 100;               /* least iterations with clipped samples: starts are far off (H6) */
+static const int64_t LONG = 32;                /* vectors of a window in which waiting for sums costs more than a call */
 
 static const double LEAST_AWAY = 0.25;         /* of a peak from a log-normal's origin, where the pulse has no width */
 static const double LEAST_WIDTH = 0.1;         /* below it a fit without damping is lost: the echo lies on one sample */
@@ -57,8 +58,25 @@ INLINE void evaluate_rows(int64_t k, int64_t per, const Settings *s, Work *work,
     for (int64_t i = 0; i <= per * k && w->is_whitened; i++) whiten(w, work->rows + i * n);
 }
 
+/* The same to the same bits where rows are long: a sum waits for each of its additions, so there are four at a time. */
+static void multiply_long_rows(int64_t rows, int64_t vectors, const lanes *row, double *gram) {
+    for (int64_t i = 0; i < rows; i++)
+        for (int64_t j = 0; j <= i; j += 4) {
+            const lanes *a = row + i * vectors, *b[4];
+            lanes sum[4];
+            for (int64_t q = 0; q < 4; q++) {
+                b[q] = row + (j + q < i ? j + q : i) * vectors;
+                sum[q] = a[0] * b[q][0];
+            }
+            for (int64_t v = 1; v < vectors; v++)
+                for (int64_t q = 0; q < 4; q++) sum[q] += a[v] * b[q][v];
+            for (int64_t q = 0; q < 4 && j + q <= i; q++) gram[i * rows + j + q] = sum_lanes(sum[q]);
+        }
+}
+
 /* Inner products of all rows: the lower triangle of gram, (rows, rows). */
 INLINE void multiply_rows(int64_t rows, int64_t vectors, const lanes *row, double *gram) {
+    if (vectors > LONG) { multiply_long_rows(rows, vectors, row, gram); return; }
     for (int64_t i = 0; i < rows; i++)
         for (int64_t j = 0; j <= i; j++) {
             const lanes *a = row + i * vectors, *b = row + j * vectors;

@@ -2,6 +2,7 @@
 
 static const double SMOOTH_GAIN = 0.61237243569579452; /* of white noise through [1 2 1]/4 */
 static const double HERMITE_REACH = 5;         /* widths: beyond, the pulse is zero */
+static const double FINE = 16;                 /* taps of a width that are enough: lines between them miss 5e-4 of the top */
 static const double LEAST_PIVOT = 1e-7;        /* below is what rounding of float32 products leaves */
 static const double LEAST_SHAPE = 1e-3;        /* share of a moment's direction that the fit must leave */
 static const double LEAST_NEW = 0.03;          /* share of a new echo's energy that the present ones must leave */
@@ -148,36 +149,60 @@ static int is_misfit(const Settings *s, Work *work, const Fit *fit) {
     return 0.25 * highest > s->gate_residual * SMOOTH_GAIN * w->std || shape > s->gate_hermite;
 }
 
-/* Half of a Gaussian of height 1 with the width of a new echo, up to three widths, and after it the same squared. No
-   more than a waveform is long: else a width out of proportion would take all memory. */
+/* Half of a Gaussian of height 1 with the width of a new echo, up to three widths, and after it the same squared; a tap
+   for each `stride` samples. No more than a waveform is long: else a width out of proportion would take all memory. */
 static int make_taps(Work *work, const Settings *s, int64_t length) {
-    work->reach = (int64_t)ceil(fmin(3 * s->width_ref, length));
+    work->stride = s->whitened ? 1 : (int64_t)fmin(fmax(1, s->width_ref / FINE), length);
+    work->reach = (int64_t)ceil(fmin(3 * s->width_ref, length) / work->stride);
     if (!enlarge(&work->taps, 2 * (work->reach + 1) * sizeof(float))) return 0;
     if (!enlarge(&work->edges, 2 * (work->reach + 4) * sizeof(float))) return 0;
     for (int64_t i = 0; i <= work->reach; i++) {
-        double z = i / s->width_ref, tap = exp_lanes(ALL(-0.5 * z * z))[0];
+        double z = i * work->stride / s->width_ref, tap = exp_lanes(ALL(-0.5 * z * z))[0];
         work->taps[i] = tap;
         work->taps[work->reach + 1 + i] = tap * tap;
     }
     return 1;
 }
 
-/* A row correlated with symmetric taps, 0 outside of the window. */
-static void correlate(const Work *work, const lanes *row, const float *taps, lanes *out) {
-    const int64_t n = work->window.vectors, before = VECTORS(work->reach);
+/* A row of n vectors correlated with symmetric taps, 0 outside of it. */
+static void correlate_each(const Work *work, const lanes *row, int64_t n, const float *taps, lanes *out) {
+    enum { TOGETHER = 4 }; /* a sum waits for each of its additions, so there are four at a time */
+    const int64_t before = VECTORS(work->reach) + TOGETHER;
     float *padded = (float *)work->padded;
     memset(padded, 0, before * sizeof(lanes));
     memcpy(padded + before * LANES, row, n * sizeof(lanes));
     memset(padded + (before + n) * LANES, 0, before * sizeof(lanes));
-    for (int64_t v = 0; v < n; v++) {
+    for (int64_t v = 0; v < n; v += TOGETHER) {
         const float *here = padded + (before + v) * LANES;
-        lanes sum = row[v] * taps[0], left, right;
-        for (int64_t i = 1; i <= work->reach; i++) {
-            memcpy(&left, here - i, sizeof left);
-            memcpy(&right, here + i, sizeof right);
-            sum += (left + right) * taps[i];
+        lanes sum[TOGETHER], left, right;
+        for (int q = 0; q < TOGETHER; q++) {
+            memcpy(&left, here + q * LANES, sizeof left);
+            sum[q] = left * taps[0];
         }
-        out[v] = sum;
+        for (int64_t i = 1; i <= work->reach; i++)
+            for (int q = 0; q < TOGETHER; q++) {
+                memcpy(&left, here + q * LANES - i, sizeof left);
+                memcpy(&right, here + q * LANES + i, sizeof right);
+                sum[q] += (left + right) * taps[i];
+            }
+        memcpy(out + v, sum, (n - v < TOGETHER ? n - v : TOGETHER) * sizeof(lanes));
+    }
+}
+
+/* A row of the window correlated with symmetric taps, 0 outside. With a wide pulse the sums of `stride` samples are, and
+   values between them lie on lines: the work would grow with the square of the width. */
+static void correlate(const Work *work, const lanes *row, const float *taps, lanes *out) {
+    const int64_t n = work->window.vectors, room = n * LANES, stride = work->stride, few = (room + stride - 1) / stride;
+    const float *number = (const float *)row;
+    float *value = (float *)out, *sums = (float *)work->coarse;
+    if (stride == 1) { correlate_each(work, row, n, taps, out); return; }
+    memset(sums, 0, VECTORS(few) * sizeof(lanes));
+    for (int64_t i = 0; i < room; i++) sums[i / stride] += number[i];
+    correlate_each(work, work->coarse, VECTORS(few), taps, work->coarse);
+    for (int64_t i = 0; i < room; i++) {
+        const int64_t twice = 2 * i + 1 - stride, part = twice > 0 ? twice / (2 * stride) : 0, next = part + 1 < few ? part + 1 : part;
+        const float share = (float)(twice - 2 * part * stride) / (2 * stride);
+        value[i] = sums[part] + (sums[next] - sums[part]) * share;
     }
 }
 

@@ -31,6 +31,7 @@ typedef struct {
     int64_t room, vectors;                     /* echoes and vectors for which there is memory */
     Window window;
     lanes *rows, *about, *padded, *energy;     /* of the fit; correlated with a new pulse */
+    lanes *coarse;                             /* a row summed over strides */
     lanes *back, *new_energy;                  /* where noise is whitened: a row filtered back; energy of a new pulse */
     Fit fit, next;
     Solution trial, best, spare;
@@ -38,7 +39,7 @@ typedef struct {
     double *known;                             /* of amplitudes: one over variance, in noise, beside what the fit says */
     uint8_t *frozen;
     float *taps, *edges;                       /* of a new pulse; its energy, whitened, from each end of a window */
-    int64_t reach;                             /* of the taps of a new pulse */
+    int64_t reach, stride;                     /* of the taps of a new pulse; samples from tap to tap */
     int has_edges;
 } Work;
 
@@ -56,11 +57,11 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
     k = k > w->room ? k + 2 : w->room;
     vectors = vectors > w->vectors ? vectors + 2 : w->vectors;
     size_t row = vectors * sizeof(lanes), p = 4 * k + 1, number = sizeof(double);
-    size_t padded = row + 2 * VECTORS(w->reach) * sizeof(lanes);
+    size_t padded = row + 2 * (VECTORS(w->reach) + 4) * sizeof(lanes);
     int good = enlarge(&w->window.y, row) && enlarge(&w->window.x, row) && enlarge(&w->window.clipped, row)
         && enlarge(&w->window.weight, row) && enlarge(&w->window.filter, 3 * row) && enlarge(&w->back, row)
         && enlarge(&w->new_energy, row) && enlarge(&w->rows, p * row) && enlarge(&w->about, p * row)
-        && enlarge(&w->padded, padded) && enlarge(&w->energy, row)
+        && enlarge(&w->padded, padded) && enlarge(&w->coarse, row) && enlarge(&w->energy, row)
         && enlarge(&w->fit.parameters, p * number) && enlarge(&w->fit.gram, p * p * number) && enlarge(&w->next.parameters, p * number)
         && enlarge(&w->kept, p * number) && enlarge(&w->products, p * p * number) && enlarge(&w->matrix, p * p * number)
         && enlarge(&w->pivot, p * number) && enlarge(&w->step, p * number) && enlarge(&w->column, p * p * number)
@@ -74,7 +75,7 @@ static int reserve(Work *w, int64_t k, int64_t vectors) {
 }
 
 static void free_work(Work *w) {
-    void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->window.filter, w->back, w->new_energy, w->rows, w->about, w->padded, w->energy,
+    void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->window.filter, w->back, w->new_energy, w->rows, w->about, w->padded, w->coarse, w->energy,
         w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->h3, w->h4,
         w->known, w->frozen, w->taps, w->edges, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
         w->best.errors, w->best.shared, w->best.at_bound, w->spare.parameters, w->spare.errors, w->spare.shared, w->spare.at_bound};

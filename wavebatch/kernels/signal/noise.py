@@ -589,8 +589,10 @@ def keep_longest(missing: np.ndarray) -> np.ndarray:
     begins = recorded.copy()
     begins[1:] &= missing[:-1]
     number = accumulate(np.add, begins.astype(np.int32)) * recorded
-    sizes = np.stack([np.count_nonzero(number == k, axis=0) for k in range(1, int(number.max(initial=1)) + 1)])
-    return number != np.argmax(sizes, axis=0) + 1
+    # One count of all: packets may hold thousands of recordings.
+    n, most = missing.shape[1], int(number.max(initial=1))
+    sizes = np.bincount((number * n + np.arange(n))[recorded], minlength=(most + 1) * n).reshape(most + 1, n)
+    return number != np.argmax(sizes[1:], axis=0) + 1
 
 
 def residual_noise(

@@ -20,7 +20,7 @@ from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.pulse_energy import PulseEnergy, find_column, name_columns, take_records
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.files.strip.scan_result import StripScan
+from wavebatch.files.strip.scanner import StripScan
 from wavebatch.kernels.physics.radiometry import usual_attenuation
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain

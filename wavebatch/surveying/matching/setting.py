@@ -18,7 +18,7 @@ from wavebatch.core.units import HALF_C, MEDIAN_ERROR
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.header import decode_text
-from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.packets import StripFacts
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.surveying.sensor import SensorSource

@@ -18,7 +18,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
 from wavebatch.stages.pulse_tables import clip_level, shape_limits
-from wavebatch.surveying.measuring.joint_pulse import learn_jointly
+from wavebatch.surveying.measuring.joint_pulse import count_telling, learn_jointly
 from wavebatch.surveying.measuring.judge import (
     SURE,
     Explained,
@@ -203,7 +203,7 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
     for name, options in (("one echo per cluster", {"max_echoes": 1}), ("all echoes", {})):
         for last in (False, True):
             explained = explain(block, _bear(system, begin.change), **options)
-            if len(explained.echoes) < ENOUGH_TO_LEARN:
+            if count_telling(explained) < ENOUGH_TO_LEARN:
                 return
             system = learn_jointly(block, system, explained, begin.change, last=last)
         yield name, system

@@ -104,6 +104,12 @@ def learn_jointly(
     return replace(system, sigma_ref=full / FWHM_PER_SIGMA * spacing)
 
 
+def count_telling(explained: Explained) -> int:
+    """Count the echoes of waveforms that say something of the pulse."""
+    number = np.diff(explained.sums.first)
+    return int(number[number <= MOST_ECHOES].sum())
+
+
 def misfit_of(left: np.ndarray, step: float, width: float) -> float:
     """Return the misfit of a pulse that leaves these shares of its height at lags `step` apart [samples].
 

@@ -11,9 +11,9 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing
-from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.packets import StripFacts
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.files.strip.scan_result import StripScan
+from wavebatch.files.strip.scanner import StripScan
 from wavebatch.stages import chain_file
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import survey_blocks

@@ -17,8 +17,8 @@ from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
 from wavebatch.files.las.header import STANDARD_TIME, Vlr, decode_text, has_record, is_projection
-from wavebatch.files.strip.header_check import audit_header
-from wavebatch.files.strip.packet_vectors import VECTORS, read_toward
+from wavebatch.files.strip.describe import audit_header
+from wavebatch.files.strip.packet_check import VECTORS, read_toward
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.files.strip.writer import FullwaveWriter
 

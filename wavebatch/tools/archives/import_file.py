@@ -2,31 +2,377 @@
 
 Two passes: the first reads everything and learns, the second writes. Memory holds one piece of the file. The strip, its
 packets and its system file appear together or not at all.
+
+Packets need metres in all three directions, so pulses in degrees are projected to UTM: by the transverse Mercator
+projection of GRS80 and WGS 84. Others stay as they are.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import InputError
 from wavebatch.core.schema import option
+from wavebatch.core.units import PS_PER_NS
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import take_fingerprint
-from wavebatch.files.las.header import Vlr, read_header
-from wavebatch.files.pulsewaves.header import RETURNING, PulseHeader, read_pulse_header
-from wavebatch.files.pulsewaves.reader import PulseReader
+from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.geo_keys import GeoKeys, build_utm
+from wavebatch.files.las.header import GEOTIFF_ID, Vlr, read_header
+from wavebatch.files.pulsewaves_file import (
+    OUTGOING,
+    RETURNING,
+    PulseHeader,
+    PulsePiece,
+    PulseReader,
+    Segments,
+    read_pulse_header,
+)
 from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.kernels.fit.closed_form import estimate_starts
+from wavebatch.kernels.signal.outgoing import measure_outgoing
+from wavebatch.kernels.signal.signal import find_peaks, smooth_121, transpose_samples
 from wavebatch.surveying.outgoing import SYSTEM_SUFFIX, save_outgoing
 from wavebatch.surveying.system_file import format_survey
-from wavebatch.tools.archives.channels import decode
-from wavebatch.tools.archives.first_pass import Outgoing, Plan, make_plan
-from wavebatch.tools.archives.frame import Frame, find_frame
-from wavebatch.tools.archives.points import Counts, build_points, list_extra_bytes
+from wavebatch.tools.archives.first_pass import (
+    SATURATED,
+    Outgoing,
+    Plan,
+    code_segments,
+    decode,
+    find_partners,
+    group_rows,
+    make_plan,
+)
+
+SCALE = 0.001
+"""Largest unit of stored coordinates [m]: coarser ones would shift samples by as much."""
+ROUND = 1000.0
+"""Offsets of coordinates are multiples of this [m]."""
+
+_NO_WKT = (
+    "the CRS stays as GeoTIFF keys: it is no UTM zone that wavebatch writes as WKT, which programs expect in LAS 1.4: "
+    "give them the CRS by hand"
+)
+
+_ZONES = {4326: 32600, 4979: 32600, 4258: 25800, 4269: 26900}
+"""EPSG code of zone 0 north by the code of the geographic CRS."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """How coordinates of a file become those of a strip."""
+
+    zone: int
+    """UTM zone; 0: coordinates stay as they are."""
+    south: bool
+    scales: tuple[float, float, float]
+    offsets: tuple[float, float, float]
+    wkt: str | None
+    records: tuple[Vlr, ...]
+    """GeoTIFF keys that still hold."""
+    notes: tuple[str, ...]
+
+    def place(self, piece: PulsePiece) -> PulsePiece:
+        """Return the piece with its pulses in the coordinates of the strip."""
+        if not self.zone:
+            return piece
+        target = piece.anchor + 1000 * piece.direction
+        anchor, target = (self._project(one) for one in (piece.anchor, target))
+        return replace(piece, anchor=anchor, direction=(target - anchor) / 1000)
+
+    def _project(self, xyz: np.ndarray) -> np.ndarray:
+        east, north = project_utm(xyz[:, 0], xyz[:, 1], self.zone, south=self.south)
+        return np.stack([east, north, xyz[:, 2]], axis=1)
+
+
+def find_frame(reader: PulseReader) -> Frame:
+    """Decide on the coordinates of a file from its GeoTIFF keys and its first pulse."""
+    header = reader.header
+    directory = next((vlr.payload for vlr in header.projection if vlr.record_id == GEOTIFF_ID), b"")
+    keys = GeoKeys.parse(directory)
+    first = next(iter(reader.pieces())).anchor[:1] if header.count else np.zeros((1, 3))
+    zero = _ZONES.get(keys.code or 4326)
+    if keys.kind == "geographic" and zero is not None:
+        zone, south = find_utm_zone(float(first[0, 0])), bool(first[0, 1] < 0) and zero == 32600
+        code = zero + zone + (100 if south else 0)
+        note = f"coordinates are degrees; they are projected to UTM zone {zone}{'S' if south else 'N'} (EPSG:{code})"
+        frame = Frame(zone, south, (SCALE,) * 3, (0.0,) * 3, build_utm(code), (), (note,))
+        first = frame._project(first)
+    else:
+        code = keys.sure_code
+        scales = tuple(min(abs(float(scale)), SCALE) for scale in header.scales)
+        wkt = build_utm(code) if code else None
+        notes = _note_crs(keys) or (() if wkt else (_NO_WKT,))
+        frame = Frame(0, False, scales, (0.0,) * 3, wkt, header.projection, notes)
+    return replace(frame, offsets=tuple(float(value) for value in np.floor(first[0] / ROUND) * ROUND))
+
+
+def _note_crs(keys: GeoKeys) -> tuple[str, ...]:
+    if keys.kind == "geocentric":
+        return ("coordinates are geocentric and stay so: project the strip before steps that need heights",)
+    if keys.kind == "geographic":
+        return ("coordinates are degrees of a datum that wavebatch does not project; packets need metres",)
+    return () if keys.keys else ("the file names no CRS",)
+
+
+_AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257222101
+"""GRS80 [m]; WGS 84 differs by 0.1 mm."""
+_SCALE, _EASTING, _NORTHING = 0.9996, 500_000.0, 10_000_000.0
+
+
+def find_utm_zone(longitude: float) -> int:
+    """Return the UTM zone, 1 to 60, of a longitude in degrees (-180 to 360)."""
+    return int((longitude + 180) // 6) % 60 + 1
+
+
+def project_utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, *, south: bool) -> tuple[np.ndarray, ...]:
+    """Return easting and northing in a UTM zone.
+
+    Parameters
+    ----------
+    longitude, latitude : float64 (n,), degrees
+    zone : int
+    south : bool
+        With the false northing of the southern hemisphere.
+
+    Returns
+    -------
+    east, north : float64 (n,), m
+
+    References
+    ----------
+    Karney (2011), Transverse Mercator with an accuracy of a few nanometers, J. Geodesy 85: Krueger's series, equations
+    7 to 11 and 35, to the third order: 0.1 mm within 6 degrees of the central meridian.
+    """
+    n = _FLATTENING / (2 - _FLATTENING)
+    eccentricity = np.sqrt(_FLATTENING * (2 - _FLATTENING))
+    away = np.radians((longitude - (6 * zone - 183) + 180) % 360 - 180)
+    # The poles themselves have no place in the series.
+    sine = np.clip(np.sin(np.radians(latitude)), -1 + 1e-15, 1 - 1e-15)
+    conformal = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))
+    xi = np.arctan2(conformal, np.cos(away))
+    eta = np.arcsinh(np.sin(away) / np.hypot(conformal, np.cos(away)))
+    alpha = (
+        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16,
+        13 * n**2 / 48 - 3 * n**3 / 5,
+        61 * n**3 / 240,
+    )
+    north, east = xi.copy(), eta.copy()
+    for order, factor in enumerate(alpha, 1):
+        north += factor * np.sin(2 * order * xi) * np.cosh(2 * order * eta)
+        east += factor * np.cos(2 * order * xi) * np.sinh(2 * order * eta)
+    radius = _SCALE * _AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    return _EASTING + radius * east, (_NORTHING if south else 0.0) + radius * north
+
+
+SENT = ("pulse_energy", "pulse_amplitude", "pulse_energy_err", "pulse_amplitude_err")
+"""Extra bytes of the outgoing pulse, over the mean of the strip."""
+FACET = "mirror_facet"
+STEP = 1e-4
+"""Time between pulses that have none [s]."""
+PEAK = 6.0
+"""Height of a detected echo, in noise of the smoothed waveform; detectors of runs use 4, but noise is rougher here."""
+MOST_RETURNS = 15
+
+
+def list_extra_bytes(plan: Plan) -> list[ExtraRecord]:
+    """Return the extra dimensions of a strip that is imported by this plan."""
+    records = [ExtraRecord.build(FACET, "u1", "mirror facet of the pulse")]
+    if plan.outgoing is not None:
+        texts = ("energy sent / mean of the strip", "height sent / mean of the strip", "std of pulse_energy",
+                 "std of pulse_amplitude")  # fmt: skip
+        records += [ExtraRecord.build(name, "<f4", text) for name, text in zip(SENT, texts, strict=True)]
+    return records
+
+
+@dataclass(slots=True)
+class Counts:
+    """What became of the segments of a file."""
+
+    points: int = 0
+    packets: int = 0
+    without_returns: int = 0
+    """Pulses without any returning segment: LAS has no place for them."""
+    replaced: int = 0
+    """Segments of the sensitive channel that are saturated, and whose packet is that of another channel."""
+    covered: int = 0
+    """Segments of other channels that the sensitive one recorded as well, unsaturated."""
+    unknown_energy: int = 0
+    """Pulses whose outgoing recording shows no pulse."""
+
+
+def choose_segments(piece: PulsePiece, plan: Plan, counts: Counts) -> np.ndarray:
+    """Return the rows of the segments that become packets, sorted by pulse and time."""
+    segments = piece.segments
+    returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
+    first, second = find_partners(segments, plan.primary, returning)
+    drop = np.zeros(len(segments), bool)
+    known = np.isin(segments.channel[second], list(plan.ratios))
+    for a, b in group_rows(segments, first[known], second[known]):
+        over = piece.samples(a).max(axis=1) >= SATURATED * plan.top
+        drop[a[over]], drop[b[~over]] = True, True
+        counts.replaced += int(np.count_nonzero(over))
+        counts.covered += int(np.count_nonzero(~over))
+    rows = returning[~drop[returning]]
+    start = (segments.start * segments.unit)[rows]
+    return rows[np.lexsort((start, segments.pulse[rows]))]
+
+
+def build_points(
+    piece: PulsePiece, plan: Plan, writer: FullwaveWriter, header: PulseHeader, counts: Counts, *, detect: bool
+) -> np.ndarray:
+    """Write the packets of a piece and return its points, sorted by pulse and time."""
+    segments = piece.segments
+    rows = choose_segments(piece, plan, counts)
+    offset, width = np.empty(len(rows), np.uint64), np.empty(len(rows), np.int64)
+    owner, sample, height = [], [], []
+    for (places,) in group_rows(segments.take(rows), np.arange(len(rows))):
+        code = int(code_segments(segments, rows[places[:1]])[0])
+        samples = _scale(piece.samples(rows[places]), plan, code)
+        digitizer = plan.digitizers[code]
+        offset[places] = writer.write_packets(samples, digitizer.index)
+        width[places] = samples.shape[1] * digitizer.width
+        found, at = _place_returns(samples, plan.noise, detect=detect)
+        owner.append(places[found])
+        sample.append(at)
+        height.append(samples[found, np.round(at).astype(np.int64)])
+    if not owner:
+        counts.without_returns += len(piece.pulses)
+        return np.empty(0, writer.dtype)
+    owner, sample, height = (np.concatenate(part) for part in (owner, sample, height))
+    order = np.lexsort((sample, owner))
+    owner, sample, height = owner[order], sample[order], height[order]
+    chosen = segments.take(rows[owner])
+    points = np.zeros(len(owner), writer.dtype)
+    sent = None if plan.outgoing is None else _measure_sent(piece, plan.outgoing, counts)
+    _fill_places(points, piece, chosen, sample, writer, sent)
+    _fill_pulses(points, piece, chosen.pulse, plan, header)
+    codes = code_segments(chosen, np.arange(len(chosen)))
+    kinds, which = np.unique(codes, return_inverse=True)
+    points["wavepacket_index"] = np.array([plan.digitizers[int(kind)].index for kind in kinds], np.uint8)[which]
+    points["wavepacket_offset"], points["wavepacket_size"] = offset[owner], width[owner]
+    if plan.dark:
+        points["intensity"] = np.minimum(height.astype(np.int64), 65535)
+    if sent is not None:
+        for name, line in zip(SENT, sent.measures, strict=True):
+            points[name] = line[chosen.pulse]
+    counts.points += len(points)
+    counts.packets += len(rows)
+    counts.without_returns += len(piece.pulses) - len(np.unique(chosen.pulse))
+    return points
+
+
+def _scale(samples: np.ndarray, plan: Plan, code: int) -> np.ndarray:
+    """Counts on the scale of the sensitive channel, padded with zeros to the length of their descriptor."""
+    digitizer, ratio = plan.digitizers[code], plan.ratios.get(code >> 46)
+    if ratio is not None:
+        samples = np.minimum(np.round(samples * ratio), digitizer.max_count).astype(f"<u{digitizer.width}")
+    lack = digitizer.n_samples - samples.shape[1]
+    return np.pad(samples, ((0, 0), (0, lack))) if lack else samples
+
+
+def _place_returns(samples: np.ndarray, noise: float, *, detect: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Waveform and time [samples] of each return: the strongest sample, or all maxima that stand out of the noise.
+
+    The time lies between samples: a run places echoes relative to the returns, so half a sample would be 7 cm.
+    """
+    smoothed = smooth_121(transpose_samples(samples))
+    smoothed -= np.partition(smoothed, len(smoothed) // 4, axis=0)[len(smoothed) // 4]
+    waveform, sample = np.arange(len(samples)), np.argmax(samples, axis=1)
+    if detect:
+        found, at = find_peaks(smoothed, np.full(len(samples), np.float32(PEAK * noise)))
+        silent = np.setdiff1d(waveform, found)
+        waveform, sample = np.concatenate([found, silent]), np.concatenate([at, sample[silent]])
+    if len(smoothed) < 5:
+        return waveform, sample
+    _, time, _ = estimate_starts(smoothed, waveform, sample, 1.0)
+    return waveform, np.clip(time, 0, len(smoothed) - 1)
+
+
+def _fill_places(
+    points: np.ndarray,
+    piece: PulsePiece,
+    chosen: Segments,
+    sample: np.ndarray,
+    writer: FullwaveWriter,
+    sent: _Sent | None,
+) -> None:
+    """Coordinates, location in the packet and vectors toward the sensor."""
+    direction = piece.direction[chosen.pulse]
+    late = 0.0 if sent is None else sent.late[chosen.pulse]
+    way = chosen.start + (sample * chosen.spacing - late) / chosen.unit
+    xyz = piece.anchor[chosen.pulse] + way[:, None] * direction
+    stored = np.round((xyz - np.array(writer.offsets)) / np.array(writer.scales))
+    for axis, (name, vector) in enumerate(zip("XYZ", ("x_t", "y_t", "z_t"), strict=True)):
+        points[name] = np.clip(stored[:, axis], -(2**31), 2**31 - 1)
+        points[vector] = -direction[:, axis] / (chosen.unit * PS_PER_NS)
+    points["return_point_wave_location"] = sample * chosen.spacing * PS_PER_NS
+
+
+def _fill_pulses(points: np.ndarray, piece: PulsePiece, pulse: np.ndarray, plan: Plan, header: PulseHeader) -> None:
+    """Fields that all returns of a pulse share, and return numbers; points are sorted by pulse and time."""
+    records = piece.pulses[pulse]
+    begin = np.searchsorted(pulse, pulse, side="left")
+    count = np.searchsorted(pulse, pulse, side="right") - begin
+    number = np.minimum(np.arange(len(pulse)) - begin + 1, MOST_RETURNS)
+    points["bit_fields"] = number | (np.minimum(count, MOST_RETURNS) << 4)
+    bits = records["bits"].astype(np.int64)
+    scanner = np.zeros(256, np.int64)
+    for index, descriptor in header.descriptors.items():
+        scanner[index] = (descriptor.scanner - 1) & 3 if descriptor.scanner else 0
+    edge, direction = (bits >> 12) & 1, (bits >> 13) & 1
+    points["classification_flags"] = (scanner[bits & 255] << 4) | (direction << 6) | (edge << 7)
+    points[FACET] = bits >> 14
+    points["intensity"], points["classification"] = records["intensity"], records["classification"]
+    has_source = "point_source" in records.dtype.names
+    points["point_source_id"] = (records["point_source"] if has_source else np.array(header.source)) & 0xFFFF
+    if plan.one_time:
+        points["gps_time"] = (piece.first + pulse) * STEP
+    else:
+        points["gps_time"] = records["time"] * header.time_scale + plan.time_offset
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sent:
+    """Outgoing pulses of a piece, over the means of the strip, by pulse; NaN where there is none."""
+
+    measures: np.ndarray
+    """The values of SENT, f8 (4, n)."""
+    late: np.ndarray
+    """Time of the peak after the strip's mean one, f8 (n,) [ns]; 0 where it is not known."""
+
+
+def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: Counts) -> _Sent:
+    """Measure the first outgoing segment of each pulse.
+
+    A digitizer does not start in step with the laser: its samples lie up to half a spacing off. Where the outgoing
+    pulse has a time on the clock of the echoes, that is taken off, else echoes would be up to 7 cm off.
+    """
+    segments = piece.segments
+    kind = code_segments(segments, np.arange(len(segments))) & ~((1 << 18) - 1)
+    sent = np.flatnonzero((segments.kind == OUTGOING) & (kind == outgoing.kind) & (segments.length > 2))
+    sent = sent[np.append(True, np.diff(segments.pulse[sent]) != 0)[: len(sent)]]
+    values, late = np.full((4, len(piece.pulses)), np.nan), np.zeros(len(piece.pulses))
+    for (rows,) in group_rows(segments, sent):
+        found, pulse = measure_outgoing(piece.samples(rows), outgoing.reference), segments.pulse[rows]
+        measures = (found.energy, found.amplitude, found.energy_error, found.amplitude_error)
+        for line, (measure, mean) in enumerate(zip(measures, (outgoing.energy, outgoing.amplitude) * 2, strict=True)):
+            values[line, pulse] = measure / mean
+        start, spacing = segments.start[rows] * segments.unit[rows], segments.spacing[rows]
+        # Without a stored duration the recording has no place on the clock.
+        peak = np.where(start != 0, start + (found.time - outgoing.origin) * spacing, 0.0)
+        late[pulse] = np.where(np.isfinite(peak), peak, 0.0)
+    counts.unknown_energy += int(np.count_nonzero(np.isnan(values[0])))
+    return _Sent(values, late)
+
 
 SUFFIXES = (".pls",)
 USER_ID = b"wavebatch_import"

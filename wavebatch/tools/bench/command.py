@@ -45,7 +45,7 @@ from wavebatch.tools.bench.accuracy import (
 )
 from wavebatch.tools.bench.speed import Laps, time_chains
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene, simulate_blocks, simulate_strip
-from wavebatch.tools.simulate.draws import Drawn
+from wavebatch.tools.simulate.scenes import Drawn
 
 PROFILES = ("fast", "balanced", "accurate")
 """Shipped chains that are always measured, cheapest first."""

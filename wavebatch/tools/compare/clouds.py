@@ -17,9 +17,8 @@ from wavebatch.core.echoes import PASSED_THROUGH
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.disk.buckets import count_buckets, spread_times
 from wavebatch.files.disk.raw_bytes import Closing
-from wavebatch.files.disk.temp_store import Spool
+from wavebatch.files.disk.temp_store import Spool, count_buckets, spread_times
 from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
 from wavebatch.tools.return_stats import pulses_told_apart
 from wavebatch.tools.simulate.truth import TruthReader

@@ -14,7 +14,7 @@ import scipy  # parts of it load when they are first asked for
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
-from wavebatch.files.las.point_formats import CLASS_NAMES
+from wavebatch.files.las.header import CLASS_NAMES
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
 from wavebatch.tools.even_sample import EvenSample

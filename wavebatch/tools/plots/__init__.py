@@ -1,5 +1,5 @@
 """Pictures of waveforms and clouds, for `wavebatch plot`.
 
-First the data as arrays (`packets` and `waveform`; `values`, `histogram` and `raster`), then the drawing
-(`draw_waveform`, `draw_cloud`), so that everything but the drawing works and is tested without matplotlib.
+First the data as arrays (`waveform`; `values`, `histogram` and `sections`; maps: `tools/rasters/cells`), then the
+drawing (`draw_waveform`, `draw_cloud`), so that everything but the drawing works and is tested without matplotlib.
 """

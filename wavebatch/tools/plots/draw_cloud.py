@@ -1,7 +1,7 @@
 """Pictures of clouds, drawn with matplotlib: histograms, counts of flags, maps.
 
-`wavebatch plot histogram` and `wavebatch plot map` call these with the results of `histogram` and `raster`. Style and
-files are those of `files.figure_file`; the same data give the same bytes.
+`wavebatch plot histogram` and `wavebatch plot map` call these with the results of `histogram` and `rasters.cells`.
+Style and files are those of `files.figure_file`; the same data give the same bytes.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.plots.histogram import PERCENTILES, FlagCounts, Histogram
 from wavebatch.tools.plots.labels import fit_text, set_head, space_ticks
-from wavebatch.tools.plots.raster import Raster
 from wavebatch.tools.plots.values import Tally
+from wavebatch.tools.rasters.cells import Raster
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

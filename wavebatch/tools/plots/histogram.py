@@ -17,7 +17,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.las.point_formats import CLASS_NAMES
+from wavebatch.files.las.header import CLASS_NAMES
 from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots.values import Clouds, Tally, name_paths, shown_limits
 

@@ -22,7 +22,6 @@ from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.las.crs import CrsWords
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
 from wavebatch.tools.plots.labels import fit_text, set_head, space_ticks
-from wavebatch.tools.plots.raster import check_crs, survey_places
 from wavebatch.tools.plots.values import (
     MARGIN,
     Clouds,
@@ -33,8 +32,8 @@ from wavebatch.tools.plots.values import (
     round_up,
     sample_points,
 )
-from wavebatch.tools.rasters.cells import compute_cells
-from wavebatch.tools.voxels.voxel_points import VoxelFile
+from wavebatch.tools.rasters.cells import check_crs, compute_cells, survey_places
+from wavebatch.tools.voxels.output import VoxelFile
 
 MOST_POINTS = 200_000
 """Most points of a section that are drawn: more would only cover each other."""

@@ -1,6 +1,6 @@
 """Values of columns of clouds of any size, read piece by piece: chosen points, counts, samples, robust limits.
 
-`histogram`, `raster`, `sections` and `rasters.grid` read their clouds through `Clouds`.
+`histogram`, `sections` and `tools/rasters` read their clouds through `Clouds`.
 """
 
 from __future__ import annotations

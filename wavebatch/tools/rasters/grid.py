@@ -1,29 +1,312 @@
 """`wavebatch grid`: columns of clouds of any size as a GeoTIFF, in memory that does not grow with clouds or raster.
 
 Clouds are read twice: here for the extent, then by `cells.compute_tiles`. Tiles without a point are not written at all.
+
+Forest metrics of cells come from voxels: cover, heights of light, leaf area density and index, each with its error.
+Formulas and sources: docs/forest.md.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.schema import Above, check_options, option
+from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
-from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
+from wavebatch.files.las.header import read_header
+from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.tools.plots.values import Clouds, check_statistic
-from wavebatch.tools.rasters import forest
 from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, Placed, check_cells, compute_tiles, is_in_bounds
+from wavebatch.tools.voxels.rays import ASSUMED_ERROR
+
+COLUMNS = ("x", "y", "height", "light", "path", "share", "ground", "free_path", "attenuation", "attenuation_error")
+"""Columns of voxels that are used."""
+
+QUANTILES = (25, 50, 75, 95)
+"""Parts of the light that plants catch, in percent."""
+
+LEAST_LIGHT = 10.0
+"""Rays that must end in a cell: of fewer, the error of a cover of one half is larger than .16."""
+
+LEAST_GROUND = 1.0
+"""Rays that must reach the ground of a cell: else nothing tells how much light the lowest leaves got, or where the
+ground is."""
+
+LEAST_SIDE = 4
+"""Voxels along a cell: fewer columns of voxels do not show how much they differ."""
+
+TALLEST = 150.0
+"""No tree is higher [m]: voxels above are noise, birds or clouds."""
+
+KNOWN, FEW_RAYS, NO_GROUND = range(3)
+"""Values of the last band: why the others have no data."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForestOptions:
+    """How metrics are computed."""
+
+    leaf_projection: Annotated[float, Range(0.1, 1.0)] = option(
+        0.5, "Area of a leaf that the light sees, over its area: 0.5 for leaves without a preferred direction, 1 for "
+        "level ones below the sensor.", form="G",
+    )  # fmt: skip
+    layer: Annotated[float, Above(0.0, TALLEST)] = option(
+        5.0, "Height of the layers that leaf area density is written for [m].", form="M"
+    )
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class _Voxels(NamedTuple):
+    """Voxels, each once, sorted by column, then layer: arrays (n,)."""
+
+    cell: np.ndarray
+    column: np.ndarray
+    layer: np.ndarray
+    """Counted from the ground of the column."""
+    x: np.ndarray
+    y: np.ndarray
+    height: np.ndarray
+    path: np.ndarray
+    light: np.ndarray
+    caught: np.ndarray
+    """Light, by plants and ground."""
+    plants: np.ndarray
+    free_path: np.ndarray
+    attenuation: np.ndarray
+    error: np.ndarray
+
+
+class _Sums(NamedTuple):
+    """What layers add to a leaf area, f8 (n,)."""
+
+    near: np.ndarray
+    """With the attenuation of each voxel."""
+    far: np.ndarray
+    """With that of blocks of eight voxels."""
+    variance: np.ndarray
+    """Of `near`, by the errors of the voxels."""
+    unknown: np.ndarray
+    """Part of `near` that stands for voxels which too little light reached."""
+
+    def total(self, group: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Leaf area, and its variance, of each group, f8 (number,)."""
+        near, far, variance, unknown = (np.bincount(group, part, number) for part in self)
+        clumped = near - far
+        return np.maximum(near + clumped, 0.0), variance + clumped**2 + unknown**2
+
+
+class Forest:
+    """Computes the metrics of cells from the voxels of files that `voxelize --forest` made.
+
+    Raises ConfigError for other files, for voxels of several sizes, and for cells smaller than LEAST_SIDE voxels.
+    """
+
+    def __init__(self, paths: Sequence[Path], cell_size: float, options: ForestOptions) -> None:
+        facts = [(path, _read_facts(path)) for path in paths]
+        self.size = facts[0][1]["size_m"]
+        other = next((path for path, one in facts if one["size_m"] != self.size), None)
+        if other is not None:
+            raise ConfigError(f"{other}: has other voxels than {paths[0]}, of {self.size:g} m; give files of one size")
+        if cell_size < LEAST_SIDE * self.size:
+            raise ConfigError(f"--size {cell_size:g}: cells need {LEAST_SIDE} voxels along a side; give "
+                              f"{LEAST_SIDE * self.size:g} or more")  # fmt: skip
+        self.options = options
+        self.ratio_error = max(_read_error(one["reflectance_ratio"]) for _, one in facts)
+        """Standard deviation of the logarithm of the ratio of reflectances, common to all cells."""
+        self.layers = 0
+        self.reasons = np.zeros(3, np.int64)
+        """Cells by KNOWN, FEW_RAYS, NO_GROUND."""
+
+    def describe(self) -> dict[str, str]:
+        """What the metrics assume, for the tags of the raster."""
+        return {"LEAF_PROJECTION": f"{self.options.leaf_projection:g}", "VOXEL_SIZE": f"{self.size:g}"}
+
+    def list_bands(self, highest: float) -> list[Band]:
+        """Names and units of the bands, for voxels up to a height [m]."""
+        step = self.options.layer
+        self.layers = max(int(np.ceil(min(highest + 0.5 * self.size, TALLEST) / step)), 1)
+        bands = [Band("cover", ""), Band("cover_err", ""), *(Band(f"light_height_{part}", "m") for part in QUANTILES)]
+        bands += [Band("leaf_area_index", ""), Band("leaf_area_index_err", "")]
+        for name in ("leaf_area_density", "leaf_area_density_err"):
+            bands += [Band(f"{name} {i * step:g}-{(i + 1) * step:g} m", "1/m") for i in range(self.layers)]
+        return [*bands, Band("no_data_reason", "")]
+
+    def compute(self, cell: np.ndarray, values: np.ndarray, number: int) -> np.ndarray:
+        """Bands f8 (m, number) from the cell of each voxel i8 (n,) and its COLUMNS f8 (n, 10); NaN without voxels."""
+        height = values[:, 2]
+        inside = (height + 0.5 * self.size > 0) & (height < TALLEST)
+        cells, cell = np.unique(cell, return_inverse=True)
+        n, voxels = len(cells), _join(values[inside], cell[inside], self.size)
+        columns, column = np.unique(voxels.column, return_inverse=True)
+        owner = np.zeros(len(columns), np.int64)
+        owner[column] = voxels.cell
+        light, soil = np.bincount(cell, _caught(values), n), np.bincount(cell, values[:, 3] * _zeroed(values[:, 6]), n)
+        plants = light - soil
+        cover = plants / np.where(light > 0, light, 1.0)
+        # Columns differ by what grows in them and by the rays that they got: the spread of their sums has both.
+        rest = np.bincount(column, voxels.plants - cover[voxels.cell] * voxels.caught, len(columns))
+        count = np.maximum(np.bincount(owner, minlength=n), 2)
+        variance = np.bincount(owner, rest**2, n) * count / (count - 1) / np.where(light > 0, light, 1.0) ** 2
+        cover_err = np.sqrt(variance + (cover * (1.0 - cover) * self.ratio_error) ** 2)
+        heights = [_find_height(voxels, n, 0.01 * part) for part in QUANTILES]
+
+        slot, sums = self._add_layers(voxels, columns, column, owner)
+        projection, common = self.options.leaf_projection, cover * self.ratio_error
+        area, variance = sums.total(slot[0], n)
+        area_err = np.sqrt(variance + common**2) / projection
+        layer = self._place(slot[1])
+        dense, variance = (one.reshape(n, -1).T for one in sums.total(slot[0] * self.layers + layer, n * self.layers))
+        place = self._place(voxels.height) * n + voxels.cell
+        caught = np.bincount(place, voxels.plants, n * self.layers).reshape(-1, n)
+        below = np.cumsum(caught, axis=0) - caught + soil
+        lit = np.where(below > 0, below, 1.0)
+        common = self.ratio_error * soil * (1.0 / lit - 1.0 / (lit + caught))
+        per_metre = 1.0 / (projection * self.options.layer)
+        bands = np.stack([cover, cover_err, *heights, area / projection, area_err, *(dense * per_metre),
+                          *(np.sqrt(variance + common**2) * per_metre)])  # fmt: skip
+        reason = np.where(light < LEAST_LIGHT, FEW_RAYS, np.where(soil < LEAST_GROUND, NO_GROUND, KNOWN))
+        self.reasons += np.bincount(reason, minlength=3)
+        result = np.full((len(bands) + 1, number), np.nan)
+        result[:, cells] = np.concatenate([np.where(reason == KNOWN, bands, np.nan), reason[None]])
+        return result
+
+    def _place(self, height: np.ndarray) -> np.ndarray:
+        """The layer of `layer` metres that a height lies in."""
+        return np.clip(height / self.options.layer, 0, self.layers - 1).astype(np.int64)
+
+    def _add_layers(
+        self, voxels: _Voxels, columns: np.ndarray, column: np.ndarray, owner: np.ndarray
+    ) -> tuple[tuple[np.ndarray, np.ndarray], _Sums]:
+        """Cell and mean height of each layer of voxels, i8 and f8 (k,) [m], and what it adds to the depth of its cell.
+
+        A layer has the mean of its voxels. Above the highest voxel of a column is air. Voxels that too few rays reached
+        count as the darkest others of their layer.
+        """
+        top = np.full(len(columns), -1)
+        np.maximum.at(top, column, voxels.layer)
+        most = int(top.max(initial=0)) + 2
+        keys, slot = np.unique(voxels.cell * most + voxels.layer, return_inverse=True)
+        cell, height = keys // most, np.bincount(slot, voxels.height) / np.bincount(slot)
+        tops = np.sort(owner * most + top)
+        air = np.searchsorted(tops, keys) - np.searchsorted(tops, cell * most)
+        there = np.bincount(owner)[cell]
+        known = np.isfinite(voxels.attenuation)
+        # A corner that rays cut counts less: up to two rays across, by their path.
+        weight = np.where(known, np.minimum(voxels.path / (2.0 * self.size), 1.0), 0.0)
+        thick = np.clip(voxels.height + 0.5 * self.size, 0.0, self.size)
+        whole = np.bincount(slot, weight, len(keys)) + air
+        whole = np.where(whole > 0, whole, 1.0)
+        block = np.unique(np.stack([voxels.cell, voxels.x // 2, voxels.y // 2, voxels.layer // 2]), axis=1,
+                          return_inverse=True)[1].ravel()  # fmt: skip
+        free, caught = (np.bincount(block, np.where(known, part, 0.0)) for part in (voxels.free_path, voxels.plants))
+        both = (_zeroed(voxels.attenuation), (caught / np.where(free > 0, free, 1.0))[block])
+        unknown = (1.0 - (air + np.bincount(slot, known, len(keys))) / there).clip(0.0, 1.0)
+        seen = (1.0 - unknown) / whole
+        # What too little light reached lies behind dense leaves, as the darkest of the known voxels do.
+        dark = weight / np.where(voxels.light > 0, voxels.light, 1.0)
+        divisor = np.bincount(slot, dark, len(keys))
+        divisor = np.where(divisor > 0, divisor, 1.0)
+        (near, hidden), (far, other) = ((np.bincount(slot, weight * thick * one, len(keys)) * seen,
+                                         np.bincount(slot, dark * thick * one, len(keys)) * unknown / divisor)
+                                        for one in both)  # fmt: skip
+        variance = np.bincount(slot, (weight * thick * _zeroed(voxels.error)) ** 2, len(keys)) * seen**2
+        return (cell, height), _Sums(near + hidden, far + other, variance, hidden)
+
+
+def _join(values: np.ndarray, cell: np.ndarray, size: float) -> _Voxels:
+    """Voxels of all files; those of several strips in the same place become one."""
+    x, y = (np.floor(values[:, axis] / size).astype(np.int64) for axis in (0, 1))
+    layer = np.floor(values[:, 2] / size + 0.5).astype(np.int64)
+    column = (x << 32) + y
+    order = np.lexsort((layer, column))
+    new = np.append(True, (np.diff(column[order]) != 0) | (np.diff(layer[order]) != 0))[: len(order)]
+    group = np.empty(len(order), np.int64)
+    group[order] = np.cumsum(new) - 1
+    first, n = order[new], int(new.sum())
+    caught, free = _caught(values), np.where(np.isfinite(values[:, 8]), values[:, 7], 0.0)
+    plants = caught - values[:, 3] * _zeroed(values[:, 6])
+    sums = values[:, 4], values[:, 3], caught, plants, free
+    path, light, caught, plants, whole = (np.bincount(group, one, n) for one in sums)
+    divisor = np.where(whole > 0, whole, np.nan)
+    attenuation = np.bincount(group, free * _zeroed(values[:, 8]), n) / divisor
+    error = np.sqrt(np.bincount(group, (free * _zeroed(values[:, 9])) ** 2, n)) / divisor
+    return _Voxels(cell[first], column[first], layer[first], x[first], y[first], values[first, 2], path, light, caught,
+                   plants, whole, attenuation, error)  # fmt: skip
+
+
+def _find_height(voxels: _Voxels, number: int, part: float) -> np.ndarray:
+    """Height below which plants caught a part of their light, f8 (number,) [m]; between the middles of layers."""
+    most = int(voxels.layer.max(initial=0)) + 1
+    keys, slot = np.unique(voxels.cell * most + voxels.layer, return_inverse=True)
+    light = np.bincount(slot, voxels.plants, len(keys))
+    kept = light > 0
+    height = (np.bincount(slot, voxels.plants * voxels.height, len(keys)) / np.where(kept, light, 1.0))[kept]
+    cell, light = keys[kept] // most, light[kept]
+    whole = np.bincount(cell, light, number)
+    before = np.cumsum(light) - light
+    start = np.full(number, np.inf)
+    np.minimum.at(start, cell, before)
+    # Cells follow each other on one axis: the part of the light below the middle of each layer, from 0 to 1.
+    rank = cell + (before - start[cell] + 0.5 * light) / whole[cell]
+    found = np.full(number, np.nan)
+    filled = np.flatnonzero(whole > 0)
+    if len(filled):
+        first, last = np.searchsorted(cell, filled), np.searchsorted(cell, filled, "right") - 1
+        at = np.searchsorted(rank, filled + part)
+        low, high = np.clip(at - 1, first, last), np.clip(at, first, last)
+        share = (filled + part - rank[low]) / np.where(high > low, rank[high] - rank[low], 1.0)
+        found[filled] = height[low] + share.clip(0.0, 1.0) * (height[high] - height[low])
+    return found
+
+
+def _caught(values: np.ndarray) -> np.ndarray:
+    return values[:, 3] * _zeroed(values[:, 5])
+
+
+def _zeroed(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(values), values, 0.0)
+
+
+def _read_facts(path: Path) -> dict:
+    """The record that voxelize wrote."""
+    records = (vlr for vlr in read_header(path).vlrs if vlr.user == "wavebatch" and vlr.record_id == 1)
+    for vlr in records:
+        try:
+            facts = json.loads(vlr.payload)
+        except ValueError:
+            continue
+        if isinstance(facts, dict) and facts.get("forest"):
+            return _check_facts(facts, path)
+    raise ConfigError(f"{path}: --forest needs voxels: wavebatch voxelize STRIP --size 1 --forest -o voxels.laz")
+
+
+def _check_facts(facts: dict, path: Path) -> dict:
+    """The record, with a size and a ratio of reflectances that voxelize can have written; ConfigError for others."""
+    ratio = facts.get("reflectance_ratio")
+    ratio = ratio if isinstance(ratio, dict) else {}
+    numbers = facts.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
+    if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
+        raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it anew with "
+                          "wavebatch voxelize --forest")  # fmt: skip
+    return facts
+
+
+def _read_error(ratio: dict) -> float:
+    return ASSUMED_ERROR if ratio.get("source") == "assumed" else (ratio.get("error") or 0.0) / ratio["ratio"]
+
 
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
 """Most cells along a side, and of the raster (300 km x 300 km at 1 m): more is damage of coordinates, clouds of several
@@ -54,7 +337,7 @@ class GridOptions:
         None, "CRS of the clouds, e.g. EPSG:32632.", form="CRS", unset="that of their headers"
     )
     no_data: float = option(-9999.0, "Value of cells without data; nan is possible.", form="VALUE")
-    forest: forest.ForestOptions | None = None
+    forest: ForestOptions | None = None
     """Metrics of voxels, in place of columns and a statistic."""
 
 
@@ -83,8 +366,8 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
         if options.chosen:
             raise ConfigError("--forest: metrics need all voxels of a cell: leave out --where, --class and flags; "
                               "--bbox takes whole cells")  # fmt: skip
-        metrics = forest.Forest(paths, options.size, options.forest)
-        options = replace(options, columns=tuple(forest.COLUMNS))
+        metrics = Forest(paths, options.size, options.forest)
+        options = replace(options, columns=tuple(COLUMNS))
     _check(options)
     options = replace(options, bbox=_grow(options.bbox, options.size))
     crs, unit, unnamed = _find_crs(paths, options.crs)
@@ -106,7 +389,7 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     if metrics is None:
         bands, statistic = [_describe(one, options.statistic, unit) for one in facts], options.statistic
     else:
-        bands, statistic = metrics.list_bands(largest[forest.COLUMNS.index("height")]), metrics.compute
+        bands, statistic = metrics.list_bands(largest[COLUMNS.index("height")]), metrics.compute
     result = GridResult(layout=layout, bands=tuple(bands), unnamed=unnamed)
     tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}"}
     tags |= {"STATISTIC": options.statistic} if metrics is None else metrics.describe()
@@ -117,7 +400,7 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
         writer.publish()
     if metrics is not None:
         result.reasons = tuple(metrics.reasons.tolist())
-        result.values = (*[result.reasons[forest.KNOWN]] * (len(bands) - 1), result.filled)
+        result.values = (*[result.reasons[KNOWN]] * (len(bands) - 1), result.filled)
     return result
 
 

@@ -14,10 +14,9 @@ Called by `wavebatch simulate`, `wavebatch synthesize`, tools.bench, the example
 """
 
 from wavebatch.tools.simulate.blocks import flag_truth, simulate_block, simulate_blocks
-from wavebatch.tools.simulate.draws import CANOPIES
 from wavebatch.tools.simulate.render import PULSES, PulseModel, Recording, find_pulse, shape_pulse
 from wavebatch.tools.simulate.returns import DiscreteReceiver
-from wavebatch.tools.simulate.scenes import OTHER_NAMES, SCENES, Scene, find_scene
+from wavebatch.tools.simulate.scenes import CANOPIES, OTHER_NAMES, SCENES, Scene, find_scene
 from wavebatch.tools.simulate.strip import ReturnSummary, StripOptions, StripSummary, simulate_returns, simulate_strip
 from wavebatch.tools.simulate.truth import TruthReader
 

@@ -19,10 +19,9 @@ from wavebatch.core.units import HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.disk.publish import protecting
-from wavebatch.files.las.header import is_projection, read_header
-from wavebatch.files.point_dtypes import field_names
+from wavebatch.files.las.crs import repair_records
+from wavebatch.files.las.header import field_names, is_projection, read_header
 from wavebatch.files.strip.writer import FullwaveWriter
-from wavebatch.files.wkt import repair_records
 from wavebatch.kernels.geometry.group_returns import fit_rays, group_pulses
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
 from wavebatch.tools.simulate.returns import LightCounts, LightModel, ReturnLight, SynthesisOptions, fill_packets

@@ -20,10 +20,8 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.extra_bytes import build_dtype
-from wavebatch.files.las.header import LasHeader
-from wavebatch.files.las.point_formats import WITHOUT_WAVES
+from wavebatch.files.las.header import WITHOUT_WAVES, LasHeader, field_names
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.files.point_dtypes import field_names
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated_echoes
 from wavebatch.tools.simulate.blocks import Simulated, seed_block, simulate_seed_block

@@ -2,6 +2,6 @@
 
 strip     the whole task: reads, deconvolves, sums, writes
 profile   waveforms to profiles along their rays (deconvolution, noise)
-rays      profiles to rays in space;  ceiling: how far up rays are followed
-grid      rays summed over voxels;    output: the files
+rays      profiles to rays in space, and the light in them;  floor: lowest and highest returns
+grid      rays summed over voxels;    output: the files, written and read
 """

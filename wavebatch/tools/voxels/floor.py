@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.files.las.point_formats import locate
+from wavebatch.files.las.header import locate
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.planes import fit_planes
 

@@ -27,8 +27,7 @@ from wavebatch.kernels.geometry.voxels import (
 )
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.tools.voxels.floor import Floor
-from wavebatch.tools.voxels.light import LightRule
-from wavebatch.tools.voxels.rays import Rays, measure_lengths
+from wavebatch.tools.voxels.rays import LightRule, Rays, measure_lengths
 
 LIGHT_UNIT = 2.0**-30
 """Unit in which light is summed [rays]."""

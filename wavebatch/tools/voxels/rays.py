@@ -3,20 +3,131 @@
 `strip.voxelize_strip` lists the signal of every block, joins the packets of each pulse and adds the rays to the grid.
 Between two packets of a pulse nothing was recorded, because no light came back that triggers the digitizer: it counts
 as empty air. Nothing here may depend on other pulses than the ray's.
+
+A pulse's packets lie in one unit or in two that follow each other, in any order: `read_batches` gives them together.
+Batches do not depend on processes, and results must not depend on batches.
+
+`find_rule` finds the reflectance ratio of canopy and ground. Without the right one, the share of a voxel is no
+interception: leaves of .5 over ground of .15 hide a gap probability of .61 as one of .41.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.cloud.point_filter import PlannedFilter
+from wavebatch.files.las.header import locate
+from wavebatch.files.strip.reader import StripReader, StripScan, Unit, read_scanner
 from wavebatch.files.strip.shared_packets import expand
-from wavebatch.kernels.geometry.group_returns import along_ray, find_rays, on_ray
+from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, along_ray, find_rays, group_times, on_ray
 from wavebatch.kernels.physics import radiometry
+from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
 from wavebatch.tools.voxels.floor import Floor
 from wavebatch.tools.voxels.profile import Profiles
+
+BATCH_SAMPLES = 1 << 20
+"""Samples read at a time."""
+
+LOST = np.dtype([("time", "f8"), ("group", "i8"), ("scanner", "u1"), ("place", "f8", 3)])
+"""Returns whose packet is missing or broken."""
+
+
+class Batch(NamedTuple):
+    """Packets of whole pulses."""
+
+    parts: list[tuple[Unit, np.ndarray, np.ndarray, np.ndarray]]
+    """Units, rows of their packets, the index in the file of the first packet of equal time of each, and whether `keep`
+    keeps a point of it.
+    """
+    lost: np.ndarray
+    """Returns of these pulses whose packet is missing or broken, LOST (k,)."""
+
+
+def read_batches(
+    reader: StripReader,
+    scan: StripScan,
+    *,
+    numbers: Sequence[int] | None = None,
+    choose: Callable[[np.ndarray], np.ndarray] | None = None,
+    keep: PlannedFilter | None = None,
+    block_size: int | None = None,
+) -> Iterator[Batch]:
+    """Yield all packets of a strip, or of the units `numbers`, in batches.
+
+    choose: of the groups of a unit, those to read. keep: of points; only groups with such a point are read.
+    block_size: packets per batch; as many as have BATCH_SAMPLES if not given. A batch ends with its last pulse.
+    """
+    units: dict[int, Unit] = {}
+    lost: dict[int, np.ndarray] = {}
+    taken = np.empty(0, np.int64)
+    for number in range(reader.unit_count()) if numbers is None else numbers:
+        near = [one for one in (number, number + 1) if one < reader.unit_count()]
+        units = {one: units.get(one) or reader.read_unit(one, scan) for one in near}
+        lost = {one: lost.get(one, np.empty(0, LOST)) for one in (number - 1, *near)}
+        lost |= {one: _list_lost(reader, unit) for one, unit in units.items() if not len(lost[one])}
+        rows = [np.flatnonzero(unit.packets.owned) for unit in units.values()]
+        rows[0] = rows[0][~np.isin(units[number].packets.owner[rows[0]], taken)]
+        tables = list(zip(units.values(), rows, strict=True))
+        owner = np.concatenate([unit.packets.owner[some] for unit, some in tables])
+        time = np.concatenate([unit.points["gps_time"][unit.packets.owner[some] - unit.start] for unit, some in tables])
+        group = group_times(time)
+        here = np.flatnonzero(group < len(rows[0]))
+        taken = owner[here[here >= len(rows[0])]]
+        known = _match_lost(np.concatenate(list(lost.values())), time, owner)
+        kept = np.ones(len(owner), bool)
+        if keep is not None:
+            kept = np.concatenate([_choose_packets(unit, keep)[some] for unit, some in tables])
+            here = here[np.isin(group[here], group[kept])]
+        if choose is not None:
+            here = here[np.isin(group[here], choose(np.unique(group[here])))]
+        here = here[np.argsort(group[here], kind="stable")]
+        cost = np.concatenate([unit.packets.n_samples[some] for unit, some in tables])[here]
+        cost, limit = (np.maximum(cost, 1), BATCH_SAMPLES) if block_size is None else (np.ones(len(here)), block_size)
+        starts = np.append(True, np.diff(group[here]) != 0)[: len(here)]
+        before = (np.cumsum(cost) - cost)[np.flatnonzero(starts)] // limit
+        for some in np.split(here, np.flatnonzero(np.diff(before[np.cumsum(starts) - 1])) + 1):
+            groups = owner[group[some]]
+            parts = []
+            for (unit, mine), shift in zip(tables, (0, len(rows[0])), strict=False):
+                inside = (some >= shift) & (some < shift + len(mine))
+                parts.append((unit, mine[some[inside] - shift], groups[inside], kept[some[inside]]))
+            if len(some):
+                yield Batch(parts, known[np.isin(known["group"], groups)])
+
+
+def _list_lost(reader: StripReader, unit: Unit) -> np.ndarray:
+    """The returns of a unit without a packet that can be read."""
+    points = unit.points[unit.packet_of_point < 0]
+    lost = np.zeros(len(points), LOST)
+    lost["time"], lost["place"] = points["gps_time"], locate(points, reader.facts.header)
+    scanner = read_scanner(points)
+    lost["scanner"] = 0 if scanner is None else scanner
+    return lost
+
+
+def _match_lost(lost: np.ndarray, time: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """Those of equal time with packets, with their group."""
+    values, first, count = np.unique(time, return_index=True, return_counts=True)
+    if not len(values):
+        return lost[:0]
+    at = np.minimum(np.searchsorted(values, lost["time"]), len(values) - 1)
+    lost["group"] = owner[first[at]]
+    return lost[(values[at] == lost["time"]) & (lost["time"] != 0) & (count[at] < LONGEST_PULSE)]
+
+
+def _choose_packets(unit: Unit, keep: PlannedFilter) -> np.ndarray:
+    """Whether a point of each packet of the unit is kept, bool (packets,)."""
+    chosen = np.zeros(len(unit.packets.owned) + 1, bool)
+    chosen[unit.packet_of_point[keep.test(unit.points, len(unit.points)) == 0]] = True
+    if len(unit.context):
+        chosen[unit.packet_of_context[keep.test(unit.context, len(unit.context)) == 0]] = True
+    return chosen[:-1]  # the last one is that of points without a packet, -1
+
 
 MOST_SECTION = 2.0**14
 """Larger cross sections of a waveform count as unknown: no target has them [m2]."""
@@ -220,3 +331,77 @@ def _measure_sections(
     with np.errstate(invalid="ignore", over="ignore"):
         unknown = ~(np.bincount(row, section, minlength=len(block)) <= MOST_SECTION)
     return np.where(unknown[row], 0.0, section), unknown
+
+
+LEAST_CANOPY = 0.01
+"""Share of the light from the canopy below which its ratio to the ground does not matter."""
+
+ASSUMED_ERROR = float(np.log(2.0))
+"""Standard deviation of the logarithm of a ratio that the strip does not show: leaves and soils of .15 to .5."""
+
+WEAKEST = 0.05
+"""Quantile of the light in packets that is stated as the most that a gap between packets hides."""
+
+
+@dataclass(frozen=True, slots=True)
+class LightRule:
+    """How signal along a ray becomes light that was caught there."""
+
+    ratio: float = 1.0
+    """Reflectance of canopy over that of ground."""
+    error: float | None = None
+    """Its standard deviation; None where it was given or assumed."""
+    source: str = "assumed"
+    """`given`, `strip`, `assumed` (1, because the strip does not show it), or `no canopy`."""
+    usual: float = 0.0
+    """Light of a pulse, in the mean: that of pulses of which a packet was lost."""
+    hidden_light: float | None = None
+    """Share of a pulse's light that may hide between two of its packets; None without pulses of several packets."""
+
+    @property
+    def log_error(self) -> float:
+        """Standard deviation of the logarithm of the ratio."""
+        return ASSUMED_ERROR if self.source == "assumed" else (self.error or 0.0) / self.ratio
+
+    def weigh(self, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+        """Share of its ray's light that was caught at each sample, and the part of it that the ground caught, f8 (m,).
+
+        0 where it is not known.
+        """
+        owner, known = rays.owner, rays.table["known"]
+        ground = np.where(rays.samples["time"] < known[owner], self.ratio * rays.samples["ground"], 0.0)
+        light = ground + np.where(rays.samples["time"] < known[owner], rays.samples["canopy"], 0.0)
+        whole = np.bincount(owner, light, minlength=len(known))
+        whole = np.where(known < np.inf, np.maximum(whole, self.usual), whole)
+        whole = np.where(whole > 0, whole, 1.0)[owner]
+        return light / whole, ground / whole
+
+
+def find_rule(sample: Iterable[Rays], given: float | None) -> LightRule:
+    """The rule by which signal counts as light, from the rays of a sample of the pulses."""
+    pulses, packets = [np.zeros((2, 0))], [np.zeros((4, 0))]
+    for rays in sample:
+        owner, n = rays.owner, len(rays.table)
+        complete = rays.table["known"] == np.inf
+        whole = np.stack([np.bincount(owner, rays.samples[name], n) for name in ("canopy", "ground")])
+        pulses.append(whole[:, complete])
+        # Packets of a ray follow each other.
+        first = np.flatnonzero(np.diff(rays.samples["packet"], prepend=-1))
+        if len(first):
+            part = np.stack([np.add.reduceat(rays.samples[name], first) for name in ("canopy", "ground")])
+            used = (complete & (rays.table["packets"] > 1))[owner[first]]
+            packets.append(np.concatenate([part, whole[:, owner[first]]])[:, used])
+    canopy, ground = np.concatenate(pulses, axis=1)
+    rule = LightRule(1.0 if given is None else given, None, "assumed" if given is None else "given")
+    if given is None and canopy.sum() < LEAST_CANOPY * (canopy.sum() + ground.sum()):
+        rule = replace(rule, source="no canopy")
+    elif given is None and (found := estimate_canopy_ratio(canopy, ground)) is not None:
+        rule = LightRule(found.ratio, found.error, "strip")
+    light = canopy + rule.ratio * ground
+    part, part_ground, whole, whole_ground = np.concatenate(packets, axis=1)
+    share = (part + rule.ratio * part_ground) / (whole + rule.ratio * whole_ground)
+    return replace(
+        rule,
+        usual=float(light[light > 0].mean()) if (light > 0).any() else 0.0,
+        hidden_light=float(np.quantile(share, WEAKEST)) if len(share) else None,
+    )

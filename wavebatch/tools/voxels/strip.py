@@ -37,12 +37,19 @@ from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.floor import Ceiling, Floor, find_ceiling
 from wavebatch.tools.voxels.grid import VoxelGrid, energy_unit
-from wavebatch.tools.voxels.light import find_rule
-from wavebatch.tools.voxels.output import Piece, VoxelSpace, check_voxel_target, write_voxels
+from wavebatch.tools.voxels.output import Piece, ProfileWriter, VoxelSpace, check_voxel_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
-from wavebatch.tools.voxels.profile_file import ProfileWriter
-from wavebatch.tools.voxels.pulses import Batch, read_batches
-from wavebatch.tools.voxels.rays import PACKET, SAMPLE, Rays, join_packets, list_signal, measure_lengths
+from wavebatch.tools.voxels.rays import (
+    PACKET,
+    SAMPLE,
+    Batch,
+    Rays,
+    find_rule,
+    join_packets,
+    list_signal,
+    measure_lengths,
+    read_batches,
+)
 
 LARGEST = 1e6
 """Largest voxel [m]."""
