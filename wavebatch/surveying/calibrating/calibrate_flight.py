@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.order import even_places
 from wavebatch.core.system import swath_columns
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
@@ -24,6 +25,7 @@ from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, measure_ties
 from wavebatch.surveying.calibrating.trends import LEAST_SPREAD, Trend, find_trend, fit_swath
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult, check_attenuation
+from wavebatch.surveying.matching.setting import PLACES
 
 _UNEXPLAINED = (
     "the strips' light from one place differs by more than their constants explain: check targets, trajectory and "
@@ -232,8 +234,9 @@ def _join_places(good: Sequence[Calibration], rows: Sequence[StripConstant]) -> 
     for found in good:
         part = np.reshape(found.places, (-1, 4))
         part[:, 3] += [drift.get((found.fingerprint["sha256_sampled"], digitizer), 0.0) for digitizer in part[:, 0]]
-        parts.append(part[:: len(good)])
-    return tuple(np.concatenate(parts).ravel().tolist())
+        parts.append(part)
+    joined = np.concatenate(parts)
+    return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
 
 
 def _list_strips(
