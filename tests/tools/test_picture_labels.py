@@ -9,11 +9,9 @@ from commands import run_command
 from plot_tools import PULSE, make_chain, simulate, write_cloud
 
 from wavebatch.files import figure_file
-from wavebatch.files.figure_file import open_picture
+from wavebatch.files.figure_file import fit_parts, fit_text, open_picture, text_width
 from wavebatch.kernels.fit.pulse_shape import PulseShape
-from wavebatch.tools.plots import labels
 from wavebatch.tools.plots.draw_waveform import draw_waveform_panels
-from wavebatch.tools.plots.labels import fit_parts, fit_text, text_width
 from wavebatch.tools.plots.waveform import build_views
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -153,12 +151,12 @@ def test_texts_are_shortened_to_their_room(tmp_path):
     ],
 )  # fmt: skip
 def test_short_axes_have_one_or_two_round_ticks(low, high, most, expected):
-    assert labels._round_places(low, high, most) == pytest.approx(expected)
+    assert figure_file._round_places(low, high, most) == pytest.approx(expected)
 
 
 def test_short_axes_always_have_a_tick_inside():
     rng = np.random.default_rng(0)
     for low, span in zip(rng.normal(0, 1000, 2000), 10.0 ** rng.uniform(-4, 4, 2000), strict=True):
         for most in (1, 2):
-            places = labels._round_places(low, low + span, most)
+            places = figure_file._round_places(low, low + span, most)
             assert 1 <= len(places) <= most and all(low - 1e-9 <= place <= low + span + 1e-9 for place in places)

@@ -20,7 +20,7 @@ from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots import values
-from wavebatch.tools.plots.histogram import count_points_by_flag, count_values, place_edges
+from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values, place_edges
 from wavebatch.tools.plots.sections import cut_section
 from wavebatch.tools.plots.values import robust_limits
 from wavebatch.tools.rasters import cells

@@ -15,8 +15,7 @@ from wavebatch.core.units import HALF_C
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.plots import sections
 from wavebatch.tools.plots.sections import cut_section, measure_profile
-from wavebatch.tools.slices.cube import align_pulses, build_cube, cut_cube
-from wavebatch.tools.slices.output import SegmentWriter, profile_segments
+from wavebatch.tools.slices.output import SegmentWriter, align_pulses, build_cube, cut_cube, profile_segments
 from wavebatch.tools.slices.segments import ScanLine, Segment, read_scan_lines
 from wavebatch.tools.voxels.grid import COLUMNS
 

@@ -309,7 +309,13 @@ def _measure_scene(
     if twin:
         rows.append({**next(row for row in rows if row["name"] == twin), "name": AUTO, "same_as": twin})
     rows += measure_others(scene, groups)
-    _mark_front(rows)
+    # Whether no other chain is as good in time, error and wrong echoes, and better in one of them. Peers get other and
+    # fewer waveforms: they are never on the front.
+    names = ("rmse_all_cm", "wrong")
+    costs = [(row["kernels"]["median"], *(row["figures"][name]["value"] for name in names))
+             if row["kind"] == "chain" else (None,) * 3 for row in rows]  # fmt: skip
+    for row, best in zip(rows, find_front(costs).tolist(), strict=True):
+        row["pareto"] = best
     section = {"scene": scene.name, "meaning": scene.meaning, "survey": _describe(groups), "rows": rows}
     if options.tolerance_cm is not None:
         cheapest = choose_cheapest([row for row in rows if row["kind"] == "chain"], options.tolerance_cm)
@@ -337,18 +343,6 @@ def make_row(name: str, kind: str, tally: AccuracyTally, laps: Laps) -> dict[str
     figures = {key: figure.to_json() for key, figure in tally.figures().items()}
     times = {key: median_range(value) if isinstance(value, list) else value for key, value in asdict(laps).items()}
     return {"name": name, "kind": kind, "waveforms": tally.waveforms, "figures": figures, **times}
-
-
-def _mark_front(rows: BenchRows) -> None:
-    """Adds to every row whether no other chain is as good in time, error and wrong echoes, and better in one of them.
-
-    Peers get other and fewer waveforms: they are never on the front.
-    """
-    names = ("rmse_all_cm", "wrong")
-    costs = [(row["kernels"]["median"], *(row["figures"][name]["value"] for name in names)) for row in rows]
-    costs = [cost if row["kind"] == "chain" else (None,) * 3 for row, cost in zip(rows, costs, strict=True)]
-    for row, best in zip(rows, find_front(costs).tolist(), strict=True):
-        row["pareto"] = best
 
 
 def _describe(groups: list[Group]) -> dict[str, Any]:
