@@ -25,10 +25,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from child_signals import give_children_default_signals
-from click.testing import CliRunner
+from commands import run_command
 
 import wavebatch
-from wavebatch.cli import main
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.strip import StripOptions
 
@@ -262,7 +261,7 @@ class Attacker:
         again = ["--resume", "--jobs", "1"] if name.startswith("run") else ["--overwrite"]
 
         def work() -> None:
-            done = CliRunner().invoke(main, [*self._words(name, out), *again])
+            done = run_command(*self._words(name, out), *again)
             assert done.exit_code == 0, done.output
 
         try:

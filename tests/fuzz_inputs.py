@@ -9,11 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from click.testing import CliRunner
+from commands import run_command
 from pulse_files import Pulse, PulseFile, Sampling, bell
 from strips import vlr
 
-from wavebatch.cli import main
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.stages.chain_file import effective, load_profile
 from wavebatch.tools.simulate import simulate_strip
@@ -271,7 +270,7 @@ def _write_vendor(strip: Path, target: Path) -> None:
 
 
 def _sound(*command: object) -> None:
-    done = CliRunner().invoke(main, list(map(str, command)))
+    done = run_command(*command)
     assert done.exit_code == 0, (command, done.output)
 
 

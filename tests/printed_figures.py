@@ -17,9 +17,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from click.testing import CliRunner
-
-from wavebatch.cli import main
+from commands import run_command
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted(path for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))
@@ -96,7 +94,7 @@ def renew_page(text: str) -> tuple[str, list[str]]:
         if program == "cat":
             Path(words[0]).write_text("".join(f"{lines[place][4:]}\n" for place in places), "utf-8")
         elif command not in MADE_ELSEWHERE:
-            done = CliRunner().invoke(main, words)
+            done = run_command(*words)
             printed = split(f"{done.stdout} {done.stderr}")
             if done.exit_code and words[0] != "check":
                 wrong.append(f"{command}: exit code {done.exit_code}: {done.stderr}")

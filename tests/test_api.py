@@ -12,10 +12,9 @@ from xml.etree import ElementTree
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
 import wavebatch as wb
-from wavebatch.cli import main
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.stages.chain_file import list_profiles
 from wavebatch.surveying.systems.figures import describe_figures
@@ -177,7 +176,7 @@ def test_echoes_become_a_frame(strips, monkeypatch):
 def test_survey_takes_a_path_and_says_what_the_command_says(strips):
     survey = wb.survey(strips[0], waveforms=500)
     assert survey.waveforms == 500
-    result = CliRunner().invoke(main, ["survey", str(strips[0]), "--waveforms", "500", "--json"])
+    result = run_command("survey", strips[0], "--waveforms", "500", "--json")
     told = json.loads(result.stdout)
     assert told["waveforms"] == 500 and told["figures"] == describe_figures(survey.figures)
     assert told["decisions"] == [
@@ -220,7 +219,7 @@ def test_run_writes_what_the_command_writes(strips, clouds, tmp_path):
     assert isinstance(result, wb.BatchResult) and result.failed == 0
     assert [outcome.status for outcome in result.outcomes] == ["written", "written"]
     command = ["run", *map(str, strips), "-o", str(tmp_path), "--profile", "accurate", "--columns", "+echo_time", "-q"]
-    assert CliRunner().invoke(main, command).exit_code == 0
+    assert run_command(*command).exit_code == 0
     for strip in strips:
         cloud = f"{strip.stem}.laz"
         assert (out / cloud).read_bytes() == (tmp_path / cloud).read_bytes()

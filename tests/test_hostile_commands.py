@@ -9,10 +9,9 @@ import time
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from strips import make_raw
 
-from wavebatch.cli import main
 from wavebatch.cli.messages import printable
 from wavebatch.files import text_file
 from wavebatch.tools.simulate import simulate_strip
@@ -31,7 +30,7 @@ def invoke(command, strip, out):
         "synthesize": ["-o", out / "a.las", "-q"],
     }.get(command, [])
     out.mkdir(exist_ok=True)
-    done = CliRunner().invoke(main, [command, str(strip), *map(str, arguments)])
+    done = run_command(command, strip, *arguments)
     assert done.exit_code in {"run": (0, 4), "compare": (0, 2)}.get(command, (0, 1)), done.output
     left = [path.name for path in out.iterdir()]
     assert not any(name.startswith(".") for name in left)
@@ -99,14 +98,14 @@ def test_names_of_files_may_hold_anything(tmp_path, name):
     strip.write_bytes(make_raw(60).write(tmp_path / "plain.las").read_bytes())
     out = ["-o", str(tmp_path / "out"), "--profile", "fast"]
     for more in ([], ["--resume"]):
-        done = CliRunner().invoke(main, ["run", str(strip), *out, *more, "--report", str(tmp_path / "batch.json")])
+        done = run_command("run", strip, *out, *more, "--report", tmp_path / "batch.json")
         assert done.exit_code == 0, done.stderr
         assert all(line.startswith(printable(str(strip))) for line in done.stderr.splitlines()), done.stderr
         assert "\x1b" not in done.stderr
     assert "is up to date, skipped" in done.stderr
     assert json.loads((tmp_path / "batch.json").read_text("utf-8"))["strips"][0]["strip"] == str(strip)
     strip.write_bytes(b"nothing")
-    done = CliRunner().invoke(main, ["run", str(strip), *out, "--overwrite"])
+    done = run_command("run", strip, *out, "--overwrite")
     assert done.exit_code == 4 and done.stderr.count("\n") == 1 and done.stderr.startswith("error: /")
 
 
@@ -116,7 +115,7 @@ def test_names_of_columns_are_read_in_linear_time(tmp_path):
     simulate_strip("flat", strip, pulses=60, seed=1)
     path.write_text("[" * 1_000_000 + ",time,x,y,z\n")
     start = time.process_time()
-    done = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "out"), "--trajectory", str(path)])
+    done = run_command("run", strip, "-o", tmp_path / "out", "--trajectory", path)
     assert done.exit_code == 4 and "t.txt" in done.stderr and time.process_time() - start < 10
 
 
@@ -136,7 +135,7 @@ def test_polygons_that_are_none_are_told_without_the_words_of_python(tmp_path, t
     strip, path = tmp_path / "a.las", tmp_path / "p.geojson"
     simulate_strip("flat", strip, pulses=60, seed=1)
     path.write_text(text)
-    done = CliRunner().invoke(main, ["stats", str(strip), "--polygon", str(path)])
+    done = run_command("stats", strip, "--polygon", path)
     assert done.exit_code == 2 and why in done.stderr and done.stderr.count("\n") == 1
     assert "Error:" not in done.stderr and "object" not in done.stderr
 
@@ -145,7 +144,7 @@ def test_stats_writes_no_table_that_lacks_a_cloud(tmp_path):
     simulate_strip("flat", tmp_path / "a.las", pulses=60, seed=1)
     (tmp_path / "b.las").write_bytes(b"nothing")
     table = tmp_path / "t.csv"
-    done = CliRunner().invoke(main, ["stats", str(tmp_path / "a.las"), str(tmp_path / "b.las"), "-o", str(table)])
+    done = run_command("stats", tmp_path / "a.las", tmp_path / "b.las", "-o", table)
     assert done.exit_code == 1 and not table.exists()
     assert "t.csv: not written, because 1 cloud of 2 cannot be read" in done.stderr and "a.las" in done.stdout
 
@@ -163,7 +162,7 @@ def test_check_goes_on_past_a_strip_that_cannot_be_read(tmp_path, monkeypatch):
             super().__init__(path, **options)
 
     monkeypatch.setattr(inspect_strip, "StripReader", Reader)
-    done = CliRunner().invoke(main, ["check", str(tmp_path / "a.las"), str(tmp_path / "b.las")])
+    done = run_command("check", tmp_path / "a.las", tmp_path / "b.las")
     assert done.exit_code == 1 and "Permission denied" in done.stdout and "b.las: ok" in done.stdout
 
 
@@ -171,7 +170,7 @@ def test_names_are_printed_without_escapes_of_the_terminal(tmp_path):
     strip = tmp_path / "red \x07\x1b[31m.las"  # click itself takes colours off where the output is no terminal
     simulate_strip("flat", strip, pulses=60, seed=1)
     for words in (["info"], ["check"], ["stats"], ["run", "--dry-run", "-o", str(tmp_path / "out")]):
-        done = CliRunner().invoke(main, [*words, str(strip)])
+        done = run_command(*words, strip)
         assert done.exit_code == 0 and "red \\x07\\x1b[31m" in done.stdout, words
 
 
@@ -188,7 +187,7 @@ def test_a_pipe_without_another_end_is_refused(tmp_path, option, code, why):
     strip, pipe = make_raw(60).write(tmp_path / "a.las"), tmp_path / "fifo"
     os.mkfifo(pipe)
     words = ["run", str(strip), "-o", str(tmp_path / "out"), option, str(pipe)]
-    done = CliRunner().invoke(main, words if option == "--chain" else [*words, "--profile", "fast"])
+    done = run_command(*words if option == "--chain" else [*words, "--profile", "fast"])
     assert done.exit_code == code and "fifo" in done.stderr and why in done.stderr, done.stderr
 
 
@@ -200,7 +199,7 @@ def test_a_chain_can_come_through_a_pipe(tmp_path, monkeypatch):
     os.mkfifo(pipe)
     code = f"import sys, time; f = open({str(pipe)!r}, 'w'); time.sleep(0.3); f.write('x'); f.flush(); time.sleep(0.3);"
     writer = subprocess.Popen([sys.executable, "-c", f"{code} f.write('y = 1' + '#' * 200_000)"])
-    done = CliRunner().invoke(main, ["check", str(strip), "-q"])  # the command line itself is fine
+    done = run_command("check", strip, "-q")  # the command line itself is fine
     text = text_file.read_text(pipe, "chain file")
     assert writer.wait() == 0 and text.startswith("xy = 1#") and len(text) == 200_006, done.output
 
@@ -213,7 +212,7 @@ def test_a_chain_can_come_through_a_pipe(tmp_path, monkeypatch):
 )  # fmt: skip
 def test_a_device_that_never_ends_is_no_input(tmp_path, words, code):
     strip = make_raw(60).write(tmp_path / "a.las")
-    done = CliRunner().invoke(main, words.format(a=strip, o=tmp_path / "out").split())
+    done = run_command(*words.format(a=strip, o=tmp_path / "out").split())
     assert done.exit_code == code and "device" in done.stderr and done.stderr.count("\n") == 1, done.stderr
 
 
@@ -221,7 +220,7 @@ def test_packets_in_a_pipe_are_refused(tmp_path):
     strip = make_raw(60, internal=False).write(tmp_path / "a.las")
     strip.with_suffix(".wdp").unlink()
     os.mkfifo(strip.with_suffix(".wdp"))
-    done = CliRunner().invoke(main, ["info", str(strip)])
+    done = run_command("info", strip)
     assert done.exit_code == 1 and "pipe" in done.stderr
 
 
@@ -230,7 +229,7 @@ def test_damaged_settings_are_wrong_usage(tmp_path, text):
     """tomllib would fail in words of Python."""
     strip = make_raw(60).write(tmp_path / "a.las")
     (tmp_path / "wavebatch.toml").write_text(text)
-    done = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "out")])
+    done = run_command("run", strip, "-o", tmp_path / "out")
     assert done.exit_code == 2 and "wavebatch.toml" in done.stderr and done.stderr.count("\n") == 1, done.stderr
 
 
@@ -254,7 +253,7 @@ def test_damaged_arrays_are_one_line(tmp_path):
                 file.writestr(name, content.replace(old, new))
         if old.startswith(b"PK"):
             cube.write_bytes(plain.replace(old, new))
-        done = CliRunner().invoke(main, ["plot", "cube", str(cube), "-o", str(tmp_path / "a.png")])
+        done = run_command("plot", "cube", cube, "-o", tmp_path / "a.png")
         assert done.exit_code == 1 and "holds no cube" in done.stderr and done.stderr.count("\n") == 1, done.stderr
 
 

@@ -14,12 +14,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from printed_figures import PAGES, renew, renew_page, split, strips_of
 
-from wavebatch.cli import COMMANDS, main
+from wavebatch.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
+
 
 @pytest.fixture
 def place(riegl, tmp_path, monkeypatch):
@@ -113,7 +114,7 @@ def run_line(line, data):
         done = run_program(*shlex.split(line))
         return f"{line}: {done.stderr}" if done.returncode else ""
     words = [name for word in shlex.split(line)[1:] for name in (sorted(glob.glob(word)) or [word])]
-    done = CliRunner().invoke(main, words)
+    done = run_command(*words)
     return f"{line}: {done.output}" if done.exit_code else ""
 
 
@@ -121,7 +122,7 @@ def make_inputs(line):
     """What a line reads and another page or line has made before it."""
     for name, words in MADE_BEFORE.items():
         if re.search(rf"(?<![\w/-]){re.escape(name)}(?![\w.])", line.partition(" -o ")[0]) and not Path(name).exists():
-            done = CliRunner().invoke(main, shlex.split(words))
+            done = run_command(*shlex.split(words))
             assert done.exit_code == 0, done.output
 
 
@@ -155,7 +156,7 @@ SNIPPETS = {
 @pytest.mark.parametrize("page", SNIPPETS)
 def test_every_python_snippet_is_a_script(page, disk):
     """Without a guard for __main__: workers do not import the user's script."""
-    assert CliRunner().invoke(main, ["export", "strip.las", "-o", "X.npz"]).exit_code == 0
+    assert run_command("export", "strip.las", "-o", "X.npz").exit_code == 0
     for number, text in enumerate(SNIPPETS[page]):
         Path(f"script{number}.py").write_text(text, "utf-8")
         done = run_program(sys.executable, f"script{number}.py")

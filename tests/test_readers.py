@@ -16,10 +16,9 @@ import like_pdal
 import numpy as np
 import pytest
 from batch_tools import run_one
-from click.testing import CliRunner
+from commands import run_command
 
 import wavebatch as wb
-from wavebatch.cli import main
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.files.cloud.column_names import style_columns
 from wavebatch.files.las.header import read_header
@@ -68,7 +67,7 @@ def make_cloud(request, tmp_path_factory):
 def _make_colours(folder, point_format, edit):
     """A strip of this point format with random colours."""
     words = ["simulate", "urban", "--pulses", "300", "--point-format", point_format, "-o", str(folder / "grey.las")]
-    result = CliRunner().invoke(main, words)
+    result = run_command(*words)
     assert result.exit_code == 0, result.output
 
     def paint(points):
@@ -219,7 +218,7 @@ def test_a_copc_file_of_copclib_is_a_cloud_like_any(make_cloud, tmp_path, case):
         np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=1e-6, err_msg=name)
     documents = []
     for one in (path, target):
-        result = CliRunner().invoke(main, ["stats", str(one), "--json"])
+        result = run_command("stats", one, "--json")
         assert result.exit_code == 0, result.output
         documents.append({**json.loads(result.stdout)["total"], "cloud": ""})
     assert documents[0] == documents[1]

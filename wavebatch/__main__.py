@@ -15,11 +15,12 @@ def _run() -> None:
     import os
 
     _open_closed_streams()
-    from wavebatch.core.process import ONE_THREAD
+    from wavebatch.core.process import ONE_THREAD, importing
 
     for name in ONE_THREAD:  # before NumPy is imported; what the user has set stays
         os.environ.setdefault(name, "1")
-    from wavebatch.cli import main
+    with importing():
+        from wavebatch.cli import main
 
     main.main()
 

@@ -14,15 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.batch.workers import dask_client
-from wavebatch.cli import main
+from wavebatch.batch.workers import dask_cluster
 from wavebatch.tools.simulate import simulate_strip
 
 distributed = pytest.importorskip("distributed", reason="needs dask's distributed: pip install distributed")
 
-CONNECT = dask_client._CONNECT
+CONNECT = dask_cluster._CONNECT
 _WORKER = [sys.executable, "-m", "distributed.cli.dask_worker"]
 _SCHEDULER = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
 
@@ -73,7 +72,7 @@ def dask(tmp_path_factory):
     cluster.start_worker()
     cluster.start_worker()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dask_client, "_CONNECT", 100.0)  # on a busy machine the scheduler answers late
+        patch.setattr(dask_cluster, "_CONNECT", 100.0)  # on a busy machine the scheduler answers late
         yield cluster
     cluster.stop()
 
@@ -91,7 +90,7 @@ def strips(tmp_path_factory, edit_points):
 
 def run(*arguments):
     """Exit code and stderr of the command."""
-    done = CliRunner().invoke(main, ["run", "--profile", "fast", *map(str, arguments)])
+    done = run_command("run", "--profile", "fast", *arguments)
     assert not done.stdout
     return done.exit_code, done.stderr
 
@@ -166,8 +165,8 @@ def _spool_as_ever():
     "address", ["tcp://127.0.0.1:9", "nonsense", "foo://127.0.0.1:9", "tcp://none.invalid:8786", "tcp://", "a:b"]
 )
 def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatch, address):
-    monkeypatch.setattr("wavebatch.batch.workers.dask_client._CONNECT", 0.5)
-    done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", address])
+    monkeypatch.setattr("wavebatch.batch.workers.dask_cluster._CONNECT", 0.5)
+    done = run_command("run", strips, "-o", tmp_path / "out", "--scheduler", address)
     assert done.exit_code == 2
     assert done.stderr.startswith(f"error: --scheduler {address}: cannot be reached") and done.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
@@ -175,14 +174,14 @@ def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatc
 
 def test_without_distributed_the_line_says_what_to_install(strips, tmp_path, monkeypatch):
     monkeypatch.setattr("wavebatch.batch.workers.dask_cluster.importlib.util.find_spec", lambda name: None)
-    done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", "tcp://a:1"])
+    done = run_command("run", strips, "-o", tmp_path / "out", "--scheduler", "tcp://a:1")
     assert done.exit_code == 2 and re.search(r"pip install .*'distributed>=", done.stderr)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("option", [["--jobs", "2"], ["--jobs", "0"], ["--memory", "2G"]])
 def test_the_cluster_decides_jobs_and_memory(strips, tmp_path, option):
-    done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path), "--scheduler", "tcp://a:1", *option])
+    done = run_command("run", strips, "-o", tmp_path, "--scheduler", "tcp://a:1", *option)
     assert done.exit_code == 2 and f"--scheduler and {option[0]} exclude each other" in done.stderr
 
 
@@ -298,7 +297,7 @@ def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path, t
 
 @pytest.mark.parametrize("address", ["", " "])
 def test_an_empty_address_is_wrong_usage(strips, tmp_path, address):
-    done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", address])
+    done = run_command("run", strips, "-o", tmp_path / "out", "--scheduler", address)
     assert done.exit_code == 2 and "--scheduler: the address is empty" in done.stderr
     assert not (tmp_path / "out").exists()
 

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from batch_tools import run_one
-from click.testing import CliRunner
+from commands import run_command
 from strips import cut_strip
 from writer_tools import data_file
 
 import wavebatch
-from wavebatch.cli import main
 from wavebatch.core.errors import WARNINGS, StripWarning
 from wavebatch.files.las.header import read_header
 
@@ -39,10 +38,10 @@ def test_a_plain_strip_has_none(tiny_strip, tmp_path):
 @pytest.mark.slow
 def test_fits_that_fail_far_more_than_usual_are_said_with_quiet_too(leica, tiny_strip, tmp_path):
     """77 % of the fits of --profile fast did not converge, and nothing was said."""
-    done = CliRunner().invoke(main, ["run", str(leica), "-o", str(tmp_path / "a"), "-q", "--profile", "fast"])
+    done = run_command("run", leica, "-o", tmp_path / "a", "-q", "--profile", "fast")
     (line,) = done.stderr.splitlines()
     assert "% of" not in line and "are NOT_CONVERGED, far more than usual" in line and "use --profile auto" in line
-    done = CliRunner().invoke(main, ["run", str(tiny_strip), "-o", str(tmp_path / "b"), "-q", "--profile", "fast"])
+    done = run_command("run", tiny_strip, "-o", tmp_path / "b", "-q", "--profile", "fast")
     assert done.stderr == ""
 
 
@@ -85,7 +84,7 @@ def test_inverted_and_empty_waveforms_are_told(tiny_strip, tmp_path):
 
 def warn_quietly(strip, folder, *options, code=0):
     """Lines of `run --quiet` on stderr; the strip is written."""
-    done = CliRunner().invoke(main, ["run", str(strip), "-o", str(folder), "--quiet", *options])
+    done = run_command("run", strip, "-o", folder, "--quiet", *options)
     assert done.exit_code == code, done.stderr
     lines = done.stderr.splitlines()
     report = json.loads((folder / f"{strip.stem}.report.json").read_text())
@@ -121,12 +120,12 @@ def test_a_pulse_that_is_a_guess_warns_in_cron_too(tiny_strip, tmp_path):
     short = cut_strip(tiny_strip, tmp_path / "short.las", 5)
     (line,) = warn_quietly(short, tmp_path)
     assert "the system pulse is a guess" in line and "--system" in line
-    assert CliRunner().invoke(main, ["survey", str(tiny_strip), "-o", str(tmp_path / "long.toml")]).exit_code == 0
+    assert run_command("survey", tiny_strip, "-o", tmp_path / "long.toml").exit_code == 0
     assert warn_quietly(short, tmp_path / "again", "--system", str(tmp_path / "long.toml")) == []
 
 
 def test_echoes_in_doubt_warn_in_cron_too(tiny_strip, tmp_path):
-    assert CliRunner().invoke(main, ["survey", str(tiny_strip), "-o", str(tmp_path / "sure.toml")]).exit_code == 0
+    assert run_command("survey", tiny_strip, "-o", tmp_path / "sure.toml").exit_code == 0
     text = (tmp_path / "sure.toml").read_text()
     for share, said in ((0.1, False), (0.2, True)):
         path = tmp_path / f"{share}.toml"
@@ -139,7 +138,7 @@ def test_echoes_in_doubt_warn_in_cron_too(tiny_strip, tmp_path):
 @pytest.mark.slow
 def test_a_known_pulse_is_no_guess_but_its_noise_may_be(tmp_path):
     neon, known = data_file("neon/neon_harv_a.las"), tmp_path / "known.toml"
-    assert CliRunner().invoke(main, ["survey", str(neon), "-o", str(known)]).exit_code == 0
+    assert run_command("survey", neon, "-o", known).exit_code == 0
     known.write_text(re.sub("echoes_in_doubt = .*", "echoes_in_doubt = 0.08", known.read_text()))
     (line,) = warn_quietly(neon, tmp_path / "out", "--system", str(known))
     assert "found 8 % of the echoes in doubt: the noise is a guess" in line and "--system" in line
@@ -148,7 +147,7 @@ def test_a_known_pulse_is_no_guess_but_its_noise_may_be(tmp_path):
 def test_a_noise_without_quiet_samples_is_a_guess(tmp_path):
     """Packets that begin in their canopy: a fifth of their echoes depends on it, and none was in doubt."""
     neon, system = data_file("neon/neon_harv_a.las"), tmp_path / "system.toml"
-    assert CliRunner().invoke(main, ["survey", str(neon), "-o", str(system)]).exit_code == 0
+    assert run_command("survey", neon, "-o", system).exit_code == 0
     sure = re.sub("echoes_in_doubt = .*", "echoes_in_doubt = 0.0", system.read_text())
     system.write_text(sure)
     assert warn_quietly(neon, tmp_path / "sure", "--system", str(system)) == []
@@ -159,7 +158,7 @@ def test_a_noise_without_quiet_samples_is_a_guess(tmp_path):
 
 def test_a_noise_below_the_first_count_is_a_guess(tiny_strip, tmp_path):
     system = tmp_path / "system.toml"
-    assert CliRunner().invoke(main, ["survey", str(tiny_strip), "-o", str(system)]).exit_code == 0
+    assert run_command("survey", tiny_strip, "-o", system).exit_code == 0
     text = system.read_text()
     system.write_text(re.sub("baseline_dn = .*", "baseline_dn = -1.5", text))
     lines = warn_quietly(tiny_strip, tmp_path / "sunk", "--system", str(system))
@@ -180,7 +179,7 @@ def test_a_residual_threshold_below_the_noise_is_said(tiny_strip, tmp_path):
         chain = tmp_path / f"{t_diff}.toml"
         chain.write_text(f'{text}\nt_diff = {t_diff}\nt_unit = "count"\n{rest}')
         folder = tmp_path / f"out-{t_diff}"
-        done = CliRunner().invoke(main, ["run", str(tiny_strip), "-o", str(folder), "-c", str(chain)])
+        done = run_command("run", tiny_strip, "-o", folder, "-c", chain)
         assert done.exit_code == 0, done.stderr
         told = json.loads((folder / f"{tiny_strip.stem}.report.json").read_text())["remarks"]
         assert any("lies below the noise of" in line and "raised" in line for line in told) == raised
@@ -213,9 +212,9 @@ def many(tiny_strip, tmp_path):
 def test_summary_and_page_have_the_warnings_of_every_strip(many, tmp_path):
     page, out = tmp_path / "page.html", tmp_path / "out"
     task = ["run", str(many), "-o", str(out), "-q", "--profile", "fast", "--json", "--html", str(page)]
-    first = CliRunner().invoke(main, [*task, "--fail-on", "nothing-selected"])
+    first = run_command(*task, "--fail-on", "nothing-selected")
     assert first.exit_code == 0
-    again = CliRunner().invoke(main, [*task, "--resume", "--fail-on", "lost-packets,empty"])
+    again = run_command(*task, "--resume", "--fail-on", "lost-packets,empty")
     assert again.exit_code == 3 and "--fail-on" in again.stderr and "d.las" in again.stderr
     before, after = (json.loads(done.stdout)["strips"] for done in (first, again))
     assert {one["status"] for one in after} == {"skipped"}
@@ -228,15 +227,15 @@ def test_summary_and_page_have_the_warnings_of_every_strip(many, tmp_path):
     assert {*rows[:doubted]} == {name for name, warnings in found.items() if warnings}
     for one in found["d"]:
         assert one["code"] in text and one["text"][:30] in text
-    wrong = CliRunner().invoke(main, [*task, "--resume", "--fail-on", "emtpy"])
+    wrong = run_command(*task, "--resume", "--fail-on", "emtpy")
     assert wrong.exit_code == 2 and "did you mean 'empty'?" in wrong.stderr
 
 
 def test_survey_prints_the_doubts_of_a_run(many):
-    shown = CliRunner().invoke(main, ["survey", str(many / "d.las"), "--json"])
+    shown = run_command("survey", many / "d.las", "--json")
     (one,) = [one for one in json.loads(shown.stdout)["warnings"] if one["code"] == "pulse-guess"]
-    assert f"warning           {one['text']}" in CliRunner().invoke(main, ["survey", str(many / "d.las")]).stdout
-    together = CliRunner().invoke(main, ["survey", str(many / "a.las"), str(many / "b.las"), "--json"])
+    assert f"warning           {one['text']}" in run_command("survey", many / "d.las").stdout
+    together = run_command("survey", many / "a.las", many / "b.las", "--json")
     assert all("warnings" in strip for strip in json.loads(together.stdout)["strips"])
 
 

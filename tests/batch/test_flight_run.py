@@ -6,16 +6,15 @@ import re
 import numpy as np
 import pytest
 from batch_tools import read_cloud
-from click.testing import CliRunner
+from commands import run_command
 from helpers_scenes import make_scene
 
-from wavebatch.cli import main
 from wavebatch.surveying.system_file import format_survey, load_survey
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 
 
 def _run(*arguments):
-    return CliRunner().invoke(main, ["run", *map(str, arguments)])
+    return run_command("run", *arguments)
 
 
 def _report(folder, name):

@@ -5,10 +5,9 @@ import shutil
 import struct
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from writer_tools import data_file
 
-from wavebatch.cli import main
 from wavebatch.files.las.header import read_header
 
 
@@ -18,12 +17,12 @@ def strip(tmp_path):
     path = tmp_path / "in" / "s.las"
     path.parent.mkdir()
     options = ["--pulses", "400", "--external", "-q"]
-    assert CliRunner().invoke(main, ["simulate", "urban", "-o", str(path), *options]).exit_code == 0
+    assert run_command("simulate", "urban", "-o", path, *options).exit_code == 0
     return path
 
 
 def run(*arguments, folder):
-    return CliRunner().invoke(main, ["run", *map(str, arguments), "-o", str(folder), "--profile", "fast", "--quiet"])
+    return run_command("run", *arguments, "-o", folder, "--profile", "fast", "--quiet")
 
 
 def read(folder, name="s"):
@@ -90,7 +89,7 @@ def test_packets_of_another_strip_are_refused_by_every_command_and_taken_by_forc
     for command in (["survey"], ["slice", "-o", "s.csv"], ["voxelize", "--size", "5", "-o", "v.npz"],
                     ["plot", "waveform", "-o", "w.csv"], ["check"]):  # fmt: skip
         arguments = [str(tmp_path / one) if "." in one else one for one in command]
-        done = CliRunner().invoke(main, [*arguments, str(other)])
+        done = run_command(*arguments, other)
         assert done.exit_code == 1 and "other.wdp belongs to another strip" in done.output, command
         if command[0] in ("voxelize", "plot"):
-            assert CliRunner().invoke(main, [*arguments, str(other), "--force"]).exit_code == 0, command
+            assert run_command(*arguments, other, "--force").exit_code == 0, command

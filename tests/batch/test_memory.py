@@ -11,11 +11,11 @@ import sys
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from strips import descriptor, make_raw
 from writer_tools import read_provenance
 
-from wavebatch.cli import main, messages
+from wavebatch.cli import messages
 from wavebatch.files.cloud.writer import MOST_PAYLOAD
 from wavebatch.files.las.header import MAX_EVLRS, find_evlrs, read_header
 
@@ -128,7 +128,7 @@ def test_the_account_of_many_digitizers_fits_into_the_cloud(tmp_path):
     raw.vlrs = [descriptor(i + 1, bits=16, samples=s, spacing=1000 + i) for i in range(k)]
     raw.points["wavepacket_index"] = 1 + np.arange(n) % k
     strip = raw.write(tmp_path / "a.las")
-    done = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "out"), "--format", "las", "-q"])
+    done = run_command("run", strip, "-o", tmp_path / "out", "--format", "las", "-q")
     assert done.exit_code == 0, done.output
     (account,) = read_provenance(tmp_path / "out" / "a.las")
     report = json.loads((tmp_path / "out" / "a.report.json").read_text())

@@ -11,7 +11,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from strips import descriptor, make_raw, vlr
 
 from wavebatch.batch import neighbour_pass
@@ -20,7 +20,6 @@ from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.neighbour_pass import ENTRY, SecondPass, process_tile
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -178,7 +177,7 @@ def test_only_the_error(strips, clouds, tmp_path):
 def test_wrong_parameters_are_one_line(strips, tmp_path, value, message):
     chain = tmp_path / "c.toml"
     chain.write_text(CHAIN.replace("radius = 2.5", value))
-    done = CliRunner().invoke(main, ["run", str(strips / "slope.las"), "-o", str(tmp_path / "out"), "-c", str(chain)])
+    done = run_command("run", strips / "slope.las", "-o", tmp_path / "out", "-c", chain)
     assert done.exit_code == 2
     assert f"({STAGE}): {message}" in done.stderr and "Traceback" not in done.stderr
     assert not list((tmp_path / "out").glob("*"))
@@ -203,7 +202,7 @@ def test_killed_in_the_second_pass_resume_gives_what_an_undisturbed_run_gives(st
     done = subprocess.run([sys.executable, "-c", _DIE.format(method=method), *arguments], capture_output=True)
     assert done.returncode == -signal.SIGKILL
     assert not list(tmp_path.glob("*.laz")) and list(tmp_path.glob(".wavebatch-*.tmp"))
-    assert CliRunner().invoke(main, [*arguments, "--resume"]).exit_code == 0
+    assert run_command(*arguments, "--resume").exit_code == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["slope.laz", "slope.report.json"]
     cloud, undisturbed = (laspy.read(folder / "slope.laz").points.array for folder in (tmp_path, clouds[0]))
     assert cloud.tobytes() == undisturbed.tobytes()

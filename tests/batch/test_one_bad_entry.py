@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 from batch_tools import make_job, run_one
-from click.testing import CliRunner
+from commands import run_command
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
-from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk import publish
 from wavebatch.files.inputs import find_strips
@@ -32,7 +31,7 @@ def place(tmp_path, monkeypatch):
 
 
 def _run(*arguments):
-    return CliRunner().invoke(main, ["run", *map(str, arguments), "-o", "out", "--profile", "fast"])
+    return run_command("run", *arguments, "-o", "out", "--profile", "fast")
 
 
 def _is_fine(result, code, *words):
@@ -104,7 +103,7 @@ def test_a_packet_file_that_cannot_be_read_is_one_line(place, monkeypatch, comma
         _is_fine(_run("bad.las", "good.las"), 3, "bad.wdp", os.strerror(number))
         return
     more = {"voxelize": ["-o", "v.npz", "--size", "1"]}.get(command, [])
-    result = CliRunner().invoke(main, [command, "bad.las", *more])
+    result = run_command(command, "bad.las", *more)
     said = result.stdout + result.stderr
     assert result.exit_code == 1 and os.strerror(number) in said and "bug" not in said and "Traceback" not in said
 

@@ -7,9 +7,8 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.system import Radiometry
 from wavebatch.core.units import HALF_C
@@ -28,7 +27,7 @@ FOUND = Calibration(2.6e-8, 0.02, 0.3, divergence=1.1, strip="strip.laz", date="
 
 
 def run(*arguments):
-    return CliRunner().invoke(main, ["run", *map(str, arguments)])
+    return run_command("run", *arguments)
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,10 @@ import shlex
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
 import wavebatch as wb
 from wavebatch.batch.counts import LEFT_OUT
-from wavebatch.cli import main
 from wavebatch.core.condition import parse_condition
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
@@ -249,7 +248,7 @@ def test_wrong_selections_are_one_line(riegl, tmp_path, options, text):
     chain = tmp_path / "x.toml"
     chain.write_text(effective(load_profile("fast")))
     words = [str(chain) if word == "CHAIN" else word for word in shlex.split(options)]
-    result = CliRunner().invoke(main, ["run", str(riegl), "-o", str(tmp_path / "out"), *words])
+    result = run_command("run", riegl, "-o", tmp_path / "out", *words)
     assert result.exit_code == 2, result.output
     assert re.search(text, result.output), result.output
     assert len(result.output.splitlines()) == 1
@@ -257,10 +256,10 @@ def test_wrong_selections_are_one_line(riegl, tmp_path, options, text):
 
 def test_the_summary_says_what_is_left_out(riegl, tmp_path):
     words = ["run", str(riegl), "-o", str(tmp_path), "--profile", "fast", "--where", "z > 1e6", "--drop-flags", "WEAK"]
-    result = CliRunner().invoke(main, words)
+    result = run_command(*words)
     assert result.exit_code == 0
     assert "-> 0 points; left out: " in result.output and " by --drop-flags, " in result.output
-    assert "no point is written" in CliRunner().invoke(main, [*words, "--overwrite", "--quiet"]).output
+    assert "no point is written" in run_command(*words, "--overwrite", "--quiet").output
 
 
 @pytest.mark.parametrize(

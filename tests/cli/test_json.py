@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
 from wavebatch.cli import COMMANDS, main
 
@@ -60,7 +60,7 @@ def _hold(document, schema):
 
 
 def _print(*words):
-    result = CliRunner().invoke(main, [*map(str, words), "--json"])
+    result = run_command(*words, "--json")
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
 
@@ -150,5 +150,5 @@ def test_every_command_with_json_is_in_the_page_and_tested():
 
 def test_only_one_document_goes_to_stdout(riegl, tmp_path):
     for more in (["--report", "-"], ["--progress", "json"]):
-        result = CliRunner().invoke(main, ["run", str(riegl), "-o", str(tmp_path), "--json", *more])
+        result = run_command("run", riegl, "-o", tmp_path, "--json", *more)
         assert result.exit_code == 2 and "would both write to stdout" in result.output

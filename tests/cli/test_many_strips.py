@@ -4,9 +4,7 @@ import json
 import shutil
 
 import pytest
-from click.testing import CliRunner
-
-from wavebatch.cli import main
+from commands import run_command as run
 
 
 @pytest.fixture
@@ -19,10 +17,6 @@ def folder(tiny_strip, tmp_path):
     (folder / "bad.laz").write_bytes(b"LASX")
     (tmp_path / "list.txt").write_text("strips\n")
     return folder
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, list(map(str, arguments)))
 
 
 COMMANDS = {

@@ -4,7 +4,7 @@ import json
 import os
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.options import OutputPath
@@ -19,7 +19,7 @@ def place(tmp_path, monkeypatch):
 
     for name in ("s.las", "t.las"):
         simulate_strip("flat", tmp_path / name, pulses=200, seed=1, options=StripOptions(internal=False))
-    CliRunner().invoke(main, ["survey", "s.las", "-o", "sys.toml", "--chain", "chain.toml"], catch_exceptions=False)
+    run_command("survey", "s.las", "-o", "sys.toml", "--chain", "chain.toml", catch_exceptions=False)
     (tmp_path / "list.txt").write_text("s.las\n")
     (tmp_path / "targets.csv").write_text("reflectance,x,y,radius\n0.5,0,0,5\n")
     (tmp_path / "areas.json").write_text('{"type": "FeatureCollection", "features": []}')
@@ -76,7 +76,7 @@ _CASES = [
 @pytest.mark.parametrize("words", _CASES)
 def test_an_input_is_never_replaced(place, words):
     before = {path.name: path.read_bytes() for path in place.iterdir() if path.is_file()}
-    result = CliRunner().invoke(main, words.split())
+    result = run_command(*words.split())
     assert result.exit_code == 2 and result.stderr.count("\n") == 1, result.stderr
     assert "would replace this input" in result.stderr or "choose another" in result.stderr
     assert {path.name: path.read_bytes() for path in place.iterdir() if path.is_file()} == before
@@ -85,9 +85,9 @@ def test_an_input_is_never_replaced(place, words):
 
 def test_outputs_next_to_an_input_are_fine(place):
     for words in ("synthesize s.las -o s.laz", f"{_RUN} --report all.json", "synthesize s.las -o u.laz --external"):
-        result = CliRunner().invoke(main, words.split(), catch_exceptions=False)
+        result = run_command(*words.split(), catch_exceptions=False)
         assert result.exit_code == 0, result.stderr
-    again = CliRunner().invoke(main, ["synthesize", "s.laz", "-o", "u.laz", "--external", "--overwrite"])
+    again = run_command("synthesize", "s.laz", "-o", "u.laz", "--external", "--overwrite")
     assert again.exit_code == 0, again.stderr
 
 

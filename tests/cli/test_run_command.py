@@ -7,14 +7,14 @@ import sys
 
 import pytest
 from batch_tools import read_cloud
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import COMMANDS, main
+from wavebatch.cli import COMMANDS
 from wavebatch.tools.simulate import simulate_strip
 
 
 def _run(*arguments):
-    return CliRunner().invoke(main, ["run", *map(str, arguments)])
+    return run_command("run", *arguments)
 
 
 @pytest.fixture
@@ -226,12 +226,12 @@ def test_commands_import_only_what_they_use(tmp_path, command, unused):
 
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_every_command_has_help(name):
-    result = CliRunner().invoke(main, [name, "--help"])
+    result = run_command(name, "--help")
     assert result.exit_code == 0 and "Usage:" in result.output
 
 
 def test_an_unknown_command_names_the_nearest():
-    result = CliRunner().invoke(main, ["rum"])
+    result = run_command("rum")
     assert result.exit_code == 2 and "did you mean 'run'" in result.output
 
 
@@ -244,7 +244,7 @@ def test_what_lies_under_the_output_is_made(tiny_strip, tmp_path):
     """README's line for cron was refused: folder `new` does not exist."""
     new = tmp_path / "new"
     words = ["run", str(tiny_strip), "-o", str(new), "-q", "--profile", "fast"]
-    done = CliRunner().invoke(main, [*words, "--report", str(new / "sub" / "sum.json"), "--html", str(new / "p.html")])
+    done = run_command(*words, "--report", new / "sub" / "sum.json", "--html", new / "p.html")
     assert done.exit_code == 0 and (new / "sub" / "sum.json").exists() and (new / "p.html").exists(), done.stderr
-    done = CliRunner().invoke(main, [*words, "--overwrite", "--report", str(tmp_path / "other" / "sum.json")])
+    done = run_command(*words, "--overwrite", "--report", tmp_path / "other" / "sum.json")
     assert done.exit_code == 2 and "other does not exist; make it first" in done.stderr

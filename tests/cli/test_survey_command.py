@@ -3,11 +3,10 @@
 import json
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from helpers_scenes import make_scene
 from strips import cut_strip
 
-from wavebatch.cli import main
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.stages.chain_file import load_chain_file
@@ -21,7 +20,7 @@ from wavebatch.tools.simulate import simulate_strip
 
 
 def _survey(*arguments):
-    return CliRunner().invoke(main, ["survey", *map(str, arguments)])
+    return run_command("survey", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +76,7 @@ def test_a_run_with_the_files_writes_the_cloud_of_a_run_that_surveys(flat_strip,
     reports = {}
     for name, options in {"auto": [], "files": by_files, "system": by_files[:2]}.items():
         arguments = ["run", flat_strip, "-o", tmp_path / name, "--format", "las", "-q", *options]
-        assert CliRunner().invoke(main, list(map(str, arguments))).exit_code == 0
+        assert run_command(*arguments).exit_code == 0
         reports[name] = json.loads((tmp_path / name / "flat.report.json").read_text())
     assert reports["auto"]["chain"] == reports["files"]["chain"] == reports["system"]["chain"]
     assert reports["auto"]["strip"]["system"] == reports["files"]["strip"]["system"]
@@ -180,8 +179,8 @@ def test_the_sensor_that_a_pulse_looks_like_is_named(riegl, flat_strip, tmp_path
     small = _survey(cut_strip(riegl, tmp_path / "small.las", 11)).stdout
     assert "RIEGL LMS-Q680i: its shipped pulse is used" in small and "riegl-q680i: " in small
     assert "looks like" not in _survey(flat_strip).stdout
-    told = CliRunner().invoke(main, ["info", "-v", str(riegl)])
+    told = run_command("info", "-v", riegl)
     assert told.exit_code == 0 and sentence in told.stdout
-    assert "pulse   " not in CliRunner().invoke(main, ["info", str(riegl)]).stdout
-    other = json.loads(CliRunner().invoke(main, ["info", "-v", "--json", str(flat_strip)]).stdout)
+    assert "pulse   " not in run_command("info", riegl).stdout
+    other = json.loads(run_command("info", "-v", "--json", flat_strip).stdout)
     assert other["pulse"]["sensor"] is None and other["pulse"]["full_width_ns"] == pytest.approx(4.71, rel=0.03)

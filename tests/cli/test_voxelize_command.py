@@ -4,16 +4,15 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.surveying.calibrating.calibration_file import format_calibration
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.tools.simulate import simulate_strip
 
 
 def voxelize(*arguments):
-    return CliRunner().invoke(main, ["voxelize", *map(str, arguments)])
+    return run_command("voxelize", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def test_counts_go_to_stdout_and_talk_to_stderr(strip, tmp_path):
 
 def test_a_saved_survey_gives_the_same_voxels(strip, tmp_path):
     system = tmp_path / "SYSTEM.toml"
-    assert CliRunner().invoke(main, ["survey", str(strip), "-o", str(system)]).exit_code == 0
+    assert run_command("survey", strip, "-o", system).exit_code == 0
     for name, more in (("a.npz", ()), ("b.npz", ("--system", system))):
         assert voxelize(strip, "--size", 0.5, "-o", tmp_path / name, *more).exit_code == 0
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()

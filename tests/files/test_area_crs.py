@@ -1,4 +1,7 @@
-"""Areas of GeoJSON lie where its standard, or its member `crs`, says; without pyproj one line says what to do."""
+"""Areas of GeoJSON lie where its standard, or its member `crs`, says; without pyproj one line says what to do.
+
+GeoJSON lies where the strip lies, by what RFC 7946 and GDAL make of its coordinates.
+"""
 
 import json
 import shutil
@@ -7,17 +10,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from strips import add_record
+from writer_tools import data_file
 
 import wavebatch
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.geojson import AreaFile, describe_miss, load_polygons, place_rings, read_area_file
+from wavebatch.files.geojson import AreaFile, describe_miss, load_polygons, place_rings, plan_crs, read_area_file
+from wavebatch.files.las.crs import read_crs, read_crs_definition
 from wavebatch.files.las.geo_keys import build_utm
 from wavebatch.files.las.header import build_wkt, read_header
 from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.slices.output import SegmentWriter
+from wavebatch.tools.slices.segments import Segment
 
 ZONE = build_utm(32633)
 
@@ -250,7 +256,7 @@ def test_resume_sees_another_crs_of_the_same_corners(strip, tmp_path):
     said = []
     for crs in ("EPSG:32633", "urn:ogc:def:crs:EPSG::32633", "EPSG:23033", "EPSG:23033"):
         _write(file, _box(strip), crs)
-        result = CliRunner().invoke(main, list(map(str, [*words, "--resume"])))
+        result = run_command(*words, "--resume")
         assert result.exit_code == 0, result.output
         report = json.loads((tmp_path / "o" / "utm.report.json").read_text())
         said.append(("skipped" in result.stderr, report["request"]["selection"]["polygon"]["crs"]))
@@ -264,13 +270,13 @@ def test_run_stats_and_calibrate_use_placed_areas(strip, tmp_path):
     own = _write(tmp_path / "own.geojson", box)
     numbers, counted = [], []
     for name, file in (("a", degrees), ("b", own)):
-        result = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / name), "--polygon", str(file), "-q"])
+        result = run_command("run", strip, "-o", tmp_path / name, "--polygon", file, "-q")
         assert result.exit_code == 0, result.output
         numbers.append(read_header(tmp_path / name / "utm.laz").point_count)
-        result = CliRunner().invoke(main, ["stats", str(strip), "--polygon", str(file), "--json"])
+        result = run_command("stats", strip, "--polygon", file, "--json")
         counted.append([area["points"] for area in json.loads(result.stdout)["files"][0]["areas"]])
         again = ["run", str(strip), "-o", str(tmp_path / name), "--polygon", str(file), "--resume"]
-        assert "skipped" in CliRunner().invoke(main, again).stderr  # the report has the corners of the file
+        assert "skipped" in run_command(*again).stderr  # the report has the corners of the file
     # An edge that is straight in degrees bends by a centimetre in UTM.
     assert 20 < numbers[0] < read_header(strip).point_count and abs(numbers[0] - numbers[1]) < 5
     assert len(counted[0]) == len(counted[1]) == 2 and abs(counted[0][0] - counted[1][0]) < 5
@@ -279,15 +285,15 @@ def test_run_stats_and_calibrate_use_placed_areas(strip, tmp_path):
             _project(_box(strip, (-0.2, 1.2)), "EPSG:32633", "EPSG:4326").tolist()]}}]}  # fmt: skip
     (tmp_path / "t.geojson").write_text(json.dumps(targets))
     words = ["calibrate", strip, "--targets", tmp_path / "t.geojson", "-o", tmp_path / "cal.toml"]
-    result = CliRunner().invoke(main, list(map(str, words)))
+    result = run_command(*words)
     assert "lies outside" not in result.output and "0 clean single echoes" not in result.output
 
 
 def test_an_area_that_misses_the_strip_is_named_with_both_extents(strip, tmp_path):
     away = _write(tmp_path / "away.geojson", _box(strip) + 1e4)
-    result = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "o"), "--polygon", str(away), "-q"])
+    result = run_command("run", strip, "-o", tmp_path / "o", "--polygon", away, "-q")
     assert "no point is written" in result.stderr and "lies outside the strip (x " in result.stderr
-    result = CliRunner().invoke(main, ["stats", str(strip), "--polygon", str(away)])
+    result = run_command("stats", strip, "--polygon", away)
     assert "lies outside the strip (x " in result.output
 
 
@@ -300,7 +306,81 @@ def test_a_selection_keeps_the_corners_of_its_file_for_the_report(strip, tmp_pat
 
 def test_help_says_in_which_coordinates_areas_are():
     for command, more in (("run", ""), ("stats", ""), ("calibrate", "in the coordinates of the strips only")):
-        result = CliRunner().invoke(main, [command, "--help"])
+        result = run_command(command, "--help")
         text = " ".join(result.output.split())
         assert "in WGS 84, in the CRS that the file names, or in the coordinates of the" in text and more in text
     assert "in the CRS that the file names" in wavebatch.run.__doc__
+
+
+POINTS = np.array([[500000.0, 5400000.0, 312.3456], [500010.0, 5400020.5, 301.0]])
+
+
+def test_longitude_and_latitude():
+    pytest.importorskip("pyproj")
+    for code, longitude in ((32632, 9.0), (25833, 15.0)):
+        crs = plan_crs("a.las", build_utm(code), "wgs84")
+        (x, y, z), (other, _, _) = crs.place(POINTS)
+        assert (x, y, z) == (pytest.approx(longitude, abs=1e-8), pytest.approx(48.7528, abs=1e-3), 312.3456)
+        # 10 m east at this latitude
+        assert (other - x) * np.cos(np.radians(y)) * 111320 == pytest.approx(10, rel=0.01)
+        assert crs.member is None
+    with pytest.raises(InputError, match="a.las: its CRS is not understood"):
+        plan_crs("a.las", "PROJCS[nothing]", "wgs84")
+
+
+def test_riegls_metres_in_the_geographic_crs_are_degrees():
+    path = data_file("riegl-q680i/100429_152240_2535pt_UTM.las")
+    header = read_header(path)
+    text, _ = read_crs(path, header)
+    found = read_crs_definition(path, header)
+    assert text.count("Meter") == 2 and found.count("Meter") == 1 and found.count('UNIT["degree"') == 1
+    pytest.importorskip("pyproj")
+    ((longitude, latitude, _),) = plan_crs(path, found, "wgs84").place(np.array([header.mins]))
+    assert (longitude, latitude) == (pytest.approx(15.656, abs=0.01), pytest.approx(48.66, abs=0.01))
+
+
+@pytest.mark.parametrize(
+    ("crs", "name"),
+    [
+        (build_utm(32632), "urn:ogc:def:crs:EPSG::32632"),
+        ("EPSG:31468", "urn:ogc:def:crs:EPSG::31468"),
+        ('PROJCRS["x",ID["EPSG",25832]]', "urn:ogc:def:crs:EPSG::25832"),
+        ('PROJCS["x",AUTHORITY["EPSG","0"]]', 'PROJCS["x"]'),
+        ('PROJCS["x",UNIT["m",1,AUTHORITY["EPSG","9001"]]]', 'PROJCS["x",UNIT["m",1,AUTHORITY["EPSG","9001"]]]'),
+    ],
+)
+def test_the_strips_crs_is_named(crs, name):
+    found = plan_crs("a.las", crs, "keep")
+    assert found.member == {"type": "name", "properties": {"name": name}}
+    assert found.place(POINTS) == POINTS.tolist()
+
+
+def test_what_cannot_be_placed_is_said(monkeypatch):
+    with pytest.raises(InputError, match="a.las: has no CRS, .* write .csv, or --geojson-crs keep"):
+        plan_crs("a.las", None, "wgs84")
+    assert plan_crs("a.las", None, "keep").member is None
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    with pytest.raises(ConfigError, match="needs pyproj: .*pip install .pyproj>=3.6.; or write .csv"):
+        plan_crs("a.las", "EPSG:32632", "wgs84")
+    with pytest.raises(ConfigError, match="must be one of wgs84, keep"):
+        plan_crs("a.las", None, "epsg")
+
+
+@pytest.mark.parametrize("mode", ["wgs84", "keep"])
+def test_gdal_finds_segments_where_they_are(tmp_path, mode):
+    pyogrio, pyproj = pytest.importorskip("pyogrio"), pytest.importorskip("pyproj")
+    segment = Segment.__new__(Segment)
+    for crs in (build_utm(32632), build_utm(32632).replace('AUTHORITY["EPSG","32632"]', 'AUTHORITY["EPSG","0"]')):
+        values = dict.fromkeys(Segment.__slots__, 1)
+        values |= {"start": tuple(POINTS[0]), "end": tuple(POINTS[1])}
+        for name, value in values.items():
+            object.__setattr__(segment, name, value)
+        target = tmp_path / "a.geojson"
+        with SegmentWriter(target, crs=plan_crs("a.las", crs, mode), overwrite=True) as writer:
+            writer.write([segment])
+            writer.commit()
+        info = pyogrio.read_info(target)
+        west, south, *_ = info["total_bounds"]
+        to_degrees = pyproj.Transformer.from_crs(info["crs"], "EPSG:4326", always_xy=True)
+        assert to_degrees.transform(west, south) == pytest.approx((9.0, 48.753013), abs=1e-5)
+        assert json.loads(target.read_text())["type"] == "FeatureCollection"

@@ -1,21 +1,39 @@
-"""Units of coordinates from WKT and GeoTIFF keys, right, contradictory and hostile; strips that are not in metres."""
+"""Units of coordinates from WKT and GeoTIFF keys, right, contradictory and hostile; strips that are not in metres.
 
+RIEGL's RiPROCESS writes metres as the unit of longitudes: whatever wavebatch writes lies where the strip lies.
+
+WKT from GeoTIFF keys: UTM zones to the letter of EPSG, and nothing that is not sure.
+"""
+
+import json
 import struct
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from batch_tools import run_one
+from commands import run_command
 from hypothesis import given
 from hypothesis import strategies as st
-from strips import descriptor, make_raw, vlr
+from strips import add_record, descriptor, make_raw, vlr
+from writer_tools import data_file, plan_output, write_source
 
-from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.files.las.crs import CrsUnits, looks_geocentric, parse_wkt, read_crs_definition
-from wavebatch.files.las.geo_keys import METRES, GeoKeys, find_unit
+from wavebatch.files.cloud.writer import CloudWriter
+from wavebatch.files.las.crs import (
+    CrsUnits,
+    looks_geocentric,
+    parse_wkt,
+    read_crs_definition,
+    repair_records,
+    repair_wkt,
+)
+from wavebatch.files.las.geo_keys import METRES, GeoKeys, build_utm, convert_geotiff, find_code, find_unit
+from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, is_projection, read_header
 from wavebatch.files.strip.ray_sample import measure_scale
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.basic import position
@@ -55,7 +73,7 @@ def parse_geotiff(*records):
         (GEOG, CrsUnits("geographic")),
         (f'COMPD_CS["both",{UTM},{HEIGHT}]', CrsUnits("projected", 1.0, 0.3048)),
         (f'COMPD_CS["both",{GEOG},{HEIGHT}]', CrsUnits("geographic", None, 0.3048)),
-        (f'BOUNDCRS[SOURCECRS[{FEET}],TARGETCRS[{GEOG}]]', CrsUnits("projected", 0.3048006096012192)),
+        (f"BOUNDCRS[SOURCECRS[{FEET}],TARGETCRS[{GEOG}]]", CrsUnits("projected", 0.3048006096012192)),
         (WKT2, CrsUnits("projected", 0.3048)),
         (THREE, CrsUnits("projected", 1.0, 0.3048)),
         (GEODETIC.format("ellipsoidal,2"), CrsUnits("geographic")),
@@ -212,13 +230,13 @@ def test_strips_that_are_not_in_metres_get_no_physics(tmp_path, records, message
     with StripReader(strip) as reader:
         assert len(reader.facts.units) == len(records)
     arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
-    done = CliRunner().invoke(main, [*arguments, "--flight-height", "500"])
+    done = run_command(*arguments, "--flight-height", "500")
     if message is None:
         assert done.exit_code == 0, done.output
         return
     assert done.exit_code == 4
     assert message in done.stderr and "project the strip to metres" in done.stderr
-    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert run_command(*arguments).exit_code == 0
 
 
 @pytest.mark.parametrize("scale", [1.0, 1 / 0.3048, 1e-5])
@@ -250,7 +268,7 @@ def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
     stages = ("noise.pooled", "detect.maximum", "decompose.closed_form", "attribute.position", "attribute.range")
     chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
     done = {
-        strip.stem: CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "out"), "--chain", str(chain)])
+        strip.stem: run_command("run", strip, "-o", tmp_path / "out", "--chain", chain)
         for strip in (tmp_path / "m.las", feet)
     }
     assert done["m"].exit_code == 0 and "in feet" not in done["m"].stderr
@@ -296,9 +314,9 @@ def test_geocentric_strips_without_a_crs_get_no_ranges(tmp_path, records):
     struct.pack_into("<6d", content, 179, 4_195e3, 4_193e3, 1_163e3, 1_161e3, 4_648e3, 4_646e3)
     strip.write_bytes(content)
     arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
-    done = CliRunner().invoke(main, [*arguments, "--flight-height", "500"])
+    done = run_command(*arguments, "--flight-height", "500")
     assert done.exit_code == 4 and "coordinates are geocentric" in done.stderr
-    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert run_command(*arguments).exit_code == 0
 
 
 def test_degrees_with_metric_vectors_get_no_new_echoes(tmp_path):
@@ -308,6 +326,243 @@ def test_degrees_with_metric_vectors_get_no_new_echoes(tmp_path):
     struct.pack_into("<6d", content, 179, 15.7, 15.6, 48.7, 48.6, 400.0, 300.0)
     strip.write_bytes(content)
     arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
-    done = CliRunner().invoke(main, arguments)
+    done = run_command(*arguments)
     assert done.exit_code == 4 and "coordinates are degrees, packet vectors metres" in done.stderr
-    assert CliRunner().invoke(main, [*arguments, "--points", "returns"]).exit_code == 0
+    assert run_command(*arguments, "--points", "returns").exit_code == 0
+
+
+METRE = 'UNIT["Meter",1.00000000000000000000,AUTHORITY["EPSG","9001"]]'
+RIPROCESS = (
+    'PROJCS["UTM_North zone 33",GEOGCS["UTM_North zone 33",DATUM["WGS84",SPHEROID["WGS84",6378137.000,298.257223563,'
+    'AUTHORITY["EPSG","7030"]],AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0.0,AUTHORITY["EPSG","8901"]],'
+    f'{METRE},AUTHORITY["EPSG","0"]],PROJECTION["Transverse_Mercator"],PARAMETER["latitude_of_origin",0.0],'
+    'PARAMETER["central_meridian",15.0],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000.000],'
+    f'PARAMETER["false_northing",0.000],{METRE},AXIS["Easting",EAST],AXIS["Northing",NORTH],AUTHORITY["EPSG","0"]]'
+)  # fmt: skip
+
+
+def test_only_the_unit_of_the_longitudes_changes():
+    found = repair_wkt(RIPROCESS)
+    assert found.count(METRE) == 1 and found.index('UNIT["degree"') < found.index("PROJECTION[")
+    assert '"EPSG","0"' not in found and parse_wkt(found).horizontal == 1.0
+    records = [build_wkt(RIPROCESS), build_wkt(build_utm(32633)), Vlr(b"other", WKT_ID, RIPROCESS.encode(), b"")]
+    first, *rest = repair_records(records)
+    assert first.payload == found.encode() + b"\0"
+    assert all(one is old for one, old in zip(rest, records[1:], strict=True))
+
+
+GEOGCS = (
+    'GEOGCS["NAD83",DATUM["North_American_Datum_1983",SPHEROID["GRS 1980",6378137,298.257222101]],'
+    'PRIMEM["Greenwich",0],UNIT["degree",0.01745329251994328,AUTHORITY["EPSG","9122"]],AUTHORITY["EPSG","4269"]]'
+)
+TM = 'PROJECTION["Transverse_Mercator"],PARAMETER["central_meridian",-123]'
+HEIGHTS = 'VERT_CS["EGM",VERT_DATUM["EGM",2005],UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Up",UP]]'
+PLAIN = 'UNIT["metre",1,AUTHORITY["EPSG","9001"]]'
+RIGHT = {
+    "empty": "",
+    "code": "EPSG:32633",
+    "ours": build_utm(32633),
+    "geographic": GEOGCS,
+    "local": f'LOCAL_CS["site",{METRE},AUTHORITY["EPSG","0"]]',
+    "unit first": f'PROJCS["NAD83 / UTM zone 10N",{GEOGCS},{PLAIN},{TM},AUTHORITY["EPSG","26910"]]',
+    "unit before all": f'PROJCS["NAD83 / UTM zone 10N",{PLAIN},{GEOGCS},{TM}]',
+    "degrees with heights": f'COMPD_CS["x",{GEOGCS},{HEIGHTS}]',
+    "projected with heights": f'COMPD_CS["x",PROJCS["y",{GEOGCS},{TM},{PLAIN},AUTHORITY["EPSG","0"]],{HEIGHTS}]',
+    "heights first": f'COMPD_CS["x",{HEIGHTS},PROJCS["y",{GEOGCS},{PLAIN},{TM}]]',
+    "ESRI": 'PROJCS["NAD_1983_UTM_Zone_10N",GEOGCS["GCS",DATUM["D",SPHEROID["S",6378137.0,298.257222101]],PRIMEM["G",'
+    '0.0],UNIT["Degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],UNIT["Meter",1.0]]',
+    "ESRI in 3D": 'GEOGCS["GCS",DATUM["D",SPHEROID["S",6378137.0,298.2]],UNIT["Degree",0.0174532925199433],'
+    'LINUNIT["Meter",1.0]]',
+    "radians": GEOGCS.replace('"degree",0.01745329251994328', '"radian",1'),
+    "WKT2": 'PROJCRS["y",BASEGEOGCRS["WGS 84",DATUM["W",ELLIPSOID["W",6378137,298.2,LENGTHUNIT["metre",1]]],PRIMEM["G",'
+    '0,ANGLEUNIT["degree",0.0174532925199433]]],CONVERSION["z",METHOD["Transverse Mercator"]],CS[Cartesian,2],'
+    'AXIS["(E)",east],AXIS["(N)",north],LENGTHUNIT["metre",1],ID["EPSG",32633]]',
+    "WKT2 in 3D": 'GEOGCRS["WGS 84",DATUM["W",ELLIPSOID["W",6378137,298.2]],CS[ellipsoidal,3],AXIS["lat",north,'
+    'UNIT["degree",0.0174532925199433]],AXIS["h",up,UNIT["metre",1]]]',
+    "brackets in names": f'PROJCS["a]b",{GEOGCS.replace("NAD83", "GEOGCS[ ""x"" ]")},{PLAIN},{TM}]',
+    "not closed": RIPROCESS[:-1],
+    "closed twice": "]" + RIPROCESS,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_a_right_wkt_stays(name):
+    assert repair_wkt(RIGHT[name]) == RIGHT[name]
+
+
+@pytest.mark.parametrize("name", [name for name, text in RIGHT.items() if GEOGCS in text])
+def test_only_a_unit_inside_of_the_geographic_crs_changes(name):
+    """The other units stay what they are, wherever they stand."""
+    right = RIGHT[name]
+    assert repair_wkt(right.replace("GEOGCS[", "GEOGCS [")) == right.replace("GEOGCS[", "GEOGCS [")
+    for unit in (METRE, PLAIN, 'UNIT["metre",1]', 'UNIT ( "Meter" , 1.0 )', 'UNIT["meters",1e0,AUTHORITY["EPSG","1"]]'):
+        wrong = right.replace('UNIT["degree",0.01745329251994328,AUTHORITY["EPSG","9122"]]', unit)
+        assert wrong != right
+        found = repair_wkt(wrong)
+        expected = right.replace("0.01745329251994328", "0.0174532925199433")
+        assert found == expected.replace(',AUTHORITY["EPSG","0"]', "")
+        assert parse_wkt(found) == parse_wkt(right)
+
+
+def test_a_hostile_wkt_takes_no_time():
+    for text in ("GEOGCS[" * 100_000, '"' * 1_000_001, "a" * 1_000_000, " [" * 300_000, 'UNIT["m",1' * 50_000):
+        assert repair_wkt(text) == text
+
+
+@pytest.fixture(scope="module")
+def strip(tmp_path_factory):
+    """A strip with such a WKT in zone 33, whose longitude is 15.66 degrees."""
+    path = tmp_path_factory.mktemp("wkt") / "s.las"
+    simulate_strip("flat", path, pulses=300, seed=1)
+    add_record(path, build_wkt(RIPROCESS))
+    return path
+
+
+def _longitude(definition):
+    warp = pytest.importorskip("rasterio.warp", reason="rasterio (extra gis) is not installed")
+    crs = pytest.importorskip("rasterio.crs").CRS.from_user_input(definition)
+    return warp.transform(crs, "EPSG:4326", [548355.0], [5389944.0])[0][0]
+
+
+def test_the_cloud_lies_where_the_strip_lies_and_says_what_changed(strip, tmp_path):
+    for number, options in enumerate(({}, {"keep_packets": True}, {"las_version": "keep"})):
+        outcome = run_one(strip, tmp_path / str(number), profile="fast", **options)
+        assert outcome.error is None
+        cloud = next((tmp_path / str(number)).glob("s.la[sz]"))
+        header = read_header(cloud)
+        (record,) = [vlr for vlr in header.vlrs if is_projection(vlr) and vlr.record_id == WKT_ID]
+        assert record.payload == repair_wkt(RIPROCESS).encode() + b"\0"
+        report = json.loads((tmp_path / str(number) / "s.report.json").read_text())
+        assert any("as RiPROCESS writes it" in line for line in report["remarks"])
+    assert _longitude(read_crs_definition(cloud, header)) == pytest.approx(15.6567, abs=1e-3)
+
+
+def _with_record(path, version, point_format, *, vlrs=(), evlrs=()):
+    points = write_source(path, point_format, version, vlrs=list(vlrs), evlrs=list(evlrs))
+    return points, plan_output(path, [], las_version="1.3" if version < (1, 4) else "1.4")
+
+
+def _write(layout, target, rows):
+    with CloudWriter(layout, target, provenance={}) as cloud:
+        cloud.write(rows)
+        cloud.commit()
+
+
+def test_an_extended_record_is_right_in_the_cloud_too(tmp_path):
+    """All else of the extended records stays, also after one that has become longer."""
+    others = [(b"mine", WKT_ID, RIPROCESS.encode()), (b"last", 6, bytes(1000))]
+    for name, wkt in (("wrong", RIPROCESS), ("right", build_utm(32633))):
+        evlrs = [others[0], (b"LASF_Projection", WKT_ID, wkt.encode() + b"\0"), others[1]]
+        points, layout = _with_record(tmp_path / f"{name}.las", (1, 4), 9, evlrs=evlrs)
+        target = tmp_path / f"{name}.laz"
+        _write(layout, target, layout.rows(points))
+        header = read_header(target)
+        found, missing = find_evlrs(target, header)
+        payloads = [target.read_bytes()[evlr.start + 60 :][: evlr.length] for evlr in found]
+        assert payloads == [others[0][2], repair_wkt(wkt).encode() + b"\0", others[1][2]] and missing == 0
+        assert [(evlr.user, evlr.record_id) for evlr in found] == [(user.decode(), key) for user, key, _ in evlrs]
+        assert any("as RiPROCESS writes it" in note for note in layout.notes) == (name == "wrong")
+        assert read_crs_definition(target, header) == repair_wkt(wkt)
+
+
+def test_las_1_3_has_no_wrong_wkt_beside_its_keys(tmp_path):
+    keys = Vlr(b"LASF_Projection", 34735, struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, 32633))
+    points, layout = _with_record(tmp_path / "a.las", (1, 3), 4, vlrs=[keys, build_wkt(RIPROCESS)])
+    _write(layout, tmp_path / "b.las", layout.rows(points))
+    header = read_header(tmp_path / "b.las")
+    assert header.version == (1, 3) and any("as RiPROCESS writes it" in note for note in layout.notes)
+    payloads = [vlr.payload for vlr in header.vlrs if is_projection(vlr)]
+    assert payloads == [keys.payload, repair_wkt(RIPROCESS).encode() + b"\0"]
+
+
+def test_so_do_synthetic_strips(strip, tmp_path):
+    words = ["synthesize", strip, "-o", tmp_path / "s.las"]
+    result = run_command(*words)
+    assert result.exit_code == 0, result.output
+    definition = read_crs_definition(tmp_path / "s.las", read_header(tmp_path / "s.las"))
+    assert definition == repair_wkt(RIPROCESS)
+    records = [vlr.payload for vlr in read_header(tmp_path / "s.las").vlrs if vlr.record_id == WKT_ID]
+    assert records == [repair_wkt(RIPROCESS).encode() + b"\0"]
+
+
+def test_so_do_rasters_and_voxels(strip, tmp_path):
+    rasterio = pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
+    for words in (["grid", strip, "--statistic", "count", "--size", 5, "-o", tmp_path / "x.tif"],
+                  ["voxelize", strip, "--size", 5, "-o", tmp_path / "v.las"]):  # fmt: skip
+        result = run_command(*words)
+        assert result.exit_code == 0, result.output
+    with rasterio.open(tmp_path / "x.tif") as raster:
+        assert raster.crs.is_projected and _longitude(raster.crs) == pytest.approx(15.6567, abs=1e-3)
+    voxels = tmp_path / "v.las"
+    assert _longitude(read_crs_definition(voxels, read_header(voxels))) == pytest.approx(15.6567, abs=1e-3)
+
+
+def geo_keys(**values):
+    """A GeoKeyDirectory with these keys, by number with a k in front."""
+    rows = [(int(key[1:]), 0, 1, value) for key, value in values.items()]
+    flat = [number for row in [(1, 1, 0, len(rows)), *rows] for number in row]
+    return [Vlr(b"LASF_Projection", 34735, struct.pack(f"<{len(flat)}H", *flat))]
+
+
+@pytest.mark.parametrize(
+    ("code", "name", "meridian", "northing", "datum"),
+    [
+        (32601, "WGS 84 / UTM zone 1N", -177, 0, "6326"),
+        (32760, "WGS 84 / UTM zone 60S", 177, 10000000, "6326"),
+        (25832, "ETRS89 / UTM zone 32N", 9, 0, "6258"),
+        (26910, "NAD83 / UTM zone 10N", -123, 0, "6269"),
+    ],
+)
+def test_utm_zones(code, name, meridian, northing, datum):
+    text = build_utm(code)
+    assert text.startswith(f'PROJCS["{name}"') and text.endswith(f'AUTHORITY["EPSG","{code}"]]')
+    assert f'"central_meridian",{meridian}]' in text and f'"false_northing",{northing}]' in text
+    assert f'AUTHORITY["EPSG","{datum}"]' in text and text.count("[") == text.count("]")
+    assert parse_wkt(text).is_metric and parse_wkt(text).kind == "projected"
+
+
+@pytest.mark.parametrize("code", [32600, 32661, 25827, 25839, 26924, 31468, 4326, 0])
+def test_other_codes_are_not_guessed(code):
+    assert build_utm(code) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "code"),
+    [
+        ({"k1024": 1, "k3072": 32633}, 32633),
+        ({"k1024": 1, "k3072": 32633, "k3076": 9001, "k4099": 9001}, 32633),
+        ({"k1024": 1, "k3072": 32633, "k4096": 5030}, 32633),  # heights above the ellipsoid
+        ({"k1024": 1, "k3072": 32633, "k4096": 5703}, None),  # NAVD88: a compound CRS
+        ({"k1024": 1, "k3072": 32633, "k3076": 9002}, None),  # feet
+        ({"k1024": 1, "k3072": 32633, "k4099": 9003}, None),
+        ({"k1024": 2, "k2048": 4326}, None),  # degrees
+        ({"k1024": 1, "k3072": 32767}, None),  # user-defined
+        ({"k1024": 1, "k3076": 32632}, 32632),  # Leica's
+        ({}, None),
+    ],
+)
+def test_only_sure_codes_are_found(values, code):
+    assert find_code(geo_keys(**values)) == code
+
+
+def test_keys_of_any_bytes():
+    for payload in (b"", b"abc", bytes(7), b"\xff" * 64, struct.pack("<4H", 1, 1, 0, 9)):
+        assert find_code([Vlr(b"LASF_Projection", 34735, payload)]) is None
+
+
+def test_leicas_own_place_of_the_code():
+    path = data_file("leica-als/simple1_3_full_internal.las")
+    assert '"WGS 84 / UTM zone 32N"' in convert_geotiff(path, read_header(path).vlrs, asked=False)
+
+
+def test_a_crs_that_only_pyproj_knows(tmp_path, monkeypatch):
+    other = geo_keys(k1024=1, k3072=31468)
+    assert convert_geotiff(tmp_path, other, asked=False) is None  # the same bytes with and without pyproj
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pyproj", None)
+        with pytest.raises(
+            InputError, match=r"EPSG:31468, which pyproj would convert: .*pip install .pyproj"
+        ):
+            convert_geotiff(tmp_path, other, asked=True)
+    pytest.importorskip("pyproj")
+    assert '"31468"' in convert_geotiff(tmp_path, other, asked=True)

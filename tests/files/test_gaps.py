@@ -1,19 +1,36 @@
-"""Fill between two recordings of a packet, and before the first: no samples for anything that reads waveforms."""
+"""Fill between two recordings of a packet, and before the first: no samples for anything that reads waveforms.
+
+Packets that are filled up with zeros behind what was recorded.
+
+Packed samples, inverted waveforms, and samples of a strip that do not depend on the order of its points.
+"""
 
 import json
+import struct
 from dataclasses import replace
 
+import laspy
 import numpy as np
 import pytest
 from batch_tools import run_one
+from commands import run_command
+from strips import descriptor, make_raw, read_all
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.sample_form import packed_bytes, unpack_samples
 from wavebatch.kernels.signal.runs import gap_distance
-from wavebatch.kernels.signal.signal import LEAST_LEVEL, LEAST_PADDING, LEAST_RECORDED, find_fill, quiet_fill
+from wavebatch.kernels.signal.signal import (
+    LEAST_LEVEL,
+    LEAST_PADDING,
+    LEAST_RECORDED,
+    find_fill,
+    quiet_fill,
+    recorded_lengths,
+)
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.noise import pooled, tail
@@ -313,9 +330,6 @@ def test_tools_leave_gaps_out(whole, tmp_path):
 @pytest.mark.slow
 def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
     pytest.importorskip("matplotlib")
-    from click.testing import CliRunner
-
-    from wavebatch.cli import main
 
     strip = cut(whole, tmp_path / "gaps.las", 0, 7)
     assert run_one(strip, tmp_path).status == "written"
@@ -324,9 +338,9 @@ def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
     for options in ([], ["--sheet"]):
         target = tmp_path / f"a{len(options)}.png"
         arguments = ["plot", "waveform", str(strip), "--random", "2", "-o", str(target), *options]
-        result = CliRunner().invoke(main, arguments)
+        result = run_command(*arguments)
         assert result.exit_code == 0, result.output
-    text = CliRunner().invoke(main, ["info", str(strip)]).stdout
+    text = run_command("info", strip).stdout
     assert "with fill between recordings" in text
 
 
@@ -345,3 +359,179 @@ def test_waveforms_of_many_recordings_keep_one_level(number, apart):
     block = replace(WaveformBlock.from_samples(samples), missing=missing)
     noise = pooled(block, SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0)))
     assert (noise.of_sample is not None) == apart
+
+
+def naive_length(waveform):
+    end = len(waveform)
+    while end and waveform[end - 1] == 0:
+        end -= 1
+    real = waveform[:end].tolist()
+    padded = len(waveform) - end >= LEAST_PADDING and end >= LEAST_RECORDED and min(real) >= LEAST_LEVEL
+    return end if padded else len(waveform)
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "u4"])
+def test_only_zeros_below_a_level_that_never_reaches_them_are_padding(rng, dtype):
+    samples = (12 + rng.normal(0, 2, (300, 48))).clip(0).astype(dtype)
+    samples[100:200] = (rng.normal(0, 2, (100, 48))).clip(0).astype(dtype)
+    for row, end in enumerate(rng.integers(0, 49, 300)):
+        samples[row, end:] = 0
+    expected = [naive_length(row) for row in samples]
+    assert recorded_lengths(samples).tolist() == expected
+    assert sum(length < 48 for length in expected[:100]) > 30 and set(expected[100:200]) == {48}
+    for short in (np.zeros((3, 48), dtype), samples[:, :20], samples[:0], samples[:, :1]):
+        assert (recorded_lengths(short) == short.shape[1]).all()
+
+
+def pad(source, target, end):
+    """A copy of a strip whose packets (of bytes) are zero from sample end(n) on; recorded samples of each point's."""
+    content = bytearray(source.read_bytes())
+    (start,) = struct.unpack_from("<Q", content, 227)
+    with StripReader(source) as reader:
+        scan = reader.scan()
+        unit = reader.read_unit(0, scan)
+        scan.close()
+    packets, ends = unit.packets, end(len(unit.packets))
+    for offset, number, stop in zip(packets.offset.tolist(), packets.n_samples.tolist(), ends.tolist(), strict=True):
+        content[start + offset + stop : start + offset + number] = bytes(number - stop)
+    target.write_bytes(content)
+    return np.append(ends, 0)[unit.packet_of_point]
+
+
+@pytest.mark.quick_cases("one length")
+@pytest.mark.parametrize("kind", ["one length", "many lengths"])
+def test_padded_strips_lose_nothing_of_what_was_recorded(tmp_path, kind):
+    whole, padded = tmp_path / "whole.las", tmp_path / "padded.las"
+    simulate_strip("mixed", whole, pulses=3000, seed=11, options=StripOptions(point_format=4))
+    rng = np.random.default_rng(12)
+    ends = pad(whole, padded, lambda n: np.full(n, 64) if kind == "one length" else rng.integers(50, 81, n))
+    result = run_command("run", padded, "-o", tmp_path, "--points", "returns", "-q")
+    assert result.exit_code == 0, result.output
+    report = json.loads((tmp_path / "padded.report.json").read_text("utf-8"))
+    recorded = laspy.read(padded).return_point_wave_location / 1000 < ends - 8
+    found = (laspy.read(tmp_path / "padded.laz").echo_flags & int(EchoFlag.NO_ECHO)) == 0
+    assert 0.5 < recorded.mean() < 1 and found[recorded].mean() > 0.98
+    assert report["counts"]["added_echoes"] < 0.15 * report["counts"]["echoes"]
+
+
+def pack(samples, bits, little):
+    """Bytes of samples (n, s) one behind the other, bit by bit."""
+    n, s = samples.shape
+    order = np.arange(bits) if little else np.arange(bits)[::-1]
+    stream = ((samples[:, :, None] >> order) & 1).astype(np.uint8).reshape(n, s * bits)
+    return np.packbits(stream, axis=1, bitorder="little" if little else "big")
+
+
+@pytest.mark.parametrize("bits", [10, 12])
+@pytest.mark.parametrize("little", [False, True])
+@pytest.mark.parametrize("s", [1, 7, 32])
+def test_unpacked_samples_are_those_that_were_packed(rng, bits, little, s):
+    samples = rng.integers(0, 1 << bits, (20, s))
+    rows = pack(samples, bits, little)
+    assert rows.shape[1] == packed_bytes(s, bits)
+    found = unpack_samples(rows, s, bits, little)
+    assert found.dtype == np.uint16 and np.array_equal(found, samples)
+
+
+def smooth_counts(rng, n, s, bits):
+    time = rng.uniform(10, s - 10, (n, 1))
+    pulse = 0.7 * (1 << bits) * np.exp(-0.5 * ((np.arange(s) - time) / 2.5) ** 2)
+    return np.rint(0.05 * (1 << bits) + pulse + rng.normal(0, 2, (n, s))).astype(np.int64)
+
+
+def packed_strip(path, rng, bits, little, s=41):
+    raw = make_raw(60, n_samples=s, bits=16)
+    samples = smooth_counts(rng, 60, s, bits)
+    rows = pack(samples, bits, little)
+    width = rows.shape[1]
+    raw.points["wavepacket_offset"] = 60 + (raw.points["wavepacket_offset"] - 60) // (2 * s) * width
+    raw.points["wavepacket_size"] = width
+    raw.packets = rows.tobytes()
+    raw.vlrs = [descriptor(1, bits=bits, samples=s)]
+    return raw.write(path), samples
+
+
+@pytest.mark.parametrize("bits", [10, 12])
+@pytest.mark.parametrize("little", [False, True])
+def test_packed_strips_are_read_in_the_order_that_is_smoother(tmp_path, rng, bits, little):
+    path, samples = packed_strip(tmp_path / "a.las", rng, bits, little)
+    found = read_all(path)
+    for (_, offset), (values, *_) in found.items():
+        assert np.array_equal(values, samples[(offset - 60) // packed_bytes(41, bits)])
+    with StripReader(path) as reader, reader.scan() as scan:
+        (block,) = reader.sample_blocks(scan, 100)
+        assert block.digitizer.bits == bits and block.samples.dtype == np.uint16
+        assert f"packed, {'lowest' if little else 'highest'} bit first" in scan.notes[0]
+    for command in ("info", "check"):
+        assert f"samples of {bits} bits are packed" in run_command(command, path).stdout
+
+
+def mirror(source, target):
+    content = np.frombuffer(source.read_bytes(), np.uint8).copy()
+    start = read_header(source).waveform_start + 60
+    content[start:] = 255 - content[start:]
+    target.write_bytes(content.tobytes())
+    return target
+
+
+@pytest.fixture(scope="module")
+def upright(tmp_path_factory):
+    path = tmp_path_factory.mktemp("form") / "up.las"
+    simulate_strip("mixed", path, pulses=2500, seed=3, options=StripOptions(point_format=4))
+    return path
+
+
+def test_inverted_waveforms_give_the_echoes_of_upright_ones(upright, tmp_path):
+    down = mirror(upright, tmp_path / "down.las")
+    with StripReader(upright) as one, one.scan() as a, StripReader(down) as two, two.scan() as b:
+        assert not a.forms and b.forms[1].inverted and "the signal goes down" in b.notes[0]
+        (first,), (second,) = one.sample_blocks(a, 500), two.sample_blocks(b, 500)
+        assert np.array_equal(first.samples, second.samples)
+        assert second.digitizer.inverted and second.digitizer.gain == -first.digitizer.gain
+        volts = first.digitizer.offset + first.digitizer.gain * 255 - first.digitizer.gain * 0
+        assert second.digitizer.offset == pytest.approx(volts)
+        assert survey_blocks(read_sample(two, b)).figures.inverted == 1.0
+    reports = []
+    for strip in (upright, down):
+        assert run_one(strip, tmp_path).status == "written"
+        reports.append(json.loads((tmp_path / f"{strip.stem}.report.json").read_text("utf-8")))
+    assert reports[0]["counts"] == reports[1]["counts"] and reports[1]["counts"]["echoes"] > 2000
+    assert any("the signal goes down" in line for line in reports[1]["remarks"])
+    text = run_command("survey", down).stdout
+    assert "inverted waveforms" in text
+    info = json.loads(run_command("info", down, "--json").stdout)
+    assert info["packets"]["descriptors"][0]["inverted"] is True and not info["warnings"]
+
+
+def test_a_negative_gain_alone_means_inverted_unless_the_counts_go_up(upright, tmp_path):
+    raw = make_raw(10, most_returns=1)
+    raw.packets = np.full(320, 200, np.uint8).tobytes()
+    raw.vlrs = [descriptor(1, gain=-0.5)]
+    with StripReader(raw.write(tmp_path / "flat.las")) as reader, reader.scan() as scan:
+        (block,) = reader.sample_blocks(scan, 10)
+        assert (block.samples == 55).all() and "its gain is negative" in scan.notes[0]
+
+    content = upright.read_bytes()
+    at = content.index(np.float64(1.0).tobytes(), content.index(b"wave packet descriptor"))
+    changed = tmp_path / "negative.las"
+    changed.write_bytes(content[:at] + np.float64(-1.0).tobytes() + content[at + 8 :])
+    with StripReader(changed) as reader, reader.scan() as scan:
+        assert reader.facts.digitizers[1].gain == -1.0
+        assert not scan.forms[1].inverted and "go up" in scan.notes[0]
+
+
+def test_noise_and_uniform_counts_are_not_inverted(tmp_path):
+    with StripReader(make_raw(200).write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        assert not scan.forms
+
+
+def test_shuffled_points_give_the_same_sample_and_survey(upright, tmp_path, edit_points):
+    shuffled = edit_points(upright, tmp_path / "s.las", lambda p: p[np.random.default_rng(5).permutation(len(p))])
+    surveys, samples = [], []
+    for path in (upright, shuffled):
+        with StripReader(path) as reader, reader.scan() as scan:
+            blocks = list(reader.sample_blocks(scan, 700))
+            samples.append(np.concatenate([block.samples for block in blocks]))
+            surveys.append(survey_blocks(read_sample(reader, scan, 700)))
+    assert np.array_equal(*samples)
+    assert surveys[0].figures == surveys[1].figures and surveys[0].system == surveys[1].system

@@ -2,7 +2,7 @@
 
 import click
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
@@ -46,7 +46,7 @@ def test_a_link_to_a_strip_that_was_given_is_named(folder):
     assert lines == [f"{folder / 'link.las'}: is the same file as {folder / 'b.las'}; it is used once"]
     find_strips([str(folder / "b.las"), str(folder / "sub" / ".." / "b.las")], note=lines.append)
     assert len(lines) == 1
-    done = CliRunner().invoke(main, ["run", str(folder / "b.las"), str(folder / "link.las"), "-o", str(folder / "o")])
+    done = run_command("run", folder / "b.las", folder / "link.las", "-o", folder / "o")
     assert lines[0] in done.stderr
 
 
@@ -104,7 +104,7 @@ def test_every_command_that_takes_lists_refuses_an_empty_one_in_one_line(tmp_pat
     assert {"run", "info", "check", "stats", "plot histogram", "plot profile", *more} <= set(takers)
     for words in takers:
         rest = [*more.get(words, []), *(["-o", tmp_path / "p.png"] if words.startswith("plot") else [])]
-        result = CliRunner().invoke(main, [*words.split(), given, *map(str, rest)])
+        result = run_command(*words.split(), given, *rest)
         assert result.exit_code == 2, (words, result.output, result.exception)
         (line,) = result.stderr.splitlines()
         assert line == f"error: {given[1:]}: the list names no file; write one file, folder or pattern per line", words

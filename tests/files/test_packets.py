@@ -1,14 +1,23 @@
-"""Where packets are looked for, what is refused, and how samples are fetched."""
+"""Where packets are looked for, what is refused, and how samples are fetched.
 
+A .wdp of another strip is refused where that is certain, and own packets never are.
+
+Which way packet vectors point and how long they are: decided, reported, overridden, refused.
+"""
+
+import itertools
+import shutil
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
-from strips import descriptor, make_raw, read_all, read_plainly, record_head, vlr
+from commands import run_command
+from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, record_head, vlr
 from writer_tools import data_file
 
-from wavebatch.core.errors import InputError
-from wavebatch.files.strip import packets
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.strip import packets, shared_packets
 from wavebatch.files.strip.packets import PacketFile, PacketPlace
 from wavebatch.files.strip.reader import StripReader
 
@@ -283,3 +292,226 @@ def _bytes_read():
 def test_a_block_of_huge_waveforms_is_kept_small():
     assert packets.block_rows(4096, 65_536, 32) * 65_536 * 4 <= packets.BLOCK_BYTES
     assert packets.block_rows(4096, 100, 8) == 4096
+
+
+SCENES = {"forest": (), "urban": (), "slope": (), "canopy.gemini-24": (), "empty": ("--noise", "15")}
+REAL = (
+    "riegl-q680i/100429_152240_2535pt_UTM", "geolas/geolas1", "lvis/lvis1", "neon/neon_harv_a", "optech/optech_a",
+)  # fmt: skip
+
+
+def find_stranger(strip: Path) -> str:
+    with StripReader(strip) as reader, reader.scan(tolerant=True) as scan:
+        return scan.stranger
+
+
+@pytest.fixture(scope="module")
+def strips(tmp_path_factory):
+    """A strip of each scene, of one sensor, with packets beside it."""
+    folder = tmp_path_factory.mktemp("strips")
+    made = {scene: folder / f"{scene}.las" for scene in SCENES}
+    for seed, (scene, path) in enumerate(made.items()):
+        options = ["--pulses", "600", "--external", "-q", "--seed", str(seed), *SCENES[scene]]
+        assert run_command("simulate", scene, "-o", path, *options).exit_code == 0
+    return made
+
+
+def swap(points: Path, packets: Path, folder: Path) -> Path:
+    shutil.copy(points, folder / "s.las")
+    shutil.copy(packets.with_suffix(".wdp"), folder / "s.wdp")
+    return folder / "s.las"
+
+
+def test_packets_of_another_strip_of_the_sensor_are_known(strips, tmp_path):
+    names = [name for name in strips if name != "empty"]
+    for points, other in itertools.product(names, names):
+        strip = swap(strips[points], strips[other], tmp_path)
+        assert bool(find_stranger(strip)) == (points != other), (points, other)
+    strip = swap(strips["forest"], strips["urban"], tmp_path)
+    with pytest.raises(InputError, match=r"s\.wdp belongs to another strip: .*--force"), StripReader(strip) as reader:
+        reader.scan()
+    with StripReader(strip) as reader, reader.scan(force=True) as scan:
+        assert scan.stranger and not scan.problems
+
+
+def test_packets_of_another_sensor_are_known(tmp_path):
+    files = {name: data_file(f"{name}.las") for name in REAL}
+    for points, other in itertools.product(REAL, REAL):
+        strip = swap(files[points], files[other], tmp_path)
+        assert bool(find_stranger(strip)) == (points != other), (points, other)
+
+
+def change(points: np.ndarray, how: str) -> np.ndarray:
+    locations = points["return_point_wave_location"]
+    if how == "zero":
+        locations[:] = 0
+    elif how == "nanoseconds":
+        locations[:] = locations / 1000
+    elif how == "shifted":
+        locations[:] = locations + 20_000
+    elif how == "random, but as strong":
+        locations[:] = np.random.default_rng(0).uniform(0, 60_000, len(points))
+    elif how == "without intensity":
+        points["intensity"] = 0
+    elif how == "nothing to go by":
+        points["intensity"], locations[:] = 0, 30_000
+    return points
+
+
+@pytest.mark.parametrize("how", [
+    "as it is", "zero", "nanoseconds", "shifted", "random, but as strong", "without intensity", "nothing to go by",
+])  # fmt: skip
+def test_own_packets_are_never_refused(strips, tmp_path, edit_points, how):
+    for name, path in strips.items():
+        if name == "empty" and how.startswith("random"):
+            continue  # no witness is left: noise hides how strong the echoes are
+        strip = edit_points(path, tmp_path / f"{name}.las", lambda points: change(points, how))
+        shutil.copy(path.with_suffix(".wdp"), strip.with_suffix(".wdp"))
+        assert not find_stranger(strip), name
+
+
+def test_own_packets_of_the_weakest_returns_alone_are_not_refused(strips, tmp_path, edit_points):
+    """Only the ground of a high canopy, say: its echoes are the lowest of their packets."""
+
+    def weaken(points):
+        order = np.lexsort((points["intensity"], points["wavepacket_offset"]))
+        weakest = order[np.unique(points["wavepacket_offset"][order], return_index=True)[1]]
+        others = np.setdiff1d(np.arange(len(points)), weakest)
+        points["wavepacket_index"][others] = points["wavepacket_size"][others] = 0
+        return points
+
+    for name in ("forest", "canopy.gemini-24"):
+        strip = edit_points(strips[name], tmp_path / f"{name}.las", weaken)
+        shutil.copy(strips[name].with_suffix(".wdp"), strip.with_suffix(".wdp"))
+        assert not find_stranger(strip), name
+
+
+def test_few_packets_prove_nothing(strips, tmp_path, edit_points):
+    def keep_few(points):
+        points["wavepacket_size"][40:] = 0
+        return points
+
+    strip = edit_points(strips["forest"], tmp_path / "few.las", keep_few)
+    shutil.copy(strips["urban"].with_suffix(".wdp"), strip.with_suffix(".wdp"))
+    assert not find_stranger(strip)
+
+
+def scan_of(path, **options):
+    with StripReader(path, **options) as reader, reader.scan() as scan:
+        return scan
+
+
+def turn(raw, factor):
+    for name in ("x_t", "y_t", "z_t"):
+        raw.points[name] *= np.float32(factor)
+
+
+@pytest.mark.parametrize("toward", [True, False])
+@pytest.mark.parametrize("most_returns", [1, 3])
+def test_either_sign_gives_the_same_rays(tmp_path, toward, most_returns):
+    raw = make_raw(toward=toward, most_returns=most_returns)
+    path = raw.write(tmp_path / "a.las")
+    scan = scan_of(path)
+    assert scan.vectors.direction == ("toward" if toward else "away")
+    assert scan.vectors.ratio == pytest.approx(np.linalg.norm(TOWARD) * 1000 / 0.149896229)
+    assert scan.warnings == ()
+    for _, _, origin, direction in read_all(path).values():
+        assert origin[2] == pytest.approx(500, abs=2e-3)
+        np.testing.assert_allclose(direction, -1000 * TOWARD, rtol=1e-6)
+
+
+def test_witnesses_that_contradict_each_other_are_refused_unless_overridden(tmp_path):
+    """The pulses go up: shared packets say toward, heights say away."""
+    raw = make_raw()
+    raw.scales = (0.001, 0.001, -0.001)
+    turn_z = raw.points["z_t"]
+    turn_z *= -1
+    path = raw.write(tmp_path / "a.las")
+    with pytest.raises(InputError, match=r"a\.las: packet vectors contradict each other: .*pass --direction"):
+        scan_of(path)
+    scan = scan_of(path, direction="toward")
+    assert (scan.vectors.direction, scan.problems) == ("toward", ())
+    assert "--direction toward overrides" in scan.warnings[0]
+    assert scan_of(path, direction="away").vectors.direction == "away"
+
+
+def test_vectors_that_say_nothing_are_refused_unless_overridden(tmp_path):
+    raw = make_raw(most_returns=1)
+    raw.points["z_t"][::2] *= -1
+    path = raw.write(tmp_path / "a.las")
+    with pytest.raises(InputError, match="is not clear.*--direction toward or away"):
+        scan_of(path)
+    assert scan_of(path, direction="away").vectors.direction == "away"
+
+
+def test_heights_that_vary_do_not_matter_where_packets_are_shared(tmp_path):
+    raw = make_raw(60, most_returns=3, toward=False)
+    pulse = np.round((raw.points["gps_time"] - 1000) * 1e5).astype(int)
+    start = np.stack([pulse * 0.5, 0 * pulse, 0 * pulse + 500.0], axis=1)
+    vector = np.where((pulse % 2 == 0)[:, None], TOWARD, -TOWARD)
+    xyz = start - raw.points["return_point_wave_location"][:, None].astype(float) * vector
+    for axis, name in enumerate("XYZ"):
+        raw.points[name] = np.rint(xyz[:, axis] / 0.001)
+        raw.points[("x_t", "y_t", "z_t")[axis]] = -vector[:, axis]
+    assert scan_of(raw.write(tmp_path / "a.las")).vectors.direction == "away"
+
+
+def test_a_given_direction_that_the_file_denies_is_used_and_said(tmp_path):
+    path = make_raw().write(tmp_path / "a.las")
+    scan = scan_of(path, direction="away")
+    assert scan.vectors.direction == "away"
+    assert "overrides the evidence of the file" in scan.warnings[0]
+    assert scan_of(path, direction="toward").warnings == ()
+
+
+def test_an_unknown_direction_is_a_config_error(tmp_path):
+    with pytest.raises(ConfigError, match="'up'.*auto, toward, away"):
+        StripReader(make_raw().write(tmp_path / "a.las"), direction="up")
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.1, 30.0])
+def test_odd_lengths_are_used_as_stored_and_said(tmp_path, factor):
+    raw = make_raw(most_returns=1)
+    turn(raw, factor)
+    path = raw.write(tmp_path / "a.las")
+    scan = scan_of(path)
+    assert scan.vectors.form == "stored"
+    assert "times c/2 long" in scan.warnings[0]
+    direction = next(iter(read_all(path).values()))[3]
+    np.testing.assert_allclose(direction, -1000 * TOWARD * factor, rtol=1e-5)
+
+
+def test_yellowscan_length_is_no_reason_to_warn(tmp_path):
+    raw = make_raw(most_returns=1)
+    turn(raw, 0.965)
+    assert scan_of(raw.write(tmp_path / "a.las")).warnings == ()
+
+
+@pytest.mark.parametrize("most_returns", [1, 3])
+def test_vectors_as_long_as_the_path_are_divided_by_minus_the_location(tmp_path, most_returns):
+    raw = make_raw(most_returns=most_returns)
+    for name in ("x_t", "y_t", "z_t"):
+        raw.points[name] *= -raw.points["return_point_wave_location"]
+    path = raw.write(tmp_path / "a.las")
+    scan = scan_of(path)
+    assert (scan.vectors.form, scan.vectors.direction) == ("range", "toward")
+    assert scan.vectors.ratio == pytest.approx(0.9997, abs=0.01)
+    assert "divided by minus the return location" in scan.warnings[0]
+    for _, _, origin, direction in read_all(path).values():
+        assert origin[2] == pytest.approx(500, abs=2e-3)
+        np.testing.assert_allclose(direction, -1000 * TOWARD, rtol=1e-5)
+
+
+def test_returns_that_meet_only_far_apart_still_vote(tmp_path, monkeypatch):
+    """Heights say nothing here, and no two returns of a packet lie in one unit or window."""
+    raw = make_raw(300, most_returns=2)
+    pulse = np.round((raw.points["gps_time"] - 1000) * 1e5).astype(int)
+    start = np.stack([pulse * 0.5, 0 * pulse, 0 * pulse + 500.0], axis=1)
+    vector = np.where((pulse % 2 == 0)[:, None], TOWARD, -TOWARD)
+    xyz = start - raw.points["return_point_wave_location"][:, None].astype(float) * vector
+    for axis, name in enumerate("XYZ"):
+        raw.points[name] = np.rint(xyz[:, axis] / 0.001)
+        raw.points[("x_t", "y_t", "z_t")[axis]] = vector[:, axis]
+    raw.points = raw.points[np.argsort(raw.points["bit_fields"], kind="stable")]
+    monkeypatch.setattr(shared_packets, "WINDOW", 64)
+    assert scan_of(raw.write(tmp_path / "a.las")).vectors.direction == "toward"

@@ -117,8 +117,7 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
     monkeypatch.setattr(shared_packets, "WINDOW", window)
     monkeypatch.setattr(shared_packets, "BINS", 64)
     monkeypatch.setattr(shared_packets, "_PER_BUCKET", 500)
-    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 3000)
-    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 100)
+    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 100)
     assert_same(read_all(path, size=50, unit_points=128), plain)
     assert_same(read_all(path, size=50, owned_only=False, unit_points=128), plain)
     with StripReader(path, unit_points=128) as reader, reader.scan() as scan:
@@ -359,7 +358,7 @@ def test_compressed_points_are_decoded_once(tmp_path, monkeypatch, case):
         calls.append(len(rows))
         decode(points, rows)
 
-    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 0)
+    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 1)
     if case == "beyond the limit":
         monkeypatch.setattr(scanner, "_KEPT_BYTES", 150 * 57)
     if case == "no room":

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -117,16 +118,34 @@ def test_a_place_given_by_another_process_is_this_thread_s_only(tmp_path):
 def test_without_a_place_the_spool_says_so(tmp_path, monkeypatch):
     with owning_scratch(tmp_path / "missing") as folder:
         assert folder is None
-    monkeypatch.setattr("wavebatch.files.disk.temp_store.SPOOL_KEPT", 0)
+    monkeypatch.setattr("wavebatch.files.disk.temp_store.SPOOL_MEMORY", 1)
 
     def refuse(*args, **options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(temp_store.tempfile, "mkdtemp", refuse)
     spool = Spool(2, np.dtype("<i8"))
-    spool.append(np.array([0, 1]), np.array([5, 6]))
     with pytest.raises(InputError, match="No space left.*set TMPDIR"):
-        spool.seal()
+        spool.append(np.array([0, 1]), np.array([5, 6]))
+
+
+def test_a_spool_that_travels_takes_a_file_or_its_entries_with_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 0)
+    use_scratch(tmp_path)
+    try:
+        with Spool(2, np.dtype("<i8")) as spool:
+            spool.append(np.array([1, 0, 1]), np.array([5, 6, 7]))
+            assert spool.read(1).tolist() == [5, 7] and spool.path is None
+            with monkeypatch.context() as full:
+                full.setattr(temp_store, "make_folder", lambda: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
+                assert pickle.loads(pickle.dumps(spool)).read(1).tolist() == [5, 7] and spool.path is None
+            copies = [pickle.loads(pickle.dumps(spool)) for _ in range(2)]
+            assert {copy.path for copy in copies} == {spool.path} and spool.path.exists()
+            for one in (spool, *copies):
+                assert [one.read(bucket).tolist() for bucket in (0, 1)] == [[6], [5, 7]]
+        assert not spool.path.exists()
+    finally:
+        use_scratch(None)
 
 
 EVERY_PROCESS = """
@@ -134,7 +153,7 @@ import os, signal
 from wavebatch.batch import strip_task
 from wavebatch.files.disk import temp_store
 from wavebatch.files.strip import reader
-temp_store.SPOOL_KEPT, reader.UNIT_POINTS = 0, 500
+temp_store.SPOOL_MEMORY, reader.UNIT_POINTS = 1, 500
 
 def kill(task, *arguments):
     os.kill(os.getpid(), signal.SIGKILL)

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from naive_wdz import pack_strip
 
-from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader
@@ -77,7 +76,7 @@ def test_a_run_of_both_gives_the_same_points(plain, packed, tmp_path):
     clouds = []
     for path in (plain, packed):
         words = ["run", str(path), "-o", str(tmp_path / "out"), "--profile", "fast", "--keep-packets"]
-        done = CliRunner().invoke(main, [*words, "--format", "las", "-q"])
+        done = run_command(*words, "--format", "las", "-q")
         assert done.exit_code == 0, done.output
         with StripReader(tmp_path / "out" / path.name) as reader:
             clouds.append(reader.read_points(0, reader.facts.header.point_count))

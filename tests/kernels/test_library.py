@@ -9,10 +9,9 @@ import tempfile
 from types import SimpleNamespace
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
 import wavebatch as wb
-from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.kernels import build_kernels, library
 
@@ -177,11 +176,11 @@ def test_a_library_without_our_functions_is_refused(checkout):
 def test_commands_report_a_missing_library_once(tmp_path, monkeypatch):
     strips = [str(tmp_path / name) for name in ("a.las", "b.las")]
     for strip in strips:
-        assert CliRunner().invoke(main, ["simulate", "flat", "-o", strip, "--pulses", "50"]).exit_code == 0
+        assert run_command("simulate", "flat", "-o", strip, "--pulses", "50").exit_code == 0
     monkeypatch.setattr(library, "LIBRARY", tmp_path / "missing.so")
     out = tmp_path / "out"
     for words, code in ((["run", *strips, "-o", str(out)], 4), (["survey", strips[0]], 1)):
-        done = CliRunner().invoke(main, words)
+        done = run_command(*words)
         assert done.exit_code == code
         assert done.stderr.count("\n") == 1 and done.stderr.startswith(f"error: {tmp_path / 'missing.so'}: ")
         assert "bug" not in done.stderr and "built again" in done.stderr

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
 import wavebatch as wb
-from wavebatch.cli import main
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.stages import chain as chain_module
@@ -137,11 +136,11 @@ def test_a_chain_without_plugins_imports_none(installed):
 def test_the_list_of_stages_has_those_of_plugins_and_a_warning_for_poor_ones(installed):
     installed("mine", GOOD)
     installed("poor", "1 / 0")
-    result = CliRunner().invoke(main, ["stages"])
+    result = run_command("stages")
     assert result.exit_code == 0 and "detect.first_half" in result.stdout
     warning = "warning: plugin poor (poor_stages) cannot be imported: ZeroDivisionError: division by zero\n"
     assert result.stderr == warning
-    one = CliRunner().invoke(main, ["stages", "detect.first_half"])
+    one = run_command("stages", "detect.first_half")
     assert one.exit_code == 0 and "level (number, 0.5 to 9, default 5.0): Least height" in one.stdout
 
 

@@ -5,11 +5,10 @@ import json
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command as call
 
 import wavebatch as wb
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip
-from wavebatch.cli import main
 from wavebatch.core.order import group_medians
 from wavebatch.surveying.calibrating.adjust_flight import Anchors, adjust_constants
 from wavebatch.surveying.calibrating.calibration_file import load_calibration
@@ -20,10 +19,6 @@ GAINS = {("a", 1): 1.0, ("b", 1): 1.08, ("c", 1): 0.95, ("c", 2): 0.4275}
 LIGHT = 1.2e8
 TRUE = 4.0 / (LIGHT * 2.0)
 SLOPE = (0.02, 0.01)
-
-
-def call(*arguments):
-    return CliRunner().invoke(main, list(map(str, arguments)))
 
 
 def fields(x, y):

@@ -7,13 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command as call
 
 import wavebatch as wb
 from tests import facet_strips, footprints
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, path_of, write_strip, write_trajectory
 from tests.footprints import Flight, Plane
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.physics.radiometry import judge_energies
@@ -26,10 +25,6 @@ pytestmark = pytest.mark.kept_surveys
 
 LIGHT = 1.2e8
 BASE = {"speed": 30.0, "rate": 10_000.0, "half_angle": 12.0}
-
-
-def call(*arguments):
-    return CliRunner().invoke(main, list(map(str, arguments)))
 
 
 def fields(x, y):

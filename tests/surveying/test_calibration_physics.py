@@ -4,12 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command as call
 
 import wavebatch as wb
 from tests import facet_strips
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip, write_trajectory
-from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
@@ -22,10 +21,6 @@ RINGING = ((1.0, 0.0, 2.0), (0.06, 9.0, 2.2), (0.03, 16.0, 2.5))
 TAIL = ((1.0, 0.0, 2.0), (0.3, 3.0, 3.0))
 DENSE = {"speed": 30.0, "line_rate": 50.0, "half_angle": 4.0}
 """Scan lines 0.6 m apart: 10 m along the flight are 17 lines of 200 pulses over 98 m."""
-
-
-def call(*arguments):
-    return CliRunner().invoke(main, list(map(str, arguments)))
 
 
 def calibrate_strip(path, targets, options):

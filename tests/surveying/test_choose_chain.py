@@ -7,10 +7,9 @@ from pathlib import Path
 import kept_surveys
 import pytest
 from batch_tools import read_cloud
-from click.testing import CliRunner
+from commands import run_command
 from helpers_scenes import make_scene
 
-from wavebatch.cli import main
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.surveying.choose_chain import COSTS, Request, make_choice, widest
@@ -22,7 +21,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def _run(*arguments):
-    return CliRunner().invoke(main, ["run", *map(str, arguments)])
+    return run_command("run", *arguments)
 
 
 def _report(folder, stem):
@@ -42,7 +41,7 @@ def strips(tmp_path_factory):
 def saved(strips):
     """SYSTEM.toml of the flat strip."""
     path = strips / "SYSTEM.toml"
-    assert CliRunner().invoke(main, ["survey", str(strips / "flat.las"), "-o", str(path)]).exit_code == 0
+    assert run_command("survey", strips / "flat.las", "-o", path).exit_code == 0
     return path
 
 
@@ -181,7 +180,7 @@ def ringing(tmp_path_factory):
     scene = make_scene("flat", pulse=find_pulse("riegl"), n_samples=100)
     simulate_strip(scene, folder / "ringing.las", pulses=3000, seed=4)
     arguments = ["survey", str(folder / "ringing.las"), "-o", str(folder / "SYSTEM.toml")]
-    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert run_command(*arguments).exit_code == 0
     return folder
 
 
@@ -231,5 +230,3 @@ def test_a_choice_travels_between_processes(strips):
         again = pickle.loads(pickle.dumps(choice))
         assert again.survey == choice.survey and again.decisions == choice.decisions
         assert again.predictions == choice.predictions
-
-

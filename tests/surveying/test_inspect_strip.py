@@ -4,20 +4,15 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command as run
 from strips import descriptor, make_raw
 from writer_tools import data_file
 
-from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.describe import describe_strip
 from wavebatch.surveying.inspect_strip import check_file
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def test_info_of_the_riegl_pair():

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import pytest
-from click.testing import CliRunner
+from commands import run_command
+from commands import run_command as run
 from helpers_scenes import make_scene
 from writer_tools import data_file
 
-from wavebatch.cli import main
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems.figures import Figures
@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("saved")
     for name, scene in SCENES.items():
         simulate_strip(scene, folder / f"{name}.las", pulses=1500, seed=5)
-    result = CliRunner().invoke(main, ["survey", str(folder / "flat.las"), "-o", str(folder / "SYSTEM.toml")])
+    result = run_command("survey", folder / "flat.las", "-o", folder / "SYSTEM.toml")
     assert result.exit_code == 0, result.output
     return folder
 
@@ -84,10 +84,6 @@ def test_shipped_and_saved_surveys_of_real_strips_fit_their_own_strip_and_no_oth
             hidden_by_canopy = (known.name, name) == ("riegl-q680i", "neon-gemini")
             assert (contradiction(path, plain) == "") == (name == known.name or hidden_by_canopy), (name, known.name)
         assert contradiction(paths[known.name], replace(plain, figures=Figures())) == ""
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, list(map(str, arguments)))
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,9 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from footprints import Flight, Plane, match, roofs, write_strip
 
-from wavebatch.cli import main
 from wavebatch.surveying.system_file import load_survey
 
 GREEN = Flight()
@@ -18,7 +17,7 @@ HILLSIDE = Plane(slope=(np.tan(np.radians(22.0)), 0.1))
 
 
 def call(*arguments):
-    done = CliRunner().invoke(main, list(map(str, arguments)))
+    done = run_command(*arguments)
     assert done.exit_code == 0, done.output
     return done
 
@@ -240,7 +239,7 @@ def test_the_energy_of_each_shot_is_divided_out(tmp_path, flickering, source):
 def test_energies_that_cannot_be_used_are_refused_in_one_line(tmp_path, flickering, make, message):
     folder, flight, _ = flickering
     options = ["--columns", "+amplitude_normalized", "--energy", str(make(tmp_path / "e.csv"))]
-    done = CliRunner().invoke(main, ["run", str(folder / "strip.las"), "-o", str(tmp_path / "out"), *options])
+    done = run_command("run", folder / "strip.las", "-o", tmp_path / "out", *options)
     assert done.exit_code == 4 and message in done.stderr and "Traceback" not in done.stderr
 
 

@@ -6,9 +6,8 @@ from dataclasses import asdict, replace
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command as call
 
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.files.strip.reader import StripReader
@@ -21,10 +20,6 @@ from wavebatch.tools.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, ST
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS
 
 pytestmark = pytest.mark.kept_surveys
-
-
-def call(*arguments):
-    return CliRunner().invoke(main, list(map(str, arguments)))
 
 
 def test_what_lies_in_a_polygon():

@@ -6,10 +6,9 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from helpers_scenes import make_scene
 
-from wavebatch.cli import main
 from wavebatch.core.system import Radiometry
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.surveying import survey_block
@@ -23,7 +22,7 @@ SCENE = find_scene("village")
 
 
 def call(*arguments):
-    done = CliRunner().invoke(main, list(map(str, arguments)))
+    done = run_command(*arguments)
     assert done.exit_code == 0, done.output
     return done
 

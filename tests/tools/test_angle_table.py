@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.system import LevelWidths, ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA, C
@@ -22,7 +21,7 @@ GAUSSIAN = SystemPulse(sigma_ref=2.0, noise=ReceiverNoise(baseline=12.0, std=1.0
 
 
 def run(*words):
-    return CliRunner().invoke(main, ["survey", *map(str, words)])
+    return run_command("survey", *words)
 
 
 def test_widths_are_the_pulse_and_the_spread_of_a_plane():

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from plot_tools import PULSE, make_chain, simulate
 
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.kernels.signal.square_differences import find_minima, keep_prominent
@@ -16,7 +15,7 @@ from wavebatch.tools.plots.waveform import build_views
 
 
 def run(*words):
-    return CliRunner().invoke(main, ["plot", "waveform", *map(str, words)])
+    return run_command("plot", "waveform", *words)
 
 
 BLOCK = simulate(PulseShape(), [(60.0, 25.3, 2.0), (6.0, 45.0, 2.0)], n=60)

@@ -4,10 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from naive_wdz import pack_strip
 
-from wavebatch.cli import main
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.archives.export_strip import USER_ID, export_strip
@@ -67,7 +66,7 @@ def test_compressed_and_damaged_packets_and_all_fields(riegl, tmp_path):
 
 
 def test_other_ends_of_names_are_refused_with_all_that_are_known(riegl, tmp_path):
-    done = CliRunner().invoke(main, ["export", str(riegl), "-o", str(tmp_path / "x.shp")])
+    done = run_command("export", riegl, "-o", tmp_path / "x.shp")
     assert done.exit_code == 2 and done.stderr.endswith("x.shp: an output's name must end in .las, .laz or .npz\n")
 
 
@@ -92,8 +91,8 @@ def test_arrays_hold_what_the_strip_holds(riegl, tmp_path):
 
 def test_several_strips_and_a_bad_one(tiny_strip, tmp_path):
     (tmp_path / "bad.las").write_bytes(b"LASF" + bytes(400))
-    done = CliRunner().invoke(main, ["export", str(tiny_strip), str(tmp_path / "bad.las"), "-o", str(tmp_path / "o")])
+    done = run_command("export", tiny_strip, tmp_path / "bad.las", "-o", tmp_path / "o")
     assert done.exit_code == 1 and done.stderr.count("error:") == 1
     assert sorted(path.suffix for path in (tmp_path / "o").iterdir()) == [".las", ".wdp"]
-    again = CliRunner().invoke(main, ["export", str(tiny_strip), "-o", str(tmp_path / "o")])
+    again = run_command("export", tiny_strip, "-o", tmp_path / "o")
     assert again.exit_code == 1 and "exists already" in again.stderr

@@ -9,11 +9,10 @@ from types import SimpleNamespace
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from writer_tools import data_file, write_source
 
 import wavebatch as wb
-from wavebatch.cli import main
 from wavebatch.files.las.header import Vlr
 from wavebatch.tools.file_facts import _describe_time, describe_file
 
@@ -54,10 +53,10 @@ def test_a_cloud_shows_how_it_was_made(tiny_strip, tmp_path):
     assert account["version"] == wb.__version__ and account["input"] == "tiny.las"
     assert facts["counts"]["echoes"] == counts["echoes"] and facts["counts"]["added"] == counts["added_echoes"]
     assert facts["counts"]["passed_through"] == counts["points_out"] - counts["echoes"]
-    shown = CliRunner().invoke(main, ["info", str(tmp_path / "tiny.laz")]).stdout
+    shown = run_command("info", tmp_path / "tiny.laz").stdout
     for line in ("command           wavebatch run tiny.las", "chain             noise.pooled", "range as EchoRange"):
         assert line in shown
-    document = json.loads(CliRunner().invoke(main, ["info", "--json", str(tmp_path / "tiny.laz")]).stdout)
+    document = json.loads(run_command("info", "--json", tmp_path / "tiny.laz").stdout)
     assert document == {"schema": "wavebatch.info/1", **facts}
 
 
@@ -95,20 +94,20 @@ def test_the_command_is_what_was_typed_without_folders():
 
 def _make(words, folder):
     """The report of a run."""
-    done = CliRunner().invoke(main, [*words, "-o", folder])
+    done = run_command(*words, "-o", folder)
     assert done.exit_code == 0, done.stderr
     return json.loads(Path(folder, "a strip.report.json").read_text())
 
 
 def test_headers_that_are_wrong_show():
-    shown = CliRunner().invoke(main, ["info", str(data_file("no-packets/simple1_3.las"))]).stdout
+    shown = run_command("info", data_file("no-packets/simple1_3.las")).stdout
     assert "the header says -235434519 to -234935841" in shown
 
 
 @pytest.mark.parametrize("account", [b"[]", b"{", b'{"options": 3, "request": [], "columns": 7, "chain": {}}'])
 def test_accounts_of_any_form_are_shown_as_far_as_they_go(tmp_path, account):
     write_source(tmp_path / "a.las", 6, (1, 4), vlrs=[Vlr(b"wavebatch", 1, account)])
-    result = CliRunner().invoke(main, ["info", str(tmp_path / "a.las")])
+    result = run_command("info", tmp_path / "a.las")
     assert result.exit_code == 0, result.output
 
 

@@ -5,10 +5,9 @@ import json
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from forest_scenes import fly, grow
 
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse
@@ -134,7 +133,7 @@ def test_voxels_have_what_forests_need(even, tmp_path):
     assert np.mean(voxels["attenuation"][inside]) == pytest.approx(0.15, rel=0.1)
     np.testing.assert_allclose(voxels["height"], voxels.z - 100.0, atol=0.1)
     assert (voxels["free_path"] <= voxels["path"] * (1 + 1e-6)).all()
-    shown = CliRunner().invoke(main, ["info", str(even[1])]).output
+    shown = run_command("info", even[1]).output
     assert "command           wavebatch voxelize s.las --size 1 --forest" in shown and "{" not in shown
 
 
@@ -171,7 +170,7 @@ def test_strips_of_a_forest_become_one_raster_with_two_commands(tmp_path):
     made = ["voxelize", *strips, "--size", 1, "--forest", "--system", tmp_path / "system.toml", "--force", "-o",
             tmp_path / "v"]  # fmt: skip
     for words in (made, ["grid", tmp_path / "v", "--forest", "--size", CELL, "-o", tmp_path / "f.tif"]):
-        result = CliRunner().invoke(main, list(map(str, words)))
+        result = run_command(*words)
         assert result.exit_code == 0, result.output
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["a.laz", "b.laz"]
     both = [tmp_path / "v" / f"{name}.laz" for name in "ab"]
@@ -185,14 +184,14 @@ def test_strips_of_a_forest_become_one_raster_with_two_commands(tmp_path):
 def test_the_command_says_what_it_wrote(even, tmp_path):
     pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     arguments = ["grid", even[1], "--forest", "--size", 10, "--bbox", "0,0,20,20", "-o", tmp_path / "f.tif"]
-    result = CliRunner().invoke(main, list(map(str, arguments)))
+    result = run_command(*arguments)
     assert result.exit_code == 0 and "2 x 2 cells of 10 m: 4 with metrics, 0 with fewer" in result.output
     for more, words in (
         (["--forest", "--column", "share"], "--forest and --column exclude each other"),
         (["--forest", "--statistic", "max"], "exclude each other"),
         (["--layer", "2", "--column", "share"], "--layer is of no use without --forest"),
     ):
-        result = CliRunner().invoke(main, ["grid", str(even[1]), *more, "-o", str(tmp_path / "g.tif")])
+        result = run_command("grid", even[1], *more, "-o", tmp_path / "g.tif")
         assert result.exit_code == 2 and words in result.output
 
 
@@ -205,7 +204,7 @@ def test_parts_of_the_voxels_and_degrees_are_refused(even, tmp_path, option, wor
     pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
     arguments = ["grid", str(even[1]), "--forest", "--size", "10", *option, "-o", str(tmp_path / "f.tif")]
-    result = CliRunner().invoke(main, arguments)
+    result = run_command(*arguments)
     assert result.exit_code == 2 and words in result.output and list(tmp_path.iterdir()) == []
 
 

@@ -5,9 +5,8 @@ import struct
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
 from wavebatch.tools.rasters import cells as module
@@ -45,7 +44,7 @@ def _cloud(path, rng, n=4000, *, wkt=UTM, west=500_000.0, south=5_400_000.0, eps
 
 
 def _run(*arguments, code=0):
-    result = CliRunner().invoke(main, ["grid", *map(str, arguments)])
+    result = run_command("grid", *arguments)
     assert result.exit_code == code, (result.stderr, result.exception)
     return result
 
@@ -215,8 +214,6 @@ def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rasterio, r
     assert "have no CRS" in _run(tmp_path / "c.las", "--statistic", "count", "-q", "-o", tmp_path / "x.tif").stderr
 
 
-
-
 RIPROCESS = (
     'PROJCS["UTM_North zone 33",GEOGCS["UTM_North zone 33",DATUM["WGS84",SPHEROID["WGS84",6378137.000,298.257223563]],'
     'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
@@ -245,7 +242,7 @@ def test_a_crs_that_no_geotiff_can_hold_is_refused(rasterio, rng, tmp_path, monk
 
 
 def test_the_raster_of_a_real_strip_has_its_crs(rasterio, riegl, tmp_path):
-    assert CliRunner().invoke(main, ["run", str(riegl), "-o", str(tmp_path), "-q"]).exit_code == 0
+    assert run_command("run", riegl, "-o", tmp_path, "-q").exit_code == 0
     _run(tmp_path / f"{riegl.stem}.laz", "--column", "echo_width", "--size", 2, "-o", tmp_path / "x.tif")
     with rasterio.open(tmp_path / "x.tif") as found:
         assert found.crs.to_epsg() == 32633

@@ -11,10 +11,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from html_tools import Page
 
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
@@ -27,7 +26,7 @@ from wavebatch.tools.sheets.sheet import Code, Table
 
 
 def _run(*arguments, code=0):
-    result = CliRunner().invoke(main, list(map(str, arguments)), catch_exceptions=False)
+    result = run_command(*arguments, catch_exceptions=False)
     assert result.exit_code == code, result.stderr
     return result
 
@@ -54,7 +53,7 @@ def test_the_page_of_a_run_has_every_part_and_its_counts_are_those_of_the_report
         assert shown.row(name)[1] == f"{report['counts'][name]:,}"
     assert "does not add up" not in shown.text and shown.text.count("adds up") == 7 * 3
     assert shown.text.count("broken.las") >= 2
-    assert 'a <b>&"1\'.las' in shown.text  # shown as it is, never as markup
+    assert "a <b>&\"1'.las" in shown.text  # shown as it is, never as markup
     assert "<b>&" not in shown.source
 
 
@@ -159,7 +158,7 @@ def test_a_page_that_cannot_be_written_does_not_hide_the_clouds(tiny_strip, tmp_
 
 def test_a_page_that_cannot_be_written_does_not_hide_the_survey(tiny_strip, tmp_path, monkeypatch):
     monkeypatch.setattr("wavebatch.tools.sheets.page.write_page", lambda *_: 1 / 0)
-    result = CliRunner().invoke(main, ["survey", str(tiny_strip), "--html", str(tmp_path / "s.html")])
+    result = run_command("survey", tiny_strip, "--html", tmp_path / "s.html")
     assert result.exit_code == 1 and "ZeroDivisionError" in result.stderr and "decisions" in result.stdout
 
 

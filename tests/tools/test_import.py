@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from pulse_files import Pulse, PulseFile, Sampling, bell
 
-from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.files import pulsewaves_file as pulse_reader
 from wavebatch.files.strip.reader import StripReader
@@ -104,7 +103,7 @@ def test_energies_and_pulse_are_those_that_were_sent(tmp_path, rng, fwhm):
     saved = load_survey(tmp_path / "o.system.toml").survey
     assert saved.figures.outgoing_fwhm_ns == pytest.approx(fwhm, rel=0.02)
     assert saved.system.sigma_ref * 2.35482 == pytest.approx(fwhm, rel=0.02)
-    shown = CliRunner().invoke(main, ["survey", str(tmp_path / "o.las")]).output
+    shown = run_command("survey", tmp_path / "o.las").output
     width = saved.figures.outgoing_fwhm_ns
     assert f"outgoing pulses   full width at half maximum {width:.3f} ns, as import found it" in shown
 
@@ -220,7 +219,7 @@ def test_a_cut_file_leaves_nothing_behind(tmp_path, rng):
 
 
 def _invoke(*words):
-    return CliRunner().invoke(main, ["import", *map(str, words)], prog_name="wavebatch")
+    return run_command("import", *words, prog_name="wavebatch")
 
 
 def test_a_batch_goes_on_after_a_bad_file_and_resumes(tmp_path, rng):
@@ -282,7 +281,7 @@ def _by_pulse(path):
 
 def test_few_outgoing_pulses_have_an_energy_but_no_width(tmp_path, rng):
     path = _make(tmp_path, list(_flight(rng, number=1)))
-    done = CliRunner().invoke(main, ["import", str(path)])
+    done = run_command("import", path)
     assert done.exit_code == 0 and "nan" not in done.output and "1 points" not in done.output, done.output
 
 

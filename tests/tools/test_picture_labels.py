@@ -5,16 +5,13 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from plot_tools import PULSE, make_chain, simulate, write_cloud
 
-from wavebatch.cli import main
 from wavebatch.files import figure_file
-from wavebatch.files.figure_file import open_picture
+from wavebatch.files.figure_file import fit_parts, fit_text, open_picture, text_width
 from wavebatch.kernels.fit.pulse_shape import PulseShape
-from wavebatch.tools.plots import labels
 from wavebatch.tools.plots.draw_waveform import draw_waveform_panels
-from wavebatch.tools.plots.labels import fit_parts, fit_text, text_width
 from wavebatch.tools.plots.waveform import build_views
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -22,7 +19,7 @@ LONG = "a_very_long_name_of_a_strip_as_flight_campaigns_give_them_" * 3 + ".las"
 
 
 def run_plot(*words):
-    return CliRunner().invoke(main, ["plot", *map(str, words)])
+    return run_command("plot", *words)
 
 
 @pytest.fixture
@@ -115,7 +112,7 @@ def test_maps_of_any_shape(texts, tmp_path, shape):
 def test_slices_and_cubes(texts, tmp_path, riegl):
     words = ["slice", riegl, "--lines", "0:6", "--shortest", "10", "--png", tmp_path / "a.png"]
     words += ["--overview", tmp_path / "b.png", "--cube", tmp_path / "c.npz"]
-    result = CliRunner().invoke(main, [str(word) for word in words])
+    result = run_command(*words)
     assert result.exit_code == 0, result.output
     assert run_plot("cube", tmp_path / "c.npz", "-o", tmp_path / "c.png").exit_code == 0
     check(texts)
@@ -127,7 +124,7 @@ def test_axes_in_metres_have_equal_scales(tmp_path, riegl, monkeypatch):
     kept = []
     save = figure_file._save
     monkeypatch.setattr(figure_file, "_save", lambda figure, *rest: (kept.append(figure), save(figure, *rest)))
-    CliRunner().invoke(main, ["slice", str(riegl), "--lines", "2", "--png", str(tmp_path / "a.png")])
+    run_command("slice", riegl, "--lines", "2", "--png", tmp_path / "a.png")
     run_plot("section", riegl, "-o", tmp_path / "s.png")
     run_plot("map", riegl, "--column", "z", "-o", tmp_path / "m.png")
     assert len(kept) == 3
@@ -154,12 +151,12 @@ def test_texts_are_shortened_to_their_room(tmp_path):
     ],
 )  # fmt: skip
 def test_short_axes_have_one_or_two_round_ticks(low, high, most, expected):
-    assert labels._round_places(low, high, most) == pytest.approx(expected)
+    assert figure_file._round_places(low, high, most) == pytest.approx(expected)
 
 
 def test_short_axes_always_have_a_tick_inside():
     rng = np.random.default_rng(0)
     for low, span in zip(rng.normal(0, 1000, 2000), 10.0 ** rng.uniform(-4, 4, 2000), strict=True):
         for most in (1, 2):
-            places = labels._round_places(low, low + span, most)
+            places = figure_file._round_places(low, low + span, most)
             assert 1 <= len(places) <= most and all(low - 1e-9 <= place <= low + span + 1e-9 for place in places)

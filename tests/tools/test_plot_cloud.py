@@ -7,12 +7,11 @@ import sys
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from hypothesis import example, given
 from hypothesis import strategies as st
 from plot_tools import POINTS, write_cloud
 
-from wavebatch.cli import main
 from wavebatch.core.condition import read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
@@ -21,7 +20,7 @@ from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.plots import values
-from wavebatch.tools.plots.histogram import count_points_by_flag, count_values, place_edges
+from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values, place_edges
 from wavebatch.tools.plots.sections import cut_section
 from wavebatch.tools.plots.values import robust_limits
 from wavebatch.tools.rasters import cells
@@ -55,7 +54,7 @@ def read_plainly(path):
 
 
 def run(*words):
-    return CliRunner().invoke(main, ["plot", *map(str, words)])
+    return run_command("plot", *words)
 
 
 def test_histogram_is_that_of_numpy(cloud):

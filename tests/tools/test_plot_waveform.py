@@ -8,12 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from plot_tools import PULSE, make_chain, simulate
 from scipy.optimize import curve_fit
 from strips import make_raw
 
-from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import WaveformBlock
@@ -44,7 +43,7 @@ KAPPA = 0.15
 
 
 def run(*words):
-    return CliRunner().invoke(main, ["plot", "waveform", *map(str, words)])
+    return run_command("plot", "waveform", *words)
 
 
 def test_residuals_are_those_of_the_cleaned_samples():
@@ -213,7 +212,8 @@ def test_without_a_wish_a_few_are_spread_over_the_strip(tiny_strip):
         ("--flags SATURATED --packet 3", 2, "--flags"),
         ("--flags SATURATD", 2, "did you mean 'SATURATED'"),
         ("--where amplitude>1 --point 3", 2, "--where chooses the waveforms"),
-        ("--where amplitud>1", 2, "did you mean 'amplitude'"), ("--where amplitude>1e6", 1, "no echo meets"),
+        ("--where amplitud>1", 2, "did you mean 'amplitude'"),
+        ("--where amplitude>1e6", 1, "no echo meets"),
         ("--profile fastt", 2, "did you mean 'fast'"),
         ("--times 5", 2, "LOW:HIGH"),
         ("--chain none.toml", 2, "none.toml"),

@@ -1,22 +1,29 @@
-"""`wavebatch stats`: return numbers, separations and flags against hand counts, whatever the order of the points."""
+"""`wavebatch stats`: return numbers, separations and flags against hand counts, whatever the order of the points.
 
+`wavebatch stats` by area: cells and polygons against loops over pulses, sums, hostile coordinates, the table.
+"""
+
+import csv
 import json
 import math
 
+import laspy
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.cli.stats import stats
+from wavebatch.cli.stats import SHOWN, stats
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.publish import publish_together
+from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.write_points import PointFile
+from wavebatch.tools import return_stats as module
 from wavebatch.tools import return_stats as returns
-from wavebatch.tools.return_stats import count_returns
+from wavebatch.tools.return_stats import AreaGrid, PolygonSet, count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, simulate_returns
 
 
@@ -236,3 +243,289 @@ def test_hidden_pairs_are_those_that_as_many_as_just_above_the_zone_would_be(tmp
     assert found.dead_zone == pytest.approx(1.0, abs=0.011)
     assert found.hidden == pytest.approx(0.3, abs=0.006)
     assert any(line.startswith("dead zone") and "0.30" in line for line in found.warnings)
+
+
+def make_cloud(path, n=800, seed=0, east=300_000.0):
+    """Slanted pulses with 1 to 4 returns over 100 m x 60 m, shuffled: the pulse of every point, x y z, numbers."""
+    rng = np.random.default_rng(seed)
+    count = rng.integers(1, 5, n)
+    pulse = np.repeat(np.arange(n), count)
+    number = np.arange(len(pulse)) - np.repeat(np.cumsum(count) - count, count) + 1
+    start = np.stack([rng.uniform(0, 100, n), rng.uniform(-30, 30, n), np.full(n, 50.0)], axis=1)
+    step = np.stack([rng.uniform(-3, 3, n), rng.uniform(-3, 3, n), rng.uniform(-8, -1, n)], axis=1)
+    xyz = np.round(start[pulse] + number[:, None] * step[pulse] + [east, 0, 0], 3)
+    order = rng.permutation(len(pulse))
+    pulse, xyz, number, total = pulse[order], xyz[order], number[order], count[pulse[order]]
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, 0.001), np.array([east, 0, 0])
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = xyz.T
+    cloud.gps_time, cloud.return_number, cloud.number_of_returns = 1e5 + pulse, number, total
+    cloud.write(path)
+    return pulse, xyz, number
+
+
+def count_naively(pulse, xyz, number, area_of):
+    """Per area: points, pulses, points by number, pulses by count, separations."""
+    found = {}
+    for one in np.unique(pulse):
+        rows = np.flatnonzero(pulse == one)
+        rows = rows[np.argsort(number[rows])]
+        area = found.setdefault(area_of(*xyz[rows[0], :2]), [0, 0, {}, {}, []])
+        area[0] += len(rows)
+        area[1] += 1
+        area[3][len(rows)] = area[3].get(len(rows), 0) + 1
+        for row in rows:
+            area[2][number[row]] = area[2].get(number[row], 0) + 1
+        area[4] += [math.dist(xyz[a], xyz[b]) for a, b in zip(rows[:-1], rows[1:], strict=True)]
+    return found
+
+
+def check_areas(found, naive, key):
+    assert {key(area) for area in found} == set(naive) and len(found) == len(naive)
+    for area in found:
+        points, pulses, by_number, by_count, apart = naive[key(area)]
+        assert (area.points, area.pulses, area.pairs) == (points, pulses, len(apart))
+        assert area.returns_per_pulse == points / pulses
+        assert area.by_number == pytest.approx({k: n / points for k, n in by_number.items()})
+        assert area.by_count == pytest.approx({k: n / pulses for k, n in by_count.items()})
+        if apart:
+            assert area.mean == pytest.approx(np.mean(apart)) and area.least == pytest.approx(min(apart))
+        else:
+            assert math.isnan(area.mean) and math.isnan(area.least)
+
+
+def check_sum(areas, total):
+    """Areas together have what the cloud has."""
+    assert sum(area.points for area in areas) == total.points
+    assert sum(area.pulses for area in areas) == total.pulses
+    assert sum(area.pairs for area in areas) == total.separations["all"].pairs
+    for kind, whole in (("by_number", "points"), ("by_count", "pulses")):
+        for k, share in getattr(total, kind).items():
+            number = sum(getattr(area, kind).get(k, 0) * getattr(area, whole) for area in areas)
+            assert number == pytest.approx(share * getattr(total, whole))
+    assert min(area.least for area in areas if area.pairs) == total.separations["all"].least
+
+
+@pytest.mark.parametrize("size", [7.5, 40.0, 1000.0])
+@pytest.mark.parametrize("bucket", [400_000, 150])
+def test_cells_as_a_loop_over_pulses_counts_them(tmp_path, monkeypatch, size, bucket):
+    points = make_cloud(tmp_path / "c.las")
+    monkeypatch.setattr(temp_store, "BUCKET_ROWS", bucket)
+    (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(size)])
+    naive = count_naively(*points, lambda x, y: (math.floor(x / size) * size, math.floor(y / size) * size))
+    check_areas(one.areas, naive, lambda area: (area.x, area.y))
+    check_sum(one.areas, one)
+    assert all(area.kind == "cell" for area in one.areas)
+    places = [(area.x, area.y) for area in one.areas]
+    assert places == sorted(places) == [(area.x, area.y) for area in total.areas]
+
+
+def square(x, y, side, name="s"):
+    return Polygon(name, (np.array([[x, y], [x + side, y], [x + side, y + side], [x, y + side]], float),))
+
+
+def test_polygons_first_come_and_what_is_outside(tmp_path):
+    points = make_cloud(tmp_path / "c.las")
+    hole = square(300_010, -20, 40, "big").rings + square(300_020, -10, 10).rings
+    polygons = [Polygon("big", hole), square(300_000, -30, 30, "corner"), square(0, 0, 1, "far")]
+
+    def area_of(x, y):
+        if 300_010 <= x < 300_050 and -20 <= y < 20 and not (300_020 <= x < 300_030 and -10 <= y < 0):
+            return "big"
+        return "corner" if 300_000 <= x < 300_030 and -30 <= y < 0 else "outside"
+
+    (one,), _ = count_returns([tmp_path / "c.las"], divisions=[PolygonSet(polygons)])
+    check_areas(one.areas, count_naively(*points, area_of), lambda area: area.name)
+    assert [area.name for area in one.areas] == ["big", "corner", "outside"]
+    check_sum(one.areas, one)
+
+
+def test_cells_and_polygons_of_several_clouds(tmp_path):
+    for seed, name in enumerate("ab"):
+        make_cloud(tmp_path / f"{name}.las", seed=seed, east=300_000.0 + 50 * seed)
+    divisions = [AreaGrid(20), PolygonSet([square(300_000, -30, 100)])]
+    each, total = count_returns([tmp_path / "a.las", tmp_path / "b.las"], divisions=divisions)
+    for one in (*each, total):
+        for kinds in (("cell",), ("polygon", "outside")):
+            check_sum([area for area in one.areas if area.kind in kinds], one)
+    cells = {(area.x, area.y): area.pulses for area in total.areas if area.kind == "cell"}
+    for (x, y), pulses in cells.items():
+        assert pulses == sum(area.pulses for one in each for area in one.areas if (area.x, area.y) == (x, y))
+
+
+@pytest.mark.parametrize("scale", [float("nan"), 1e300, float("inf")])
+def test_damaged_coordinates_are_counted_outside(tmp_path, scale):
+    make_cloud(tmp_path / "c.las", n=50)
+    content = bytearray((tmp_path / "c.las").read_bytes())
+    content[131:139] = np.float64(scale).tobytes()
+    (tmp_path / "d.las").write_bytes(content)
+    result = CliRunner().invoke(stats, [str(tmp_path / "d.las"), "--area", "10", "--json"])
+    if result.exit_code:
+        assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+        return
+    found = json.loads(result.stdout)["total"]
+    assert sum(area["pulses"] for area in found["areas"]) == found["pulses"] == 50
+
+
+def test_places_that_are_none_are_outside():
+    x = np.array([5.0, np.nan, np.inf, 1e300, 1.0, -1e300])
+    y = np.array([5.0, 1.0, 1.0, 1.0, np.nan, -np.inf])
+    for division in (AreaGrid(10), PolygonSet([square(0, 0, 10)])):
+        found = division.find(x, y)
+        assert (found[1:] == -1).all() and found[0] != -1
+        assert division.describe(-1).name == "outside"
+    assert AreaGrid(0.25).describe(int(AreaGrid(0.25).find(np.array([-0.1]), np.array([0.3]))[0])).name == "-0.25 0.25"
+
+
+def test_too_many_and_too_small_cells_are_one_line(tmp_path, monkeypatch):
+    make_cloud(tmp_path / "c.las")
+    tiny = CliRunner().invoke(stats, [str(tmp_path / "c.las"), "--area", "1e-5"])
+    assert tiny.exit_code == 2 and "too small for these coordinates" in tiny.stderr and tiny.stderr.count("\n") == 1
+    monkeypatch.setattr(module, "MOST_AREAS", 50)
+    many = CliRunner().invoke(stats, [str(tmp_path / "c.las"), "--area", "2"])
+    assert many.exit_code == 2 and "more than 50 areas" in many.stderr and many.stderr.count("\n") == 1
+    monkeypatch.setattr(module, "MOST_AREAS", 50_000)
+    monkeypatch.setattr(returns, "MOST_AREAS", 50)
+    with pytest.raises(ConfigError, match="more than 50 areas with it"):
+        count_returns([tmp_path / "c.las"] * 4, divisions=[AreaGrid(30)])
+    for wrong in ("0", "-3", "nan", "inf"):
+        result = CliRunner().invoke(stats, [str(tmp_path / "c.las"), "--area", wrong])
+        assert result.exit_code == 2 and "must be above 0" in result.stderr
+
+
+def write_features(path, *features):
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": list(features)}))
+    return path
+
+
+def feature(kind, coordinates, **properties):
+    return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
+
+
+def test_polygons_of_a_file(tmp_path):
+    ring = [[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]]
+    hole, other = [[2, 2], [4, 2], [4, 4], [2, 4], [2, 2]], [[20, 0, 7], [30, 0, 7], [30, 10, 7], [20, 0, 7]]
+    path = write_features(
+        tmp_path / "p.json", feature("Polygon", [ring, hole], name="lawn"), feature("MultiPolygon", [[ring], [other]])
+    )
+    lawn, two = load_polygons(path)
+    assert (lawn.name, two.name) == ("lawn", "2")
+    x, y = np.array([1.0, 3, 29, -1]), np.array([1.0, 3, 5, 1])
+    assert find_inside(lawn.rings, x, y).tolist() == [True, False, False, False]
+    assert find_inside(two.rings, x, y).tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("features", "words"),
+    [
+        ([], "holds no polygon"),
+        ([feature("Point", [1, 2])], "is a Point"),
+        ([feature("Polygon", [])], "has no ring"),
+        ([feature("Polygon", [[[0, 0], [1, 1]]])], "three corners"),
+        ([feature("Polygon", [[[0, 0], [1, 1], [float("nan"), 2]]])], "finite"),
+        ([feature("Polygon", [[[0], [1, 1], [2, 2]]])], "not GeoJSON"),
+        ([3], "not GeoJSON"),
+    ],
+)
+def test_wrong_polygons_are_one_line(tmp_path, features, words):
+    path = write_features(tmp_path / "p.json", *features)
+    with pytest.raises(ConfigError, match=words) as caught:
+        load_polygons(path)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_separations_by_rank_and_depth_of_pulses(tmp_path):
+    pulse, xyz, number = make_cloud(tmp_path / "c.las")
+    (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(25.0)])
+    cells, depths = {}, {}
+    for each in np.unique(pulse):
+        rows = np.flatnonzero(pulse == each)
+        rows = rows[np.argsort(number[rows])]
+        place = tuple(np.floor(xyz[rows[0], :2] / 25) * 25)
+        for rank, (a, b) in enumerate(zip(rows[:-1], rows[1:], strict=True), 1):
+            cells.setdefault((*place, f"{rank}-{rank + 1}"), []).append(math.dist(xyz[a], xyz[b]))
+        if len(rows) > 1:
+            depths.setdefault(place, []).append(xyz[rows[0], 2] - xyz[rows[-1], 2])
+    assert sum(len(area.separations) for area in one.areas) == len(cells)
+    for area in one.areas:
+        for name, found in area.separations.items():
+            apart = cells[area.x, area.y, name]
+            assert found.pairs == len(apart) and found.least == pytest.approx(min(apart))
+            assert found.mean == pytest.approx(np.mean(apart))
+        depth = depths.get((area.x, area.y), [])
+        assert area.several == len(depth)
+        assert area.depth == pytest.approx(np.mean(depth) if depth else math.nan, nan_ok=True)
+    every = np.concatenate(list(depths.values()))
+    for stats_of in (one, total):
+        assert stats_of.several == len(every) and stats_of.depth == pytest.approx(every.mean())
+
+
+def test_table_text_and_json_say_the_same(tmp_path):
+    make_cloud(tmp_path / "c.las")
+    path = write_features(tmp_path / "p.json", feature("Polygon", [[[300_000, -30], [300_050, -30], [300_050, 30]]],
+                                                       name="a, \"b\""))  # fmt: skip
+    arguments = [str(tmp_path / "c.las"), "--area", "12", "--polygon", str(path), "-o", str(tmp_path / "t.csv")]
+    document = json.loads(CliRunner().invoke(stats, [*arguments, "--json"]).stdout)
+    found = document["files"][0]["areas"]
+    with open(tmp_path / "t.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert rows[0]["kind"] == "cloud" and int(rows[0]["pulses"]) == document["total"]["pulses"] == 800
+    assert len(rows) == 1 + len(found)
+    for row, area in zip(rows[1:], found, strict=True):
+        assert (row["kind"], row["area"]) == (area["kind"], area["name"])
+        for name, key in (("points", "points"), ("mean_m", "mean"), ("least_m", "least"), ("x", "x")):
+            assert float(row[name] or "nan") == pytest.approx(
+                float("nan") if area[key] is None else area[key], nan_ok=True
+            )
+        ranks = {pair: int(row[f"pairs_{pair}"]) for pair in ("1_2", "2_3", "3_4", "4")}
+        assert sum(ranks.values()) == area["pairs"] and int(row["pulses_with_several"]) == area["several"]
+        for pair, number in ranks.items():
+            one = area["separations"].get(pair.replace("_", "-"), {})
+            assert number == one.get("pairs", 0)
+            assert float(row[f"mean_m_{pair}"] or 0) == pytest.approx(one.get("mean", 0))
+        for k in range(1, 5):
+            assert float(row[f"return_{k}"]) == pytest.approx(area["by_number"].get(str(k), 0), abs=1e-9)
+            assert float(row[f"pulses_with_{k}"]) == pytest.approx(area["by_count"].get(str(k), 0), abs=1e-9)
+    for pair, name in (("", "all"), ("_1_2", "1-2"), ("_2_3", "2-3"), ("_3_4", "3-4"), ("_4", "4-")):
+        zone = document["files"][0]["dead_zones"].get(name, {"size": None, "error": None})
+        for column, key in (("dead_zone_m", "size"), ("dead_zone_err_m", "error")):
+            assert rows[0][column + pair] == ("" if zone[key] is None else f"{zone[key]:.10g}")
+            assert rows[1][column + pair] == ""  # areas have none
+    again = CliRunner().invoke(stats, arguments)
+    assert again.exit_code != 0 and "exists already" in again.stderr
+    out = CliRunner().invoke(stats, [*arguments, "--overwrite"]).stdout
+    assert f"and {len(found) - SHOWN} more; --json has all of them" in out and found[0]["name"] in out
+
+
+def test_an_empty_cloud_has_no_area(tmp_path):
+    make_cloud(tmp_path / "c.las", n=1)
+    cloud = laspy.read(tmp_path / "c.las")
+    cloud.points = cloud.points[:0]
+    cloud.write(tmp_path / "e.las")
+    (one,), total = count_returns([tmp_path / "e.las"], divisions=[AreaGrid(10)])
+    assert one.areas == total.areas == ()
+    result = CliRunner().invoke(stats, [str(tmp_path / "e.las"), "--area", "10", "-o", str(tmp_path / "e.csv")])
+    assert result.exit_code == 0 and (tmp_path / "e.csv").read_text().count("\n") == 2
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e300, -np.inf])
+def test_pulses_without_a_place_are_counted_outside(tmp_path, monkeypatch, bad):
+    pulse, _, number = make_cloud(tmp_path / "c.las", n=300)
+    pieces = returns.CloudReader.read_pieces
+
+    def damage(self):
+        for rows in pieces(self):
+            rows["xyz"][(rows["gps_time"] < 1e5 + 40) & (rows["number"] == 1), 0] = bad
+            yield rows
+
+    monkeypatch.setattr(returns.CloudReader, "read_pieces", damage)
+    (one,), _ = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(10), PolygonSet([square(299_000, -500, 2000)])])
+    for kinds in (("cell",), ("polygon",)):
+        inside = [area for area in one.areas if area.kind in kinds]
+        assert sum(area.pulses for area in inside) == 260
+    outside = [area for area in one.areas if area.kind == "outside"]
+    assert [area.pulses for area in outside] == [40, 40]
+    assert outside[0].points == (pulse < 40).sum()
+    # The separation from a place that is none is none; one of 1e300 m overflows.
+    assert outside[0].pairs == ((pulse < 40) & (number > 1)).sum() - ((pulse < 40) & (number == 2)).sum()

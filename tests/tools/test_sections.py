@@ -7,25 +7,19 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command as run
 from plot_tools import write_cloud
 
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.plots import sections
 from wavebatch.tools.plots.sections import cut_section, measure_profile
-from wavebatch.tools.slices.cube import align_pulses, build_cube, cut_cube
-from wavebatch.tools.slices.output import SegmentWriter, profile_segments
+from wavebatch.tools.slices.output import SegmentWriter, align_pulses, build_cube, cut_cube, profile_segments
 from wavebatch.tools.slices.segments import ScanLine, Segment, read_scan_lines
 from wavebatch.tools.voxels.grid import COLUMNS
 
 LINE = (500_005.0, 5_400_003.0, 500_030.0, 5_400_020.0)
-
-
-def run(*words):
-    return CliRunner().invoke(main, [str(word) for word in words])
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from commands import run_command
 from strips import cut_strip
 
-from wavebatch.cli import main
 from wavebatch.cli.slice import slice_
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
@@ -321,22 +321,22 @@ def test_noise_holds_no_surface(tmp_path, rng):
     content[start:] = np.rint(rng.normal(20, 1, len(content) - start))
     strip.write_bytes(content.tobytes())
     for more in ([], ["--sigma", "2"], ["--geometry", "time"]):
-        done = CliRunner().invoke(main, ["slice", str(strip), "-o", str(tmp_path / "x.csv"), "--overwrite", *more])
+        done = run_command("slice", strip, "-o", tmp_path / "x.csv", "--overwrite", *more)
         assert done.exit_code == 0 and f"{strip}: 0 segments in " in done.stderr, done.stderr
 
 
 def test_strips_too_short_for_a_scan_line_say_so(tiny_strip, tmp_path):
     short = cut_strip(tiny_strip, tmp_path / "short.las", 5)
-    done = CliRunner().invoke(main, ["slice", str(short), "-o", str(tmp_path / "x.csv")])
+    done = run_command("slice", short, "-o", tmp_path / "x.csv")
     assert done.exit_code == 1 and re.search(r"has \d pulses, a scan line to find surfaces in needs 8", done.stderr)
     none = cut_strip(tiny_strip, tmp_path / "none.las", 0)
-    done = CliRunner().invoke(main, ["slice", str(none), "-o", str(tmp_path / "y.csv")])
+    done = run_command("slice", none, "-o", tmp_path / "y.csv")
     assert done.exit_code == 0 and "none.las: has no waveform, so no scan line\n" in done.stderr
 
 
 def test_lines_with_as_many_segments_as_allowed_are_counted_and_said(riegl, tmp_path):
     words = ["slice", str(riegl), "--lines", "0:6", "-o", str(tmp_path / "s.csv"), "--json", "--overwrite", "--most"]
-    few, many = (CliRunner().invoke(main, [*words, most]) for most in ("1", "50"))
+    few, many = (run_command(*words, most) for most in ("1", "50"))
     found = json.loads(few.stdout)
     assert found["full"] == found["segments"] > 0 and f"{found['full']} scan lines may have more" in few.stderr
     assert json.loads(many.stdout)["full"] == 0 and "may have more" not in many.stderr
@@ -389,5 +389,5 @@ def test_packets_of_one_pulse_are_one_pulse(tmp_path, edit_points):
                 place = np.searchsorted(times, found - 0.5)
                 assert found == pytest.approx(times[place], abs=0.02) and np.all(np.diff(found) > 0.9)
     assert both > 100
-    done = CliRunner().invoke(main, ["slice", str(cut), "-o", str(tmp_path / "cut.csv"), "--json"])
+    done = run_command("slice", cut, "-o", tmp_path / "cut.csv", "--json")
     assert json.loads(done.stdout)["pulses"] == sum(map(len, read_all(whole)))

@@ -7,10 +7,9 @@ import struct
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import run_command
 from strips import add_record
 
-from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.las.crs import metres_per_unit, parse_wkt
 from wavebatch.files.las.geo_keys import build_utm
@@ -30,8 +29,7 @@ DEGREES = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257]],
 def clouds(tiny_strip, tmp_path_factory):
     """The same cloud in metres, in feet (the same places), and with a CRS in degrees."""
     folder = tmp_path_factory.mktemp("units")
-    result = CliRunner().invoke(main, ["run", str(tiny_strip), "-o", str(folder), "--profile", "balanced", "--format",
-                                       "las", "-q"])  # fmt: skip
+    result = run_command("run", tiny_strip, "-o", folder, "--profile", "balanced", "--format", "las", "-q")  # fmt: skip
     assert result.exit_code == 0, result.output
     metres = folder / tiny_strip.name
     found = {"m": metres}
@@ -49,7 +47,7 @@ def clouds(tiny_strip, tmp_path_factory):
 
 
 def _print(*words, code=0):
-    result = CliRunner().invoke(main, [*map(str, words)])
+    result = run_command(*words)
     assert result.exit_code == code, result.output
     return result
 

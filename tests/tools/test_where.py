@@ -6,15 +6,14 @@ import laspy
 import numpy as np
 import pytest
 from batch_tools import run_one
-from click.testing import CliRunner
+from commands import run_command
 
-from wavebatch.cli import main
 from wavebatch.core.condition import parse_condition
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.compare.clouds import compare_clouds
-from wavebatch.tools.plots.histogram import count_values
+from wavebatch.tools.plots.draw_cloud import count_values
 from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
@@ -117,26 +116,26 @@ def test_an_unknown_column_is_named_with_its_place_and_the_nearest(cloud):
 )
 def test_every_command_says_where_the_text_is_wrong(cloud, tmp_path, arguments, text):
     words = [str(cloud) if word == "CLOUD" else word.replace("OUT", str(tmp_path / "x")) for word in arguments.split()]
-    result = CliRunner().invoke(main, [*words, "z = 5"])
+    result = run_command(*words, "z = 5")
     assert result.exit_code == 2 and result.output.startswith("error: ") and text in result.output
     assert len(result.output.splitlines()) == 1
 
 
 def test_compare_of_chains_refuses_it(riegl):
-    result = CliRunner().invoke(main, ["compare", "fast", "--strip", str(riegl), "--where", "z > 0"])
+    result = run_command("compare", "fast", "--strip", riegl, "--where", "z > 0")
     assert result.exit_code == 2 and "--where" in result.output
 
 
 def test_plots_and_stats_take_it_on_the_command_line(cloud, split, tmp_path):
     _, number, total = split
-    result = CliRunner().invoke(main, ["stats", str(cloud), "--where", TEXT, "--json"])
+    result = run_command("stats", cloud, "--where", TEXT, "--json")
     assert json.loads(result.stdout)["files"][0]["points"] == number
     for kind in ("histogram", "map"):
         words = ["plot", kind, str(cloud), "--column", "z", "--where", TEXT, "-o", str(tmp_path / f"{kind}.png")]
-        result = CliRunner().invoke(main, words)
+        result = run_command(*words)
         assert result.exit_code == 0 and f"{total - number} left out" in result.output
     words = ["plot", "map", str(cloud), "--column", "z", "--where", "z > 1e6", "-o", str(tmp_path / "none.png")]
-    result = CliRunner().invoke(main, words)
+    result = run_command(*words)
     assert result.exit_code == 1 and f"{total} of {total} points are left out by --where" in result.output
 
 
@@ -145,7 +144,7 @@ def test_grids_are_of_them(cloud, split, tmp_path):
     path, number, total = split
     for source, name, more in ((cloud, "some", ["--where", TEXT]), (path, "same", [])):
         words = ["grid", source, "--column", "amplitude", "--size", 3, "-o", tmp_path / f"{name}.tif", "--json", *more]
-        result = CliRunner().invoke(main, list(map(str, words)))
+        result = run_command(*words)
         assert result.exit_code == 0, result.output
         found = json.loads(result.stdout)
         assert found["points"] - found["left_out"] == number and found["left_out"] == (total - number) * bool(more)
@@ -161,5 +160,5 @@ def test_grids_are_of_them(cloud, split, tmp_path):
 def test_a_grid_of_no_point_says_why(cloud, tmp_path, where, words):
     pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     target = tmp_path / "x.tif"
-    result = CliRunner().invoke(main, ["grid", str(cloud), "--column", "z", "--where", where, "-o", str(target)])
+    result = run_command("grid", cloud, "--column", "z", "--where", where, "-o", target)
     assert result.exit_code in (1, 2) and words in result.stderr and not target.exists()

@@ -14,6 +14,7 @@ import click
 
 from wavebatch.cli.messages import NearestGroup
 from wavebatch.core.interrupts import guard
+from wavebatch.core.process import importing
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("wavebatch.cli.run:run", "Decompose strips into enriched point clouds: the main job."),
@@ -55,7 +56,9 @@ class LazyGroup(NearestGroup):
         module, _, function = COMMANDS[cmd_name][0].partition(":")
         from wavebatch.cli.program.command import dress
 
-        return dress(getattr(importlib.import_module(module), function), cmd_name)
+        with importing():
+            home = importlib.import_module(module)
+        return dress(getattr(home, function), cmd_name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes the list of commands without importing them."""

@@ -71,6 +71,7 @@ def calibrate(
     from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
     from wavebatch.surveying.calibrating.calibration_file import format_calibration
     from wavebatch.surveying.calibrating.target_file import load_targets
+    from wavebatch.tools.api.run import find_request, read_sensor
     from wavebatch.tools.sheets.calibrate import calibration_sheet, write_calibrate_page
     from wavebatch.tools.sheets.sheet import list_lines
 
@@ -84,7 +85,10 @@ def calibrate(
     for target in filter(None, (output, options["report"])):
         refuse_existing(target, overwrite)
     shared.check_html(html_file)
-    flight = calibrate_flight(paths, load_targets(targets) if targets else [], _read_options(options))
+    asked = shared.from_options(RunOptions, options)
+    chain, request = find_request(asked)  # pulse and chain are chosen as `wavebatch run` chooses them
+    how = shared.from_options(CalibrationOptions, options, sensor=read_sensor(asked), chain=chain, request=request)
+    flight = calibrate_flight(paths, load_targets(targets) if targets else [], how)
     found = flight.calibration
     write_text(output, format_calibration(found), overwrite=overwrite)
     if options["report"] is not None:
@@ -97,15 +101,6 @@ def calibrate(
     for line in list_lines(calibration_sheet(flight)):
         tell(line)
     tell(f"{output}: written")
-
-
-def _read_options(options: dict[str, Any]) -> CalibrationOptions:
-    """How to measure; pulse and chain are chosen as `wavebatch run` chooses them."""
-    from wavebatch.tools.api.run import find_request, read_sensor
-
-    asked = shared.from_options(RunOptions, options)
-    chain, request = find_request(asked)
-    return shared.from_options(CalibrationOptions, options, sensor=read_sensor(asked), chain=chain, request=request)
 
 
 def _list_report(flight: FlightCalibration) -> dict[str, Any]:

@@ -110,7 +110,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.tools.plots.histogram import count_points_by_flag, count_values
+    from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values
     from wavebatch.tools.plots.values import Clouds
 
     column, chosen = options["column"], choose_points(options)
@@ -271,7 +271,7 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
 
     Exit code: 0 done, 1 the cube cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.tools.slices.cube import cut_cube
+    from wavebatch.tools.slices.output import cut_cube
 
     check_picture(output, overwrite=options["overwrite"])
     slices = cut_cube(cube_file, {name: options[name] for name in "xyt"})
@@ -285,10 +285,6 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
 
 
 _SHOWN = ("detector", "asdf", "wavelet", "correlation", "deconvolved", "derivative")
-
-
-def _read_times(text: str) -> tuple[float, ...] | str:
-    return "all" if text == "all" else read_range(text)
 
 
 @click.group(cls=NearestGroup)
@@ -318,7 +314,8 @@ def plot() -> None:
 @click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
 @shared.seed_option("Seed of the random packets.")
 @click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
-@click.option("--times", "shown", type=shared.Text("LOW:HIGH|all", _read_times), metavar="LOW:HIGH|all",
+@click.option("--times", "shown", metavar="LOW:HIGH|all",
+              type=shared.Text("LOW:HIGH|all", lambda text: text if text == "all" else read_range(text)),
               help="Part of the waveforms to show [ns].  [default: the part with signal, of each waveform]")
 @click.option("--show", metavar="|".join(_SHOWN), help="Also draw the signal in which the detector searches, with its "
               "threshold; detector: that of the chain's detector.")

@@ -32,6 +32,7 @@ from wavebatch.cli.messages import (
 )
 from wavebatch.cli.program.progress import Progress
 from wavebatch.core.errors import WARNINGS, ConfigError, InputError
+from wavebatch.core.process import importing
 from wavebatch.core.suggest import nearest
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_input
@@ -84,7 +85,8 @@ def run(**options: Any) -> None:
     _check_options(options)
     try:
         _start_processes(options)
-        from wavebatch.tools.api.run import plan_run
+        with importing():
+            from wavebatch.tools.api.run import plan_run
 
         jobs, batch_options = plan_run(options["strips"], shared.from_options(RunOptions, options), shared.note_input)
         if options["report"] not in (None, "-"):
@@ -130,7 +132,7 @@ def _is_made(target: Path, output: Path) -> bool:
 
 def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str = "--report") -> None:
     """Raises ConfigError if the summary would replace a file that is read or written by this run."""
-    from wavebatch.batch.preflight import find_outputs
+    from wavebatch.batch.run import find_outputs
 
     refuse_input(report)
     outputs = {os.path.realpath(path) for job in jobs for path in find_outputs(job, batch_options.folder)}
@@ -213,7 +215,7 @@ def find_exit_code(errors: Sequence[BaseException | None]) -> int:
 
 
 def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
-    from wavebatch.batch.preflight import plan_strip
+    from wavebatch.batch.run import plan_strip
     from wavebatch.stages.chain_file import effective
 
     errors: list[BaseException | None] = []

@@ -23,7 +23,6 @@ from wavebatch.tools.simulate import (
     PULSES,
     SCENES,
     DiscreteReceiver,
-    Scene,
     StripOptions,
     find_scene,
     shape_pulse,
@@ -82,7 +81,11 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
     Exit code: 0 done, 1 the strip cannot be written, 2 wrong usage.
     """  # fmt: skip
     receiver = _build_receiver(truth, options)
-    shaped = _shape_scene(find_scene(scene), options)
+    found = find_scene(scene)
+    given = shared.given_options(options, ("bits", *_RECORDING))
+    shape = {name: options[name] for name in ("pulse", "sigma", "kappa", "ringing")}
+    pulse = shape_pulse(found.recording.pulse, **shape)
+    shaped = replace(found, recording=replace(found.recording, pulse=pulse, **given))
     bar = counting("pulses", options["quiet"], pulses)
     common = {
         "pulses": pulses,
@@ -113,14 +116,6 @@ def _build_receiver(truth: Path | None, options: dict[str, Any]) -> DiscreteRece
     if shared.given_options(options, _RECEIVER):
         raise click.UsageError("--dead-zone, --threshold and --most-returns need --sensor discrete")
     return None
-
-
-def _shape_scene(scene: Scene, options: dict[str, Any]) -> Scene:
-    """The scene with the recording of the options."""
-    given = shared.given_options(options, ("bits", *_RECORDING))
-    shape = {name: options[name] for name in ("pulse", "sigma", "kappa", "ringing")}
-    pulse = shape_pulse(scene.recording.pulse, **shape)
-    return replace(scene, recording=replace(scene.recording, pulse=pulse, **given))
 
 
 @click.command()

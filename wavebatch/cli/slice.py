@@ -22,12 +22,11 @@ from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.geojson import GEOJSON_CRS, GeoJsonCrs, plan_crs
-from wavebatch.files.las.crs import read_crs_definition
+from wavebatch.files.las.crs import describe_crs, read_crs_definition
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import survey_blocks
-from wavebatch.tools.slices.cube import CubeBuilder
-from wavebatch.tools.slices.output import SEGMENT_SUFFIXES, SegmentWriter, draw_slice
-from wavebatch.tools.slices.segments import Segment, SliceOptions, cut_slice, find_segments, read_scan_lines
+from wavebatch.tools.slices.output import SEGMENT_SUFFIXES, CubeBuilder, SegmentWriter, draw_segments, draw_slice
+from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments, read_scan_lines
 
 EXIT_SOME_FAILED = 1
 """Some strips failed."""
@@ -192,21 +191,14 @@ def _find(
         if extras.targets and not counts["lines"]:
             raise InputError(f"{extras.targets[0]}: not written, because no scan line has a number in --lines")
         if extras.overview:
-            _draw_overview(every, extras.overview, reader, counts["lines"], overwrite)
+            if not every:
+                raise InputError(f"{extras.overview}: not drawn, because the scan lines have no segment")
+            path = reader.facts.path
+            draw_segments(every, extras.overview, strip=path.name, lines=counts["lines"], crs=describe_crs(path)[0],
+                          overwrite=overwrite)  # fmt: skip
         if cube:
             meta = {"version": __version__, "strip": reader.facts.path.name}
             counts["cube"] = list(cube.write(meta, reader.facts.crs, overwrite=overwrite))
         if writer:
             writer.commit()
     return counts
-
-
-def _draw_overview(segments: list[Segment], target: Path, reader: StripReader, lines: int, overwrite: bool) -> None:
-    """Draws the segments of all lines; InputError without any."""
-    from wavebatch.files.las.crs import describe_crs
-    from wavebatch.tools.slices.output import draw_segments
-
-    if not segments:
-        raise InputError(f"{target}: not drawn, because the scan lines have no segment")
-    path = reader.facts.path
-    draw_segments(segments, target, strip=path.name, lines=lines, crs=describe_crs(path)[0], overwrite=overwrite)

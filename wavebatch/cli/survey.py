@@ -61,10 +61,12 @@ def survey(
     Exit code: 0 done, 1 a strip cannot be surveyed or does not belong to the others, or a file cannot be written, 2
     wrong usage.
     """  # fmt: skip
+    from wavebatch.core.errors import ConfigError
     from wavebatch.files.disk.publish import check_target
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
+    from wavebatch.tools.compare.angle_table import check_angles
     from wavebatch.tools.sheets.sheet import Sheet
     from wavebatch.tools.sheets.survey import list_doubts, survey_sheet, write_survey_page
 
@@ -76,7 +78,10 @@ def survey(
             check_target(target, overwrite=overwrite)
     shared.check_html(html_file)
     if angles is not None:
-        _check_angles(angles, paths, overwrite)
+        if len(paths) > 1:
+            words = "is for one strip, because widths depend on the distance of the ground"
+            raise ConfigError(f"--angles {angles}: {words}")
+        check_angles(angles, overwrite=overwrite)
     options["angles"] = angles
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
     if output is not None:
@@ -102,9 +107,11 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     """The survey, and what else is shown of the strip."""
     from wavebatch.files.disk.raw_bytes import take_fingerprint
     from wavebatch.surveying.inspect_strip import doubt_files
+    from wavebatch.surveying.sensor import SensorRequest, find_sensor
     from wavebatch.surveying.system_file import SavedSurvey
     from wavebatch.tools.api.strip import open_strip
     from wavebatch.tools.api.strip import survey as survey_strip
+    from wavebatch.tools.compare.angle_table import write_angles
 
     with open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
         found = survey_strip(
@@ -120,27 +127,11 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
         }
         packet_file = opened.facts.packets.file
         if options["angles"] is not None:
-            _write_angles(options["angles"], opened, found, options["overwrite"])
+            distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
+            sizes = {"spacing": found.figures.spacing_ns, "amplitude": found.figures.amplitude_50}
+            write_angles(options["angles"], found.system, distance=distance, strip=opened.facts.path.name, **sizes,
+                         overwrite=options["overwrite"])  # fmt: skip
     return SavedSurvey(found, strip.name, take_fingerprint(strip, packet_file)), facts
-
-
-def _check_angles(target: Path, paths: Sequence[Path], overwrite: bool) -> None:
-    from wavebatch.core.errors import ConfigError
-    from wavebatch.tools.compare.angle_table import check_angles
-
-    if len(paths) > 1:
-        raise ConfigError(f"--angles {target}: is for one strip, because widths depend on the distance of the ground")
-    check_angles(target, overwrite=overwrite)
-
-
-def _write_angles(target: Path, opened: Any, found: Any, overwrite: bool) -> None:
-    from wavebatch.surveying.sensor import SensorRequest, find_sensor
-    from wavebatch.tools.compare.angle_table import write_angles
-
-    distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
-    sizes = {"spacing": found.figures.spacing_ns, "amplitude": found.figures.amplitude_50}
-    name = opened.facts.path.name
-    write_angles(target, found.system, distance=distance, strip=name, **sizes, overwrite=overwrite)
 
 
 def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:

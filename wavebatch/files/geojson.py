@@ -153,7 +153,10 @@ def _find_source(file: AreaFile, header: LasHeader) -> str | None:
         return file.crs
     sides = [high - low for low, high in zip(header.mins[:2], header.maxs[:2], strict=True)]
     inside = file.extent is not None and max(sides) <= _LONGEST_STRIP and _overlaps(file.extent, header)
-    return WGS84 if file.maybe_degrees and not inside and not _holds_degrees(header) else None
+    # Degrees fit a strip that is in degrees itself, or in local metres near the origin.
+    values = [*header.mins[:2], *header.maxs[:2]]
+    fits = all(abs(value) <= most for value, most in zip(values, (180, 90, 180, 90), strict=True))
+    return WGS84 if file.maybe_degrees and not inside and not fits else None
 
 
 def _project(
@@ -205,12 +208,6 @@ def _overlaps(extent: tuple[float, float, float, float], header: LasHeader) -> b
     (west, south, _), (east, north, _) = header.mins, header.maxs
     left, low, right, high = extent
     return left <= east and right >= west and low <= north and high >= south
-
-
-def _holds_degrees(header: LasHeader) -> bool:
-    """Whether the strip lies where degrees do: it is in degrees itself, or in local metres near the origin."""
-    values = [*header.mins[:2], *header.maxs[:2]]
-    return all(abs(value) <= most for value, most in zip(values, (180, 90, 180, 90), strict=True))
 
 
 def _code(definition: str) -> str | None:

@@ -85,7 +85,8 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
     else:
         found, problem = [Path(name) for name in sorted(glob.glob(str(path), recursive=True))], f"{argument}: matches"
     for suffixes in kinds:
-        chosen = [entry for entry in found if _is_visible(entry, suffixes)]
+        chosen = [entry for entry in found if entry.suffix.lower() in suffixes and os.path.isfile(entry)
+                  and not entry.name.startswith(".")]  # fmt: skip
         if chosen:
             yield from chosen
             return
@@ -108,10 +109,6 @@ def _expand_home(name: str) -> str:
         return os.path.expanduser(name)
     except ValueError:  # no user can have this name
         return name
-
-
-def _is_visible(path: Path, suffixes: Sequence[str]) -> bool:
-    return path.suffix.lower() in suffixes and os.path.isfile(path) and not path.name.startswith(".")
 
 
 def _read_list(path: Path, recursive: bool, kinds: Sequence[Sequence[str]]) -> Iterator[Path]:

@@ -161,8 +161,12 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
         return None
     found = found or _read_file(reader, request or "")
     chosen = even_places(reader.unit_count(), SAMPLED_UNITS)
-    # Points of one pulse follow each other: each pulse counts once.
-    values = np.concatenate([np.empty(0), *(_once(found, reader.read_unit(int(number), scan)) for number in chosen)])
+    values = np.empty(0)
+    for number in chosen:
+        points = reader.read_unit(int(number), scan).points
+        # Points of one pulse follow each other: each pulse counts once.
+        new = np.append(True, np.diff(points["gps_time"]) != 0)[: len(points)]
+        values = np.append(values, found.read(points[new]))
     there = values[np.isfinite(values)]
     if len(values) and len(there) < LEAST_KNOWN * len(values):
         if request is None:
@@ -176,13 +180,6 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
     known = len(there) / max(len(values), 1)
     shots = float(np.sqrt(0.5 * np.mean(np.diff(there) ** 2)) / mean) if len(there) > 1 else 0.0
     return replace(found, mean=mean, spread=spread, shots=shots, known=known, fills=request is None)
-
-
-def _once(found: PulseEnergy, unit: Unit) -> np.ndarray:
-    """Energies of the pulses of a unit."""
-    points = unit.points
-    new = np.append(True, np.diff(points["gps_time"]) != 0)[: len(points)]
-    return found.read(points[new])
 
 
 def find_column(reader: StripReader, request: str) -> PulseEnergy | None:

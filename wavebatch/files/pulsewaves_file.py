@@ -153,7 +153,9 @@ def _read(file: BinaryIO, path: Path, front: bytes) -> PulseHeader:
     if not 48 <= length <= MOST_PULSE_BYTES or not 0 <= count <= (size - start) // length:
         raise damaged(path, f"{count} pulses of {length} bytes do not fit between byte {start} and the end at {size}")
     scales, offsets = np.array(numbers[:3]), np.array(numbers[3:])
-    _check_scales(path, scales, offsets, time_scale, time_offset)
+    sizes, shifts = np.abs(np.append(scales, time_scale)), np.abs(np.append(offsets, time_offset))
+    if not ((sizes >= LEAST_SCALE) & (sizes <= LARGEST_SCALE) & (shifts <= LARGEST_OFFSET)).all():
+        raise damaged(path, "scales or offsets of coordinates or time that no survey has")
     found = [*_list_records(file, path, header_size, start, records)]
     found += _list_appended(file, size, start + count * length, appended)
     descriptors: dict[int, Any] = {}
@@ -168,12 +170,6 @@ def _read(file: BinaryIO, path: Path, front: bytes) -> PulseHeader:
         tuple(Vlr(PROJECTION.encode(), number, payload) for user, number, payload in found
               if user == _PROJ and number in (34735, 34736, 34737) and len(payload) < 65536),
     )  # fmt: skip
-
-
-def _check_scales(path: Path, scales: np.ndarray, offsets: np.ndarray, *time: float) -> None:
-    good = (np.abs(scales) >= LEAST_SCALE) & (np.abs(scales) <= LARGEST_SCALE) & (np.abs(offsets) <= LARGEST_OFFSET)
-    if not good.all() or not (LEAST_SCALE <= abs(time[0]) <= LARGEST_SCALE and abs(time[1]) <= LARGEST_OFFSET):
-        raise damaged(path, "scales or offsets of coordinates or time that no survey has")
 
 
 def _build_dtype(attributes: int, length: int) -> np.dtype:

@@ -345,15 +345,6 @@ class Distances:
         """Adds the pairs of another cloud."""
         self.bins += other.bins
 
-    def list_zones(self) -> dict[str, DeadZone]:
-        """The dead zone of `all` pairs, and of the classes of RANKS that have pairs."""
-        zones = {"all": find_dead_zone(self.bins.sum(axis=0))}
-        return zones | {name: find_dead_zone(bins) for name, bins in zip(RANKS, self.bins, strict=True) if bins.any()}
-
-    def count_hidden(self, size: float) -> int:
-        """Pairs that a dead zone would hold if they were as frequent there as up to twice its size."""
-        return int(self.bins[:, round(size / BIN) : round(2 * size / BIN)].sum())
-
 
 def find_dead_zone(bins: np.ndarray) -> DeadZone:
     """The dead zone of the pairs of a histogram: the 0.1 % quantile of their distances."""
@@ -590,9 +581,13 @@ class _Tally:
     def finish(self, cloud: str) -> ReturnStats:
         """The statistics."""
         (whole,) = self.whole.finish()
-        zones = self.distances.list_zones()
+        bins = self.distances.bins
+        zones = {"all": find_dead_zone(bins.sum(axis=0))}
+        zones |= {name: find_dead_zone(each) for name, each in zip(RANKS, bins, strict=True) if each.any()}
         zone = zones["all"].size
-        hidden = math.nan if math.isnan(zone) else self.distances.count_hidden(zone) / whole.pulses
+        # Pairs that the zone would hold if they were as frequent there as up to twice its size.
+        above = slice(0, 0) if math.isnan(zone) else slice(round(zone / BIN), round(2 * zone / BIN))
+        hidden = math.nan if math.isnan(zone) else int(bins[:, above].sum()) / whole.pulses
         names = list(EchoFlag.__members__)
         return ReturnStats(
             cloud=cloud,

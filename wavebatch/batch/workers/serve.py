@@ -18,7 +18,7 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
-from wavebatch.core.process import keep_freed_memory
+from wavebatch.core.process import importing, keep_freed_memory
 
 _FIRST_MODULE = "wavebatch.batch.neighbour_pass"
 """What a new process imports while it waits: with it comes nearly all that calls need."""
@@ -36,7 +36,7 @@ def serve_calls(pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     keep_freed_memory()
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
-    with contextlib.suppress(Exception):  # the call that needs it reports the error
+    with contextlib.suppress(Exception), importing():  # the call that needs it reports the error
         importlib.import_module(_FIRST_MODULE)
     with contextlib.suppress(EOFError, OSError):
         while True:

@@ -72,7 +72,9 @@ class Progress:
             for one in event["warnings"]:
                 say = self._say if StripWarning(**one).is_loud else self._tell
                 say(printable(f"{strip}: warning: {one['text']}"))
-            more = [*_decisions(event), *_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])]
+            chosen = [f"{one['part']}: {'kept' if one['needed'] else 'left out'}: {one['reason']}"
+                      for one in event["decisions"]]  # fmt: skip
+            more = [*chosen, *_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])]
             for line in [*more * (self._level > 0), *event["remarks"]]:
                 self._tell(f"{strip}: {line}")
         elif kind == "skipped":
@@ -127,12 +129,6 @@ def _sensor_lines(sensor: dict[str, Any]) -> Iterator[str]:
     parts = [text.format(sensor[key]) for key, text in words.items() if sensor.get(key) is not None]
     if parts:
         yield f"sensor from {sensor['source']}: {', '.join(parts)}"
-
-
-def _decisions(event: dict[str, Any]) -> Iterator[str]:
-    """What the automatic chain keeps and leaves out, and why."""
-    for decision in event["decisions"]:
-        yield f"{decision['part']}: {'kept' if decision['needed'] else 'left out'}: {decision['reason']}"
 
 
 def _reasons(no_data: dict[str, dict[str, int]]) -> Iterator[str]:

@@ -235,19 +235,15 @@ def _read_file(path: Path, title: str, options: Mapping[str, click.Option], *, i
         key = OLD_NAMES.get(f"--{key}", key).removeprefix("--") if key not in known else key
         if key not in known:
             raise click.UsageError(f"{path}: [{title}] has no option {shorten(key)}; {nearest(key, list(known))}")
-        if not is_users and not _is_harmless(key, value):
+        # A profile may also be the path of a chain file.
+        harmless = key in HARMLESS and len(str(value)) <= LONGEST and (key != "profile" or str(value).isidentifier())
+        if not is_users and not harmless:
             raise click.UsageError(
                 f"{path}: [{title}] must not set {key} so: a file that lies with the data may change numbers only; "
                 f"remove the line, or, if the whole file can be trusted, give --config {shlex.quote(str(path))}"
             )
         found[known[key]] = _convert(value, options[known[key]], path)
     return found
-
-
-def _is_harmless(key: str, value: Any) -> bool:
-    """Whether a file that came with the data may set an option to this value."""
-    # A profile may also be the path of a chain file.
-    return key in HARMLESS and len(str(value)) <= LONGEST and (key != "profile" or str(value).isidentifier())
 
 
 def _convert(value: Any, option: click.Option, path: Path) -> Any:

@@ -82,13 +82,18 @@ class PointFilter:
         if box is not None and not (len(box) == 4 and box[0] < box[2] < math.inf and box[1] < box[3] < math.inf):
             order = "must be west, south, east, north, with west < east and south < north"
             raise ConfigError(f"--bbox: {list(bbox or ())} {order}")
-        polygons = () if polygon is None else tuple(load_polygons(polygon))
+        polygons, file = () if polygon is None else tuple(load_polygons(polygon)), None
+        if polygon is not None:
+            # All that decides where they lie; the strip's part of it is in its header, which --resume compares too.
+            corners = b"".join(ring.tobytes() + b"|" for one in polygons for ring in one.rings)
+            crs = next((one.file.crs for one in polygons if one.file is not None), None)
+            file = {"file": str(polygon), "corners_sha256": hashlib.sha256(corners).hexdigest(), "crs": crs}
         return cls(
             drop_flags=flags,
             classes=chosen,
             bbox=box,
             polygons=polygons,
-            polygon_file=None if polygon is None else _describe_polygons(str(polygon), polygons),
+            polygon_file=file,
             where=parse_condition(where) if isinstance(where, str) else where,
         )
 
@@ -117,7 +122,13 @@ class PointFilter:
         ConfigError
             For a column that there is not; with its place in the text of --where.
         """
-        columns = {} if self.where is None else _find_columns(self.where, find)
+        columns = {}
+        if self.where is not None:
+            for column in self.where.columns:
+                try:
+                    columns[column] = find(column)
+                except ConfigError as error:
+                    raise self.where.complain(column, str(error)) from error
         if (self.flags or self.drop_flags) and "echo_flags" not in standard:
             raise ConfigError(f"{name}: has no column echo_flags to select points by")
         return PlannedFilter(self, standard, columns)
@@ -190,21 +201,3 @@ class PlannedFilter:
                 yield "polygon", np.logical_or.reduce(inside)
         if chosen.where is not None:
             yield "where", chosen.where.choose({name: column(rows) for name, column in self.columns.items()})
-
-
-def _find_columns(where: Condition, find: Callable[[str], ReadColumn]) -> dict[str, ReadColumn]:
-    """The columns of a condition by their names there."""
-    columns = {}
-    for column in where.columns:
-        try:
-            columns[column] = find(column)
-        except ConfigError as error:
-            raise where.complain(column, str(error)) from error
-    return columns
-
-
-def _describe_polygons(path: str, polygons: Sequence[Polygon]) -> dict[str, Any]:
-    """All that decides where they lie; the strip's part of it is in its header, which --resume compares too."""
-    corners = b"".join(ring.tobytes() + b"|" for polygon in polygons for ring in polygon.rings)
-    crs = next((polygon.file.crs for polygon in polygons if polygon.file is not None), None)
-    return {"file": path, "corners_sha256": hashlib.sha256(corners).hexdigest(), "crs": crs}

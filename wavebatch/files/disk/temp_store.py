@@ -131,7 +131,7 @@ def _prefix() -> str:
 SPOOL_MEMORY = 1 << 24
 """Bytes of entries in memory before they are written to disk."""
 SPOOL_KEPT = 1 << 20
-"""Bytes of entries that a sealed spool keeps in memory: it is pickled for other processes."""
+"""Bytes of entries with which a spool travels to other processes: more of them read a file."""
 
 
 class Spool(Closing):
@@ -173,11 +173,20 @@ class Spool(Closing):
         if self._sealed:
             return self
         self._sealed = True
-        if self._segments or self._held > SPOOL_KEPT:
+        if self._segments:
             self._flush()
         else:
-            self._memory = self._take_pending()
+            starts, parts = self._take_pending()
+            self._memory = starts, np.concatenate(parts) if parts else np.empty(0, self.dtype)
         return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Move many entries to a file; without room for it they travel themselves."""
+        if self._memory is not None and self._memory[1].nbytes > SPOOL_KEPT:
+            with contextlib.suppress(InputError):
+                self._write(self._memory[0], [self._memory[1]])
+                self._memory = None
+        return self.__dict__
 
     def read(self, bucket: int) -> np.ndarray:
         """Return the entries of a bucket in the order in which they were added."""
@@ -216,27 +225,30 @@ class Spool(Closing):
             shutil.rmtree(self.path.parent, ignore_errors=True)
         self._pending, self._memory = [], None
 
-    def _take_pending(self) -> tuple[np.ndarray, np.ndarray]:
-        """Start of every bucket, i8 (buckets + 1,), and the entries sorted by bucket."""
+    def _take_pending(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Start of every bucket, i8 (buckets + 1,), and the entries sorted by bucket, in parts."""
         pending, self._pending, self._held = self._pending, [], 0
+        parts = [part for _, part in pending]
         if not pending:
-            return np.zeros(self.buckets + 1, np.int64), np.empty(0, self.dtype)
+            return np.zeros(self.buckets + 1, np.int64), parts
         bucket = np.concatenate([part for part, _ in pending])
-        entries = np.concatenate([part for _, part in pending])
         if np.any(bucket[1:] < bucket[:-1]):
             order = np.argsort(bucket, kind="stable")
-            bucket, entries = bucket[order], take_whole_records(entries, order)
-        return np.searchsorted(bucket, np.arange(self.buckets + 1)).astype(np.int64), entries
+            bucket, parts = bucket[order], [take_whole_records(np.concatenate(parts), order)]
+        return np.searchsorted(bucket, np.arange(self.buckets + 1)).astype(np.int64), parts
 
     def _flush(self) -> None:
-        starts, entries = self._take_pending()
+        self._write(*self._take_pending())
+
+    def _write(self, starts: np.ndarray, parts: list[np.ndarray]) -> None:
         with reporting_scratch():
             if self.path is None:
                 self.path = make_folder() / "spool"
             with open(self.path, "ab") as file:
                 self._segments.append(file.tell())
                 file.write(starts.data)
-                file.write(entries.view(np.uint8).data)
+                for part in parts:
+                    file.write(np.ascontiguousarray(part).view(np.uint8).data)
 
 
 PARCEL_KEPT = 1 << 16

@@ -216,9 +216,6 @@ class LasHeader:
             *((self.point_count, *self.by_return[:5]) if legacy else (0,) * 6),
             *self.scales, *self.offsets, *bounds,
         )  # fmt: skip
-        return front + self._encode_tail() + self.user_bytes + vlrs + self.padding
-
-    def _encode_tail(self) -> bytes:
         tail = b""
         if self.version >= (1, 3):
             tail += struct.pack("<Q", self.waveform_start)
@@ -226,7 +223,7 @@ class LasHeader:
             tail += struct.pack("<QIQ15Q", self.evlr_start, self.evlr_count, self.point_count, *self.by_return)
         if self.version >= (1, 5):
             tail += struct.pack("<ddH", *self.gps_range, self.gps_offset)
-        return tail
+        return front + tail + self.user_bytes + vlrs + self.padding
 
 
 def read_header(path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
@@ -455,16 +452,11 @@ def copy_standard(source: np.ndarray, rows: np.ndarray, old: int, new: int) -> N
         if name in field_names(STANDARD_DTYPES[old]):
             rows[name] = source[name]
     if old < 6 <= new:
-        _promote_bits(source, rows)
-
-
-def _promote_bits(source: np.ndarray, rows: np.ndarray) -> None:
-    """Writes flags, class, returns and angle of formats 0-5 into formats 6-10; class 12 also sets the overlap bit."""
-    bits, flags = source["bit_fields"], source["raw_classification"]
-    kind = flags & 0b11111
-    rows["bit_fields"] = (bits & 0b111) | ((bits & 0b111000) << 1)
-    rows["classification"] = kind
-    rows["classification_flags"] = (
-        (flags >> 5) | ((kind == _OVERLAP_CLASS).astype(np.uint8) << np.uint8(3)) | (bits & 0b11000000)
-    )
-    rows["scan_angle"] = np.rint(source["scan_angle_rank"] / ANGLE_UNIT).astype(np.int16)
+        # Flags, class, returns and angle of formats 0-5; class 12 also sets the overlap bit.
+        bits, flags = source["bit_fields"], source["raw_classification"]
+        kind = flags & 0b11111
+        overlap = (kind == _OVERLAP_CLASS).astype(np.uint8) << np.uint8(3)
+        rows["bit_fields"] = (bits & 0b111) | ((bits & 0b111000) << 1)
+        rows["classification"] = kind
+        rows["classification_flags"] = (flags >> 5) | overlap | (bits & 0b11000000)
+        rows["scan_angle"] = np.rint(source["scan_angle_rank"] / ANGLE_UNIT).astype(np.int16)

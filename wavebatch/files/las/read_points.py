@@ -75,7 +75,9 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     if waveforms:
         _check_waveforms(path, header)
     _check_format(path, header)
-    _check_numbers(path, header)
+    for axis, scale, offset in zip("xyz", header.scales, header.offsets, strict=True):
+        if not (LEAST_SCALE <= abs(scale) <= LARGEST_SCALE and abs(offset) <= LARGEST_OFFSET):
+            raise damaged(path, f"scale {scale} and offset {offset} of {axis} give no usable coordinates")
     payloads = [vlr.payload for vlr in header.vlrs if has_record([vlr], "LASF_Spec", EXTRA_BYTES_RECORD_ID)]
     extra = header.point_length - STANDARD_DTYPES[header.point_format].itemsize
     records = tuple(read_records(payloads[0] if payloads else b"", extra))
@@ -109,12 +111,6 @@ def _check_format(path: Path, header: LasHeader) -> None:
     least = STANDARD_DTYPES[number].itemsize
     if header.point_length < least:
         raise damaged(path, f"point records of {header.point_length} bytes are too short for format {number} ({least})")
-
-
-def _check_numbers(path: Path, header: LasHeader) -> None:
-    for axis, scale, offset in zip("xyz", header.scales, header.offsets, strict=True):
-        if not (LEAST_SCALE <= abs(scale) <= LARGEST_SCALE and abs(offset) <= LARGEST_OFFSET):
-            raise damaged(path, f"scale {scale} and offset {offset} of {axis} give no usable coordinates")
 
 
 def _find_warnings(header: LasHeader) -> tuple[str, ...]:
@@ -249,16 +245,13 @@ class LazPoints:
             while done < len(rows):
                 chunk = int(np.searchsorted(self._first, start + done, "right")) - 1
                 count = min(len(rows) - done, int(self._first[chunk + 1]) - start - done)
-                self._seek(chunk, start + done)
+                if chunk != self._chunk or start + done < self._next:
+                    self._open_chunk(chunk)
+                while self._next < start + done:
+                    self._decode(np.empty(min(_PIECE, start + done - self._next), self._checked.dtype))
                 self._decode(rows[done : done + count])
                 done += count
         return rows
-
-    def _seek(self, chunk: int, point: int) -> None:
-        if chunk != self._chunk or point < self._next:
-            self._open_chunk(chunk)
-        while self._next < point:
-            self._decode(np.empty(min(_PIECE, point - self._next), self._checked.dtype))
 
     def _decode(self, rows: np.ndarray) -> None:
         self._decoder.decompress_many(rows.view(np.uint8).reshape(-1))

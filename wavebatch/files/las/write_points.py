@@ -75,7 +75,7 @@ def compress_rows(rows: np.ndarray, point_format: int) -> Chunk:
 
 
 class PointEncoder:
-    """Writes records to the file as they are; `finish` ends the points and must be called once."""
+    """Writes header, VLRs and records to the file as they are; `finish` ends the points and must be called once."""
 
     def __init__(self, file: BinaryIO, header: LasHeader) -> None:
         self._file = file
@@ -92,15 +92,9 @@ class PointEncoder:
         """Write what is left to be written."""
 
 
-def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
-    """Write header and VLRs at the start of `file` and return the encoder for the points after them.
-
-    For a compressed file the "laszip encoded" record is added to `header.vlrs`.
-    """
-    return _LazEncoder(file, header) if header.compressed else PointEncoder(file, header)
-
-
 class _LazEncoder(PointEncoder):
+    """Compresses records; adds the "laszip encoded" record to `header.vlrs`."""
+
     def __init__(self, file: BinaryIO, header: LasHeader) -> None:
         self._format, self._coding = header.point_format, _encode_coding(header.point_format, header.point_length)
         header.vlrs.append(Vlr(b"laszip encoded", 22204, self._coding, b"http://laszip.org"))
@@ -192,7 +186,10 @@ class PointFile(contextlib.AbstractContextManager):
         self.dtype = dtype
         self._header = header
         self._records = list(records)
-        header.compressed = is_compressed(self.target)
+        suffix = self.target.suffix.lower()
+        if suffix not in (".las", ".laz"):
+            raise ConfigError(f"{self.target}: an output's name must end in .las or .laz")
+        header.compressed = suffix == ".laz"
         header.point_length = dtype.itemsize
         header.vlrs = [vlr for vlr in header.vlrs if not has_record([vlr], "laszip encoded", 22204)]
         self._place_extra_bytes()
@@ -203,7 +200,7 @@ class PointFile(contextlib.AbstractContextManager):
         """All files that are published together, the point file last."""
         try:
             with self._guarded():
-                self._encoder = open_encoder(self.draft.file, header)
+                self._encoder = (_LazEncoder if header.compressed else PointEncoder)(self.draft.file, header)
         except BaseException:
             self.draft.discard()
             raise
@@ -387,14 +384,6 @@ class Statistics:
             return record.with_range(None, None)
         least, largest = zip(*found, strict=True)
         return record.with_range(np.array(least), np.array(largest))
-
-
-def is_compressed(target: Path) -> bool:
-    """Whether the name ends in .laz; raises ConfigError if it ends in neither .las nor .laz."""
-    suffix = target.suffix.lower()
-    if suffix not in (".las", ".laz"):
-        raise ConfigError(f"{target}: an output's name must end in .las or .laz")
-    return suffix == ".laz"
 
 
 def copy_bytes(source: BinaryIO, start: int, end: int, target: BinaryIO) -> None:

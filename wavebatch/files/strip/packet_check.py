@@ -416,7 +416,10 @@ class Judge:
         """
         fields = dict(zip(FIELDS, (points[name] for name in _NAMES), strict=True))
         if self._compressed.any():
-            self._refuse_compressed(fields["index"][(fields["index"] > 0) & (fields["size"] > 0)])
+            used = fields["index"][(fields["index"] > 0) & (fields["size"] > 0)]
+            bad = self._compressed[used]
+            if bad.any():
+                raise refuse_compressed(self._facts.path, self._facts.compression[int(used[np.argmax(bad)])])
         geometry = Geometry(form == "range", PS_PER_NS / HALF_C, RANGE_RATIO, MAX_LOCATION)
         reason, n_samples, keys, short, packed = judge_packets(fields, self._rules, geometry)
         if overfull is not None and len(overfull):
@@ -444,11 +447,6 @@ class Judge:
         finally:
             packets.close()
         return good
-
-    def _refuse_compressed(self, index: np.ndarray) -> None:
-        bad = self._compressed[index]
-        if bad.any():
-            raise refuse_compressed(self._facts.path, self._facts.compression[int(index[np.argmax(bad)])])
 
 
 def packed_bytes(n_samples: int, bits: int) -> int:

@@ -268,8 +268,13 @@ class _Scanner:
             overfull = distinct(np.concatenate(full))
             if suspects.any():
                 self._vote_far()
-            if len(overfull):
-                self._count_overfull(overfull)
+            for start, judged in self._judge_again(overfull) if len(overfull) else ():
+                here, tally = judged.reason == Reason.OVERFULL, found.tally
+                many = int(here.sum())
+                if many and tally.first[Reason.OVERFULL] < 0:
+                    tally.first[Reason.OVERFULL] = start + int(np.argmax(here))
+                tally.reasons[Reason.OVERFULL] += many
+                tally.reasons[Reason.USABLE] -= many
         except BaseException:
             found.close()
             raise
@@ -284,7 +289,11 @@ class _Scanner:
             part = self._source.read(at, min(at + step, count))
             cut = _find_cut(rest, part) if at else 0
             if at == begin:
-                self._open_window(np.concatenate([rest, part[:cut]]), at + cut)
+                # The window begins with the last points before the first unit.
+                points, start = np.concatenate([rest, part[:cut]]), at - len(rest)
+                judged = self._judge.judge(points, self._form)
+                rows = np.flatnonzero(judged.usable)
+                self._window = [_Part(judged.keys[rows], start + rows, self._first - 1, points, start)]
             else:
                 yield borders[-1], np.concatenate([rest, part[:cut]]) if cut else rest
             borders.append(at + cut)
@@ -294,12 +303,6 @@ class _Scanner:
             cut = _find_cut(rest, after) if len(after) else 0
             yield borders[-1], np.concatenate([rest, after[:cut]]) if cut else rest
             borders.append(end + cut)
-
-    def _open_window(self, points: np.ndarray, stop: int) -> None:
-        """Begin with the last points before the first unit."""
-        rows = np.flatnonzero((judged := self._judge.judge(points, self._form)).usable)
-        start = stop - len(points)
-        self._window = [_Part(judged.keys[rows], start + rows, self._first - 1, points, start)]
 
     def _keep(self, unit: int, points: np.ndarray) -> None:
         """Keep the points of a compressed strip: to decode them again takes twenty times as long as to read them."""
@@ -361,7 +364,12 @@ class _Scanner:
             for unit in range(len(borders) - 1):
                 wants = far.wants.read(unit)
                 if len(wants):
-                    self._give(int(borders[unit]), int(borders[unit + 1]), wants)
+                    start, context = int(borders[unit]), self._found.context
+                    points = self._source.read(start, int(borders[unit + 1]))
+                    entries = np.empty(len(wants), context.dtype)
+                    entries["index"] = wants["index"]
+                    entries["record"] = take_whole_records(points, wants["index"] - start)
+                    context.append(wants["unit"], entries)
         finally:
             far.wants.close()
         return far.packets, far.reach, far.overfull
@@ -377,12 +385,6 @@ class _Scanner:
             rows = rows[self._found.near.is_suspect(judged.keys[rows], suspects)]
             yield judged.keys[rows], start + rows
 
-    def _give(self, start: int, stop: int, wants: np.ndarray) -> None:
-        points = self._source.read(start, stop)
-        entries = np.empty(len(wants), self._found.context.dtype)
-        entries["index"], entries["record"] = wants["index"], take_whole_records(points, wants["index"] - start)
-        self._found.context.append(wants["unit"], entries)
-
     def _vote_far(self) -> None:
         """Some units vote again with their context: in a shuffled strip only there the returns of a packet meet."""
         for unit in range(0, self._units, max(1, self._units // _FAR_SAMPLES)):
@@ -395,15 +397,6 @@ class _Scanner:
             rows = rows[np.argsort(index[rows], kind="stable")]
             parts = _Parts([_Part(judged.keys[rows], np.arange(len(rows)), unit, take_whole_records(points, rows), 0)])
             self._vote(group_keys(parts.keys), parts, np.ones(len(rows), bool))
-
-    def _count_overfull(self, overfull: np.ndarray) -> None:
-        for start, judged in self._judge_again(overfull):
-            here = judged.reason == Reason.OVERFULL
-            many = int(here.sum())
-            if many and self._found.tally.first[Reason.OVERFULL] < 0:
-                self._found.tally.first[Reason.OVERFULL] = start + int(np.argmax(here))
-            self._found.tally.reasons[Reason.OVERFULL] += many
-            self._found.tally.reasons[Reason.USABLE] -= many
 
     def _finish(self, packets: int, reach: int, overfull: np.ndarray, most: int) -> StripScan:
         """most: how many times packets may claim the bytes that are there."""

@@ -202,21 +202,17 @@ def find_far(units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders
                 lead, tail = groups.order[groups.starts], groups.order[groups.starts + groups.counts - 1]
                 reach = max(reach, int((entries["index"][tail] - entries["index"][lead]).max()))
                 overfull.append(entries["key"][lead[groups.counts > MAX_RETURNS]])
-            _append_wants(wants, groups, entries["index"], borders)
+            unit = np.searchsorted(borders, entries["index"], "right") - 1
+            target, member = cross_units(groups, unit)
+            asked = np.empty(len(target), _WANT)
+            asked["index"], asked["unit"] = entries["index"][member], target
+            wants.append(unit[member], asked)
     except BaseException:
         wants.close()
         raise
     finally:
         spool.close()
     return FarSharing(wants.seal(), packets, reach, np.concatenate([np.empty(0, np.uint64), *overfull]))
-
-
-def _append_wants(wants: Spool, groups: PacketGroups, index: np.ndarray, borders: np.ndarray) -> None:
-    unit = np.searchsorted(borders, index, "right") - 1
-    target, member = cross_units(groups, unit)
-    entries = np.empty(len(target), _WANT)
-    entries["index"], entries["unit"] = index[member], target
-    wants.append(unit[member], entries)
 
 
 def _read_bucket(spool: Spool, bucket: int) -> np.ndarray:

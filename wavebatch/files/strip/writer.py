@@ -83,14 +83,26 @@ class FullwaveWriter(PointFile):
         overwrite: bool = False,
     ) -> None:
         target = Path(target)
-        numbers = _check_version(target, version, point_format)
-        _check_digitizers(target, digitizers)
+        numbers = next((known for known in _FORMATS if version == ".".join(map(str, known))), None)
+        if numbers is None or point_format not in _FORMATS[numbers]:
+            raise ConfigError(
+                f"{target}: LAS {version} has no waveforms in point format {point_format}; choose format 4 or 5 for "
+                "1.3; 4, 5, 9 or 10 for 1.4; 9 or 10 for 1.5"
+            )
+        indices, descriptors = [digitizer.index for digitizer in digitizers], []
+        if not indices or len(set(indices)) < len(indices) or not all(1 <= index <= 255 for index in indices):
+            raise ConfigError(f"{target}: digitizers need different indices from 1 to 255, got {indices}")
+        for one in digitizers:
+            if one.bits not in (8, 16, 32):
+                raise ConfigError(f"{target}: digitizer {one.index} has {one.bits} bits, not 8, 16 or 32")
+            payload = DESCRIPTOR.pack(one.bits, 0, one.n_samples, round(one.spacing * PS_PER_NS), one.gain, one.offset)
+            descriptors.append(Vlr(b"LASF_Spec", 99 + one.index, payload, b"wave packet descriptor"))
         self._digitizers = {digitizer.index: digitizer for digitizer in digitizers}
         self._internal, self._toward = internal, toward
         header = LasHeader.new(
             numbers, point_format, scales, offsets, wkt, WAVES_INTERNAL if internal else WAVES_EXTERNAL
         )
-        header.vlrs = [*map(_build_descriptor, digitizers), *header.vlrs, *records]
+        header.vlrs = [*descriptors, *header.vlrs, *records]
         header.system_identifier, header.file_source_id = system.encode("latin-1", "replace")[:32], source
         if week:
             header.global_encoding &= ~STANDARD_TIME
@@ -145,28 +157,3 @@ class FullwaveWriter(PointFile):
             self.append_record(head, self._packets.file, EVLR_HEADER_SIZE, self._end, waveforms=True)
             self._packets.discard()
             self.drafts.remove(self._packets)
-
-
-def _check_version(target: Path, version: str, point_format: int) -> tuple[int, int]:
-    numbers = next((known for known in _FORMATS if version == ".".join(map(str, known))), None)
-    if numbers is None or point_format not in _FORMATS[numbers]:
-        raise ConfigError(
-            f"{target}: LAS {version} has no waveforms in point format {point_format}; choose format 4 or 5 for 1.3; "
-            "4, 5, 9 or 10 for 1.4; 9 or 10 for 1.5"
-        )
-    return numbers
-
-
-def _check_digitizers(target: Path, digitizers: Sequence[Digitizer]) -> None:
-    indices = [digitizer.index for digitizer in digitizers]
-    if not indices or len(set(indices)) < len(indices) or not all(1 <= index <= 255 for index in indices):
-        raise ConfigError(f"{target}: digitizers need different indices from 1 to 255, got {indices}")
-    for digitizer in digitizers:
-        if digitizer.bits not in (8, 16, 32):
-            raise ConfigError(f"{target}: digitizer {digitizer.index} has {digitizer.bits} bits, not 8, 16 or 32")
-
-
-def _build_descriptor(digitizer: Digitizer) -> Vlr:
-    spacing = round(digitizer.spacing * PS_PER_NS)
-    payload = DESCRIPTOR.pack(digitizer.bits, 0, digitizer.n_samples, spacing, digitizer.gain, digitizer.offset)
-    return Vlr(b"LASF_Spec", 99 + digitizer.index, payload, b"wave packet descriptor")

@@ -195,9 +195,12 @@ def position(
     returns = block.returns
     if returns is not None and len(returns):
         reach = tolerance + 0.5 * block.spacing
-        for _ in range(2):  # the second time with the offset that the first one found
-            shifted = returns.time + offset[returns.waveform]
-            match = match_returns(waveform, echoes.time, returns.waveform, shifted, reach)
+        match = match_returns(waveform, echoes.time, returns.waveform, returns.time, reach)
+        offset, doubt, known = _shared_offset(len(block), echoes, match, returns.time)
+        shifted = returns.time + offset[returns.waveform]
+        again = match_returns(waveform, echoes.time, returns.waveform, shifted, reach)
+        if not np.array_equal(again, match):
+            match = again
             offset, doubt, known = _shared_offset(len(block), echoes, match, returns.time)
         point = np.where(match >= 0, returns.point[match], -1)
     along = echoes.time - offset[waveform]

@@ -14,8 +14,7 @@ from typing import Any, Literal, TypedDict, Unpack
 
 from wavebatch.batch.job import StripJob, choose_columns, list_column_names
 from wavebatch.batch.options import RunOptions, describe_options
-from wavebatch.batch.preflight import check_outputs, plan_memory
-from wavebatch.batch.run import BatchResult, run_batch
+from wavebatch.batch.run import BatchResult, check_outputs, plan_memory, run_batch
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.point_filter import PointFilter
@@ -235,7 +234,13 @@ def read_air(options: RunOptions) -> tuple[float, float] | None:
 def _check_use(chain: Chain, job: StripJob) -> None:
     """Raise ConfigError for files that the chain would ignore, and for a trajectory that cannot be read."""
     sensor = job.sensor
-    _check_trajectory(sensor)
+    if sensor.trajectory is not None:
+        # Once, not for each strip after its survey.
+        try:
+            with reporting_reads(sensor.trajectory, "trajectory "), open_regular(sensor.trajectory):
+                pass
+        except InputError as error:
+            raise ConfigError(str(error)) from error
     given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": job.calibration,
              "--attenuation": job.attenuation, "--energy": None if job.energy == NONE else job.energy}  # fmt: skip
     option = next((name for name, value in given.items() if value is not None), None)
@@ -245,14 +250,3 @@ def _check_use(chain: Chain, job: StripJob) -> None:
         name = stages.get(option, "range")
         remedy = f"give --columns +{name}, or add stage attribute.{name} to a chain file"
         raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; {remedy}")
-
-
-def _check_trajectory(sensor: SensorRequest) -> None:
-    """Raise ConfigError once where the trajectory cannot be read, not for each strip after its survey."""
-    if sensor.trajectory is None:
-        return
-    try:
-        with reporting_reads(sensor.trajectory, "trajectory "), open_regular(sensor.trajectory):
-            pass
-    except InputError as error:
-        raise ConfigError(str(error)) from error

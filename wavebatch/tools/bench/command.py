@@ -175,7 +175,13 @@ def _kind(block: WaveformBlock) -> tuple[float, int]:
 
 def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
     """The receiver that a survey found: levels, noise and its colour, clipping, learned pulse."""
-    color = _find_color(system)
+    kinds = system.noise.by_kind
+    pairs = [(kinds.get(f"{kind}_smoothed", 0.0), kinds.get(kind, 0.0)) for kind in ("tail", "quiet")]
+    ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
+    # The binomial filter whose noise changes by smoothing as the noise of the strip does.
+    color = int(np.argmin(np.abs(np.sqrt(smoothed_power(np.arange(5)) / 6) - ratio)))
+    # Noise of one sample; `noise.std` is what coloured noise does to the amplitude of a pulse.
+    noise = kinds.get("outside") or kinds.get("quiet") or system.noise.std
     gain = np.sqrt(smoothed_power(color) / 6)
     pulse = PulseModel(sigma=system.sigma_ref, kappa=system.kappa)
     if len(system.components) > 1:
@@ -188,26 +194,12 @@ def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
         bits=block.digitizer.bits,
         baseline=system.noise.baseline,
         baseline_spread=system.noise.baseline_spread,
-        noise_std=float(np.sqrt(max(_sample_noise(system) ** 2 - QUANTISATION_STD**2, 0.0))) / float(gain),
+        noise_std=float(np.sqrt(max(noise**2 - QUANTISATION_STD**2, 0.0))) / float(gain),
         rho=color / (color + 1),
         noise_gain=system.noise.gain,
         saturation=clip,
         pulse=pulse,
     )
-
-
-def _sample_noise(system: SystemPulse) -> float:
-    """Noise of one sample [count]; `noise.std` is what coloured noise does to the amplitude of a pulse."""
-    kinds = system.noise.by_kind
-    return kinds.get("outside") or kinds.get("quiet") or system.noise.std
-
-
-def _find_color(system: SystemPulse) -> int:
-    """Order of the binomial filter whose noise changes by smoothing as the noise of the strip does."""
-    kinds = system.noise.by_kind
-    pairs = [(kinds.get(f"{kind}_smoothed", 0.0), kinds.get(kind, 0.0)) for kind in ("tail", "quiet")]
-    ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
-    return int(np.argmin(np.abs(np.sqrt(smoothed_power(np.arange(5)) / 6) - ratio)))
 
 
 def _take_sample(found: EchoTable, n: int, system: SystemPulse, recording: Recording) -> Sample:
@@ -317,7 +309,13 @@ def _measure_scene(
     if twin:
         rows.append({**next(row for row in rows if row["name"] == twin), "name": AUTO, "same_as": twin})
     rows += measure_others(scene, groups)
-    _mark_front(rows)
+    # Whether no other chain is as good in time, error and wrong echoes, and better in one of them. Peers get other and
+    # fewer waveforms: they are never on the front.
+    names = ("rmse_all_cm", "wrong")
+    costs = [(row["kernels"]["median"], *(row["figures"][name]["value"] for name in names))
+             if row["kind"] == "chain" else (None,) * 3 for row in rows]  # fmt: skip
+    for row, best in zip(rows, find_front(costs).tolist(), strict=True):
+        row["pareto"] = best
     section = {"scene": scene.name, "meaning": scene.meaning, "survey": _describe(groups), "rows": rows}
     if options.tolerance_cm is not None:
         cheapest = choose_cheapest([row for row in rows if row["kind"] == "chain"], options.tolerance_cm)
@@ -345,18 +343,6 @@ def make_row(name: str, kind: str, tally: AccuracyTally, laps: Laps) -> dict[str
     figures = {key: figure.to_json() for key, figure in tally.figures().items()}
     times = {key: median_range(value) if isinstance(value, list) else value for key, value in asdict(laps).items()}
     return {"name": name, "kind": kind, "waveforms": tally.waveforms, "figures": figures, **times}
-
-
-def _mark_front(rows: BenchRows) -> None:
-    """Adds to every row whether no other chain is as good in time, error and wrong echoes, and better in one of them.
-
-    Peers get other and fewer waveforms: they are never on the front.
-    """
-    names = ("rmse_all_cm", "wrong")
-    costs = [(row["kernels"]["median"], *(row["figures"][name]["value"] for name in names)) for row in rows]
-    costs = [cost if row["kind"] == "chain" else (None,) * 3 for row, cost in zip(rows, costs, strict=True)]
-    for row, best in zip(rows, find_front(costs).tolist(), strict=True):
-        row["pareto"] = best
 
 
 def _describe(groups: list[Group]) -> dict[str, Any]:

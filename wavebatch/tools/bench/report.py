@@ -57,11 +57,6 @@ PANELS = (
 )
 
 
-def _ratios(kind: str) -> tuple[ReportColumn, ...]:
-    columns = tuple((name, f"{name}_ratio_{kind}", 1.0, 3) for name in QUANTITIES)
-    return (*columns, ("gross %", f"gross_{kind}", 100, 2), ("err column", f"time_calibration_{kind}", 1.0, 3))
-
-
 def bench_sheet(document: Mapping[str, Any]) -> Sheet:
     """The sheet of a benchmark: for each scene what was measured of every chain."""
     words = (
@@ -97,7 +92,9 @@ def _scene_sheet(section: Mapping[str, Any], tolerance_cm: float | None) -> Shee
     parts += [Later(partial(_draw_scene, section)), _speed_table(rows)]
     parts += [_figure_table("echoes found", rows, SHARES), _figure_table("rms error of the range", rows, LENGTHS)]
     for kind in ("isolated", "overlapped"):
-        parts.append(_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind)))
+        ratios = [(name, f"{name}_ratio_{kind}", 1.0, 3) for name in QUANTITIES]
+        ratios += [("gross %", f"gross_{kind}", 100, 2), ("err column", f"time_calibration_{kind}", 1.0, 3)]
+        parts.append(_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, ratios))
     parts.append(_figure_table("rms error of the time / its error column, SNR >= 10", rows, REPORTED))
     if tolerance_cm is not None:
         wanted = f"an error of {tolerance_cm:g} cm for isolated echoes"
@@ -169,7 +166,10 @@ def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[
         return [written, NO_PLOT]
     for section in document["scenes"]:
         name = f"bench-{Path(section['scene']).stem}.png"
-        plot_scene(section, folder / name)
+        with open_picture(folder / name, (11, 4.6), overwrite=True, dpi=120) as figure:
+            figure.suptitle(plain_text(f"{section['scene']}: error against run time, one core"))
+            for axes, panel in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+                _draw_panel(axes, section["rows"], *panel)
         written += f", {name}"
     return [written]
 
@@ -181,14 +181,6 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> str:
         for name, text in texts.items():
             write_text(folder / name, text + "\n", overwrite=True)
     return f"{folder}: {', '.join(texts)}"
-
-
-def plot_scene(section: Mapping[str, Any], target: Path) -> None:
-    """Writes the plot of one scene of a document as PNG, over an older one."""
-    with open_picture(target, (11, 4.6), overwrite=True, dpi=120) as figure:
-        figure.suptitle(plain_text(f"{section['scene']}: error against run time, one core"))
-        for axes, panel in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
-            _draw_panel(axes, section["rows"], *panel)
 
 
 def _draw_scene(section: Mapping[str, Any]) -> Iterator[Picture]:

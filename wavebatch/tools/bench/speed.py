@@ -153,19 +153,16 @@ def time_chains(
                 laps[name].kernels.append(1e6 * seconds / len(block))
                 if strip is not None:
                     clouds = folder / re.sub(r"\W", "-", name)
-                    _add_file_lap(laps[name], workers[name].call(run_file, chain, strip, clouds, 1))
+                    run, lap = workers[name].call(run_file, chain, strip, clouds, 1), laps[name]
+                    lap.file.append(1e6 * (run.seconds - run.survey_seconds) / run.waveforms)
+                    lap.file_with_survey.append(1e6 * run.seconds / run.waveforms)
+                    lap.survey_seconds.append(run.survey_seconds)
         for name, worker in workers.items():
             laps[name].peak_bytes = worker.call(peak_memory)
     finally:
         for worker in workers.values():
             worker.close()
     return laps
-
-
-def _add_file_lap(lap: Laps, run: FileRun) -> None:
-    lap.file.append(1e6 * (run.seconds - run.survey_seconds) / run.waveforms)
-    lap.file_with_survey.append(1e6 * run.seconds / run.waveforms)
-    lap.survey_seconds.append(run.survey_seconds)
 
 
 def run_kernels(chain: Chain, block: WaveformBlock, system: SystemPulse) -> float:

@@ -19,14 +19,13 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.publish import check_target
-from wavebatch.files.figure_file import check_picture, open_picture, plain_text
+from wavebatch.files.figure_file import check_picture, open_picture, plain_text, set_head
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.incidence_angle import added_variance
 from wavebatch.surveying.angle_limits import REFERENCE_ERROR
 from wavebatch.tools.plots.draw_cloud import SERIES
-from wavebatch.tools.plots.labels import set_head
 from wavebatch.tools.sheets.sheet import format_csv
 
 ANGLES = np.arange(0.0, 81.0)

@@ -94,7 +94,8 @@ class FitQuality:
         found = {}
         for name, (number, misfit, floor) in self._sums.items():
             means = [float(total / number) if number else float("nan") for total in (misfit, floor)]
-            medians = [_median(whole[kind][classes[name]]) for kind in ("misfit", "floor")]
+            some = [whole[kind][classes[name]] for kind in ("misfit", "floor")]
+            medians = [float(np.median(values)) if len(values) else float("nan") for values in some]
             found[name] = Goodness(int(number), means[0], medians[0], means[1], medians[1])
         return found
 
@@ -102,10 +103,6 @@ class FitQuality:
 def _classes(part: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     number = part["number"]
     return {"all": number > 0, "single": number == 1, "multi": number > 1, "both": part["both"]}
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
 
 
 _BLOCK = 8192

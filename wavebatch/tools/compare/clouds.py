@@ -56,8 +56,10 @@ def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float) -> C
     for reader in (first, second):
         reader.measure_in_metres()
     task = CloudTask(by_time, check_tolerance(tolerance_ns), max(first.point_count, second.point_count))
-    if not by_time:
-        task.place_borders(first)
+    if not by_time and task.number > 1:
+        # Borders along x, so that all buckets have about the same number of points.
+        some = np.concatenate([rows["xyz"][::100, 0] for rows in first.read_pieces()])
+        task.borders = np.quantile(some, np.arange(1, task.number) / task.number)
     return task
 
 
@@ -129,12 +131,6 @@ class CloudTask(Closing):
         """Removes the temporary files."""
         for bucket in self.buckets:
             bucket.close()
-
-    def place_borders(self, reader: CloudReader) -> None:
-        """Chooses borders along x, so that all buckets have about the same number of points."""
-        if self.number > 1:
-            some = np.concatenate([rows["xyz"][::100, 0] for rows in reader.read_pieces()])
-            self.borders = np.quantile(some, np.arange(1, self.number) / self.number)
 
     def add(self, side: int, rows: np.ndarray) -> None:
         """Adds rows of a (side 0), of b (1) or of the truth's packets (2)."""

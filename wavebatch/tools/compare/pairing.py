@@ -377,7 +377,10 @@ class Pairing:
             counts_a=_list_counts(self.counts[0]),
             counts_b=_list_counts(self.counts[1]),
             differences=self.differences.spreads(),
-            differences_by=_name_groups(self.differences.groups()),
+            differences_by={
+                kind: {name_class(number) if kind == "class" else str(number): one for number, one in group.items()}
+                for kind, group in self.differences.groups().items()
+            },
             errors=self.differences.errors(self.meta) if self.meta else {},
             missed_by=self.breakdowns[1].tables(),
             extra_by=self.breakdowns[0].tables(),
@@ -448,12 +451,6 @@ def check_tolerance(tolerance_ns: float) -> float:
     if not 0 < tolerance_ns < 1e6:
         raise ConfigError(f"tolerance {tolerance_ns:g} ns (--within): must be above 0 and below 1e6")
     return tolerance_ns
-
-
-def _name_groups(groups: dict[str, dict[int, dict[str, ErrorSpread]]]) -> dict[str, dict[str, dict[str, ErrorSpread]]]:
-    """Groups of differences with names: of LAS classes, and numbers of echoes as text, as JSON has them."""
-    names = {"class": name_class, "echoes": str}
-    return {kind: {names[kind](number): one for number, one in group.items()} for kind, group in groups.items()}
 
 
 def _add_counts(old: np.ndarray, numbers: np.ndarray) -> np.ndarray:

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.files.figure_file import open_picture, plain_text
+from wavebatch.files.figure_file import fit_parts, fit_text, open_picture, plain_text, set_head
 from wavebatch.kernels.signal.runs import find_stretches
 from wavebatch.tools.plots.detector_signals import DetectorSignal
-from wavebatch.tools.plots.labels import fit_parts, fit_text, set_head
 from wavebatch.tools.plots.waveform import WaveformView, list_echoes
 
 if TYPE_CHECKING:
@@ -159,7 +158,13 @@ def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, 
         low = level[curve.part]
         axes.fill_between(view.fine[curve.part], low, low + curve.height, color=PULSE, alpha=0.15, linewidth=0)
     draw_samples(axes, view, times, dot=(2.4 if small else 3.4) * (1.0 if len(view.time) <= _MANY else 0.6))
-    _draw_errors(axes, view, times)
+    shown = (view.echoes.time >= times[0]) & (view.echoes.time <= times[1])
+    time, amplitude = (
+        np.minimum(np.nan_to_num(error[shown].astype(np.float64)), _LONGEST_BAR)
+        for error in (view.echoes.time_err, view.echoes.amplitude_err)
+    )
+    axes.errorbar(view.echoes.time[shown].astype(np.float64), find_echo_heights(view)[shown], yerr=amplitude, xerr=time,
+                  fmt="D", markersize=4, markerfacecolor="none", color=ECHO, capsize=2, zorder=4, label="echoes")
     fit_signal_panel(axes, view, times)
 
 
@@ -201,17 +206,6 @@ def find_echo_heights(view: WaveformView) -> np.ndarray:
     """Heights of the echoes in the signal panel [DN], f8 (k,)."""
     level = np.interp(view.echoes.time, view.time, view.level)
     return level + view.echoes.amplitude.astype(np.float64)
-
-
-def _draw_errors(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
-    """Draws the echoes with error bars."""
-    shown = (view.echoes.time >= times[0]) & (view.echoes.time <= times[1])
-    time, amplitude = (
-        np.minimum(np.nan_to_num(error[shown].astype(np.float64)), _LONGEST_BAR)
-        for error in (view.echoes.time_err, view.echoes.amplitude_err)
-    )
-    axes.errorbar(view.echoes.time[shown].astype(np.float64), find_echo_heights(view)[shown], yerr=amplitude, xerr=time,
-                  fmt="D", markersize=4, markerfacecolor="none", color=ECHO, capsize=2, zorder=4, label="echoes")
 
 
 def _number_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:

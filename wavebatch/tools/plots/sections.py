@@ -18,10 +18,9 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.figure_file import open_picture, plain_text
+from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, space_ticks
 from wavebatch.files.las.crs import CrsWords
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
-from wavebatch.tools.plots.labels import fit_text, set_head, space_ticks
 from wavebatch.tools.plots.values import (
     MARGIN,
     Clouds,
@@ -110,8 +109,15 @@ def cut_section(
     if not (math.isfinite(width) and width > 0):
         raise ConfigError(f"--width {width:g}: must be above 0")
 
+    along = (end - start) / length
+
     def cut(rows: np.ndarray) -> np.ndarray:
-        return _cut_rows(rows, start, (end - start) / length, length, width)
+        """Distance along the line, height and value of the points beside it, f8 (k, 3)."""
+        offset = np.stack([rows["x"], rows["y"]], axis=1) - start
+        far, aside = offset @ along, offset @ np.array([-along[1], along[0]])
+        height = rows["values"][:, 1]
+        keep = (far >= 0) & (far <= length) & (np.abs(aside) <= 0.5 * width) & np.isfinite(height)
+        return np.stack([far, height, rows["values"][:, 0]], axis=1)[keep]
 
     total, sample, _ = sample_points(clouds, lambda _, rows: cut(rows), MOST_POINTS)
     if not sample.seen:
@@ -126,24 +132,15 @@ def cut_section(
     if sample.seen > len(places):
         every = (cut(rows)[:, 1] for _, rows, _ in clouds.read())
         outside = sum(int(np.count_nonzero((height < low) | (height > high))) for height in every)
-    along, height, value = places[near].T
+    far, height, value = places[near].T
     shown = tuple(np.percentile(value, (2, 98)).tolist())
     names = tuple(path.name for path in paths)
-    return Section(clouds.facts, names, tuple(map(float, line)), width, along, height, value, total, sample.seen,
+    return Section(clouds.facts, names, tuple(map(float, line)), width, far, height, value, total, sample.seen,
                    outside, shown, voxel, crs)  # fmt: skip
 
 
 def _find_crs(clouds: Clouds | VoxelFile) -> CrsWords:
     return CrsWords(clouds.crs) if isinstance(clouds, VoxelFile) else check_crs(clouds.paths)
-
-
-def _cut_rows(rows: np.ndarray, start: np.ndarray, along: np.ndarray, length: float, width: float) -> np.ndarray:
-    """Distance along the line, height and value of the points beside it, f8 (k, 3); along: its unit vector."""
-    offset = np.stack([rows["x"], rows["y"]], axis=1) - start
-    far, aside = offset @ along, offset @ np.array([-along[1], along[0]])
-    height = rows["values"][:, 1]
-    keep = (far >= 0) & (far <= length) & (np.abs(aside) <= 0.5 * width) & np.isfinite(height)
-    return np.stack([far, height, rows["values"][:, 0]], axis=1)[keep]
 
 
 def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:

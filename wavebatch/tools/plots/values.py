@@ -1,6 +1,6 @@
 """Values of columns of clouds of any size, read piece by piece: chosen points, counts, samples, robust limits.
 
-`histogram`, `sections` and `tools/rasters` read their clouds through `Clouds`.
+`draw_cloud`, `sections` and `tools/rasters` read their clouds through `Clouds`.
 """
 
 from __future__ import annotations

@@ -328,9 +328,14 @@ def grid_values(
         where = "within the bounds" if bounds else "with finite coordinates"
         raise InputError(f"{paths[0]}: nothing to draw: no point {where} has a value")
     grid = choose_grid(str(paths[0]), sample, box, size, fixed=bounds is not None)
-    values, placed = _fill_map(clouds, statistic, grid, total.values)
+    values, placed = np.full((grid.rows, grid.columns), np.nan), Placed()
+    for row, column, tile in compute_tiles(clouds, statistic, grid, total.values, placed):
+        part = values[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
+        part[:] = tile[0, : part.shape[0], : part.shape[1]]
+    values = values[::-1]  # the first row is the southernmost
     names = tuple(path.name for path in paths)
-    return Raster(names, clouds.facts, statistic, grid, values, total, total.values - placed, find_shown(values), crs)
+    return Raster(names, clouds.facts, statistic, grid, values, total, total.values - placed.values[0],
+                  find_shown(values), crs)  # fmt: skip
 
 
 def find_shown(values: np.ndarray) -> tuple[float, float]:
@@ -338,15 +343,6 @@ def find_shown(values: np.ndarray) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, SHOWN).tolist() if len(known) else (0.0, 1.0)
     return low, high
-
-
-def _fill_map(clouds: Clouds, statistic: str, grid: Grid, points: int) -> tuple[np.ndarray, int]:
-    """Values (rows, columns), the first row is the southernmost, and the number of values in the grid."""
-    values, placed = np.full((grid.rows, grid.columns), np.nan), Placed()
-    for row, column, tile in compute_tiles(clouds, statistic, grid, points, placed):
-        part = values[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
-        part[:] = tile[0, : part.shape[0], : part.shape[1]]
-    return values[::-1], placed.values[0]
 
 
 def survey_places(clouds: Clouds, bounds: Box | None = None, option: str = "--bbox") -> tuple[Tally, EvenSample, Box]:

@@ -128,7 +128,10 @@ class Forest:
             raise ConfigError(f"--layer {options.layer:g}: layers are thinner than the voxels, so that some would have "
                               f"none; give {self.size:g} or more")  # fmt: skip
         self.options = options
-        self.ratio_error = max(_read_error(one["reflectance_ratio"]) for _, one in facts)
+        ratios = [one["reflectance_ratio"] for _, one in facts]
+        errors = (ASSUMED_ERROR if one.get("source") == "assumed" else (one.get("error") or 0.0) / one["ratio"]
+                  for one in ratios)  # fmt: skip
+        self.ratio_error = max(errors)
         """Standard deviation of the logarithm of the ratio of reflectances, common to all cells."""
         self.layers = 0
         self.reasons = np.zeros(3, np.int64)
@@ -306,10 +309,6 @@ def _check_facts(facts: dict, path: Path) -> dict:
         raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it anew with "
                           "wavebatch voxelize --forest")  # fmt: skip
     return facts
-
-
-def _read_error(ratio: dict) -> float:
-    return ASSUMED_ERROR if ratio.get("source") == "assumed" else (ratio.get("error") or 0.0) / ratio["ratio"]
 
 
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000

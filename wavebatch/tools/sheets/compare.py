@@ -150,7 +150,9 @@ def _list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         elif name == "differences_by":
             for kind, groups in value.items():
                 for group, quantities in groups.items():
-                    yield from _list_group(kind, group, quantities)
+                    for quantity, spread in quantities.items():
+                        for figure, number in spread.items():
+                            yield "differences by " + kind, "", group, quantity, figure, number
         elif name == "between":
             yield from _list_rows(value)
         elif name == "vendor":
@@ -171,13 +173,6 @@ def _list_classes(name: str, tables: Mapping[str, Any]) -> Iterator[Row]:
         for each, (alone, of) in classes.items():
             for figure, value in (("echoes", alone), ("of", of), ("share", alone / of if of else math.nan)):
                 yield title, side, kind, str(each), figure, value
-
-
-def _list_group(kind: str, group: str, quantities: Mapping[str, Any]) -> Iterator[Row]:
-    """Differences of one LAS class, or of the pulses with one number of echoes."""
-    for quantity, spread in quantities.items():
-        for figure, value in spread.items():
-            yield "differences by " + kind, "", group, quantity, figure, value
 
 
 def _list_nested(table: str, values: Mapping[str, Any], *path: str) -> Iterator[Row]:

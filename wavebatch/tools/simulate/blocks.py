@@ -114,13 +114,16 @@ def simulate_pulses(
     truth = EchoTable.build(drawn.waveform[real], drawn.time[real], drawn.amplitude[real], drawn.sigma[real])
     truth = flag_truth(truth, recording)
     counts.flags.writeable = False
+    # Each ray meets the ground at its last echo, or in the middle of the window without one.
+    ground_time = np.full(n, recording.duration / 2)
+    ground_time[truth.waveform] = truth.time
     block = WaveformBlock(
         digitizer=recording.digitizer,
         samples=counts,
         first=first,
         point=first + np.arange(n),
         gps_time=rays.gps_time,
-        origin=rays.ground - _ground_time(truth, n, recording)[:, None] * rays.direction,
+        origin=rays.ground - ground_time[:, None] * rays.direction,
         direction=rays.direction,
     )
     return Simulated(block, truth, rays)
@@ -139,13 +142,6 @@ def flag_truth(truth: EchoTable, recording: Recording) -> EchoTable:
     truth = truth.with_flags(EchoFlag.NEAR_EDGE, depth < EDGE * sigma)
     truth = truth.with_flags(EchoFlag.SATURATED, truth.amplitude + recording.baseline > recording.clip)
     return truth.with_flags(EchoFlag.WEAK, truth.amplitude < WEAK * recording.recorded_noise)
-
-
-def _ground_time(truth: EchoTable, n: int, recording: Recording) -> np.ndarray:
-    """Time at which each ray meets the ground [ns]: its last echo, or the middle of the window without one."""
-    time = np.full(n, recording.duration / 2)
-    time[truth.waveform] = truth.time
-    return time
 
 
 def _join(parts: list[Simulated], first: int) -> tuple[WaveformBlock, EchoTable]:

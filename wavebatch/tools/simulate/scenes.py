@@ -225,12 +225,6 @@ def _find_room(recording: Recording, margin: float) -> tuple[float, float]:
     return keep, recording.duration - keep
 
 
-def draw_numbers(rng: np.random.Generator, n: int, probabilities: tuple[float, ...]) -> np.ndarray:
-    """Echoes per waveform, i8 (n,), with the given probabilities of 0, 1, 2 ... echoes."""
-    edges = np.cumsum(probabilities)
-    return np.searchsorted(edges[:-1] / edges[-1], rng.random(n), side="right")
-
-
 def widen_on_slope(
     sigma: np.ndarray, amplitude: np.ndarray, incidence: np.ndarray, beam_radius: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -401,25 +395,22 @@ class Scene:
             return draw_hazards(rng, n, self.recording, self.hazards)
         if self.canopy:
             return self.canopy.draw(rng, n, self.recording)
-        count = draw_numbers(rng, n, self.counts)
+        edges = np.cumsum(self.counts)
+        count = np.searchsorted(edges[:-1] / edges[-1], rng.random(n), side="right")
         waveform = np.repeat(np.arange(n), count)
         time = self.times(rng, count, self.recording)
         amplitude = self.amplitude(rng, len(waveform))
         sigma = self.width(rng, np.repeat(count == 1, count), self.recording.pulse.sigma)
         if self.light:
-            amplitude = _light_surfaces(self.light, rays)[waveform] / self.recording.pulse.sigma
+            # Of surfaces that face their ray, as bright as roofs or as ground.
+            reflectance = np.where(rays.ground[:, 2] > GROUND + LEAST_ROOF, ROOFS_REFLECT, GROUND_REFLECTS)
+            energy = self.light * reflectance * transmit(rays.distance, AIR_ATTENUATION) / rays.distance**2
+            amplitude = energy[waveform] / self.recording.pulse.sigma
         if self.divergence:
             radius = (0.5e-3 * self.divergence * rays.distance)[waveform]
             sigma, amplitude = widen_on_slope(sigma, amplitude, rays.incidence[waveform], radius)
         order = np.lexsort((time, waveform)) if len(self.counts) > 2 else slice(None)
         return Drawn(waveform, time[order], amplitude[order], sigma[order])
-
-
-def _light_surfaces(light: float, rays: SceneRays) -> np.ndarray:
-    """amplitude times sigma of surfaces that face their ray [count ns], (n,)."""
-    high = rays.ground[:, 2] > GROUND + LEAST_ROOF
-    reflectance = np.where(high, ROOFS_REFLECT, GROUND_REFLECTS)
-    return light * reflectance * transmit(rays.distance, AIR_ATTENUATION) / rays.distance**2
 
 
 _SCENES = (

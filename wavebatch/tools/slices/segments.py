@@ -107,8 +107,15 @@ def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
             continue
         pulses = _join(parts)
         pulses = _join_waveforms(pulses.take(np.argsort(pulses.point, kind="stable")))
-        axis = _find_across(pulses.direction) if axis is None else axis
-        edges = _cut_long(np.append(find_sweeps(_measure_angle(pulses, axis), pulses.gps_time), len(pulses)))
+        flat, length = pulses.direction[:, :2], np.linalg.norm(pulses.direction, axis=1)
+        if axis is None:  # across the flight: where rays spread most
+            unit_rays = flat / length[:, None]
+            axis = find_main_axis(unit_rays - unit_rays.mean(axis=0))
+        angle = np.arcsin(np.clip(flat @ axis / length, -1, 1))
+        edges = np.append(find_sweeps(angle, pulses.gps_time), len(pulses))
+        # Lines that are too long are cut.
+        pieces = [np.arange(a, b, MOST_PULSES) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        edges = np.concatenate([*pieces, edges[-1:]])
         last = unit.number == reader.unit_count() - 1
         for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             if b == len(pulses) and not last:
@@ -168,22 +175,6 @@ def find_main_axis(apart: np.ndarray) -> np.ndarray:
     """Direction (k,) of the largest spread of vectors (n, k), positive along its longest component."""
     axis = np.linalg.eigh(apart.T @ apart)[1][:, -1]
     return axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
-
-
-def _find_across(direction: np.ndarray) -> np.ndarray:
-    """Horizontal axis (2,) with the largest spread of the rays: across the flight."""
-    flat = direction[:, :2] / np.linalg.norm(direction, axis=1)[:, None]
-    return find_main_axis(flat - flat.mean(axis=0))
-
-
-def _measure_angle(pulses: _Pulses, axis: np.ndarray) -> np.ndarray:
-    return np.arcsin(np.clip(pulses.direction[:, :2] @ axis / np.linalg.norm(pulses.direction, axis=1), -1, 1))
-
-
-def _cut_long(edges: np.ndarray) -> np.ndarray:
-    """The edges, with further edges in lines that are too long."""
-    more = [np.arange(a, b, MOST_PULSES) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    return np.concatenate([*more, edges[-1:]])
 
 
 def _build_line(number: int, pulses: _Pulses) -> ScanLine:
@@ -338,7 +329,11 @@ def cut_slice(line: ScanLine, options: SliceOptions) -> Slice:
         pixel, base, axis = line.spacing, zero, zero
     else:
         pixel = line.spacing * HALF_C
-        base, axis = _find_plane(line, roi)
+        # A vertical plane: its direction is the main axis of the searched samples, seen from above.
+        use = np.flatnonzero(roi) if roi.any() else np.arange(len(line.row))
+        searched = line.origin[line.row[use]] + line.time[use, None] * line.direction[line.row[use]]
+        base = searched.mean(axis=0)
+        axis = np.append(find_main_axis(searched[:, :2] - base[:2]), 0.0)
         place = line.origin[line.row] - base + line.time[:, None] * line.direction[line.row]
         x, y = place @ axis / pixel, place[:, 2] / pixel
     return Slice(line, options.geometry, x, y, pixel, base, axis, roi, start)
@@ -356,14 +351,6 @@ def find_segments(piece: Slice, options: SliceOptions) -> list[Segment]:
     pulse = piece.line.row[rows] if piece.geometry == "plane" else None
     lines = find_lines(x, y, weight, sigma=sigma, gap=gap, shortest=options.shortest, most=options.most, pulse=pulse)
     return [_describe(piece, found, rows[found.rows], number) for number, found in enumerate(lines)]
-
-
-def _find_plane(line: ScanLine, roi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A point of the vertical plane and its direction: the main axis of the searched samples, seen from above."""
-    use = np.flatnonzero(roi) if roi.any() else np.arange(len(line.row))
-    place = line.origin[line.row[use]] + line.time[use, None] * line.direction[line.row[use]]
-    base = place.mean(axis=0)
-    return base, np.append(find_main_axis(place[:, :2] - base[:2]), 0.0)
 
 
 def _choose_gap(piece: Slice) -> float:

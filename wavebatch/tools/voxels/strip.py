@@ -7,7 +7,7 @@ output must not depend on batches, so nothing here may mix pulses of a batch.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import MISSING, asdict, dataclass, field, replace
 from pathlib import Path
@@ -37,7 +37,7 @@ from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.floor import Ceiling, Floor, find_ceiling
 from wavebatch.tools.voxels.grid import VoxelGrid, energy_unit
-from wavebatch.tools.voxels.output import Piece, ProfileWriter, VoxelSpace, check_voxel_target, write_voxels
+from wavebatch.tools.voxels.output import ProfileWriter, VoxelSpace, check_voxel_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
 from wavebatch.tools.voxels.rays import (
     PACKET,
@@ -202,7 +202,12 @@ def voxelize_strip(
         floor = Floor(middle)
         ceiling = find_ceiling(reader, scan, middle, options.size, floor)
         tracer = _Tracer(reader, source, pulse, options, floor.finish(), ceiling, energy, calibration is not None)
-        rule = find_rule(map(tracer.trace, _sample_batches(reader, scan)), options.reflectance_ratio)
+        numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
+        each = -(-SAMPLED // max(len(numbers), 1))  # about SAMPLED pulses, spread evenly over the strip
+        batches = read_batches(
+            reader, scan, numbers=numbers.tolist(), choose=lambda rows: rows[even_places(len(rows), each)]
+        )
+        rule = find_rule(map(tracer.trace, batches), options.reflectance_ratio)
         with (
             _open_grid(reader, middle, options, calibration is not None, tracer.floor, held) as grid,
             (
@@ -233,7 +238,12 @@ def voxelize_strip(
             }
             meta["pulse_energy"] = None if energy is None else energy.describe()
             space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
-            voxels = _write_both(target, space, grid.pieces(rule.log_error), writer, overwrite)
+            # Profiles and voxels, or neither.
+            others = []
+            if writer is not None:
+                known = {name: value for name, value in meta.items() if name not in ("columns", "size_m", "headroom_m")}
+                others.append(writer.complete_profiles(known, space.facts.crs or ""))
+            voxels = write_voxels(target, space, grid.pieces(rule.log_error), others=others, overwrite=overwrite)
             return VoxelSummary(
                 **counts,
                 strip=str(strip),
@@ -265,17 +275,6 @@ def _plan(strip: Path, chosen: PointFilter) -> PlannedFilter | None:
         return None
     with CloudReader(strip) as reader:
         return reader.plan(chosen)
-
-
-def _write_both(
-    target: Path, space: VoxelSpace, pieces: Iterable[Piece], writer: ProfileWriter | None, overwrite: bool
-) -> int:
-    """Writes profiles and voxels, or neither; the number of voxels."""
-    others = []
-    if writer is not None:
-        meta = {name: value for name, value in space.meta.items() if name not in ("columns", "size_m", "headroom_m")}
-        others.append(writer.complete_profiles(meta, space.facts.crs or ""))
-    return write_voxels(target, space, pieces, others=others, overwrite=overwrite)
 
 
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
@@ -315,13 +314,6 @@ def _open_grid(
         floor=floor if options.forest else None,
         held=held,
     )
-
-
-def _sample_batches(reader: StripReader, scan: StripScan) -> Iterator[Batch]:
-    """Pulses spread evenly over the strip, about SAMPLED."""
-    numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
-    share = -(-SAMPLED // max(len(numbers), 1))
-    return read_batches(reader, scan, numbers=numbers.tolist(), choose=lambda some: some[even_places(len(some), share)])
 
 
 @dataclass(frozen=True, slots=True)
