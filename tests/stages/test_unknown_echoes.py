@@ -62,3 +62,26 @@ def test_no_pulse_loses_its_only_echo():
     clipped = replace(SYSTEM, saturation=60.0, beside=((-20.0, 1e4), (20.0, 1e4)), misfit=0.2)
     cut = WaveformBlock.from_samples(np.minimum(block.samples, 60))
     assert find(cut, clipped).count(N).min() >= 1
+
+
+def test_no_faint_tail_hides_weak_echoes_of_a_broad_pulse():
+    """2 counts in noise of 1 under a pulse of 8 samples: 8 standard deviations, 70 samples after an echo of 60.
+
+    The tail there is a thousandth of a count. Such echoes were left out: they had to be 2.2 noises of one sample high.
+    """
+    rng, x = np.random.default_rng(3), np.arange(200)
+    system = replace(SYSTEM, sigma_ref=8.6, components=((1.0, 0.0, 8.0), (0.1, 14.0, 14.0)))
+    y, place = 20 + rng.standard_normal((N, 200)), 60 + rng.random(N)[:, None]
+    for height, after in ((60.0, 0), (2.0, 70)):
+        for weight, delay, sigma in system.components:
+            y += height * weight * np.exp(-0.5 * ((x - place - after - delay) / sigma) ** 2)
+    found = find(WaveformBlock.from_samples(np.rint(y).astype(np.uint16)), system)
+    assert (found.count(N) >= 2).mean() > 0.95
+
+
+def test_an_echo_alone_that_its_neighbour_explains_is_left_out():
+    """In a cluster of its own, 9 widths after the strong one, and no higher than its error there."""
+    block = record((200.0, 0.0), (8.0, 9.0))
+    found = find(block, replace(SYSTEM, beside=((-40.0, 900.0), (40.0, 900.0))))
+    assert (found.count(N) == 1).mean() > 0.95 and (found.amplitude >= found.amplitude_err).all()
+    assert (find(block).count(N) == 2).mean() > 0.95

@@ -398,7 +398,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if not (system.components or system.kappa):
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system = choose_whitening(part, system, choice.best.change)
-        system, mirror = settle(block, system, choice.best.seen)
+        system, mirror = settle(block, system, choice.best.seen, choice.best.missed)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)

@@ -182,26 +182,36 @@ static int64_t next_strongest(const Described *w, int64_t first, int64_t end, in
     return best;
 }
 
-/* Length of what the echoes leave of each waveform, with what its shapes cost, and the volume that echoes share. */
-EXPORT int64_t describe_waveforms(const Described *w, double *length, double *volume) {
+/* Length of what the echoes leave of each waveform by Student's law [nats]. */
+static double measure_rest(const Described *w, int64_t i, const float *rest) {
+    double sum = 0, product = 1;
+    for (int64_t t = 0; t < w->length; t++) {
+        if (!w->used[i * w->length + t]) continue;
+        product *= 1 + (double)rest[t] * rest[t] / (0.75 * FREEDOM);
+        if (product > 1e200) { sum += 0.5 * (FREEDOM + 1) * log_double(product); product = 1; }
+        sum += PEAK;
+    }
+    return sum + 0.5 * (FREEDOM + 1) * log_double(product);
+}
+
+/* Length of what the echoes leave of each waveform, with what its shapes cost, for each of `number` changes of the pulse,
+   (number, n); and the volume that echoes share, (n). */
+EXPORT int64_t describe_waveforms(const Described *w, int64_t number, const double *changes, double *length, double *volume) {
     Desk d = {0};
+    Described tried = *w;
     const int64_t vectors = VECTORS(w->length);
     int good = furnish(&d, 3 * TOGETHER, vectors);
     for (int64_t i = 0; i < w->n && good; i++) {
         const int64_t first = w->first[i], end = w->first[i + 1];
-        double sum = lay_out(w, i, &d), product = 1;
-        innovate(w, d.rest, vectors);
-        int64_t echo = -1;
-        for (int64_t j = 0; w->change > 0 && j < CHANGED && (echo = next_strongest(w, first, end, echo)) >= 0; j++)
-            sum += change_shape(w, &d, echo, NULL, NULL);
-        const float *rest = (const float *)d.rest;
-        for (int64_t t = 0; t < w->length; t++) {
-            if (!w->used[i * w->length + t]) continue;
-            product *= 1 + (double)rest[t] * rest[t] / (0.75 * FREEDOM);
-            if (product > 1e200) { sum += 0.5 * (FREEDOM + 1) * log_double(product); product = 1; }
-            sum += PEAK;
+        for (int64_t c = 0; c < number; c++) {
+            double sum = lay_out(w, i, &d);
+            innovate(w, d.rest, vectors);
+            tried.change = changes[c];
+            int64_t echo = -1;
+            for (int64_t j = 0; changes[c] > 0 && j < CHANGED && (echo = next_strongest(w, first, end, echo)) >= 0; j++)
+                sum += change_shape(&tried, &d, echo, NULL, NULL);
+            length[c * w->n + i] = sum + measure_rest(w, i, (const float *)d.rest);
         }
-        length[i] = sum + 0.5 * (FREEDOM + 1) * log_double(product);
         volume[i] = 0;
         for (int64_t j = first; j < end; j += TOGETHER) volume[i] += shared_volume(w, &d, j, end - j < TOGETHER ? end - j : TOGETHER);
     }

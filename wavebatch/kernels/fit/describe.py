@@ -6,6 +6,7 @@ The survey's judge and its learning call it; the loops are C (kernels/c/describe
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -75,20 +76,20 @@ def count_echoes(waveform: np.ndarray, n: int) -> np.ndarray:
     return np.cumsum(np.r_[0, np.bincount(waveform, minlength=n)], dtype=np.int64)
 
 
-def describe_left(sums: Sums, noise: SampleNoise, change: float) -> tuple[np.ndarray, np.ndarray]:
+def describe_left(sums: Sums, noise: SampleNoise, changes: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Return how long the description of what echoes leave is, and how much less their errors say together than alone.
 
     Parameters
     ----------
     sums : Sums
     noise : SampleNoise
-    change : float
+    changes : sequence of float, k of them
         How much the pulse's shape changes from shot to shot, as a share of its amplitude: the three strongest echoes of
         a waveform may leave so much in the two directions (Gauss-Hermite h3 and h4) that follow those of the fit.
 
     Returns
     -------
-    length : float64 (n,)
+    length : float64 (k, n)
         Negative logarithm of the likelihood [nats], by Student's law with four degrees of freedom of what the two
         samples before do not predict; with the cost of the changes.
     volume : float64 (n,)
@@ -98,8 +99,9 @@ def describe_left(sums: Sums, noise: SampleNoise, change: float) -> tuple[np.nda
     ----------
     docs/algorithms.md R2.
     """
-    length, volume = np.zeros(len(sums.left)), np.zeros(len(sums.left))
-    call("describe_waveforms", _as_structure(sums, noise, change), length, volume)
+    tried, n = np.array(changes, np.float64), len(sums.left)
+    length, volume = np.zeros((len(tried), n)), np.zeros(n)
+    call("describe_waveforms", _as_structure(sums, noise, 0.0), ctypes.c_int64(len(tried)), tried, length, volume)
     return length, volume
 
 

@@ -23,6 +23,7 @@ from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
 from wavebatch.stages.detect.candidates import samples_of
+from wavebatch.stages.detect.maximum import choose_smoothing
 from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes, scale_errors
 from wavebatch.stages.pulse_tables import (
     BROADEST,
@@ -81,14 +82,14 @@ def find_clusters(
     clusters : Clusters
         Disjoint windows with their candidates.
     """
+    ref = system.sigma_ref / block.spacing
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     columns = np.maximum(echoes.amplitude, 0), echoes.time / block.spacing, echoes.sigma / block.spacing
     start = np.stack(columns, axis=1).astype(np.float64)
     amplitude, time, width = model_parameters(settings.shape, limits, start).T
     candidates = Candidates(echoes.waveform.astype(np.int64), time, amplitude, np.clip(width, limits.low, limits.high))
     candidates = _join_plateaus(block, candidates, clip_level(block, system))
-    candidates, tail = _explain_tails(candidates, noise, settings)
-    ref = system.sigma_ref / block.spacing
+    candidates, tail = _explain_tails(candidates, noise, settings, ref)
     clusters = cluster_candidates(
         samples_of(block, noise),
         candidates,
@@ -127,10 +128,13 @@ def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float) ->
     return kept._replace(time=np.where(number > 1, middle, kept.time), amplitude=np.maximum.reduceat(amplitude, first))
 
 
-def _explain_tails(candidates: Candidates, noise: Noise, settings: Settings) -> tuple[Candidates, np.ndarray | None]:
+def _explain_tails(
+    candidates: Candidates, noise: Noise, settings: Settings, ref: float
+) -> tuple[Candidates, np.ndarray | None]:
     """Candidates that after-pulses of stronger echoes do not explain, and how far tails reach (docs/algorithms.md H7).
 
-    Growth finds a dropped candidate again if the fit of the stronger echo leaves a residual there.
+    Growth finds a dropped candidate again if the fit of the stronger echo leaves a residual there. `ref` is the width
+    of the system pulse [samples].
     """
     tail = pulse_tail(settings.shape, settings.width_ref)
     if tail is None:
@@ -143,7 +147,9 @@ def _explain_tails(candidates: Candidates, noise: Noise, settings: Settings) -> 
         expected[step:] += np.where(same, amplitude[:-step] * tail_at(tail, lag), 0.0)
         expected[:-step] += np.where(same, amplitude[step:] * tail_at(tail, -lag), 0.0)
     std = noise.std[waveform]
-    keep = (expected <= 0) | (amplitude - expected > 2.2 * std + 0.5 * expected)
+    keep = amplitude - expected > 2.2 * std + 0.5 * expected
+    # A tail below the noise of what found a candidate does not explain it, however broad the pulse is.
+    keep |= expected <= choose_smoothing(ref).gain * std
     candidates = Candidates(*(field[keep] for field in candidates))
     return candidates, tail_reach(tail, candidates.amplitude / std[keep])
 
@@ -309,11 +315,11 @@ def _leave_out_unknown(
     noise = np.ones(len(solution.number))
     unknown = (_find_unknown(table, settings, noise) > 0) & (solution.number > 1)
     if not unknown.any():
-        return replace(table, attributes={})
+        return _leave_out_explained(table, solution)
     is_part = np.zeros(len(samples.counts), bool)
     is_part[clusters.waveform[unknown]] = True
     part, own = np.flatnonzero(is_part[clusters.waveform]), is_part[table.waveform]
-    rest, table = table.take(~own), table.take(own)
+    rest, table = _leave_out_explained(table.take(~own), solution), table.take(own)
     table = table.with_attributes(**{CLUSTER: np.searchsorted(part, table.attributes[CLUSTER])})
     clusters, solution, noise = Clusters(*(column[part] for column in clusters)), solution.take(part), noise[part]
     again = settings._replace(grow=False, acceptance=settings.known**2)
@@ -325,8 +331,19 @@ def _leave_out_unknown(
         noise[rows] = larger[rows]
         solution = _replace_clusters(solution, rows, _fit_again(samples, clusters, solution, again, rows, noise[rows]))
         table = describe(clusters, solution)
-    both = EchoTable.concatenate((replace(rest, attributes={}), replace(table, attributes={})))
+    both = EchoTable.concatenate((rest, _leave_out_explained(table, solution)))
     return both.take(np.argsort(both.waveform, kind="stable"))
+
+
+def _leave_out_explained(table: EchoTable, solution: Solution) -> EchoTable:
+    """The table without echoes alone in their cluster that are no higher than what a stronger one leaves beside it.
+
+    Their errors say so. The columns of the decomposer go.
+    """
+    alone = solution.number[table.attributes[CLUSTER]] == 1
+    alone &= (table.flags & np.uint16(EchoFlag.SATURATED)) == 0
+    explained = alone & (table.attributes[FACTOR] > ROOM) & (table.amplitude < table.amplitude_err)
+    return replace(table, attributes={}).take(~explained)
 
 
 def _find_unknown(table: EchoTable, settings: Settings, noise: np.ndarray) -> np.ndarray:

@@ -22,14 +22,10 @@ from wavebatch.surveying.measuring.joint_pulse import count_telling, learn_joint
 from wavebatch.surveying.measuring.judge import (
     SURE,
     Explained,
-    Laws,
     count_errors,
-    describe_echoes,
-    describe_residual,
     describe_waveforms,
     explain,
     find_changed,
-    find_laws,
     find_own_width,
     measure_change,
     replace_rows,
@@ -59,16 +55,18 @@ HOPELESS = 5.0
 """Standard errors by which a description is longer where a pulse is not looked at any further: chance makes so many
 once in three million times."""
 
+HINT, FEWER = 1.5, 0.95
+"""Standard errors by which another pulse must describe shorter, in place of SURE, where it needs at most this share of
+a learned pulse's echoes, or where that is known to miss the stacked echoes by more than the change from shot to shot.
+Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes so many errors once in fifteen times.
+"""
+
 FEWEST = 48
 """Waveforms on which each candidate is judged first."""
 
 MISFITS = 0.0005 * 2.0 ** np.arange(9)
 """Misfits of the chosen pulse that are tried: half a noise at 1,000 noises up to an eighth of the pulse, beyond which
 it is no pulse of this strip."""
-
-BY_CHANCE = 2.0
-"""Standard errors up to which a description without misfit may be longer: three waveforms that agree have no more, and
-chance has more once in forty strips."""
 
 FALSE_QUIET = 0.0075
 """Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
@@ -95,6 +93,11 @@ class Candidate:
     """Of the pulse, as far as they had to be learned: 2 for one that is known, so that a plain Gaussian goes first."""
     seen: float
     """Change of the shape that the median of the strongest echoes shows."""
+
+    @property
+    def missed(self) -> float:
+        """What its model misses of the stacked echoes, as a share of the amplitude; one from elsewhere has no stack."""
+        return 0.0 if self.known else self.system.misfit
 
     @property
     def typical(self) -> float:
@@ -167,7 +170,7 @@ def choose_pulse(
     Pulses are learned on one half of the waveforms and judged on the other, where the pulse has to be written down too:
     half the logarithm of the samples for each of its parameters; one from elsewhere is known. Of those that cost the
     same, by SURE standard errors, the simplest pulse is taken, then the one with the fewest echoes: what is claimed
-    must be proven.
+    must be proven. By HINT one is taken in place of a learned pulse that needs more echoes or misses the stacked ones.
     """
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
     part = thin_block(block, 2 * number)
@@ -221,7 +224,7 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     gaussians = max(len(system.components), 1)
     used = max(int(np.count_nonzero(explained.sums.used)), 1)
     written = 0.0 if known else 3 * gaussians * 0.5 * log(used) / len(block)
-    length = describe_waveforms(block, borne, explained, change) + written
+    length = describe_waveforms(block, borne, explained, [change])[0] + written
     return Candidate(
         name, system, change, length, len(explained.echoes), known, 2 if known else gaussians,
         measure_change(borne, explained),
@@ -264,15 +267,18 @@ def _decide(found: list[Candidate]) -> Choice:
     ordered = sorted(found, key=lambda one: (one.gaussians, one.echoes, one.name))
     best = ordered[0]
     for one in ordered[1:]:
-        if best.exceeds(one) > SURE:
+        doubtful = one.echoes <= FEWER * best.echoes or best.missed > max(COVERED * best.change, one.missed)
+        if best.exceeds(one) > (HINT if doubtful and not best.known else SURE):
             best = one
     tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
     doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
 
 
-def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0) -> tuple[SystemPulse, Mirror]:
-    """Choose the misfit that describes waveforms shortest, then raise the significance until noise adds no echoes.
+def settle(
+    block: WaveformBlock, system: SystemPulse, seen: float = 1.0, missed: float = 0.0
+) -> tuple[SystemPulse, Mirror]:
+    """Choose the misfit by the length of descriptions, then raise the significance until noise adds no echoes.
 
     Parameters
     ----------
@@ -282,6 +288,8 @@ def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0) -> tupl
         With the pulse that the judge chose.
     seen : float
         Change of the pulse from shot to shot that its strongest echoes show, as a share of the amplitude.
+    missed : float
+        What the pulse is known to miss of the strip's stacked echoes, as a share of the amplitude: the least misfit.
 
     Returns
     -------
@@ -291,7 +299,7 @@ def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0) -> tupl
         Echoes of mirrored residuals that are left.
     """
     part = thin_block(block, int(np.clip(4 * SAMPLES // block.samples.shape[1], 2 * LEAST, 2048)))
-    system = replace(system, misfit=_choose_misfit(part, system, seen))
+    system = replace(system, misfit=max(_choose_misfit(part, system, seen), missed))
     harder = np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER)
     tried = []
     for significance, mirror in look_in_mirror(part, system, [0.0, *map(float, harder)]):
@@ -302,81 +310,55 @@ def settle(block: WaveformBlock, system: SystemPulse, seen: float = 1.0) -> tupl
 
 
 def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> float:
-    """Return the misfit that describes waveforms shortest; none where that is hardly longer.
+    """Return the least misfit whose description is longer than the shortest by at most one standard error.
 
     It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
-    much of it neighbours are not found, and both lengthen the description. The lengths of its neighbours say where
-    between them the shortest one lies: halves of a strip then agree.
+    much of it neighbours are not found, and both lengthen the description. Between two misfits that are tried it is
+    found by their standard errors: halves of a strip then agree.
     """
     # What clipped echoes hide is no misfit.
     whole = np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1))
     block = block.rows(whole) if len(whole) >= FEWEST else block
-    tried = _TriedMisfits(block, system, [change for change in CHANGES if change <= STEP_OF_CHANGES * seen])
-    last = len(MISFITS) - 1
-    for place in (4, last, 6):
-        tried.look(place)
-    # Less than what misses the echoes for sure only costs time.
-    if tried.longer(4) < HOPELESS:
-        tried.look(0)
-        if tried.longer(0) <= BY_CHANCE:
-            return 0.0
-        tried.look(2)
-    for place in (tried.best - 1, tried.best + 1):
-        if 0 <= place <= last:
-            tried.look(place)
-    # Those that a description cannot tell apart: half the logarithm of the waveforms is what a parameter costs.
-    alike = 0.5 * log(len(block))
-    best = min(place for place in tried.known if tried.exceed(place) <= alike)
-    further = 0.0
-    if best - 1 in tried.known and best + 1 in tried.known and tried.exceed(best + 1) > alike:
-        before, after = tried.exceed(best - 1), tried.exceed(best + 1)
-        further = 0.5 * (before - after) / (before + after)
-    return float(MISFITS[0] * 2.0 ** (best + further))
+    changes = [change for change in CHANGES if change <= STEP_OF_CHANGES * seen]
+    found: dict[int, Explained] = {}
+    lengths: dict[int, np.ndarray] = {}
+
+    def look(*places: int) -> tuple[int, list[float]]:
+        """The best place of those tried, and by how many standard errors each of them is longer, by the best change."""
+        for place in places:
+            if place not in found:
+                found[place] = _explain_between(block, replace(system, misfit=float(MISFITS[place])), found, place)
+                lengths[place] = describe_waveforms(block, system, found[place], changes)
+        tried = product(sorted(lengths), range(len(changes)))
+        best, change = min(tried, key=lambda one: lengths[one[0]][one[1]].mean())
+        least = lengths[best][change]
+        return best, [count_errors(lengths[place][change] - least) for place in sorted(lengths)]
+
+    # From coarse to fine, and no further up than echoes are lost for sure.
+    best, longer = look(0, 4, 2)
+    while longer[-1] < HOPELESS and max(lengths) + 4 < len(MISFITS):
+        best, longer = look(max(lengths) + 4, max(lengths) + 2)
+    if longer[0] > 1:
+        best, longer = look(*(place for place in (best - 1, best + 1) if place < len(MISFITS)))
+        first = next(place for place, errors in zip(sorted(lengths), longer, strict=True) if errors <= 1)
+        best, longer = look(first - 1)
+    if longer[0] <= 1:
+        return 0.0
+    places = sorted(lengths)
+    first = next(place for place, errors in enumerate(longer) if errors <= 1)
+    before, after = MISFITS[places[first - 1]], MISFITS[places[first]]
+    share = (longer[first - 1] - 1) / (longer[first - 1] - longer[first])
+    return float(before * (after / before) ** share)
 
 
-class _TriedMisfits:
-    """Descriptions of a block with some of MISFITS, by their places."""
-
-    def __init__(self, block: WaveformBlock, system: SystemPulse, changes: list[float]) -> None:
-        self._block, self._system, self._changes = block, system, changes
-        self.known: dict[int, tuple[Explained, list[np.ndarray]]] = {}
-        """Echoes, and the length of what they leave, for each change of the pulse."""
-        self._lengths: dict[int, list[np.ndarray]] = {}
-        self.best, self._change = 0, 0
-        self._laws: Laws | None = None
-
-    def look(self, place: int) -> None:
-        """Try a misfit. What the next smaller and the next larger one explain alike, it does too."""
-        if place in self.known:
-            return
-        block, borne = self._block, replace(self._system, misfit=float(MISFITS[place]))
-        below = max((one for one in self.known if one < place), default=None)
-        above = min((one for one in self.known if one > place), default=None)
-        if below is None or above is None:
-            explained = explain(block, borne)
-            left = [describe_residual(self._system, explained, change) for change in self._changes]
-        else:
-            before, left = self.known[below]
-            rows = find_changed(before, self.known[above][0])
-            some = explain(block.rows(rows), borne)
-            explained, left = replace_rows(before, rows, some), [length.copy() for length in left]
-            for length, change in zip(left, self._changes, strict=True):
-                length[rows] = describe_residual(self._system, some, change)
-        self.known[place] = explained, left
-        # By common laws: else each waveform is longer or shorter by what echoes of others change in them.
-        self._laws = self._laws or find_laws(block, self._system, explained)
-        echoes = describe_echoes(block, self._system, explained, self._laws)
-        self._lengths[place] = [echoes + length for length in left]
-        tried = product(sorted(self._lengths), range(len(self._changes)))
-        self.best, self._change = min(tried, key=lambda one: self._lengths[one[0]][one[1]].mean())
-
-    def longer(self, place: int) -> float:
-        """Standard errors by which the description is longer than with the best misfit, by the best change."""
-        return count_errors(self._lengths[place][self._change] - self._lengths[self.best][self._change])
-
-    def exceed(self, place: int) -> float:
-        """How much longer it is [nats]."""
-        return float(np.sum(self._lengths[place][self._change] - self._lengths[self.best][self._change]))
+def _explain_between(block: WaveformBlock, system: SystemPulse, found: dict[int, Explained], place: int) -> Explained:
+    """Echoes of a block with a misfit. What the next smaller and the next larger one explain alike, it does too."""
+    below = max((one for one in found if one < place), default=None)
+    above = min((one for one in found if one > place), default=None)
+    if below is None or above is None:
+        return explain(block, system)
+    rows = find_changed(found[below], found[above])
+    return replace_rows(found[below], rows, explain(block.rows(rows), system)) if len(rows) else found[below]
 
 
 def _bound(share: float, number: int) -> float:

@@ -6,8 +6,8 @@ only for what shortens the description of waveforms that nothing was learned fro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -130,7 +130,7 @@ def measure_change(system: SystemPulse, explained: Explained) -> float:
 
 
 def describe_waveforms(
-    block: WaveformBlock, system: SystemPulse, explained: Explained, change: float = 0.0
+    block: WaveformBlock, system: SystemPulse, explained: Explained, changes: Sequence[float]
 ) -> np.ndarray:
     """Measure how long the description of each waveform is: its echoes, and what they leave.
 
@@ -140,36 +140,13 @@ def describe_waveforms(
     system : SystemPulse
     explained : Explained
         The block decomposed with this system.
-    change : float
-        Of the pulse from shot to shot, as a share of its amplitude (`describe_left`).
+    changes : sequence of float, k of them
+        Of the pulse from shot to shot, as shares of its amplitude (`describe_left`).
 
     Returns
     -------
-    float64 array, shape (n,)
+    float64 array, shape (k, n)
         [nats].
-    """
-    return describe_echoes(block, system, explained) + describe_residual(system, explained, change)
-
-
-def describe_residual(system: SystemPulse, explained: Explained, change: float) -> np.ndarray:
-    """Measure how long the description of what echoes leave of each waveform is (n,) [nats]; less what their errors
-    say together rather than alone."""
-    length, volume = describe_left(explained.sums, sample_noise(system), change)
-    return length + volume
-
-
-def describe_echoes(
-    block: WaveformBlock, system: SystemPulse, explained: Explained, laws: Laws | None = None
-) -> np.ndarray:
-    """Measure how long the description of the echoes of each waveform is (n,) [nats].
-
-    Parameters
-    ----------
-    block : WaveformBlock
-    system : SystemPulse
-    explained : Explained
-    laws : Laws, optional
-        Those of other echoes of the same waveforms and pulse; by default of these.
 
     Notes
     -----
@@ -178,51 +155,23 @@ def describe_echoes(
     own width on. Nothing reflects narrower than the pulse, so a pulse that is too narrow finds no echo where the
     density is highest. Their number follows a geometric law with the strip's mean.
     """
-    laws = laws or find_laws(block, system, explained)
     echoes, sums = explained.echoes, explained.sums
     n, s = sums.left.shape
-    ratio, error, _ = _measure_widths(explained, shape_limits(system, block.spacing).ref)
+    length, volume = describe_left(sums, sample_noise(system), changes)
+    ratio, error, known = _measure_widths(explained, shape_limits(system, block.spacing).ref)
     amplitude = echoes.amplitude.astype(np.float64)
+    typical = max(float(np.mean(amplitude)), 1.0) if len(amplitude) else 1.0
     by_time = np.clip(np.nan_to_num(echoes.time_err / block.spacing, nan=s), 1e-3, s)
-    by_amplitude = np.maximum(np.nan_to_num(echoes.amplitude_err, nan=laws.amplitude), 1e-3 * system.noise.quiet)
+    by_amplitude = np.maximum(np.nan_to_num(echoes.amplitude_err, nan=typical), 1e-3 * system.noise.quiet)
     cost = np.maximum(log(s / (SQRT_2PI * by_time)), 0.0)
-    cost += np.maximum(log(laws.amplitude / (SQRT_2PI * by_amplitude)), 0.0)
-    cost += log(1.0 + (amplitude / laws.amplitude) ** 2)
-    if len(laws.shares):
-        cost += _cost_of_widths(_densities(ratio, np.hypot(error, laws.scatter)), laws.shares) - log(SQRT_2PI * error)
-    number, mean = np.diff(sums.first), laws.number
+    cost += np.maximum(log(typical / (SQRT_2PI * by_amplitude)), 0.0) + log(1.0 + (amplitude / typical) ** 2)
+    cost += _describe_widths(ratio, error, known)
+    number = np.diff(sums.first)
+    mean = max(float(number.mean()), 0.01) if n else 1.0
     # Of k echoes in any order: their factorial is the number of orders.
     orders = np.r_[0.0, np.cumsum(log(np.arange(1.0, max(int(number.max(initial=0)), 1) + 1)))]
     count = log(1 + mean) - number * log(mean / (1 + mean)) - orders[number]
-    return count + np.bincount(echoes.waveform, cost, minlength=n)
-
-
-class Laws(NamedTuple):
-    """What a description expects of echoes."""
-
-    amplitude: float
-    """Mean amplitude [count]."""
-    number: float
-    """Mean number in a waveform."""
-    scatter: float
-    """Of the widths of level ground beyond their errors [widths of the pulse]."""
-    shares: np.ndarray
-    """Of the laws of the widths (`_densities`); empty where too few widths are known."""
-
-
-def find_laws(block: WaveformBlock, system: SystemPulse, explained: Explained) -> Laws:
-    """Find the laws by which the description of these echoes is shortest."""
-    amplitude, number = explained.echoes.amplitude, np.diff(explained.sums.first)
-    typical = max(float(np.mean(amplitude, dtype=np.float64)), 1.0) if len(amplitude) else 1.0
-    mean = max(float(number.mean()), 0.01) if len(number) else 1.0
-    ratio, error, known = _measure_widths(explained, shape_limits(system, block.spacing).ref)
-    if np.count_nonzero(known) < LEAST_KNOWN:
-        return Laws(typical, mean, 0.0, np.empty(0))
-    tried = [_densities(ratio[known], np.hypot(error[known], scatter)) for scatter in SCATTERS]
-    shares = [_share_laws(densities) for densities in tried]
-    costs = [float(np.sum(_cost_of_widths(*pair))) for pair in zip(tried, shares, strict=True)]
-    best = int(np.argmin(costs))
-    return Laws(typical, mean, SCATTERS[best], shares[best])
+    return length + volume + count + np.bincount(echoes.waveform, cost, minlength=n)
 
 
 def count_errors(values: np.ndarray) -> float:
@@ -253,18 +202,23 @@ def _measure_widths(explained: Explained, ref: float) -> tuple[np.ndarray, np.nd
     return ratio, error, ((echoes.flags & _DOUBTFUL) == 0) & (error < KNOWN * ratio)
 
 
-def _share_laws(laws: np.ndarray) -> np.ndarray:
-    """Share of each law (k,) in the density that makes widths likeliest, from their densities by each (m, k)."""
+def _describe_widths(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Cost of each width (m,) by the density of those that are known, with the scatter that serves best; 0 for few."""
+    if np.count_nonzero(known) < LEAST_KNOWN:
+        return np.zeros(len(ratio))
+    costs = [_describe_scattered(ratio, np.hypot(error, scatter), known) for scatter in SCATTERS]
+    return min(costs, key=lambda cost: float(np.sum(cost[known]))) - log(SQRT_2PI * error)
+
+
+def _describe_scattered(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Cost of each width (m,), each with its error, by the sum of laws that makes the known ones likeliest."""
+    laws = _densities(ratio, error)
+    seen = laws[known]
     share = np.full(laws.shape[1], 1.0 / laws.shape[1])
     for _ in range(15):
-        weight = laws * share
+        weight = seen * share
         weight /= np.maximum(np.einsum("mk->m", weight), 1e-300)[:, None]
-        share = (np.einsum("mk->k", weight) + 0.5) / (len(laws) + 0.5 * len(share))
-    return share
-
-
-def _cost_of_widths(laws: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Negative logarithm of the density of each width (m,), from its densities by each law (m, k) and their shares."""
+        share = (np.einsum("mk->k", weight) + 0.5) / (len(seen) + 0.5 * len(share))
     return -log((1 - ANYWHERE) * np.einsum("mk,k->m", laws, share) + ANYWHERE / WIDER[-1])
 
 

@@ -50,7 +50,8 @@ CONSTANT = 2.0
 neighbours, too weak to be found or taken for a part of the pulse."""
 
 LEAST_TAIL = 0.002
-"""Share of an echo below which its tail is as the pulse says."""
+"""Share of an echo below which its tail is as the pulse says; less where the strip's echoes are so high that twice the
+noise is less."""
 
 
 def measure_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
@@ -161,6 +162,6 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
         spread = max(low - lowest, expected)
         common, scatter = abs(low + spread), 2 * np.sqrt(spread**2 - expected**2)
         share = common + scatter
-        if share > LEAST_TAIL and common > CONSTANT * scatter:
+        if share > min(LEAST_TAIL, 2 * expected) and common > CONSTANT * scatter:
             profile.append((float(place * system.sigma_ref), float(share)))
     return tuple(profile)

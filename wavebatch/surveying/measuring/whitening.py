@@ -61,8 +61,8 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
     if len(left) < FEW or np.median(left) > MOST_LEFT:
         return plain
     # Whitened fits take small changes of the pulse for echoes: the description, which knows both, is then longer.
-    length = describe_waveforms(block, whitened, explained, change)
-    other = describe_waveforms(block, plain, explain(block, plain), change)
+    length = describe_waveforms(block, whitened, explained, [change])[0]
+    other = describe_waveforms(block, plain, explain(block, plain), [change])[0]
     return whitened if count_errors(length - other) <= SURE else plain
 
 

@@ -41,8 +41,10 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
     known = (alone < FEW or (doubt or 0.0) > MOST_DOUBTED_KNOWN) and find_source(system) is not None
     most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
     reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
-    # So few that the judge sees what the pulse was learned from: many Gaussians explain any waveforms.
-    if alone < FEW and not known and (waveforms < SMALL or not system.components):
+    # So few that the judge sees what the pulse was learned from: many Gaussians explain any waveforms, and a shipped
+    # pulse may be that of another sensor.
+    few = alone < FEW and (waveforms < SMALL or not (known or system.components))
+    if few:
         reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
     measured = system.noise.by_kind
     unseen = measured.get("quiet") == 0 and "outside" not in measured
@@ -54,7 +56,7 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
         reason, remedy = "most of the noise below count 0", "raise the level of the digitizer in the next flight"
     if reason:
         code, guess = "pulse-guess", f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
-        if known or unseen or hidden:
+        if (known and not few) or unseen or hidden:
             code, guess = "noise-guess", f"noise is a guess, of {system.noise.std:.3g} DN"
         yield StripWarning(
             code, f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
