@@ -16,15 +16,15 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 
 INSIDE = {
     "batch": [
-        {"counts", "options", "output_rows", "packing", "workers"}, {"job"}, {"unit"},
-        {"explain", "neighbour_pass"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
+        {"counts", "options", "output_rows", "workers"}, {"job"}, {"unit"},
+        {"neighbour_pass", "report_file"}, {"strip_task"}, {"run"},
     ],
     "surveying/measuring": [
         {"lone_echoes", "trial"}, {"noise_and_width"}, {"residuals"},
-        {"misfit", "learn_pulse", "judge", "whitening"}, {"joint_pulse", "mirror"}, {"choose_pulse"},
+        {"misfit", "learn_pulse", "judge", "whitening", "return_scatter"}, {"joint_pulse", "mirror"}, {"choose_pulse"},
     ],
     "batch/workers": [
-        {"processor"}, {"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"},
+        {"serve", "worker_check"}, {"processes"}, {"dask_cluster"},
     ],
     "surveying": [
         {"measuring"}, {"flat_ground", "predict_error"}, {"hidden_neighbours"}, {"survey", "sensor"},

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from commands import run_command
 
-from wavebatch.batch.workers import dask_client
+from wavebatch.batch.workers import dask_cluster
 from wavebatch.tools.simulate import simulate_strip
 
 distributed = pytest.importorskip("distributed", reason="needs dask's distributed: pip install distributed")
 
-CONNECT = dask_client._CONNECT
+CONNECT = dask_cluster._CONNECT
 _WORKER = [sys.executable, "-m", "distributed.cli.dask_worker"]
 _SCHEDULER = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
 
@@ -72,7 +72,7 @@ def dask(tmp_path_factory):
     cluster.start_worker()
     cluster.start_worker()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dask_client, "_CONNECT", 100.0)  # on a busy machine the scheduler answers late
+        patch.setattr(dask_cluster, "_CONNECT", 100.0)  # on a busy machine the scheduler answers late
         yield cluster
     cluster.stop()
 
@@ -165,7 +165,7 @@ def _spool_as_ever():
     "address", ["tcp://127.0.0.1:9", "nonsense", "foo://127.0.0.1:9", "tcp://none.invalid:8786", "tcp://", "a:b"]
 )
 def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatch, address):
-    monkeypatch.setattr("wavebatch.batch.workers.dask_client._CONNECT", 0.5)
+    monkeypatch.setattr("wavebatch.batch.workers.dask_cluster._CONNECT", 0.5)
     done = run_command("run", strips, "-o", tmp_path / "out", "--scheduler", address)
     assert done.exit_code == 2
     assert done.stderr.startswith(f"error: --scheduler {address}: cannot be reached") and done.stderr.count("\n") == 1

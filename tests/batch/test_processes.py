@@ -13,7 +13,7 @@ from concurrent.futures import Future
 import pytest
 
 from wavebatch.batch.workers.processes import WorkerDied, Workers
-from wavebatch.batch.workers.processor import _probe_alone
+from wavebatch.batch.workers.worker_check import _probe_alone
 from wavebatch.tools.bench.speed import Worker
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")

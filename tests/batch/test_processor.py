@@ -8,7 +8,7 @@ import sys
 import pytest
 from writer_tools import data_file
 
-from wavebatch.batch.workers.processor import describe_processor, probe_arithmetic
+from wavebatch.batch.workers.worker_check import describe_processor, probe_arithmetic
 from wavebatch.tools.simulate import simulate_strip
 
 
@@ -19,7 +19,7 @@ def test_the_probe_is_the_same_each_time():
 
 
 def test_threads_are_no_other_kind():
-    code = "from wavebatch.batch.workers.processor import describe_processor; print(describe_processor()['probe'])"
+    code = "from wavebatch.batch.workers.worker_check import describe_processor; print(describe_processor()['probe'])"
     found = set()
     for threads in ("1", "2", "4"):
         env = {**os.environ, "OPENBLAS_NUM_THREADS": threads}

@@ -11,8 +11,7 @@ from writer_tools import read_provenance
 
 from wavebatch.batch.job import choose_columns
 from wavebatch.batch.options import RunOptions
-from wavebatch.batch.preflight import LEAST_MEMORY, check_outputs, plan_memory, plan_strip
-from wavebatch.batch.run import run_batch
+from wavebatch.batch.run import LEAST_MEMORY, check_outputs, plan_memory, plan_strip, run_batch
 from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import ConfigError, InputError

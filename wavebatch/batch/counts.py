@@ -103,9 +103,9 @@ class RunReport:
     last_left_out: int = 0
     """Points of left_out["where"] that are the last echo of their pulse."""
     remarks: tuple[str, ...] = ()
-    """Lines about the strip as a whole, from `explain`."""
+    """Lines about the strip as a whole, from `report_file`."""
     warnings: tuple[StripWarning, ...] = ()
-    """What makes the results doubtful, from `explain`."""
+    """What makes the results doubtful, from `report_file`."""
     echoes_per_waveform: np.ndarray = _zeros(OVERFLOW + 1)
     amplitude: np.ndarray = _zeros(AMPLITUDE_BINS.number)
     """Echoes per bin of AMPLITUDE_BINS."""

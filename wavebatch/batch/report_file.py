@@ -1,6 +1,8 @@
-"""The report file next to a cloud: its contents, and the check of --resume whether a cloud is up to date.
+"""The report file next to a cloud: its contents, its remarks, and the check of --resume whether a cloud is up to date.
 
-`strip_task` writes it after the cloud, so its presence means that the cloud is complete.
+`strip_task` writes it after the cloud, so its presence means that the cloud is complete. It calls `find_warnings` and
+`find_remarks` once all rows of a strip are counted: columns without any value, with cause and remedy, and doubtful
+waveforms.
 Before you change it: everything but `timing` must be the same for every run of the same input and options.
 """
 
@@ -9,23 +11,31 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
-from wavebatch.batch.counts import RunReport
-from wavebatch.batch.explain import explain_absence
+from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.unit import Prepared
-from wavebatch.core.no_data import without_nan
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import StripWarning
+from wavebatch.core.no_data import REASONS, NoData, without_nan
 from wavebatch.core.process import Seconds
+from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
+from wavebatch.stages.decompose.loops import loop_model
+from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
+from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets
+from wavebatch.surveying.sensor import SensorSource
 from wavebatch.surveying.system_file import format_survey
+from wavebatch.surveying.systems.doubt import doubt_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 MOST_REPORT = 64 << 20
@@ -233,3 +243,314 @@ def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> R
         if same and document["output"]["file"] == cloud.name and document["output"]["size"] == cloud.stat().st_size:
             return RunReport.from_json(document)
     return None
+
+
+_ANGLE = "incidence_angle"
+
+LEAST_JUDGED = 20
+"""Fewer waveforms, or returns in waveforms with echoes, are too few for a remark."""
+
+MOST_FAILED = 0.25
+"""Share of echoes whose fit did not converge, or ended at a bound, that is far above usual: 4 % at most of a chain that
+suits a strip; 35 % on a RIEGL and 80 % on a Leica strip of Gaussians in place of the learned pulse."""
+
+INVERTED = 5.0
+"""Signals are inverted where counts reach this many times further below the baseline than above it."""
+
+_NEEDS: dict[str, tuple[NoData, ...]] = {
+    "range": (),
+    "backscatter_coefficient": (NoData.NOT_CALIBRATED,),
+    "cross_section": (NoData.NOT_CALIBRATED, NoData.NO_DIVERGENCE),
+    "reflectance": (NoData.NOT_CALIBRATED,),
+    "level_reflectance": (NoData.NOT_CALIBRATED,),
+    _ANGLE: (NoData.NO_DIVERGENCE,),
+}
+"""Physical columns, and what each needs besides the sensor's position."""
+
+FASTEST = 120.0
+"""Speed of a sensor above which its coordinates are doubted [m/s]: survey aircraft fly at 40 to 100, in feet 130 up."""
+
+JETS = 5000.0
+"""Height of a sensor above the points from which a speed beyond FASTEST is believed where a CRS says metres [m]."""
+
+MOST_ABOVE_ONE = 0.03
+"""Share of the reflectances above 1 from which a warning is printed."""
+
+MOST_GAPS = 3
+"""Most gaps of a trajectory that a remark lists."""
+
+
+def _name_model(prepared: Prepared) -> list[str]:
+    """The pulse that a residual loop takes from the survey where the chain names none."""
+    step = prepared.job.chain.steps[2]
+    model = step.effective().get("model")
+    if model != "auto":
+        return []
+    fitted = loop_model(prepared.system, model)
+    return [f'{step.stage.name} fits the pulse of the survey: model = "{fitted}"']
+
+
+def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
+    """Find what a user should know about a strip that is written.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    report : RunReport
+        Of the whole strip.
+
+    Returns
+    -------
+    tuple of str
+        One line each: a column that no echo has, with the commonest reason and its remedy; angles that the beam can
+        hardly measure; a trajectory that contradicts the vectors, or
+        that does not cover the strip; changes of energy that nothing shows.
+    """
+    lines = [*prepared.scan.notes]
+    lines += filter(None, [prepared.sensor.doubt()])
+    lines += prepared.job.calibration.notes if prepared.job.calibration else ()
+    lines += _find_gaps(prepared.sensor, report.no_data)
+    lines += _doubt_units(prepared)
+    lines += _name_height(prepared)
+    lines += [*_name_model(prepared), *_name_raised(prepared)]
+    last, lost = report.last_left_out, report.left_out.get("where", 0)
+    if last:
+        lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
+                     "the ground: return numbers stay those of the whole pulse")  # fmt: skip
+    lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
+    for column, counts in sorted(report.no_data.items()):
+        known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
+        if total and not known:
+            lines.append(_explain(prepared, report, column, counts))
+        elif total and column == _ANGLE:
+            outlook = _look_out(prepared, report)
+            if outlook is not None and not outlook.possible:
+                remedy = REASONS[NoData.UNCERTAIN][1]
+                lines.append(f"{column}: {known} of {total} echoes have one, the widest: {outlook.reason}; {remedy}")
+    return tuple(lines)
+
+
+def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, str]) -> tuple[StripWarning, ...]:
+    """Find what makes results of a strip doubtful.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    report : RunReport
+        Of the whole strip.
+    dropped : mapping of str to str
+        Records of the input that the cloud does not have, and why.
+
+    Returns
+    -------
+    tuple of StripWarning
+        What makes results wrong comes first: a forced survey of another sensor, a selection that leaves nothing, a
+        strip without any waveform or echo, packets that do not fit the returns, a pulse that is a guess, a chain that
+        does not fit the strip's pulse. Then what the files, the calibration and the records of the input have.
+    """
+    choice, echoes, warn = prepared.choice, report.count("echoes"), StripWarning.of
+    found = [*warn("forced-system", _name_forced(prepared)), *warn("nothing-selected", _miss_all(prepared, report))]
+    found += warn("empty", _find_nothing(prepared, report))
+    found += warn("foreign-packets", _doubt_waveforms(prepared, report))
+    found += doubt_survey(choice.survey.system, choice.survey.figures, choice.survey.waveforms) if echoes else ()
+    found += () if choice.doubted else warn("failed-fits", _doubt_fits(prepared, report))
+    found += warn("reflectance", _doubt_reflectance(report))
+    if choice.doubted and echoes:
+        share, (_, best) = choice.false_share, choice.predictions
+        line = (
+            f"{choice.chain.name or 'this chain'}: does not fit this strip's pulse, which is no plain Gaussian: about "
+            f"{round(share * echoes)} of its {echoes} echoes are false ({100 * share:.0f} % in a trial with the "
+            f"learned pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
+        )
+        found += warn("false-echoes", [line])
+    found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
+    return (*found, *warn("dropped-records", map(": ".join, dropped.items())))
+
+
+def _name_forced(prepared: Prepared) -> Iterator[str]:
+    """A survey of another sensor, or of other ground."""
+    if prepared.forced and prepared.job.request.force:
+        yield f"--force: the survey given by --system is not of this sensor: {prepared.forced}"
+    elif prepared.forced:
+        yield f"the survey given by --system is of another sensor, or this is a hillside: {prepared.forced}"
+
+
+def _name_raised(prepared: Prepared) -> Iterator[str]:
+    """A threshold of the residual loop that lies below the noise, which the stage takes in its place."""
+    step, survey = prepared.choice.chain.steps[2], prepared.choice.survey
+    if step.stage.name != "decompose.residual_loop":
+        return
+    given, noise = step.effective(), survey.system.noise.std
+    unit = {"count": 1.0, "amplitude": survey.figures.amplitude_50 or 0.0}.get(given["t_unit"], 0.0)
+    if 0 < unit * given["t_diff"] < noise:
+        yield (
+            f"decompose.residual_loop: t_diff = {given['t_diff']:g} (unit {given['t_unit']}) lies below the noise of "
+            f"{noise:.2f} DN and was raised to it"
+        )
+
+
+def _doubt_fits(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """A line for each flag of failed fits that far more echoes have than usual."""
+    written = report.count("points_out") - sum(report.passed_through.values())
+    for flag in (EchoFlag.NOT_CONVERGED, EchoFlag.AT_BOUND):
+        number = report.flags.get(str(flag.name), 0)
+        if written >= LEAST_JUDGED and number > MOST_FAILED * written:
+            auto = prepared.job.request.describe(prepared.job.chain) is not None
+            remedy = "draw some with `wavebatch plot waveform --flags`" if auto else "use --profile auto"
+            yield (
+                f"{number} of {written} echoes ({100 * number / written:.0f} %) are {flag.name}, far more than usual: "
+                f"their errors cannot be trusted; {remedy}, or leave them out with --drop-flags {flag.name}"
+            )
+
+
+def _miss_all(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """A selection that leaves no point."""
+    number = sum(report.left_out.values())
+    if number and not report.count("points_out"):
+        reasons = ", ".join(f"{n} {LEFT_OUT[name]}" for name, n in report.left_out.items() if n)
+        place = prepared.chosen.chosen.describe_extent(prepared.facts.header)
+        yield f"no point is written: of {number}, {reasons}{place and '; ' + place}"
+
+
+def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """A strip without any point, waveform or echo: its cloud is empty, or has no attributes."""
+    points, waveforms, echoes = (report.count(name) for name in ("points_in", "waveforms", "echoes"))
+    if not points:
+        yield "the strip has no points, so its cloud has none; if it should have some, get the file again"
+    elif not waveforms:
+        yield f"none of {points} points has a waveform: all are written unchanged, without attributes"
+    elif waveforms >= LEAST_JUDGED and not echoes:
+        figures, noise = prepared.choice.survey.figures, prepared.system.noise
+        least, largest = figures.least_count, figures.largest_count
+        down = 0.0 if least is None else noise.baseline - least
+        up = 0.0 if largest is None else largest - noise.baseline
+        reason = "nothing rises far enough above the noise"
+        if down > INVERTED * max(up, noise.std):
+            reason = f"the signal falls from {noise.baseline:.0f} to {noise.baseline - down:.0f} DN: it is inverted"
+        yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` shows what the strip records"
+
+
+def _doubt_reflectance(report: RunReport) -> Iterator[str]:
+    """More reflectances above 1 than metal, signs and wet roofs explain."""
+    known = max(report.no_data.get(name, {}).get(NoData.KNOWN.name, 0) for name in ("level_reflectance", "reflectance"))
+    if report.above_one > MOST_ABOVE_ONE * known > 0:
+        share = f"{100 * report.above_one / known:.0f} %"
+        yield (
+            f"{share} of the reflectances exceed 1, that of a white matt surface: the calibration is of another sensor "
+            "or setting, a target's reflectance is wrong, or coordinates are not in metres"
+        )
+
+
+def _name_height(prepared: Prepared) -> Iterator[str]:
+    """A flight height that was not needed."""
+    height, sensor = prepared.job.sensor.height, prepared.sensor
+    if height is not None and sensor.height is None:
+        seen = dict(sensor.facts).get("height_m")
+        where = f": {seen:.0f} m above the points" if seen else ""
+        yield f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}"
+
+
+def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """Extra bytes of the input that added echoes share with the nearest return."""
+    added = report.count("added_echoes")
+    if added and prepared.layout.copied:
+        yield (
+            f"{', '.join(prepared.layout.copied)}: kept; {added} added echoes have the value of the nearest return of "
+            "their packet, because no value is free for no-data"
+        )
+    marked = [f"{one.record.name} {one.record.no_data[0]:g}" for one in prepared.layout.carried
+              if not (one.copied or prepared.layout.whole or one.record.no_data is None)
+              and math.isfinite(one.record.no_data[0])]  # fmt: skip
+    if added and marked:
+        yield (
+            f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
+            "value: leave these points out before a mean (flag ADDED)"
+        )
+
+
+def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """Packets of another strip, by --force, and return locations that fit no echo."""
+    if prepared.scan.stranger:
+        yield f"--force: {prepared.scan.stranger}"
+        return
+    matched = report.count("matched_returns")
+    yield from doubt_packets(prepared.facts, matched, matched + report.count("unmatched_returns"))
+
+
+def _doubt_units(prepared: Prepared) -> Iterator[str]:
+    """An aircraft that is too fast: its strip may be in feet without saying so."""
+    facts = dict(prepared.sensor.facts)
+    named = any(unit.horizontal is not None for unit in prepared.facts.units)
+    if named and facts.get("height_m", 0.0) > JETS:
+        return
+    if prepared.sensor.kind != "trajectory" and facts.get("speed_m_s", 0.0) > FASTEST:
+        yield (
+            f"range: if coordinates are in metres, the sensor flies at {facts['speed_m_s']:.0f} m/s, "
+            f"{facts['height_m']:.0f} m above the points, whatever a CRS says: are they in feet? Then ranges are "
+            "3.28 times too long: project the strip to metres"
+        )
+
+
+def _find_gaps(sensor: SensorSource, no_data: Mapping[str, Mapping[str, int]]) -> Iterator[str]:
+    """Echoes at times for which there is no position of the sensor, while others have one."""
+    missing = {column: counts.get(NoData.NO_SENSOR.name, 0) for column, counts in no_data.items()}
+    columns = [name for name, number in sorted(missing.items()) if 0 < number < sum(no_data[name].values())]
+    if not columns:
+        return
+    worst = max(columns, key=lambda name: missing[name])
+    number, total = missing[worst], sum(no_data[worst].values())
+    facts = dict(sensor.facts)
+    reason, remedy = "rays from which the sensor's position follows are missing there", "give --trajectory"
+    if sensor.kind == "trajectory":
+        gaps = facts.get("gaps_s", [])
+        times = [f"{begin:.2f} to {end:.2f} s" for begin, end in gaps[:MOST_GAPS]]
+        times += [f"{len(gaps) - MOST_GAPS} more"] * (len(gaps) > MOST_GAPS)
+        reason, remedy = f"{facts['file']} has no position there", "give a trajectory that covers the strip"
+        if times:
+            reason += f" ({100 * (1 - facts['share_covered']):.2g} % of the strip's time: {', '.join(times)})"
+    yield f"{', '.join(columns)}: {number} of {total} echoes have none: {reason}; {remedy}"
+
+
+def explain_absence(prepared: Prepared) -> dict[str, str]:
+    """Explain why physical columns are not computed.
+
+    Parameters
+    ----------
+    prepared : Prepared
+
+    Returns
+    -------
+    dict of str to str
+        The reason by column.
+    """
+    chain, known = prepared.job.chain, prepared.system.radiometry
+    lacks = {NoData.NOT_CALIBRATED: known.constant is None, NoData.NO_DIVERGENCE: known.divergence is None}
+    reasons = {}
+    for column, needs in _NEEDS.items():
+        if column not in chain.makes:
+            reason = next((REASONS[need][0] for need in needs if lacks[need]), None)
+            reasons[column] = reason or f"the chain has no stage attribute.{column}"
+    return reasons
+
+
+def _explain(prepared: Prepared, report: RunReport, column: str, counts: Mapping[str, int]) -> str:
+    total = sum(counts.values())
+    first = max(NoData, key=lambda reason: (counts.get(reason.name, 0), -reason))
+    meaning, remedy = REASONS[first]
+    share = f"{counts[first.name]} of them: " if counts[first.name] < total else ""
+    if column == _ANGLE and first in (NoData.UNCERTAIN, NoData.SHORT_PULSE, NoData.TOO_STEEP):
+        outlook = _look_out(prepared, report)
+        meaning = f"{meaning}: {outlook.reason}" if outlook is not None else meaning
+    return f"{column}: none of {total} echoes has one; {share}{meaning}; {remedy}"
+
+
+def _look_out(prepared: Prepared, report: RunReport) -> AngleOutlook | None:
+    """How good angles from widths are on the strip; None where distance or divergence is unknown."""
+    parameters = angle_parameters(prepared.job.chain) or {}
+    divergence = parameters.get("divergence") or prepared.system.radiometry.divergence
+    distance = prepared.sensor.distance
+    amplitude = AMPLITUDE_BINS.quantile(report.amplitude, 0.5)
+    spacing = prepared.choice.survey.figures.spacing_ns
+    if not (divergence and distance and amplitude and spacing):
+        return None
+    return predict_angles(prepared.system, spacing, distance, divergence, amplitude, parameters["max_error"])

@@ -20,11 +20,10 @@ import numpy as np
 
 from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.job import StripJob
 from wavebatch.batch.options import RunOptions
-from wavebatch.batch.packing import Packing, pack_chunk
-from wavebatch.batch.unit import Prepared, UnitResult, prepare_strip, process_unit, scan_run
+from wavebatch.batch.report_file import find_remarks, find_warnings
+from wavebatch.batch.unit import Packing, Prepared, UnitResult, pack_chunk, prepare_strip, process_unit, scan_run
 from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError, StageError
 from wavebatch.core.process import Seconds

@@ -132,7 +132,7 @@ def _is_made(target: Path, output: Path) -> bool:
 
 def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str = "--report") -> None:
     """Raises ConfigError if the summary would replace a file that is read or written by this run."""
-    from wavebatch.batch.preflight import find_outputs
+    from wavebatch.batch.run import find_outputs
 
     refuse_input(report)
     outputs = {os.path.realpath(path) for job in jobs for path in find_outputs(job, batch_options.folder)}
@@ -215,7 +215,7 @@ def find_exit_code(errors: Sequence[BaseException | None]) -> int:
 
 
 def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
-    from wavebatch.batch.preflight import plan_strip
+    from wavebatch.batch.run import plan_strip
     from wavebatch.stages.chain_file import effective
 
     errors: list[BaseException | None] = []

@@ -112,7 +112,7 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
     if system.tail_misfit:
         for row, other, lag in list_neighbours(table):
             faint[row] |= table.amplitude[row] < TAIL_FACTOR * _tail_share(system, lag) * table.amplitude[other]
-    return table.take(np.flatnonzero(~faint))
+    return table.take(np.flatnonzero(~faint)) if faint.any() else table
 
 
 def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:

@@ -1,6 +1,7 @@
 """Worker processes on this machine; with one job, the same calls run in this process.
 
-`run` submits all work through it, or through `dask_cluster.Cluster`, which has the same methods.
+`run` submits all work through it, or through `dask_cluster.Cluster`, which has the same methods. Futures are waited for
+so that no interrupt leaves a lock taken, and ended once.
 Before you change it: workers must end with this process, however it ends, or they would go on writing. Any worker may
 be killed or stopped at any instant, also while it sends a result: nothing here may wait for a worker without a limit,
 except for the result of a call of a process that is alive.
@@ -21,17 +22,52 @@ import time
 import types
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import FIRST_COMPLETED, Future, InvalidStateError, wait
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.workers.futures import end_future, settle_future, wait_uninterrupted
 from wavebatch.batch.workers.serve import PATIENCE, serve_calls
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.core.process import CHILD, keep_freed_memory
 from wavebatch.files.disk.temp_store import owning_scratch, use_scratch
+
+LATENCY = 0.1
+"""Seconds after which Ctrl-C is seen at the latest while results are waited for."""
+
+
+def wait_uninterrupted(futures: list[Future], seconds: float) -> set[Future]:
+    """Return the futures that are done within so many seconds, or as soon as one is.
+
+    An interrupt inside `wait` may leave a lock taken. The thread that settles this future would then hold it for ever,
+    and so would `cancel`. So interrupts come between short waits only.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        with uninterrupted():
+            done = wait(futures, timeout=LATENCY, return_when=FIRST_COMPLETED).done
+        if done or time.monotonic() > deadline:
+            return done
+
+
+def end_future(future: Future, result: Any = None, error: BaseException | None = None) -> None:
+    """Give the future its end, unless it has one."""
+    with contextlib.suppress(InvalidStateError):
+        if error is None:
+            future.set_result(result)
+        else:
+            future.set_exception(error)
+
+
+def settle_future(future: Future, function: Callable, *arguments: Any) -> Future:
+    """Run `function(*arguments)` here; its result or its error becomes that of `future`."""
+    try:
+        future.set_result(function(*arguments))
+    except Exception as error:
+        future.set_exception(error)
+    return future
+
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""

@@ -2,22 +2,30 @@
 
 `dask_cluster` asks all workers before anything starts, and each that joins later before it gets work. Before you change
 it: a worker that does not fit must never make a row of a cloud.
+
+Kinds of processors differ in the last bits of sums, and a survey's decisions follow them, so a strip's bytes would
+depend on which worker it meets. NumPy and its BLAS choose code for the processor when they load; the probe shows what
+was chosen by its results.
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 import platform
+import subprocess
+import sys
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy
+import numpy as np
 import scipy
 
 import wavebatch
-from wavebatch.batch.workers.processor import describe_processor
+from wavebatch.core.process import CHILD
 
 
 @functools.cache
@@ -78,3 +86,80 @@ def _size(file: str) -> int:
         return os.path.getsize(file)
     except (OSError, ValueError):
         return -1
+
+
+_PROBE = "from wavebatch.batch.workers.worker_check import probe_arithmetic; print(probe_arithmetic())"
+
+_SIZES = ((3, 40), (13, 80), (19, 200), (64, 300))
+"""Parameters and samples of the systems that are solved: from one echo in a window to the stack of a pulse."""
+
+
+def describe_processor() -> dict[str, str]:
+    """Return the kind of the processor of this process.
+
+    Returns
+    -------
+    dict
+        `name` for people; `probe`: equal on two machines if and only if arithmetic gave the same bits on both.
+
+    Notes
+    -----
+    The probe runs in a process of one thread: threads share out large products, which none of wavebatch's are, and
+    change their last bits.
+
+    References
+    ----------
+    docs/reliability.md, "The same bytes".
+    """
+    return {"name": _find_name(), "probe": _probe_alone()}
+
+
+@functools.lru_cache(maxsize=1)
+def _probe_alone() -> str:
+    root = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, **CHILD, "PYTHONPATH": path}
+    found = subprocess.run([sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, check=True)
+    return found.stdout.strip()
+
+
+def probe_arithmetic() -> str:
+    """Return a checksum of products, solutions, sums and functions whose last bits differ between processors."""
+    digest = hashlib.sha256()
+    for parameters, samples in _SIZES:
+        for kind in (np.float64, np.float32):
+            rows: np.ndarray = _make_rows(parameters, samples).astype(kind)
+            gram = rows @ rows.T
+            matrix = gram.astype(np.float64) + np.eye(parameters)
+            results = [
+                gram,
+                rows @ rows[0],
+                np.linalg.solve(matrix, rows[:, :5].astype(np.float64)),
+                np.linalg.inv(matrix),
+                np.linalg.eigvalsh(matrix),
+                np.linalg.lstsq(rows.T.astype(np.float64), np.arange(samples, dtype=np.float64), rcond=None)[0],
+                np.einsum("pl,ql->pq", rows, rows),
+                rows.sum(axis=1),
+                np.exp(-rows),
+                np.log1p(np.abs(rows)),
+                np.sqrt(np.abs(rows)).sum(axis=0),
+            ]
+            for result in results:
+                digest.update(np.ascontiguousarray(result).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _make_rows(parameters: int, samples: int) -> np.ndarray:
+    """Numbers of many digits (parameters, samples) that every machine makes alike: whole numbers, then one division."""
+    place = np.arange(parameters * samples, dtype=np.uint64)
+    mixed = (place * np.uint64(2654435761) + np.uint64(12345)) % np.uint64(1_000_003)
+    return (mixed.astype(np.float64) / 500_001.5 - 1.0).reshape(parameters, samples)
+
+
+def _find_name() -> str:
+    """The model of the processor, as well as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

@@ -351,7 +351,8 @@ def _leave_signal_out(
 def _pulse_variance(covariance: np.ndarray, lags: int) -> float:
     """Variance of noise to a pulse a sixth as wide as the lags, over that of white noise, or that of a sample."""
     k = np.arange(1, len(covariance))
-    return float(covariance[0] + max(2 * covariance[1:] @ exp(-0.25 * (k * 6 / lags) ** 2), 0.0))
+    weight = exp(-0.25 * (k * 6 / lags) ** 2)  # not by BLAS, whose last bits depend on the processor
+    return float(covariance[0] + max(2 * np.einsum("k,k->", covariance[1:], weight), 0.0))
 
 
 def measure_covariance(

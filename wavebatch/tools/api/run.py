@@ -14,8 +14,7 @@ from typing import Any, Literal, TypedDict, Unpack
 
 from wavebatch.batch.job import StripJob, choose_columns, list_column_names
 from wavebatch.batch.options import RunOptions, describe_options
-from wavebatch.batch.preflight import check_outputs, plan_memory
-from wavebatch.batch.run import BatchResult, run_batch
+from wavebatch.batch.run import BatchResult, check_outputs, plan_memory, run_batch
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.point_filter import PointFilter
