@@ -358,6 +358,5 @@ def _noise_gain(
     rest = share * fits[1][0][0] + (1 - share) * fits[3][0][0]
     if coloured and gain > 0:
         gain *= std**2 / np.clip(rest, std**2 / MOST_COLOURED, std**2)
-    if gain * edges[-2] <= 0.3 * std**2:
-        return 0.0
-    return float(gain * np.clip((sigma - 3) / 3, 0.0, 1.0))
+    gain = float(gain * np.clip((sigma - 3) / 3, 0.0, 1.0))
+    return gain if gain * edges[-2] > 0.3 * std**2 else 0.0
