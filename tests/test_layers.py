@@ -21,7 +21,7 @@ INSIDE = {
     ],
     "surveying/measuring": [
         {"lone_echoes", "trial"}, {"noise_and_width"}, {"residuals"},
-        {"misfit", "learn_pulse", "judge", "whitening"}, {"joint_pulse", "mirror"}, {"choose_pulse"},
+        {"misfit", "learn_pulse", "judge", "whitening", "return_scatter"}, {"joint_pulse", "mirror"}, {"choose_pulse"},
     ],
     "batch/workers": [
         {"serve", "worker_check"}, {"processes"}, {"dask_cluster"},

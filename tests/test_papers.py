@@ -6,11 +6,15 @@ import shlex
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from html_tools import Page
+
+from wavebatch.stages.decompose.fit import gaussian
+from wavebatch.tools.simulate import DiscreteReceiver
 
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "papers"
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -120,6 +124,53 @@ def test_the_paper_column_has_what_is_printed(load):
     assert models["table 3: Leica, mean of both classes, log-normal"] == "0.0083"
 
 
+def break_height(s4, monkeypatch):
+    """Echoes of `synthesize` are .5 % too high."""
+    monkeypatch.setattr(s4, "gaussian", lambda *known: _raise(gaussian(*known)))
+    return s4.table_of_synthesis(3000, 0)
+
+
+def break_energy(s4, monkeypatch):
+    """Waveforms of `synthesize` have 3 % too much energy."""
+    made = s4.synthesize_strip
+
+    def synthesize_more(cloud, strip, options, **known):
+        return made(cloud, strip, replace(options, gain=1.03 * options.gain), **known)
+
+    monkeypatch.setattr(s4, "synthesize_strip", synthesize_more)
+    return s4.table_of_footprints(3000, 0)
+
+
+def break_dead_zone(s4, monkeypatch):
+    """The receiver is blind for 3 mm more."""
+    monkeypatch.setattr(s4, "DiscreteReceiver", lambda dead_zone: DiscreteReceiver(dead_zone + 0.003))
+    return s4.table_of_separations(s4.FULL, 0)
+
+
+def break_number(s4, monkeypatch):
+    """The receiver gives a fifth return."""
+    monkeypatch.setattr(s4, "DiscreteReceiver", lambda dead_zone: DiscreteReceiver(dead_zone, most=5))
+    return s4.table_of_numbers(s4.FULL, 0)
+
+
+def _raise(found):
+    return replace(found, amplitude=found.amplitude * np.float32(1.005))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "failures"),
+    [
+        (break_height, {"height of lone echoes over gain times intensity"}),
+        (break_energy, {"pulses of 1, shares of 1/1", "pulses of 2, shares of 1/2"}),
+        (break_dead_zone, {"0.64 m, least of 2-3", "0.67 m, least of 1-2"}),
+        (break_number, {"orion-20 m, numbers above 4", "gemini-24 m, numbers above 4"}),
+    ],
+)
+def test_small_faults_are_not_accepted(fault, failures, load, monkeypatch):
+    assert failures <= set(fault(load("s4_ussyshkin"), monkeypatch).failures)
+
+
 def test_the_profile_of_the_third_paper_has_its_table(load):
     scripts = {"s2_jutzi": load("s2_jutzi")}
     profile = str(scripts["s2_jutzi"].table_of_profile(1000, 0))
@@ -213,7 +264,9 @@ def test_long_tables_are_folded_unless_a_figure_is_not_accepted(load):
     assert wrong.startswith("<details open><summary>t: 20 figures, 1 not accepted<")
 
 
-@pytest.mark.parametrize("name", ["draw_cases", "draw_coefficients", "draw_noise", "draw_record"])
+@pytest.mark.parametrize(
+    "name", ["draw_cases", "draw_coefficients", "draw_fan", "draw_noise", "draw_peak", "draw_record"]
+)
 def test_figures_are_drawn(name, load, tmp_path):
     pytest.importorskip("matplotlib")
     target = tmp_path / "p.png"

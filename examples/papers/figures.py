@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from given_echoes import FINE, fine_recording, known_noise, known_system
 from published import WANG_CASES, simulate_wang
-from s3_rhomberg_kauert import DIVERGENCE, HEIGHT, LENGTH, PULSE_SIGMA, strike_planes
+from s3_rhomberg_kauert import DIVERGENCE, FWHM_PER_TAU, HEIGHT, LENGTH, PULSE_SIGMA, strike_planes
 from s4_ussyshkin import fly_cloud
 
 import wavebatch as wb
 from wavebatch.core.units import HALF_C
 from wavebatch.files.figure_file import open_picture
-from wavebatch.kernels.physics.incidence import paper_table, pulse_table, spread_of_angle
+from wavebatch.kernels.physics.incidence import PAPER_TAU, paper_table, pulse_table, spread_of_angle, spread_pulse
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.detect.transformed import transform, wavelet
@@ -114,33 +114,44 @@ def draw_noise(folder: Path, seed: int, target: Path) -> None:
         every[0].set_ylabel("signal [paper's unit]")
 
 
+def draw_fan(folder: Path, seed: int, target: Path) -> None:
+    """Rhomberg-Kauert et al., figures 2A and 2B: echoes of planes by angle, of the printed pulse and of the other."""
+    angles = DEGREES[::5]
+    spreads = spread_of_angle(np.radians(angles), HEIGHT, DIVERGENCE)
+    fans = {
+        "2A: t exp(-t), half a Gaussian": spread_pulse(1, spreads / 2**0.5, LENGTH / PAPER_TAU, causal=True),
+        "2B: t^2 exp(-t)": spread_pulse(2, spreads, LENGTH / FWHM_PER_TAU),
+    }
+    with open_picture(target, (12.0, 4.8), overwrite=True) as figure:
+        sides = figure.subplots(1, 2, sharey=True)
+        for axes, (name, (time, curves)) in zip(sides, fans.items(), strict=True):
+            shown = axes.scatter([], [], c=[], cmap="viridis", vmin=0, vmax=angles[-1])
+            for angle, curve in zip(angles, curves, strict=True):
+                axes.plot(time, curve, color=shown.to_rgba(angle), linewidth=1.0)
+            axes.set_xlim(-8, 12)
+            axes.set_title(name, loc="left", fontsize=10)
+            axes.set_xlabel("time [ns]")
+        sides[0].set_ylabel("echo, over its maximum")
+        figure.colorbar(shown, ax=sides, label="angle of incidence [deg]")
+
+
 def draw_widths(folder: Path, seed: int, target: Path) -> None:
-    """Rhomberg-Kauert et al., figures 2A and 3: the two pulses, and widths by angle with measured points."""
+    """Rhomberg-Kauert et al., figure 3: widths by angle with measured points."""
     rng = np.random.default_rng(seed)
     spread = spread_of_angle(np.radians(DEGREES), HEIGHT, DIVERGENCE)
     printed, fitted = paper_table(PULSE_SIGMA), pulse_table(2.5364 / 4, 0.05)
-    with open_picture(target, (12.0, 4.8), overwrite=True) as figure:
-        left, right = figure.subplots(1, 2)
-        t = np.linspace(0, 8, 400)
-        for power, name in ((1, "as printed: t exp(-t)"), (2, "Carlsson's: t^2 exp(-t)")):
-            pulse = t**power * np.exp(-t)
-            pulse /= pulse.max()
-            above = t[pulse >= 0.5]
-            left.plot(t * LENGTH / (above[-1] - above[0]), pulse, label=name)
-        left.set_xlim(0, 6)
-        left.set_xlabel("time [ns]")
-        left.set_ylabel("pulse h, over its maximum")
-        left.legend(fontsize=8)
-        right.plot(DEGREES, 4 * np.interp(spread, printed.spread, printed.width), label="as printed")
+    with open_picture(target, (8.0, 4.8), overwrite=True) as figure:
+        axes = figure.subplots()
+        axes.plot(DEGREES, 4 * np.interp(spread, printed.spread, printed.width), label="as printed")
         label = "4 x fitted Gaussian, h = t^2 exp(-t)"
-        right.plot(DEGREES, 4 * np.interp(spread, fitted.spread, fitted.width), label=label)
-        right.plot(DEGREES, 4 * np.hypot(PULSE_SIGMA, spread), linestyle="--", label="Gaussian closed form")
+        axes.plot(DEGREES, 4 * np.interp(spread, fitted.spread, fitted.width), label=label)
+        axes.plot(DEGREES, 4 * np.hypot(PULSE_SIGMA, spread), linestyle="--", label="Gaussian closed form")
         widths = np.array([_measure_width(degrees, rng) for degrees in MEASURED])
-        right.errorbar(MEASURED, widths[:, 0], widths[:, 1], fmt="o", color="black", markersize=4,
-                       label="fitted to planes that are summed ray by ray")  # fmt: skip
-        right.set_xlabel("angle of incidence [deg]")
-        right.set_ylabel("width at e^-2 [ns]")
-        right.legend(fontsize=8)
+        axes.errorbar(MEASURED, widths[:, 0], widths[:, 1], fmt="o", color="black", markersize=4,
+                      label="fitted to planes that are summed ray by ray")  # fmt: skip
+        axes.set_xlabel("angle of incidence [deg]")
+        axes.set_ylabel("width at e^-2 [ns]")
+        axes.legend(fontsize=8)
 
 
 def _measure_width(degrees: float, rng: np.random.Generator) -> tuple[float, float]:
@@ -185,28 +196,42 @@ def draw_record(folder: Path, seed: int, target: Path) -> None:
     with open_picture(target, (13.0, 4.6), overwrite=True) as figure:
         every = figure.subplots(1, 2)
         for axes, (stand, returns) in zip(every, (("orion-6", 4), ("corn", 3)), strict=True):
-            cloud, strip = folder / f"record-{stand}.las", folder / f"modelled-{stand}.las"
-            fly_cloud(stand, cloud, 0.65, 2000, seed)
-            synthesize_strip(cloud, strip, SynthesisOptions(bits=16, baseline=0.0), overwrite=True)
-            with wb.open_strip(strip) as opened:
-                block, row = next(
-                    (block, row) for block in opened.blocks()
-                    for row in np.flatnonzero(np.bincount(block.returns.waveform, minlength=len(block)) == returns)
-                )  # fmt: skip
-                time = np.arange(block.samples.shape[1]) * block.spacing
-                mine = np.flatnonzero(block.returns.waveform == row)
-                height = np.interp(block.returns.time[mine], time, block.samples[row])
-                metres = HALF_C * (block.returns.time[mine] - block.returns.time[mine][0])
-            axes.plot(time, block.samples[row], color="black", label="modelled waveform")
-            axes.vlines(block.returns.time[mine], 0, height, color="tab:red", label="returns")
-            for number, (at, top, deep) in enumerate(zip(block.returns.time[mine], height, metres, strict=True), 1):
-                text = f"{number}: {deep:.2f} m"
-                axes.annotate(text, (at, top), xytext=(4, 4), textcoords="offset points", fontsize=8)
-            axes.set_ylim(0, 1.15 * float(block.samples[row].max()))
-            axes.set_title(f"{returns} returns, {stand}", loc="left", fontsize=10)
-            axes.set_xlabel("time [ns]")
+            _draw_modelled(axes, folder, seed, stand, returns)
         every[0].set_ylabel("signal [DN]")
         every[0].legend(fontsize=8)
+
+
+def draw_peak(folder: Path, seed: int, target: Path) -> None:
+    """Ussyshkin and Theriault, figure 6: a return as the peak of a Gaussian."""
+    with open_picture(target, (7.0, 4.6), overwrite=True) as figure:
+        axes = figure.subplots()
+        _draw_modelled(axes, folder, seed, "orion-6", 1)
+        axes.set_ylabel("signal [DN]")
+        axes.legend(fontsize=8)
+
+
+def _draw_modelled(axes, folder: Path, seed: int, stand: str, returns: int) -> None:
+    """A pulse with so many returns over a stand, and the waveform that `synthesize` models from them."""
+    cloud, strip = folder / f"record-{stand}.las", folder / f"modelled-{stand}.las"
+    fly_cloud(stand, cloud, 0.65, 2000, seed)
+    synthesize_strip(cloud, strip, SynthesisOptions(bits=16, baseline=0.0), overwrite=True)
+    with wb.open_strip(strip) as opened:
+        block, row = next(
+            (block, row) for block in opened.blocks()
+            for row in np.flatnonzero(np.bincount(block.returns.waveform, minlength=len(block)) == returns)
+        )  # fmt: skip
+        time = np.arange(block.samples.shape[1]) * block.spacing
+        mine = np.flatnonzero(block.returns.waveform == row)
+        height = np.interp(block.returns.time[mine], time, block.samples[row])
+        metres = HALF_C * (block.returns.time[mine] - block.returns.time[mine][0])
+    axes.plot(time, block.samples[row], color="black", label="modelled waveform")
+    axes.vlines(block.returns.time[mine], 0, height, color="tab:red", label="returns")
+    for number, (at, top, deep) in enumerate(zip(block.returns.time[mine], height, metres, strict=True), 1):
+        text = f"{number}: {deep:.2f} m"
+        axes.annotate(text, (at, top), xytext=(4, 4), textcoords="offset points", fontsize=8)
+    axes.set_ylim(0, 1.15 * float(block.samples[row].max()))
+    axes.set_title(f"{returns} return{'s' * (returns > 1)}, {stand}", loc="left", fontsize=10)
+    axes.set_xlabel("time [ns]")
 
 
 def draw_canopy(folder: Path, seed: int, target: Path) -> None:

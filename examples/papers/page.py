@@ -88,9 +88,11 @@ PAPERS = (
         Picture("Length of the segments per height: the ground at 120 m, flat roofs at 124 m, slopes above.",
                 "plot profile segments.csv --column length --log"),
     )),
-    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024)", "2A, 3, 4, 5, 6A, 6B", (
-        Picture("Figures 2A and 3: the pulse h as printed and Carlsson's, and the width of the echo by angle, with "
-                "widths that were fitted to planes of 400,000 rays (bars: their spread at A/sn 100).",
+    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024)", "2, 3, 4, 5, 6", (
+        Picture("Figures 2A and 2B: echoes of planes of 0 to 75 degrees, of the pulse h as printed and of Carlsson's.",
+                "draw_fan", ""),
+        Picture("Figure 3: the width of the echo by angle, of both pulses, with widths that were fitted to planes of "
+                "400,000 rays (bars: their spread at A/sn 100).",
                 "draw_widths", ""),
         Picture("Figure 6B: angles from widths by angles from the normals of surfaces, and the histogram of "
                 "their differences.", "draw_angles", ""),
@@ -109,10 +111,11 @@ PAPERS = (
         Picture("Figure 6A: the same from the normals of surfaces; roofs of 60 degrees give few.",
                 "plot histogram out/village.laz --column incidence_angle_normals --where 'z > 123.5'"),
     )),
-    Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2a, 2b, 4, 7a, 7b", (
+    Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2a, 2b, 4, 6, 7a, 7b", (
         Picture("Figures 1, 2a, 2b, 7a and 7b: pulses with four returns over trees of 6 m and with three over corn, "
                 "and the waveforms that `synthesize` models from them.",
                 "draw_record", ""),
+        Picture("Figure 6: a return as the peak of a Gaussian, as `synthesize` models it.", "draw_peak", ""),
         Picture("Figure 4: the same trees of 20 m by a receiver with a dead zone of 0.65 m and by one of 2 "
                 "m, and their returns by height.", "draw_canopy", ""),
         Picture("Amplitudes by the number of returns of the pulse.",

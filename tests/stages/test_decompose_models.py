@@ -13,7 +13,8 @@ from wavebatch.kernels.fit.pulse_shape import (
     fit_one_gaussian,
     tabulate_pulse,
 )
-from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain import STAGES, Step
+from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import ShapeLimits, model_parameters
 
 FINE = 100.0
@@ -152,3 +153,16 @@ def test_generalized_gaussians_fit_flat_and_peaked_echoes(power):
     assert np.median(found.residual) < 1.3
     if power != 2.0:
         assert np.median(decompose("gaussian", block, noise, system).residual) > 3
+
+
+def test_skewed_echoes_are_drawn_where_they_were_fitted_on_a_strip_with_a_learned_pulse():
+    """They were drawn by the width of the main component of the learned pulse, .05 samples off."""
+    x, time, sigma = np.arange(64.0)[None, :], 30.3 + 0.1 * np.arange(20)[:, None], 2.1
+    y = 100 * evaluate_pulse(PulseShape(kappa=0.2), np.repeat(x, 20, 0), time, np.full((20, 1), sigma))[0]
+    block, noise = record(y, std=0.1)
+    step = Step(STAGES["decompose.skewed"])
+    for components in ((), ((1.0, 0.0, 1.6), (0.4, 2.5, 1.9))):
+        system = SystemPulse(sigma, components=components, skew=0.2)
+        found = decompose("skewed", block, noise, system)
+        drawn = rebuild_waveforms(block, system, step, found)
+        assert np.abs(drawn - (block.samples - 2000.0)).max() < 0.002 * 100 * FINE

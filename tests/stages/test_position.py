@@ -14,7 +14,7 @@ ERROR = 0.02
 """Of the fitted times [ns]."""
 
 
-def place(times, locations):
+def place(times, locations, **errors):
     """x and range_err of echoes at `times` in one packet whose returns lie at `locations` [m along the ray]."""
     block = WaveformBlock.from_samples(np.zeros((1, 80), np.uint8))
     k = len(locations)
@@ -23,7 +23,8 @@ def place(times, locations):
     n = len(times)
     echoes = EchoTable.build(np.zeros(n), np.array(times), np.full(n, 50.0), np.full(n, 2.0),
                              time_err=np.full(n, ERROR))  # fmt: skip
-    done = position(block, Noise(np.zeros(1, "f4"), np.ones(1, "f4")), SystemPulse(2.0), echoes)
+    system = SystemPulse(2.0).with_radiometry(**errors)
+    done = position(block, Noise(np.zeros(1, "f4"), np.ones(1, "f4")), system, echoes)
     return (done.attributes["x"] - block.origin[0, 0]) / HALF_C, done.attributes["range_err"] / HALF_C
 
 
@@ -44,3 +45,10 @@ def test_an_added_echo_has_the_error_of_its_packet():
 def test_returns_that_agree_within_their_errors_leave_the_error_of_the_fit(locations):
     _, error = place([20.0, 40.0, 60.0][: len(locations)], locations)
     assert error == pytest.approx(ERROR, rel=1e-3)
+
+
+def test_returns_have_their_scatter_and_echoes_without_one_the_phase():
+    errors = {"returns": 0.03 * HALF_C, "phase": 0.29 * HALF_C}
+    for locations, other in (([19.6], 0.03), ([19.6, 39.6], 0.03), ([19.6, 38.6], 0.5), ([99.0], 0.29)):
+        _, error = place([20.0, 40.0], locations, **errors)
+        assert error == pytest.approx(np.hypot(ERROR, other), rel=1e-3)

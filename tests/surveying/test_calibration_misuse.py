@@ -19,7 +19,7 @@ from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
-from wavebatch.surveying.matching.setting import _find_fading, compare_scenes
+from wavebatch.surveying.matching.setting import _find_fading, compare_ground, compare_scenes, keep_places
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -224,7 +224,8 @@ def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_pat
 def test_another_gain_over_a_like_scene_is_named_and_in_the_error(tmp_path, calibrated, gain):
     write_strip(tmp_path / "b.las", GROUND, replace(SENSOR, light=gain * LIGHT, time=START + 600), 10_000, seed=3)
     line = run(calibrated, tmp_path / "out", tmp_path / "b.las")
-    assert f"all echoes of digitizer 1 are brighter by a factor of {gain:.1f}" in line and "scenes are alike" in line
+    assert f"all echoes of digitizer 1 are brighter by a factor of {gain:.1f}" in line
+    assert "ground in common is alike" in line
     cloud = wb.read_cloud(tmp_path / "out" / "b.laz")
     stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
     assert stated == pytest.approx(0.25, abs=0.05)
@@ -246,6 +247,56 @@ def test_what_scenes_do_not_show_of_another_gain_or_energy_is_in_the_error():
         if abs(change) > 0.3:
             assert compare_scenes(other + change, scene, change).chance > 0.7
     assert compare_scenes(scene + 0.3, scene).error > 0.25
+
+
+def keep(places):
+    return np.reshape(keep_places({1: places}), (-1, 4))[:, 1:]
+
+
+def see_ground(rng, known=None, factor=1.0, fade=0.0, move=0.0, pattern=0.0):
+    """Places of a strip over fields of 30 m: 2,000 waveforms on 400 m x 200 m."""
+    if known is None:
+        known = rng.normal(0.0, 0.5, (40, 20))
+    east, north = rng.uniform(0.0, 400.0, 2000) + move, rng.uniform(0.0, 200.0, 2000)
+    time = (east - east.mean()) / 200.0
+    light = known[((east + pattern) // 30).astype(int), (north // 30).astype(int)] + rng.normal(0.0, 0.05, 2000)
+    return known, np.stack([east, north, light + np.log(factor) + 0.5 * time * np.log1p(fade), time])
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.75, 0.8, 1.25])
+def test_ground_that_a_calibrated_strip_saw_shows_another_energy(rng, factor):
+    ground, places = see_ground(rng)
+    _, later = see_ground(rng, ground, factor, move=150.0)
+    level, growth = compare_ground(later, keep(places))
+    assert level.shift == pytest.approx(np.log(factor), abs=0.03)
+    assert (level.chance > 0.5) == (factor != 1.0) and growth.chance < 0.5
+    assert factor != 1.0 or level.error < 0.02
+
+
+@pytest.mark.parametrize("fade", [-0.3, 0.0, 0.4])
+def test_ground_that_a_calibrated_strip_saw_shows_a_laser_that_fades(rng, fade):
+    ground, places = see_ground(rng)
+    _, growth = compare_ground(see_ground(rng, ground, fade=fade)[1], keep(places))
+    assert growth.shift == pytest.approx(0.5 * np.log1p(fade), abs=0.04) and (growth.chance > 0.5) == bool(fade)
+
+
+@pytest.mark.parametrize("other", [{"move": 500.0}, {"move": 390.0}, {"pattern": 300.0}])
+def test_other_ground_and_ground_that_has_changed_show_no_energy(rng, other):
+    ground, places = see_ground(rng)
+    assert compare_ground(see_ground(rng, ground, 0.75, **other)[1], keep(places)) is None
+
+
+@pytest.mark.slow
+def test_a_strip_beside_the_calibrated_one_shows_another_energy_by_common_ground(tmp_path, calibrated):
+    """Fields of 20 m are too large for scenes of so small strips to be alike."""
+    for light, seed in ((1.0, 5), (0.8, 6)):
+        beside = replace(SENSOR, light=light * LIGHT, start=(0.0, 150.0), time=START + 600)
+        write_strip(tmp_path / "b.las", GROUND, beside, 10_000, seed=seed)
+        said = run(calibrated, tmp_path / f"out{seed}", tmp_path / "b.las")
+        cloud = wb.read_cloud(tmp_path / f"out{seed}" / "b.laz")
+        stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
+        assert ("ground in common is alike" in said) == (light != 1.0)
+        assert stated < 0.06 if light == 1.0 else 0.2 < stated < 0.35
 
 
 @pytest.mark.slow
@@ -496,7 +547,8 @@ def test_air_that_is_not_given_thins_with_the_height_above_sea(tmp_path, monkeyp
     off = np.nanmedian((cloud["level_reflectance"] / fields(x, y))[inside]) - 1
     stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
     # Fields seen along other lines leave a change of the energy of some 10 % open.
-    assert abs(off) < stated < 0.12 and (abs(off) < 0.03 or fall != 2000)
+    # A strip of one second over fields of 20 m does not show whether its laser fades: a tenth of error holds that.
+    assert abs(off) < stated < 0.17 and (abs(off) < 0.03 or fall != 2000)
 
 
 def test_an_attenuation_per_metre_is_refused(tmp_path, calibrated):

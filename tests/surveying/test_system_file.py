@@ -119,7 +119,7 @@ def test_every_number_of_the_system_has_a_key():
     keys = {entry.field for entry in list_entries(SystemPulse) if entry.shape != "record"} | {"digitizers"}
     # Of a calibration and of the sensor's position, which come with files of their own.
     elsewhere = {"constant", "constant_error", "channels", "attenuation", "sensor_error", "shot_error"}
-    elsewhere |= {"attenuation_error", "swath", "right"}
+    elsewhere |= {"attenuation_error", "swath", "right", "returns", "phase"}
     parts = {"noise": ReceiverNoise, "defects": Defects, "widths": LevelWidths, "radiometry": Radiometry}
     keys |= {f"{name}.{entry.field}" for name, part in parts.items() for entry in list_entries(part)}
     fields = set(SystemPulse.__dataclass_fields__) - set(parts)

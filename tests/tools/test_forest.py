@@ -13,7 +13,7 @@ from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.surveying import Survey
-from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.system_file import SavedSurvey, format_survey
 from wavebatch.tools.rasters import cells
 from wavebatch.tools.rasters.grid import COLUMNS, Forest, ForestOptions, GridOptions, write_grid
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
@@ -147,6 +147,8 @@ def test_other_clouds_sizes_and_cells_are_refused(even, tmp_path, forest_strip):
         Forest([even[1], other], 10.0, ForestOptions())
     with pytest.raises(ConfigError, match="cells need 4 voxels along a side; give 4 or more"):
         Forest([even[1]], 3.0, ForestOptions())
+    with pytest.raises(ConfigError, match="layers are thinner than the voxels, .*; give 1 or more"):
+        Forest([even[1]], 10.0, ForestOptions(layer=0.5))
     for wrong in ({"leaf_projection": 0.0}, {"layer": 0.0}, {"layer": np.nan}):
         with pytest.raises(ConfigError):
             ForestOptions(**wrong)
@@ -156,6 +158,27 @@ def test_other_clouds_sizes_and_cells_are_refused(even, tmp_path, forest_strip):
 def forest_strip(tmp_path):
     rng = np.random.default_rng(5)
     return fly(tmp_path / "p.las", rng, grow(rng, 4.0, crowns=None, density=0.1), 4.0, pulses=1.0)
+
+
+def test_strips_of_a_forest_become_one_raster_with_two_commands(tmp_path):
+    """Each strip sees half of the plot; voxels in a folder are clouds, which grid reads as one."""
+    pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
+    rng = np.random.default_rng(7)
+    leaves = grow(rng, SIDE, crowns=None, density=0.3)
+    strips = [fly(tmp_path / f"{name}.las", rng, leaves, SIDE, pulses=4.0) for name in "ab"]
+    (tmp_path / "system.toml").write_text(format_survey(SAVED))
+    made = ["voxelize", *strips, "--size", 1, "--forest", "--system", tmp_path / "system.toml", "--force", "-o",
+            tmp_path / "v"]  # fmt: skip
+    for words in (made, ["grid", tmp_path / "v", "--forest", "--size", CELL, "-o", tmp_path / "f.tif"]):
+        result = run_command(*words)
+        assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["a.laz", "b.laz"]
+    both = [tmp_path / "v" / f"{name}.laz" for name in "ab"]
+    _, found = measure(both, tmp_path)
+    one = measure(both[:1], tmp_path)[1]
+    true = np.array([[leaves.area_index(x, y, CELL) for x in (0, 10)] for y in (10, 0)])
+    assert (np.abs(found["leaf_area_index"] - true) < 2 * found["leaf_area_index_err"]).all()
+    assert found["leaf_area_index_err"].mean() < one["leaf_area_index_err"].mean()
 
 
 def test_the_command_says_what_it_wrote(even, tmp_path):

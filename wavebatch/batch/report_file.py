@@ -304,10 +304,11 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     tuple of str
         One line each: a column that no echo has, with the commonest reason and its remedy; angles that the beam can
         hardly measure; a trajectory that contradicts the vectors, or
-        that does not cover the strip.
+        that does not cover the strip; changes of energy that nothing shows.
     """
     lines = [*prepared.scan.notes]
     lines += filter(None, [prepared.sensor.doubt()])
+    lines += prepared.job.calibration.notes if prepared.job.calibration else ()
     lines += _find_gaps(prepared.sensor, report.no_data)
     lines += _doubt_units(prepared)
     lines += _name_height(prepared)

@@ -33,7 +33,7 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @click.command()
 @shared.strips_argument
 @shared.output_option("Voxels to write: .npz, or .las or .laz with a point at the centre of each; or a folder, which "
-                      "gets STEM.npz for each strip.", "FILE|DIR", folder=None)
+                      "gets STEM.npz for each strip, with --forest STEM.laz.", "FILE|DIR", folder=None)
 @shared.options_of(VoxelOptions, "size")
 @shared.options_of(Deconvolution)
 @shared.options_of(VoxelOptions, "headroom", "ground_height", "reflectance_ratio")
@@ -106,7 +106,9 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
         refuse_input(options["profiles"])
     if len(paths) > 1 and options["profiles"] is not None:
         raise ConfigError(f"--profiles {options['profiles']}: one file for {len(paths)} strips; make them one by one")
-    targets = shared.name_outputs(paths, output, (".npz", ".las", ".laz"), ".npz")
+    # `grid --forest` reads clouds.
+    kind = ".laz" if options["forest"] else ".npz"
+    targets = shared.name_outputs(paths, output, (".npz", ".las", ".laz"), kind)
 
     def work(strip: Path) -> VoxelSummary:
         with counting("waveforms", options["quiet"]) as bar:

@@ -140,6 +140,10 @@ class Radiometry:
     """Standard deviation of the attenuation [dB/km]."""
     sensor_error: float = 0.0
     """Standard deviation of the distance to the sensor's position [m]."""
+    returns: float = 0.0
+    """Standard deviation of the vendor's returns along the ray [m], which echoes are placed by."""
+    phase: float = 0.0
+    """Root mean square of what locations of returns differ from echoes [m]: the error of echoes without a return."""
 
 
 def angle_to_vertical(direction: np.ndarray) -> np.ndarray:

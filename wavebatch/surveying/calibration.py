@@ -212,12 +212,14 @@ class Calibration:
     """Standard deviation of these energies from shot to shot, relative."""
     energy_source: Annotated[str, Key()] = ""
     energy_unit: Annotated[str, Key()] = ""
+    places: Annotated[tuple[Annotated[float, Range(-1e9, 1e9)], ...], Key(blank=True)] = ()
+    """Ground that other strips may see again: digitizer, east, north, logarithm of its light, and so on."""
     swath: tuple[float, ...] = ()
     """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
     right: tuple[float, float] = (0.0, 0.0)
     """Of the strip's flight, as `Radiometry.right`; not kept in the file."""
     notes: tuple[str, ...] = ()
-    """What is doubtful about it, one line each; not kept in the file."""
+    """What is doubtful about it, or would not show in the strip that it is used for; not kept in the file."""
 
     @property
     def section_constant(self) -> float | None:

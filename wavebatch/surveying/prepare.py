@@ -20,6 +20,7 @@ from wavebatch.surveying.choose_chain import ChainChoice, Request, make_choice
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
 from wavebatch.surveying.matching.strip_match import match_strip
+from wavebatch.surveying.measuring.return_scatter import measure_returns
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.saved_check import check_saved
 
@@ -58,7 +59,7 @@ class Setup:
 
     @property
     def system(self) -> SystemPulse:
-        """The pulse with its calibration and the error of the sensor's position."""
+        """The pulse with its calibration and the errors of the places of returns and sensor."""
         system = self.sensor.place(self.choice.survey.system)
         return system if self.calibration is None else self.calibration.apply(system)
 
@@ -115,12 +116,13 @@ def prepare(
     source = UNKNOWN
     if positions is not Positions.IF_NEEDED or needs_sensor(choice.chain):
         source = _find_sensor(reader, scan, sensor or SensorRequest(), positions)
-    sent = StripEnergies(None)
+    system, sent = choice.survey.system, StripEnergies(None)
+    source = replace(source, returns=measure_returns(reader, scan, system))
     if calibration is not None or positions is not Positions.IF_NEEDED or needs_sensor(choice.chain):
         sent = take_energies(reader, scan, energy, calibration)
     if calibration is None:
         return Setup(choice, source, None, sent, (), stranger, forced)
-    system, level = choice.survey.system, None if sent.energy is None else sent.energy.level
+    level = None if sent.energy is None else sent.energy.level
     fitted, doubts = match_strip(calibration, reader, scan, system, source, choice.chain, air, level)
     return Setup(choice, source, sent.widen(fitted), sent, doubts, stranger, forced)
 

@@ -22,6 +22,7 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
 from wavebatch.kernels.physics.radiometry import mean_haze
+from wavebatch.surveying.measuring.return_scatter import ReturnScatter
 
 NODE_SECONDS = 0.5
 """Time between two positions that are estimated from rays [s]."""
@@ -53,11 +54,6 @@ LEAST_OVERLAPS = 3
 JERK, JERK_LEFT = 1.0, 0.025
 """Change of acceleration of an aircraft in turbulent air [m/s3], assumed where fewer windows overlap; and what a
 parabola leaves of it: a root mean square of JERK half^3 times this."""
-
-SCANNER = 1.3e-4
-"""Distance, as a share of the range, from where rays meet to the scanner's origin: a mirror whose facet moves, or a
-scan angle with a wrong scale, bends all rays alike, and no residual shows it. It is 7.2 cm of 559 m on the RIEGL strip
-whose PulseWaves file has the origin of each pulse."""
 
 LEAST_DOUBT = 2.0
 """Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
@@ -107,6 +103,8 @@ class SensorSource:
     """Error of the ranges by the packet vectors [m]."""
     facts: tuple[tuple[str, Any], ...] = ()
     """More values for reports, by name."""
+    returns: ReturnScatter = ReturnScatter(0.0)
+    """How exactly the vendor placed the returns."""
 
     @property
     def haze(self) -> float:
@@ -123,8 +121,9 @@ class SensorSource:
         return facts.get("angle_to_packet_vectors_deg") or facts.get("angle_to_pairs_deg") or 0.0
 
     def place(self, system: SystemPulse) -> SystemPulse:
-        """Return the system with the error of the distance, and with the usual air at the heights of the flight."""
-        return system.with_radiometry(sensor_error=self.error, attenuation=AIR_ATTENUATION * self.haze)
+        """Return the system with errors of sensor and returns, and with the usual air at the flight's heights."""
+        places = {"sensor_error": self.error, "returns": self.returns.scatter, "phase": self.returns.phase}
+        return system.with_radiometry(attenuation=AIR_ATTENUATION * self.haze, **places)
 
     def fill(self, block: WaveformBlock) -> WaveformBlock:
         """Return the block with the sensor's positions; the block itself where they are unknown.
@@ -171,7 +170,9 @@ class SensorSource:
 
     def describe(self) -> dict[str, Any]:
         """Return kind, errors and the other values for reports."""
-        report = {"source": self.kind, "range_error_m": round(self.error, 6) or None, **dict(self.facts)}
+        returns = {"scatter_m": round(self.returns.scatter, 5), "from": self.returns.source}
+        error = round(self.error, 6) or None
+        report = {"source": self.kind, "range_error_m": error, "returns": returns, **dict(self.facts)}
         return report if self.distance is None else {**report, "distance_m": self.distance}
 
 
@@ -351,7 +352,7 @@ def _find_lag(known: Trajectory, path: Trajectory) -> tuple[float | None, float 
 def _compare_ranges(
     distance: np.ndarray, rays: RaySample, path: SensorSource | None
 ) -> tuple[float | None, float, float | None]:
-    """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, root mean square, and
+    """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, mean with scatter, and
     the error of the latter; None, 0 and None where the vectors give no position."""
     if path is None or path.trajectory is None:
         return None, 0.0, None
@@ -359,7 +360,7 @@ def _compare_ranges(
     longer = longer[np.isfinite(longer)]
     if not len(longer):
         return None, 0.0, None
-    error = float(np.sqrt(np.mean(longer**2)))
+    error = float(abs(np.mean(longer)) + np.std(longer))  # what all rays share holds for each of them
     # A contradiction is known no better than the vectors are.
     error = float(np.hypot(error, path.error)) if error > path.error else error
     return round(float(np.median(longer)), 3), error, round(path.error, 6)
@@ -450,7 +451,7 @@ def estimate_path(rays: RaySample, kind: str) -> SensorSource | None:
     xyz += velocity * (time - inside)[:, None]
     path = Trajectory.build(time, xyz, velocity, gap=(max(WIDER) + 1) * NODE_SECONDS)
     distance = round(float(np.median([fit.distance for fit, _, _ in found])), 2)
-    error, facts = _overall_error(found, rays, distance), _describe(found, path, rays)
+    error, facts = _overall_error(found, rays), _describe(found, path, rays)
     return SensorSource(kind, path, distance=distance, error=error, facts=facts)
 
 
@@ -477,9 +478,8 @@ def _node_times(nodes: np.ndarray, node: float, low: float, high: float, middle:
     return np.unique(times)
 
 
-def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: RaySample, distance: float) -> float:
-    """Root mean square of the range's error over all windows [m]: what the fits say, what they contradict, and what
-    none of them can see."""
+def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: RaySample) -> float:
+    """Root mean square of the range's error over all windows [m]: what the fits say, and what they contradict."""
     squares, apart = [], []
     for number, (fit, _, within) in enumerate(found):
         near = np.abs(rays.time - fit.centre) <= fit.half
@@ -494,7 +494,7 @@ def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: 
         motion = 0.5 * np.mean(apart)  # both windows are off
     else:
         motion = (JERK * JERK_LEFT * max(fit.half for fit, _, _ in found) ** 3) ** 2
-    return float(np.sqrt(np.mean(squares) + motion + (SCANNER * distance) ** 2))
+    return float(np.sqrt(np.mean(squares) + motion))
 
 
 def _contradiction(fit: SensorFit, later: SensorFit) -> np.ndarray:

@@ -173,9 +173,10 @@ def position(
     """Coordinates of each echo along its ray [m], relative to the returns of its packet, and the return it matches.
 
     Return locations differ from the fit by an offset that all returns of a packet share (phase of the emitted pulse, a
-    detector of leading edges). The offset is measured on the matched returns and subtracted. Where the returns of a
-    packet contradict each other by more than their errors, range_err also has the error of their mean. Packets without
-    a matched return keep the raw location and are flagged.
+    detector of leading edges). The offset is measured on the matched returns and subtracted. Besides the error of the
+    fit, range_err has that of the returns: their scatter in this strip, or, where the returns of a packet contradict
+    each other by more, the error of their mean. Packets without a matched return keep the raw location and are flagged;
+    their error has what locations differ from echoes.
 
     Parameters
     ----------
@@ -207,12 +208,13 @@ def position(
     speed = np.sqrt(np.sum(block.direction**2, axis=1))
     # In strips in feet or degrees the vectors are no speeds in m/ns, but the error is always in metres.
     speed = np.where(np.abs(speed / HALF_C - 1.0) < 0.5, speed, HALF_C)
+    shared = np.where(known, np.maximum(doubt * speed, system.radiometry.returns), system.radiometry.phase)
     echoes = echoes.with_attributes(
         x=xyz[:, 0],
         y=xyz[:, 1],
         z=xyz[:, 2],
         point=point,
-        range_err=(np.hypot(echoes.time_err, doubt[waveform]) * speed[waveform]).astype(np.float32),
+        range_err=np.hypot(echoes.time_err * speed[waveform], shared[waveform]).astype(np.float32),
     )
     if returns is None:
         return echoes

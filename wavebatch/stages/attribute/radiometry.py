@@ -299,11 +299,6 @@ def add_reason(echoes: EchoTable, name: str, *cases: tuple[NoData, np.ndarray | 
     return echoes.with_attributes(**{f"{name}{SUFFIX}": explain_no_data(echoes.attributes[name], *cases)})
 
 
-RETURNS = 0.02
-"""Scatter of vendors' returns along the ray [m], by data sheets: echoes are placed relative to these, and where a
-packet has one return nothing shows how far it is off."""
-
-
 DECIBEL = 10.0 / math.log(10.0)
 """Decibel per unit of the natural logarithm."""
 
@@ -360,11 +355,11 @@ def amplitude_normalized_db(
 def range(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Distance from the sensor to each echo [m], and its error; no-data where the sensor's position is not known.
 
-    The error holds that of the fit (range_err), of the sensor's position and mounting, and the scatter of the vendor's
-    returns (2 cm). It is no-data where nothing shows how well the sensor's position is known.
+    Distances count from where the rays meet, or from the trajectory. The error holds that of the echo's place
+    (range_err) and that of the sensor's; it is no-data where nothing shows how well the latter is known.
     """
     distance = sensor_distance(block, echoes)
-    error = np.hypot(np.hypot(fit_range_error(echoes), system.radiometry.sensor_error), RETURNS)
+    error = np.hypot(fit_range_error(echoes), system.radiometry.sensor_error)
     error[np.isnan(distance) | (system.radiometry.sensor_error <= 0)] = np.nan
     columns = {"range": distance.astype(np.float32), "range_error": error.astype(np.float32)}
     return add_reason(echoes.with_attributes(**columns), "range", (NoData.NO_SENSOR, np.isnan(distance)))

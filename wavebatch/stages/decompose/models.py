@@ -425,7 +425,9 @@ def echo_pulses(
 def _parameters(shape: PulseShape, system: SystemPulse, spacing: float, echoes: EchoTable) -> np.ndarray:
     """Amplitude, time and width of the fitted pulses in samples, float64 (3, k)."""
     described = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1)
-    limits = shape_limits(system, spacing, most=BROADEST)
+    # As `make_settings` does: a pulse without components has no width of a main component.
+    pulse = system if shape.components else replace(system, components=())
+    limits = shape_limits(pulse, spacing, most=BROADEST)
     return model_parameters(shape, limits, described.astype(np.float64)).T
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.order import even_places
 from wavebatch.core.system import swath_columns
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
@@ -24,6 +25,7 @@ from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, measure_ties
 from wavebatch.surveying.calibrating.trends import LEAST_SPREAD, Trend, find_trend, fit_swath
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult, check_attenuation
+from wavebatch.surveying.matching.setting import PLACES
 
 _UNEXPLAINED = (
     "the strips' light from one place differs by more than their constants explain: check targets, trajectory and "
@@ -215,6 +217,7 @@ def _assemble(
         targets=tuple(_list_targets(strips)),
         channels=tuple(channels),
         strips=tuple(rows),
+        places=_join_places(good, rows),
         notes=tuple(
             note if len(strips) == 1 else f"{strip.path.name}: {note}"
             for strip in strips
@@ -222,6 +225,18 @@ def _assemble(
             for note in strip.found.notes
         ),
     )
+
+
+def _join_places(good: Sequence[Calibration], rows: Sequence[StripConstant]) -> tuple[float, ...]:
+    """Ground of the strips with targets, as bright as it is by the mean constants of their channels."""
+    drift = {(row.sha256, row.digitizer): math.log1p(row.drift) for row in rows}
+    parts = []
+    for found in good:
+        part = np.reshape(found.places, (-1, 4))
+        part[:, 3] += [drift.get((found.fingerprint["sha256_sampled"], digitizer), 0.0) for digitizer in part[:, 0]]
+        parts.append(part)
+    joined = np.concatenate(parts)
+    return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
 
 
 def _list_strips(

@@ -30,7 +30,7 @@ from wavebatch.surveying.calibrating.target_constants import (
 )
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
-from wavebatch.surveying.matching.setting import SCANNERS, read_day, read_sensor_name
+from wavebatch.surveying.matching.setting import SCANNERS, keep_places, read_day, read_sensor_name
 from wavebatch.surveying.sensor import SensorSource
 
 MOST_ECHOES = 200_000
@@ -105,6 +105,7 @@ def build_calibration(
         flight=read_day(source.reader),
         chain=source.choice.chain.name,
         decomposer=decomposer,
+        places=keep_places(source.setting.places),
         height=float(np.median(-used["ray"][:, 2] * used["distance"])),
         distance=float(np.median(used["distance"])),
         fingerprint=take_fingerprint(source.path, facts.packets.file),

@@ -6,15 +6,15 @@ makes another sensor of it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.order import robust_std
-from wavebatch.core.units import HALF_C
+from wavebatch.core.order import even_places, robust_std
+from wavebatch.core.units import HALF_C, MEDIAN_ERROR
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.header import decode_text
@@ -39,6 +39,15 @@ USUAL_CHANGE = 0.35
 
 SUNLIGHT = 0.1
 """By how much sunlight changes the noise of one gain (standard deviation of the logarithm)."""
+
+PLACES, NEAR, LEAST_COMMON, SPAN, BORDER = 256, 20.0, 20, 0.25, 4.0
+"""Places that a calibration keeps; distance up to which a waveform of another strip sees the same ground [m], since
+fields are larger; fewest of these that show a change; how far they spread along the strip to show that it fades
+(standard deviation, in half of its time); and standard deviations of their differences from which they lie apart."""
+
+LIKE_GROUND = 0.5
+"""Scatter of the differences of neighbours, over that of surfaces that have nothing to do with each other, up to which
+they are the same surfaces: even ground looks like all even ground, and ground may have changed."""
 
 PRIORS = ((0.7, (0.0, 0.0)), (0.15, (1.0, 0.0)), (0.15, (1.0, 1.0)))
 """How likely nothing, the energy and the gain are another one before light and noise are seen, and whether light and
@@ -132,6 +141,8 @@ class Setting(NamedTuple):
     it."""
     scenes: dict[int, tuple[float, ...]]
     """Logarithms of the QUANTILES of that light, for each digitizer."""
+    places: dict[int, np.ndarray]
+    """East, north, logarithm of that light, and time from -1 to 1 of waveforms of each digitizer, f8 (4, k)."""
     right: tuple[float, float]
     """Unit vector to the right of the flight."""
     fades: Change
@@ -182,6 +193,49 @@ def compare_scenes(one: Sequence[float], other: Sequence[float], noise: float | 
     return weigh_change(float(np.median(off)), float(np.hypot(UNLIKE * np.std(off), LEAST_UNLIKE)), noise)
 
 
+def compare_ground(
+    places: np.ndarray, known: np.ndarray, noise: float | None = None
+) -> tuple[Change, Change | None] | None:
+    """Weigh by how much the ground that a calibrated strip saw too is brighter, and how that grows along the strip.
+
+    Parameters
+    ----------
+    places : float array, shape (4, k)
+        As `Setting.places`.
+    known : float array, shape (m, 3)
+        East, north and logarithm of the light of places of the calibration.
+    noise : float, optional
+        As for `weigh_change`.
+
+    Returns
+    -------
+    level, growth : Change
+        Growth is that from the first half of the strip to the second; None where common ground is at one end. None
+        instead of both for too little common ground, or where its pattern is not the same.
+    """
+    there = known.T
+    if not (there.size and places.size):
+        return None
+    apart = np.hypot(*(there[:2, :, None] - places[:2, None]))
+    near = apart.argmin(axis=1)
+    rows = np.flatnonzero(apart.min(axis=1) < NEAR)
+    if len(np.unique(near[rows])) < LEAST_COMMON:
+        return None
+    light, time = places[2:, near[rows]]
+    off, whole = light - there[2, rows], np.hypot(robust_std(light), robust_std(there[2, rows]))
+    if robust_std(off) > LIKE_GROUND * whole:
+        return None
+    # Neighbours on two sides of a field's border say nothing.
+    same = np.abs(off - np.median(off)) <= BORDER * robust_std(off)
+    off, time, number = off[same], time[same], len(np.unique(near[rows[same]]))
+    error, spread = float(np.std(off)) / number**0.5, float(np.std(time))
+    level = weigh_change(float(np.median(off)), float(np.hypot(MEDIAN_ERROR * error, LEAST_UNLIKE)), noise)
+    if spread < SPAN:
+        return level, None
+    slope = float(np.polyfit(time, off, 1)[0])
+    return level, weigh_change(slope, float(np.hypot(error / spread, LEAST_UNLIKE)))
+
+
 def measure_setting(
     reader: StripReader, scan: StripScan, sensor: SensorSource, attenuation: float, energy: float = 1.0
 ) -> Setting:
@@ -205,8 +259,9 @@ def measure_setting(
     zone = _find_zone(reader, every, 1e9 * HALF_C / rate) if known and rate else None
     brightest = {index: float(np.quantile(rows[1], BRIGHT)) for index, rows in known.items()}
     scenes = {index: _describe_scene(rows[1]) for index, rows in known.items()}
+    places = {index: _list_places(*rows[[2, 3, 1, 0]]) for index, rows in known.items()}
     fades = max((_find_fading(*rows[:2]) for rows in known.values()), key=lambda one: one.error, default=NO_CHANGE)
-    return Setting(rate, brightest, scenes, _find_right(every), fades, zone)
+    return Setting(rate, brightest, scenes, places, _find_right(every), fades, zone)
 
 
 def _find_right(rows: np.ndarray) -> tuple[float, float]:
@@ -260,6 +315,21 @@ def _jumps(rows: np.ndarray, size: float) -> bool:
 def _is_whole(zones: np.ndarray) -> np.ndarray:
     number = np.rint(zones)
     return (number != 0) & (np.abs(number) <= MOST_ZONES) & (np.abs(zones - number) < MOST_BEND)
+
+
+def keep_places(places: Mapping[int, np.ndarray]) -> tuple[float, ...]:
+    """Return a part of `Setting.places` as `Calibration.places`, spread evenly over the strip."""
+    parts = [
+        np.column_stack([np.full(part.shape[1], index), *part[:2].round(1), part[2].round(3)])
+        for index, part in places.items()
+    ]
+    joined = np.concatenate([np.empty((0, 4)), *parts])
+    return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
+
+
+def _list_places(east: np.ndarray, north: np.ndarray, light: np.ndarray, time: np.ndarray) -> np.ndarray:
+    place = time - 0.5 * (time.min() + time.max())
+    return np.stack([east, north, np.log(light), place / max(float(place.max()), 1e-9)])
 
 
 def _describe_scene(light: np.ndarray) -> tuple[float, ...]:

@@ -22,8 +22,11 @@ from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.matching.setting import (
     MOST_ZONES,
     OTHER_PULSE,
+    PRIORS,
     SUNLIGHT,
+    Change,
     Setting,
+    compare_ground,
     compare_scenes,
     read_day,
     read_sensor_name,
@@ -55,8 +58,8 @@ OTHER_RANGE, LIKE_RANGE = 1.5, 0.35
 LIKE_FEET = 0.35
 """Logarithm by which light may differ from what feet taken for metres make of it: other surfaces, and more air."""
 
-LIKELY = 0.5
-"""Chance from which another gain or energy is named."""
+LIKELY, HIDDEN = 0.5, 0.05
+"""Chance from which another gain or energy is named; and error from which it is said that one would not show."""
 
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
@@ -147,9 +150,11 @@ def refuse_zone(calibration: Calibration, found: Setting, distance: float | None
             )
 
 
-def compare_setting(calibration: Calibration, found: Setting, system: SystemPulse) -> tuple[float, list[str]]:
-    """Error that another pulse rate or gain adds to the constant, relative, and the warnings."""
-    growth, lines = 0.0, []
+def compare_setting(
+    calibration: Calibration, found: Setting, system: SystemPulse
+) -> tuple[float, list[str], list[str]]:
+    """Error that another pulse rate or gain adds to the constant, relative, the warnings, and what would not show."""
+    growth, lines, notes = 0.0, [], []
 
     def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
         nonlocal growth
@@ -172,15 +177,59 @@ def compare_setting(calibration: Calibration, found: Setting, system: SystemPuls
         if not scene or len(row.scene) != len(scene):
             continue
         louder = math.log(noise / row.noise_dn) if noise and row.noise_dn else None
-        change = compare_scenes(scene, row.scene, louder)
-        growth = max(growth, math.expm1(abs(change.shift) if change.chance > LIKELY else change.error))
-        if change.chance > LIKELY:
+        ground = _compare_places(calibration, found, row.digitizer, louder)
+        seen, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
+        change = change or compare_scenes(scene, row.scene, louder)
+        more = math.expm1(abs(change.shift) if change.chance > LIKELY else change.error)
+        growth = max(growth, more)
+        if change.chance <= LIKELY and more > HIDDEN:
+            notes.append(
+                f"calibration: surfaces {which} differ and no ground is common, so that another energy under the same "
+                f"header would not show: {100 * more:.0f} % of error hold it, by an assumed chance of "
+                f"{PRIORS[1][0]:.0%}; calibrate a strip that overlaps this one"
+            )
+        elif change.chance > LIKELY:
             lines.append(
                 f"calibration: another gain or energy under the same header: all echoes {which} are brighter by a "
                 f"factor of {math.exp(change.shift):.2f}, "
-                + ("and noise with them" if abs(louder or 0.0) > SUNLIGHT else "though scenes are alike")
+                + ("and noise with them" if abs(louder or 0.0) > SUNLIGHT else f"though {seen} alike")
             )
-    return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines]
+    return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines], notes
+
+
+def _compare_places(
+    calibration: Calibration, found: Setting, digitizer: int, noise: float | None = None
+) -> tuple[Change, Change | None] | None:
+    known = np.reshape(calibration.places[: len(calibration.places) // 4 * 4], (-1, 4))
+    seen = found.places.get(digitizer, np.empty((4, 0)))
+    return compare_ground(seen, known[known[:, 0] == digitizer, 1:], noise)
+
+
+def judge_fading(calibration: Calibration, found: Setting, *, other: bool) -> tuple[float, list[str], list[str]]:
+    """Error of the constant by light that changes along the strip, relative, the warnings, and what would not show.
+
+    other: a strip that was not calibrated, so that ground in common shows it. Of strips that were calibrated together
+    their overlaps do.
+    """
+    fades, hidden = found.fades, "surfaces in large patches"
+    for row in calibration.channels if other else ():
+        ground = _compare_places(calibration, found, row.digitizer)
+        if ground and ground[1]:
+            fades, hidden = ground[1], "the scatter of the ground in common"
+    if fades.chance > LIKELY:
+        growth = math.expm1(abs(fades.shift))
+        return growth, [
+            f"calibration: the second half of the strip is {100 * math.expm1(fades.shift):+.0f} % brighter, though "
+            "both are like one scene: a laser that fades, or haze? The error of the constant grows by "
+            f"{100 * growth:.0f} %; calibrate shorter strips"
+        ], []
+    growth = math.expm1(fades.error)
+    if growth < HIDDEN or not other and len(calibration.strips) > 1:
+        return 0.0, [], []
+    return growth, [], [
+        f"calibration: {hidden} hide whether the laser fades along the strip: {100 * growth:.0f} % of error hold it; "
+        "calibrate strips that overlap this one"
+    ]
 
 
 def compare_air(

@@ -24,12 +24,12 @@ from wavebatch.surveying.angle_limits import sample_reference
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.matching.setting import measure_setting, see_channels
 from wavebatch.surveying.matching.strip_conditions import (
-    LIKELY,
     compare_air,
     compare_divergence,
     compare_setting,
     doubt_calibration,
     find_growth,
+    judge_fading,
     refuse_zone,
 )
 from wavebatch.surveying.sensor import SensorSource
@@ -100,18 +100,14 @@ def match_strip(
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
     setting = measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0)
     refuse_zone(calibration, setting, sensor.distance, reader.facts.path)
+    notes: list[str] = []
     measured = {calibration.fingerprint.get("sha256_sampled"), *(row.sha256 for row in calibration.strips)}
     if own_strip not in measured:
-        more, lines = compare_setting(calibration, setting, system)
+        more, lines, notes = compare_setting(calibration, setting, system)
         growth, reasons = math.hypot(growth, more), [*reasons, *lines]
-    fades = setting.fades
-    if fades.chance > LIKELY and energy is None:
-        growth = math.hypot(growth, math.expm1(abs(fades.shift)))
-        reasons.append(
-            f"calibration: the second half of the strip is {100 * math.expm1(fades.shift):+.0f} % brighter, though "
-            "both are like one scene: a laser that fades, or haze? The error of the constant grows by "
-            f"{100 * math.expm1(abs(fades.shift)):.0f} %; calibrate shorter strips"
-        )
+    if energy is None:
+        more, lines, hidden = judge_fading(calibration, setting, other=own_strip not in measured)
+        growth, reasons, notes = math.hypot(growth, more), [*reasons, *lines], [*notes, *hidden]
     warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows: list[ChannelConstant] = []
@@ -140,7 +136,9 @@ def match_strip(
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
     air = compare_air(calibration, reader, sensor, attenuation, warnings)
-    fitted = replace(calibration, right=setting.right, constant=math.nan, channels=tuple(rows), strips=())
+    fitted = replace(
+        calibration, right=setting.right, constant=math.nan, channels=tuple(rows), strips=(), notes=tuple(notes)
+    )
     return fitted.widened(air), tuple(dict.fromkeys(warnings))
 
 

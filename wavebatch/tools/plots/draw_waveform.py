@@ -155,7 +155,8 @@ def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, 
     axes.axhspan(view.baseline - view.std, view.baseline + view.std, color="#e6e6e6", zorder=0, label=_LEGEND[1])
     level = view.fine_level
     for curve in view.curves:
-        axes.fill_between(view.fine, level, level + curve, color=PULSE, alpha=0.15, linewidth=0)
+        low = level[curve.part]
+        axes.fill_between(view.fine[curve.part], low, low + curve.height, color=PULSE, alpha=0.15, linewidth=0)
     draw_samples(axes, view, times, dot=(2.4 if small else 3.4) * (1.0 if len(view.time) <= _MANY else 0.6))
     shown = (view.echoes.time >= times[0]) & (view.echoes.time <= times[1])
     time, amplitude = (
@@ -177,11 +178,13 @@ def draw_samples(
         axes.axvline(place, color=VENDOR, linewidth=thin, linestyle=_DASHED, zorder=1, label="returns of the file")
     # Up to the sample beyond each side: all of a long waveform would be most of a page.
     near = (view.fine >= times[0] - view.spacing) & (view.fine <= times[1] + view.spacing)
-    level = view.fine_level[near]
+    level, fit = view.fine_level, view.fit
     for curve in view.curves:
-        axes.plot(view.fine[near], level + curve[near], color=PULSE, linewidth=0.9 * thin, label="one echo")
-    if view.fit is not None:
-        axes.plot(view.fine[near], view.fit[near], color=FIT, linewidth=1.5 * thin, label="fit")
+        shown = curve.part.start + np.flatnonzero(near[curve.part])
+        height = curve.height[shown - curve.first]
+        axes.plot(view.fine[shown], level[shown] + height, color=PULSE, linewidth=0.9 * thin, label="one echo")
+    if fit is not None:
+        axes.plot(view.fine[near], fit[near], color=FIT, linewidth=1.5 * thin, label="fit")
     inside = (view.time >= times[0]) & (view.time <= times[1])
     free, full = inside & ~view.clipped, inside & view.clipped
     axes.plot(view.time[free], view.samples[free], "o", color=INK, markersize=dot, zorder=3, label="samples")

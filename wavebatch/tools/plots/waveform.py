@@ -14,7 +14,7 @@ import math
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -242,11 +242,28 @@ FINE = 8
 MOST_POINTS = 20_000
 """Most points of a curve: more than any picture resolves."""
 
+NEGLIGIBLE = 1e-4
+"""Share of its peak below which a curve is not kept: less than any line is wide."""
+
 BEFORE, AFTER = 4.0, 8.0
 """What is shown before the first [full widths] and after the last echo [sigma] of the widest echo."""
 
 VISIBLE = 5.0
 """Samples this far above the baseline, and residuals this large, are always shown [noise std]."""
+
+
+class Curve(NamedTuple):
+    """The pulse of an echo where it is not negligible."""
+
+    first: int
+    """Where it begins in `WaveformView.fine`."""
+    height: np.ndarray
+    """Above the baseline [DN], f8 (n,)."""
+
+    @property
+    def part(self) -> slice:
+        """The part of the times of the curves that it has."""
+        return slice(self.first, self.first + len(self.height))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -272,8 +289,10 @@ class WaveformView:
     """Baseline at each sample [DN], f8 (s,): recordings of one packet may differ."""
     fine: np.ndarray
     """Times of the curves [ns], f8 (q,)."""
-    curves: np.ndarray
-    """Pulse of each echo above the baseline [DN], f8 (k, q); (0, q) if the chain fits no pulses."""
+    curves: tuple[Curve, ...]
+    """Pulse of each echo; none if the chain fits no pulses."""
+    total: np.ndarray
+    """Their sum [DN], f8 (q,)."""
     residual: np.ndarray | None
     """Samples less baseline and fit, in standard deviations of the noise at each sample, f8 (s,); NaN for clipped
     samples below the fit, which agree with it, and where nothing was recorded. None without a fit."""
@@ -292,7 +311,7 @@ class WaveformView:
     @property
     def fit(self) -> np.ndarray | None:
         """Sum of baseline and curves [DN], f8 (q,); None without a fit. NaN in gaps between two recordings."""
-        return None if self.residual is None else self.fine_level + self.curves.sum(axis=0)
+        return None if self.residual is None else self.fine_level + self.total
 
     @property
     def fine_level(self) -> np.ndarray:
@@ -388,17 +407,24 @@ def build_views(
         baseline, std = float(noise.baseline[row]), float(noise.std[row])
         time = np.arange(len(samples)) * block.spacing
         fine = np.linspace(0.0, time[-1], max(len(time), min(FINE * (len(time) - 1) + 1, MOST_POINTS)))
-        curves, residual = np.zeros((0, len(fine))), None
+        curves, total, fit, residual = [], np.zeros(len(fine)), np.zeros(len(time)), None
         if shape is not None:
-            pulses = echo_pulses(shape, system, block.spacing, table)
-            curves = pulses(fine)
-            residual = _residual(samples - noise.level[row], pulses(time).sum(axis=0), clipped, std, system.noise.gain)
+            # One echo after the other: long waveforms have hundreds.
+            for echo in range(len(table)):
+                pulse = echo_pulses(shape, system, block.spacing, table.take(np.array([echo])))
+                height = pulse(fine)[0]
+                total += height
+                fit += pulse(time)[0]
+                seen_at = np.flatnonzero(np.abs(height) > NEGLIGIBLE * np.abs(height).max())
+                first, last = (seen_at[0], seen_at[-1]) if len(seen_at) else (0, 0)
+                curves.append(Curve(int(first), height[first : last + 1].copy()))
+            residual = _residual(samples - noise.level[row], fit, clipped, std, system.noise.gain)
         returns = np.empty(0) if block.returns is None else block.returns.time[block.returns.waveform == row]
         views.append(
             WaveformView(
                 number, int(block.point[row]), float(block.gps_time[row]), time, samples, clipped, baseline, std,
-                np.broadcast_to(noise.level[row].astype(np.float64), samples.shape), fine, curves, residual, table,
-                returns, seen[row],
+                np.broadcast_to(noise.level[row].astype(np.float64), samples.shape), fine, tuple(curves), total,
+                residual, table, returns, seen[row],
             )  # fmt: skip
         )
     return views

@@ -111,7 +111,8 @@ class _Sums(NamedTuple):
 class Forest:
     """Computes the metrics of cells from the voxels of files that `voxelize --forest` made.
 
-    Raises ConfigError for other files, for voxels of several sizes, and for cells smaller than LEAST_SIDE voxels.
+    Raises ConfigError for other files, for voxels of several sizes, for cells smaller than LEAST_SIDE voxels, and for
+    layers thinner than a voxel.
     """
 
     def __init__(self, paths: Sequence[Path], cell_size: float, options: ForestOptions) -> None:
@@ -123,6 +124,9 @@ class Forest:
         if cell_size < LEAST_SIDE * self.size:
             raise ConfigError(f"--size {cell_size:g}: cells need {LEAST_SIDE} voxels along a side; give "
                               f"{LEAST_SIDE * self.size:g} or more")  # fmt: skip
+        if options.layer < self.size:
+            raise ConfigError(f"--layer {options.layer:g}: layers are thinner than the voxels, so that some would have "
+                              f"none; give {self.size:g} or more")  # fmt: skip
         self.options = options
         ratios = [one["reflectance_ratio"] for _, one in facts]
         errors = (ASSUMED_ERROR if one.get("source") == "assumed" else (one.get("error") or 0.0) / one["ratio"]

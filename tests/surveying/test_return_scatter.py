@@ -1,0 +1,91 @@
+"""How exactly returns were placed, and that errors of places and ranges hold it: traced strips with noise on points."""
+
+from dataclasses import replace
+
+import footprints
+import numpy as np
+import pytest
+from facet_strips import Facet, Sensor
+from facet_strips import write_strip as write_facets
+from footprints import EAST, NORTH, Flight, Plane, match, roofs, write_strip
+
+import wavebatch as wb
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying.measuring.return_scatter import ReturnScatter, measure_returns
+
+TOWN = [*roofs([0, 20, 38, 55]), Plane(0.25)]
+HILL = [Plane(slope=(np.tan(np.radians(22.0)), 0.1))]
+COLUMNS = "x,y,z,range,range_err,range_error"
+
+
+def measure(path):
+    with StripReader(path) as reader, reader.scan() as scan:
+        return measure_returns(reader, scan, wb.survey(path).system)
+
+
+def share_within(folder, planes, flight, seed):
+    """Of places along the ray within range_err, and of ranges within range_error."""
+    truth = write_strip(folder / "strip.las", planes, flight, 6000, seed)
+    chain = folder / "chain.toml"
+    stages = ("noise.pooled", "detect.maximum", "decompose.adaptive", "attribute.position", "attribute.range")
+    chain.write_text("".join(f'[[chain]]\nstage = "{stage}"\n' for stage in stages))
+    wb.run(folder / "strip.las", folder / "out", chain=chain, columns="range,range_err,range_error")
+    cloud = wb.read_cloud(folder / "out" / "strip.laz")
+    rows = match(cloud["gps_time"], truth)
+    origin, ray = footprints._fly(flight, np.arange(6000) / flight.rate)
+    place = np.stack([cloud[name] for name in "xyz"], axis=1) - (origin[rows] + [EAST, NORTH, 0.0])
+    # A pulse whose footprint lies on two planes has two echoes, and one place that is true.
+    known = truth.pure[rows] & np.isfinite(cloud["range_err"]) & np.isfinite(cloud["range"])
+    along = np.abs((place * ray[rows]).sum(axis=1) - truth.range[rows])[known]
+    away = np.abs(cloud["range"] - truth.range[rows])[known]
+    assert known.mean() > 0.9
+    return np.mean(along <= cloud["range_err"][known]), np.mean(away <= cloud["range_error"][known])
+
+
+@pytest.mark.parametrize(
+    ("planes", "flight", "seed"),
+    [
+        (TOWN, Flight(), 11),
+        pytest.param(TOWN, Flight(point_error=0.02, height=900.0, light=3e8), 12, marks=pytest.mark.slow),
+        pytest.param(TOWN, Flight(point_error=0.005, height=300.0, half_angle=25.0), 13, marks=pytest.mark.slow),
+        (HILL, Flight(point_error=0.03), 14),
+        pytest.param(HILL, Flight(spacing=1.0, point_error=0.01), 15, marks=pytest.mark.slow),
+    ],
+)
+def test_two_of_three_places_and_ranges_are_within_their_errors(tmp_path, planes, flight, seed):
+    places, ranges = share_within(tmp_path, planes, flight, seed)
+    assert 0.60 < places < 0.80
+    assert 0.60 < ranges < 0.80
+
+
+@pytest.mark.parametrize("scatter", [0.005, 0.05])
+def test_the_scatter_of_points_is_measured(tmp_path, scatter):
+    write_strip(tmp_path / "a.las", TOWN, Flight(point_error=scatter), 6000, 3)
+    found = measure(tmp_path / "a.las")
+    assert found.scatter == pytest.approx(scatter, rel=0.15)
+    assert found.phase == pytest.approx(scatter, rel=0.15)  # these locations have no phase
+
+
+def test_points_of_two_channels_that_are_exact_have_no_scatter(tmp_path):
+    sensor = replace(Sensor(), gains={1: 1.0, 2: 0.6})
+    write_facets(tmp_path / "a.las", [Facet(0.3, slope=(0.2, 0.1))], sensor, 5000)
+    assert measure(tmp_path / "a.las").scatter < 0.004
+
+
+def test_a_phase_of_the_pulse_is_no_scatter(tiny_strip):
+    """Locations of simulated returns are up to half a sample off, their points are true."""
+    found = measure(tiny_strip)
+    assert found.scatter < 0.005 and 0.03 < found.phase < 0.07
+
+
+def test_real_strips(riegl, leica):
+    assert measure(riegl).scatter < 0.012
+    assert measure(leica) == ReturnScatter(
+        pytest.approx(0.0045, abs=0.002), pytest.approx(0.045, abs=0.005), "locations"
+    )
+
+
+def test_without_enough_echoes_a_scatter_is_assumed(tmp_path):
+    write_strip(tmp_path / "a.las", TOWN, Flight(light=1e3), 400, 3)
+    assert measure(tmp_path / "a.las").source == "assumed"
+    assert measure(tmp_path / "a.las").scatter == 0.02
