@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack
-from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,9 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.figure_file import check_picture
-from wavebatch.files.geojson import GEOJSON_CRS, GeoJsonCrs, plan_crs
+from wavebatch.files.geojson import GEOJSON_CRS, plan_crs
 from wavebatch.files.las.crs import describe_crs, read_crs_definition
-from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
 from wavebatch.tools.slices.output import SEGMENT_SUFFIXES, CubeBuilder, SegmentWriter, draw_segments, draw_slice
 from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments, read_scan_lines
@@ -40,23 +39,6 @@ _ALL = (0, None)
 
 _SURVEYED = 2000
 """Waveforms from which the width of the pulse is measured: enough for 1 % of it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Extras:
-    """What is made of one strip besides its segments."""
-
-    png: Path | None
-    """Picture of the first slice."""
-    overview: Path | None
-    """Picture of all segments."""
-    cube: Path | None
-    """The samples as a cube."""
-
-    @property
-    def targets(self) -> list[Path]:
-        """The files that are wanted."""
-        return [path for path in (self.png, self.overview, self.cube) if path is not None]
 
 
 @click.command(name="slice")
@@ -107,31 +89,32 @@ def slice_(
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
     """  # fmt: skip
-    extras = Extras(png, overview, cube)
-    if output is None and not extras.targets:
+    extras = [path for path in (png, overview, cube) if path is not None]
+    if output is None and not extras:
         raise click.UsageError("give -o for the segments, --png or --overview for a picture, or --cube")
     if options["geojson_crs"] == "keep" and (output is None or output.suffix.lower() != ".geojson"):
         raise click.UsageError("--geojson-crs keep is of no use without -o FILE.geojson: other files keep the CRS")
-    for target in extras.targets:
+    for target in extras:
         refuse_existing(target, options["overwrite"])
     for picture in filter(None, (png, overview)):
         check_picture(picture, overwrite=options["overwrite"])
     paths = shared.find_inputs(strips, recursive=options["recursive"])
-    if extras.targets and len(paths) > 1:
-        raise ConfigError(f"{extras.targets[0]}: one file for {len(paths)} strips; make them one by one")
+    if extras and len(paths) > 1:
+        raise ConfigError(f"{extras[0]}: one file for {len(paths)} strips; make them one by one")
     targets = {} if output is None else shared.name_outputs(paths, output, SEGMENT_SUFFIXES, ".csv")
+    options |= {"lines": lines, "png": png, "overview": overview, "cube": cube, "extras": extras}
     found, failed = shared.for_each(
-        paths, lambda strip: _slice(strip, targets.get(strip), lines, extras, options), debug=options["debug"]
+        paths, lambda strip: _slice(strip, targets.get(strip), options), debug=options["debug"]
     )
     answer(found[0] if len(paths) == 1 else found)
     sys.exit(EXIT_SOME_FAILED if failed else 0)
 
 
-def _slice(
-    strip: Path, output: Path | None, lines: tuple[int, int | None], extras: Extras, options: dict[str, Any]
-) -> dict[str, Any]:
-    """Work on one strip; returns its counts and says them."""
-    with StripReader(strip, direction=options["direction"]) as reader, reader.scan() as scan:
+def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[str, Any]:
+    """Writes the segments of the wanted lines of one strip; returns their counts and says them."""
+    (first, end), overwrite = options["lines"], options["overwrite"]
+    png, overview = options["png"], options["overview"]
+    with StripReader(strip, direction=options["direction"]) as reader, reader.scan() as scan, ExitStack() as stack:
         crs = None
         if output is not None and output.suffix.lower() == ".geojson":
             known = read_crs_definition(strip, reader.facts.header)
@@ -141,34 +124,9 @@ def _slice(
             system = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system
             sigma, floor = system.sigma_ref if sigma is None else sigma, _NOISE_FLOOR * system.noise.std
         settings = shared.from_options(SliceOptions, options, **{"sigma": sigma} if sigma else {}, floor=floor)
-        counts = _find(reader, scan, settings, output, lines, extras, crs, options["overwrite"])
-    if not counts["lines"]:
-        none = "no scan line" if scan.with_waveform else "no waveform, so no scan line"
-        talk(f"{strip}: has {none}" + ("" if lines == _ALL else " with a number in --lines"))
-    found = f"{count(counts['segments'], 'segment')} in {count(counts['lines'], 'scan line')}"
-    tell(f"{strip}: {found} of {count(counts['pulses'], 'pulse')}")
-    if counts["full"]:
-        tell(f"{strip}: {count(counts['full'], 'scan line')} may have more segments than --most {settings.most}; "
-             "raise it")  # fmt: skip
-    return {"strip": str(strip), **counts}
-
-
-def _find(
-    reader: StripReader,
-    scan: StripScan,
-    settings: SliceOptions,
-    output: Path | None,
-    lines: tuple[int, int | None],
-    extras: Extras,
-    crs: GeoJsonCrs | None,
-    overwrite: bool,
-) -> dict[str, Any]:
-    """Writes the segments of the wanted lines; returns their counts."""
-    first, end = lines
-    counts = {"lines": 0, "pulses": 0, "segments": 0, "full": 0, "sigma": settings.sigma}
-    with ExitStack() as stack:
+        counts: dict[str, Any] = {"lines": 0, "pulses": 0, "segments": 0, "full": 0, "sigma": settings.sigma}
         writer, every = None, []
-        cube = CubeBuilder(extras.cube) if extras.cube else None
+        cube = CubeBuilder(options["cube"]) if options["cube"] else None
         if output:
             writer = stack.enter_context(SegmentWriter(output, crs=crs, overwrite=overwrite))
         for line in takewhile(lambda one: end is None or one.number < end, read_scan_lines(reader, scan)):
@@ -176,9 +134,9 @@ def _find(
                 continue
             piece = cut_slice(line, settings)
             segments = find_segments(piece, settings)
-            if extras.png and not counts["lines"]:
-                draw_slice(piece, segments, extras.png, strip=reader.facts.path.name, overwrite=overwrite)
-            if extras.overview:
+            if png and not counts["lines"]:
+                draw_slice(piece, segments, png, strip=strip.name, overwrite=overwrite)
+            if overview:
                 every += segments
             if cube:
                 cube.add(line)
@@ -188,17 +146,24 @@ def _find(
             counts["pulses"] += len(line)
             counts["segments"] += len(segments)
             counts["full"] += len(segments) >= settings.most
-        if extras.targets and not counts["lines"]:
-            raise InputError(f"{extras.targets[0]}: not written, because no scan line has a number in --lines")
-        if extras.overview:
+        if options["extras"] and not counts["lines"]:
+            raise InputError(f"{options['extras'][0]}: not written, because no scan line has a number in --lines")
+        if overview:
             if not every:
-                raise InputError(f"{extras.overview}: not drawn, because the scan lines have no segment")
-            path = reader.facts.path
-            draw_segments(every, extras.overview, strip=path.name, lines=counts["lines"], crs=describe_crs(path)[0],
+                raise InputError(f"{overview}: not drawn, because the scan lines have no segment")
+            draw_segments(every, overview, strip=strip.name, lines=counts["lines"], crs=describe_crs(strip)[0],
                           overwrite=overwrite)  # fmt: skip
         if cube:
-            meta = {"version": __version__, "strip": reader.facts.path.name}
+            meta = {"version": __version__, "strip": strip.name}
             counts["cube"] = list(cube.write(meta, reader.facts.crs, overwrite=overwrite))
         if writer:
             writer.commit()
-    return counts
+    if not counts["lines"]:
+        none = "no scan line" if scan.with_waveform else "no waveform, so no scan line"
+        talk(f"{strip}: has {none}" + ("" if options["lines"] == _ALL else " with a number in --lines"))
+    found = f"{count(counts['segments'], 'segment')} in {count(counts['lines'], 'scan line')}"
+    tell(f"{strip}: {found} of {count(counts['pulses'], 'pulse')}")
+    if counts["full"]:
+        tell(f"{strip}: {count(counts['full'], 'scan line')} may have more segments than --most {settings.most}; "
+             "raise it")  # fmt: skip
+    return {"strip": str(strip), **counts}

@@ -66,7 +66,6 @@ def survey(
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
-    from wavebatch.tools.compare.angle_table import check_angles
     from wavebatch.tools.sheets.sheet import Sheet
     from wavebatch.tools.sheets.survey import list_doubts, survey_sheet, write_survey_page
 
@@ -81,6 +80,8 @@ def survey(
         if len(paths) > 1:
             words = "is for one strip, because widths depend on the distance of the ground"
             raise ConfigError(f"--angles {angles}: {words}")
+        from wavebatch.tools.compare.angle_table import check_angles
+
         check_angles(angles, overwrite=overwrite)
     options["angles"] = angles
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
@@ -107,11 +108,9 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     """The survey, and what else is shown of the strip."""
     from wavebatch.files.disk.raw_bytes import take_fingerprint
     from wavebatch.surveying.inspect_strip import doubt_files
-    from wavebatch.surveying.sensor import SensorRequest, find_sensor
     from wavebatch.surveying.system_file import SavedSurvey
     from wavebatch.tools.api.strip import open_strip
     from wavebatch.tools.api.strip import survey as survey_strip
-    from wavebatch.tools.compare.angle_table import write_angles
 
     with open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
         found = survey_strip(
@@ -127,6 +126,9 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
         }
         packet_file = opened.facts.packets.file
         if options["angles"] is not None:
+            from wavebatch.surveying.sensor import SensorRequest, find_sensor
+            from wavebatch.tools.compare.angle_table import write_angles
+
             distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
             sizes = {"spacing": found.figures.spacing_ns, "amplitude": found.figures.amplitude_50}
             write_angles(options["angles"], found.system, distance=distance, strip=opened.facts.path.name, **sizes,

@@ -329,23 +329,6 @@ class DeadZone:
     1 mm; NaN where the size is."""
 
 
-class Distances:
-    """Histograms of the distances between consecutive returns, one per class of RANKS."""
-
-    def __init__(self) -> None:
-        self.bins = np.zeros((len(RANKS), BINS), np.int64)
-
-    def add(self, number: np.ndarray, distance: np.ndarray) -> None:
-        """Adds pairs; number: return number of the first of each, from 1, (k,). distance: f8 (k,) [m]."""
-        rank = np.minimum(number.astype(np.int64), len(RANKS)) - 1
-        place = np.minimum(distance / BIN, BINS - 1).astype(np.int64)
-        np.add.at(self.bins, (rank, place), 1)
-
-    def merge(self, other: Distances) -> None:
-        """Adds the pairs of another cloud."""
-        self.bins += other.bins
-
-
 def find_dead_zone(bins: np.ndarray) -> DeadZone:
     """The dead zone of the pairs of a histogram: the 0.1 % quantile of their distances."""
     pairs = int(bins.sum())
@@ -532,7 +515,8 @@ class _Tally:
     incomplete: int = 0
     depth: float = 0.0
     methods: set[str] = field(default_factory=set)
-    distances: Distances = field(default_factory=Distances)
+    distances: np.ndarray = field(default_factory=lambda: np.zeros((len(RANKS), BINS), np.int64))
+    """Histograms of the distances between consecutive returns, one per class of RANKS."""
     whole: AreaTally = field(default_factory=lambda: AreaTally(Whole(), _RANKS))
     flags: np.ndarray | None = None
     areas: list[AreaTally] = field(default_factory=list)
@@ -562,7 +546,8 @@ class _Tally:
             distance = np.linalg.norm((rows["xyz"][before + 1] - rows["xyz"][before]) * self.metres, axis=1)
         known = np.isfinite(distance)
         before, distance = before[known], distance[known]
-        self.distances.add(rows["number"][before], distance)
+        rank = np.minimum(rows["number"][before].astype(np.int64), len(RANKS)) - 1
+        np.add.at(self.distances, (rank, np.minimum(distance / BIN, BINS - 1).astype(np.int64)), 1)
         for area in (self.whole, *self.areas):
             area.add(rows, first, (before, distance), depths)
 
@@ -572,7 +557,7 @@ class _Tally:
         self.left_out += other.left_out
         self.incomplete += other.incomplete
         self.depth += other.depth
-        self.distances.merge(other.distances)
+        self.distances += other.distances
         for area, more in zip((self.whole, *self.areas), (other.whole, *other.areas), strict=True):
             area.merge(more)
         if other.flags is not None:
@@ -581,7 +566,7 @@ class _Tally:
     def finish(self, cloud: str) -> ReturnStats:
         """The statistics."""
         (whole,) = self.whole.finish()
-        bins = self.distances.bins
+        bins = self.distances
         zones = {"all": find_dead_zone(bins.sum(axis=0))}
         zones |= {name: find_dead_zone(each) for name, each in zip(RANKS, bins, strict=True) if each.any()}
         zone = zones["all"].size

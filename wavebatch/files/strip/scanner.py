@@ -359,10 +359,10 @@ class _Scanner:
         """Finds points anywhere in the strip that share packets of suspect bins, and adds them to the context."""
         borders = np.array(self._found.borders)
         count = int(self._found.tally.reasons[Reason.USABLE])
-        far = find_far(self._suspect_keys(suspects), count, borders)
+        far, packets, reach, overfull = find_far(self._suspect_keys(suspects), count, borders)
         try:
             for unit in range(len(borders) - 1):
-                wants = far.wants.read(unit)
+                wants = far.read(unit)
                 if len(wants):
                     start, context = int(borders[unit]), self._found.context
                     points = self._source.read(start, int(borders[unit + 1]))
@@ -371,8 +371,8 @@ class _Scanner:
                     entries["record"] = take_whole_records(points, wants["index"] - start)
                     context.append(wants["unit"], entries)
         finally:
-            far.wants.close()
-        return far.packets, far.reach, far.overfull
+            far.close()
+        return packets, reach, overfull
 
     def _judge_again(self, overfull: np.ndarray | None = None) -> Iterator[tuple[int, Judged]]:
         """First index and check of each unit, for passes after the first one."""

@@ -171,19 +171,14 @@ class NearSharing:
         return int(self._new[~suspects].sum())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FarSharing:
-    """Result of the far search."""
+def find_far(
+    units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders: np.ndarray
+) -> tuple[Spool, int, int, np.ndarray]:
+    """Far search among all keys of `units`, as (keys, file index), `count` in all, in bounded memory.
 
-    wants: Spool
-    """For each unit: which of its points which other unit needs."""
-    packets: int
-    reach: int
-    overfull: np.ndarray
-
-
-def find_far(units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders: np.ndarray) -> FarSharing:
-    """Far search among all keys of `units`, as (keys, file index), `count` in all, in bounded memory."""
+    Returns for each unit which of its points which other unit needs, the number of packets, how far apart points of a
+    packet lie, and the keys of overfull packets.
+    """
     buckets = count // _PER_BUCKET + 1
     spool = Spool(buckets, _KEY)
     wants = Spool(len(borders) - 1, _WANT)
@@ -212,7 +207,7 @@ def find_far(units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders
         raise
     finally:
         spool.close()
-    return FarSharing(wants.seal(), packets, reach, np.concatenate([np.empty(0, np.uint64), *overfull]))
+    return wants.seal(), packets, reach, np.concatenate([np.empty(0, np.uint64), *overfull])
 
 
 def _read_bucket(spool: Spool, bucket: int) -> np.ndarray:

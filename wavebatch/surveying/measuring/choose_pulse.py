@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -203,7 +203,8 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
         every = explain(block, _bear(system, begin.change), width_prior=0.0)
         own = find_own_width(every, shape_limits(system, block.spacing).ref)
         yield "gaussian of all echoes", replace(system, sigma_ref=system.sigma_ref * own)
-    for name, options in (("one echo per cluster", {"max_echoes": 1}), ("all echoes", {})):
+    rounds: tuple[tuple[str, dict[str, Any]], ...] = (("one echo per cluster", {"max_echoes": 1}), ("all echoes", {}))
+    for name, options in rounds:
         for last in (False, True):
             explained = explain(block, _bear(system, begin.change), **options)
             if count_telling(explained) < ENOUGH_TO_LEARN:

@@ -6,7 +6,7 @@ only for what shortens the description of waveforms that nothing was learned fro
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,14 +59,16 @@ class Explained:
     sums: Sums
 
 
-def explain(block: WaveformBlock, system: SystemPulse, **options: float) -> Explained:
+def explain(
+    block: WaveformBlock, system: SystemPulse, detect: Callable[..., EchoTable] = matched_filter, **options: float
+) -> Explained:
     """Decompose cleaned waveforms, with options of `decompose.adaptive`.
 
     Errors are those of noise alone: else a larger misfit would make every description shorter.
     """
     block = clean_block(block, system)
     noise = pooled_noise(block, system)
-    echoes = adaptive(block, noise, system, matched_filter(block, noise, system), **options)
+    echoes = adaptive(block, noise, system, detect(block, noise, system), **options)
     echoes = scale_errors(echoes, 1 / misfit_factor(echoes, system, block.spacing))
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
     whole = np.stack([echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1)

@@ -148,8 +148,10 @@ def _learn(
         best = sums[-1]
     chosen = _with_pulse(system, best, stack, block.spacing)
     if best.kappa and len(sums) > 1:
-        other = _with_pulse(system, _simplest(sums[1:], goal), stack, block.spacing)
-        return _fit_wide_best(block, system, (chosen, other))
+        # The same pulse on level ground, so that widened echoes alone decide.
+        drawn = stack._replace(value=_draw(best, stack.lag), error=np.full(len(stack.lag), 1.0))
+        other = fit_gaussians(drawn, width)[-1]
+        return _fit_wide_best(block, system, (chosen, _with_pulse(system, other, stack, block.spacing)))
     return chosen
 
 
@@ -173,7 +175,8 @@ def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[Syst
     for pulse in pulses:
         noise = pooled_noise(part, pulse)
         alone = replace(clear, waveform=rows.astype(np.int32))
-        misfits.append(float(np.median(adaptive(part, noise, pulse, alone, max_echoes=1).residual)))
+        # In a canopy most of them are several echoes, which no pulse fits: the tenth that fits best is of one.
+        misfits.append(float(np.quantile(adaptive(part, noise, pulse, alone, max_echoes=1).residual, 0.1)))
     return pulses[1] if misfits[1] < BETTER * misfits[0] else pulses[0]
 
 

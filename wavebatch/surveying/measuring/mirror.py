@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.stages.detect.maximum import matched_filter, maximum
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying.measuring.judge import explain
@@ -65,12 +66,24 @@ def look_in_mirror(
     ------
     level : float
     mirror : Mirror
-        Of the echoes that have this energy.
+        Of the echoes that have this energy, by the detector that is worse off.
     """
     block = block.rows(np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1)))
-    explained = explain(block, system)
+    # Chains find candidates by either detector, and the smoothing of one is broader than a narrow pulse.
+    looks = [_look(block, system, detect, levels) for detect in (matched_filter, maximum)]
+    for level, *counts in zip(levels, *looks, strict=True):
+        found = [min(one) for one in zip(*(one[:2] for one in counts), strict=True)]
+        false = [max(one) for one in zip(*(one[2:] for one in counts), strict=True)]
+        yield level, Mirror(found[0], false[0], found[1], false[1])
+
+
+def _look(
+    block: WaveformBlock, system: SystemPulse, detect: Callable[..., EchoTable], levels: Sequence[float]
+) -> Iterator[tuple[int, int, int, int]]:
+    """Main echoes, echoes, and false ones beside main ones and in quiet, of each level."""
+    explained = explain(block, system, detect)
     mirrored = (block.samples - 2 * explained.sums.left).astype(np.float32)
-    echoes, other = explained.echoes, explain(replace(block, samples=mirrored), system).echoes
+    echoes, other = explained.echoes, explain(replace(block, samples=mirrored), system, detect).echoes
     width = system.sigma_ref * FWHM_PER_SIGMA
     alone = np.ones(len(other), bool)
     alone[match_echoes(other, echoes, SAME * width).found] = False
@@ -83,8 +96,7 @@ def look_in_mirror(
         found = np.count_nonzero(_measure_energy(echoes, system, block.spacing) >= level)
         false = rest.take(np.flatnonzero(_measure_energy(rest, system, block.spacing) >= level))
         beside = _count_near(false, mains, ZONE * width)
-        quiet = len(false) - _count_near(false, echoes, ZONE * width)
-        yield level, Mirror(len(mains), beside, int(found), quiet)
+        yield len(mains), int(found), beside, len(false) - _count_near(false, echoes, ZONE * width)
 
 
 def _measure_energy(echoes: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:

@@ -236,8 +236,11 @@ def build_points(
     owner, sample, height = [], [], []
     for (places,) in group_rows(segments.take(rows), np.arange(len(rows))):
         code = int(code_segments(segments, rows[places[:1]])[0])
-        samples = _scale(piece.samples(rows[places]), plan, code)
-        digitizer = plan.digitizers[code]
+        # Counts on the scale of the sensitive channel, padded with zeros to the length of their descriptor.
+        samples, digitizer, ratio = piece.samples(rows[places]), plan.digitizers[code], plan.ratios.get(code >> 46)
+        if ratio is not None:
+            samples = np.minimum(np.round(samples * ratio), digitizer.max_count).astype(f"<u{digitizer.width}")
+        samples = np.pad(samples, ((0, 0), (0, digitizer.n_samples - samples.shape[1])))
         offset[places] = writer.write_packets(samples, digitizer.index)
         width[places] = samples.shape[1] * digitizer.width
         found, at = _place_returns(samples, plan.noise, detect=detect)
@@ -252,8 +255,8 @@ def build_points(
     owner, sample, height = owner[order], sample[order], height[order]
     chosen = segments.take(rows[owner])
     points = np.zeros(len(owner), writer.dtype)
-    sent = None if plan.outgoing is None else _measure_sent(piece, plan.outgoing, counts)
-    _fill_places(points, piece, chosen, sample, writer, sent)
+    sent, late = (None, 0.0) if plan.outgoing is None else _measure_sent(piece, plan.outgoing, counts)
+    _fill_places(points, piece, chosen, sample, writer, late)
     _fill_pulses(points, piece, chosen.pulse, plan, header)
     codes = code_segments(chosen, np.arange(len(chosen)))
     kinds, which = np.unique(codes, return_inverse=True)
@@ -262,21 +265,12 @@ def build_points(
     if plan.dark:
         points["intensity"] = np.minimum(height.astype(np.int64), 65535)
     if sent is not None:
-        for name, line in zip(SENT, sent.measures, strict=True):
+        for name, line in zip(SENT, sent, strict=True):
             points[name] = line[chosen.pulse]
     counts.points += len(points)
     counts.packets += len(rows)
     counts.without_returns += len(piece.pulses) - len(np.unique(chosen.pulse))
     return points
-
-
-def _scale(samples: np.ndarray, plan: Plan, code: int) -> np.ndarray:
-    """Counts on the scale of the sensitive channel, padded with zeros to the length of their descriptor."""
-    digitizer, ratio = plan.digitizers[code], plan.ratios.get(code >> 46)
-    if ratio is not None:
-        samples = np.minimum(np.round(samples * ratio), digitizer.max_count).astype(f"<u{digitizer.width}")
-    lack = digitizer.n_samples - samples.shape[1]
-    return np.pad(samples, ((0, 0), (0, lack))) if lack else samples
 
 
 def _place_returns(samples: np.ndarray, noise: float, *, detect: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -303,11 +297,11 @@ def _fill_places(
     chosen: Segments,
     sample: np.ndarray,
     writer: FullwaveWriter,
-    sent: _Sent | None,
+    late: np.ndarray | float,
 ) -> None:
     """Coordinates, location in the packet and vectors toward the sensor."""
     direction = piece.direction[chosen.pulse]
-    late = 0.0 if sent is None else sent.late[chosen.pulse]
+    late = late if isinstance(late, float) else late[chosen.pulse]
     way = chosen.start + (sample * chosen.spacing - late) / chosen.unit
     xyz = piece.anchor[chosen.pulse] + way[:, None] * direction
     stored = np.round((xyz - np.array(writer.offsets)) / np.array(writer.scales))
@@ -340,18 +334,9 @@ def _fill_pulses(points: np.ndarray, piece: PulsePiece, pulse: np.ndarray, plan:
         points["gps_time"] = records["time"] * header.time_scale + plan.time_offset
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sent:
-    """Outgoing pulses of a piece, over the means of the strip, by pulse; NaN where there is none."""
-
-    measures: np.ndarray
-    """The values of SENT, f8 (4, n)."""
-    late: np.ndarray
-    """Time of the peak after the strip's mean one, f8 (n,) [ns]; 0 where it is not known."""
-
-
-def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: Counts) -> _Sent:
-    """Measure the first outgoing segment of each pulse.
+def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: Counts) -> tuple[np.ndarray, np.ndarray]:
+    """Measure the first outgoing segment of each pulse: the values of SENT over the means of the strip, f8 (4, n), NaN
+    where there is none; and the time of its peak after the strip's mean one, f8 (n,) [ns], 0 where it is not known.
 
     A digitizer does not start in step with the laser: its samples lie up to half a spacing off. Where the outgoing
     pulse has a time on the clock of the echoes, that is taken off, else echoes would be up to 7 cm off.
@@ -371,7 +356,7 @@ def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: Counts) -> _Sen
         peak = np.where(start != 0, start + (found.time - outgoing.origin) * spacing, 0.0)
         late[pulse] = np.where(np.isfinite(peak), peak, 0.0)
     counts.unknown_energy += int(np.count_nonzero(np.isnan(values[0])))
-    return _Sent(values, late)
+    return values, late
 
 
 SUFFIXES = (".pls",)

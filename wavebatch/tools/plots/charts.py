@@ -7,7 +7,6 @@ matplotlib is not installed: the page then says how to get the pictures.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -288,40 +287,6 @@ def map_columns(path: Path, facts: Sequence[ColumnFacts], sample: EvenSample) ->
     return maps
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Views:
-    """Waveforms of a strip with the result of its chain."""
-
-    searched: int
-    total: int
-    """Waveforms of the strip."""
-    random: tuple[WaveformView, ...]
-    worst: tuple[tuple[WaveformView, float], ...]
-    """With the root mean square of their residual in standard deviations of the noise, the largest first."""
-
-
-def read_page_views(path: Path, chain: Chain, system: SystemPulse, *, seed: int = 0, **reading: Any) -> Views:
-    """Waveforms of a sample that is spread evenly over the strip; reading: direction and headerless.
-
-    Raises InputError if the strip cannot be read.
-    """
-    generator = np.random.default_rng(seed)
-    drawn: list[tuple[float, WaveformView]] = []
-    worst: list[tuple[float, WaveformView]] = []
-    searched = 0
-    with StripReader(path, **reading) as reader, reader.scan() as scan:
-        total = scan.packets
-        for block in reader.sample_blocks(scan, min(SEARCHED, sample_size(reader, scan))):
-            searched += len(block)
-            residual = measure_view_residuals(block, chain, system)
-            # The least of random numbers, kept over all blocks, draw each waveform with the same chance.
-            order = generator.random(len(block))
-            drawn = _keep(drawn, block, chain, system, order, SHOWN_RANDOM)
-            worst = _keep(worst, block, chain, system, -residual, SHOWN_WORST)
-    bad = tuple((view, -key) for key, view in worst if np.isfinite(key))
-    return Views(searched, total, tuple(sorted((view for _, view in drawn), key=lambda view: view.point)), bad)
-
-
 def _keep(
     kept: list[tuple[float, WaveformView]], block: WaveformBlock, chain: Chain, system: SystemPulse, keys: np.ndarray,
     most: int,
@@ -358,23 +323,35 @@ def measure_view_residuals(block: WaveformBlock, chain: Chain, system: SystemPul
 def draw_waveforms(path: Path, chain: Chain, system: SystemPulse, name: str, **reading: Any) -> Iterator[Sheet]:
     """Random waveforms of a strip, and the worst fits among a sample, as parts of a page; name: of the chain.
 
-    reading, errors: as for `read_page_views`.
+    reading: direction and headerless. Raises InputError if the strip cannot be read.
     """
-    views = read_page_views(path, chain, system, **reading)
-    whole = f"all {views.searched:,} waveforms"
-    part = f"{views.searched:,} waveforms that are spread over the strip ({views.total:,} in all)"
+    generator, searched = np.random.default_rng(0), 0
+    drawn: list[tuple[float, WaveformView]] = []
+    worst: list[tuple[float, WaveformView]] = []
+    with StripReader(path, **reading) as reader, reader.scan() as scan:
+        total = scan.packets
+        for block in reader.sample_blocks(scan, min(SEARCHED, sample_size(reader, scan))):
+            searched += len(block)
+            residual = measure_view_residuals(block, chain, system)
+            # The least of random numbers, kept over all blocks, draw each waveform with the same chance.
+            order = generator.random(len(block))
+            drawn = _keep(drawn, block, chain, system, order, SHOWN_RANDOM)
+            worst = _keep(worst, block, chain, system, -residual, SHOWN_WORST)
+    worst = [pair for pair in worst if np.isfinite(pair[0])]
+    whole = f"all {searched:,} waveforms"
+    part = f"{searched:,} waveforms that are spread over the strip ({total:,} in all)"
     head = (
-        f"Drawn at random from {whole if views.searched >= views.total else part}. Chain: {name}. `wavebatch plot "
+        f"Drawn at random from {whole if searched >= total else part}. Chain: {name}. `wavebatch plot "
         "waveform STRIP --point N -o FILE.png` draws one of them large."
     )
-    yield Sheet("Random waveforms", [Note(head), *draw_sheet(views.random, "Random waveforms")])
-    if views.worst:
+    random = sorted((view for _, view in drawn), key=lambda view: view.point)
+    yield Sheet("Random waveforms", [Note(head), *draw_sheet(random, "Random waveforms")])
+    if worst:
         words = (
-            f"The largest residuals among these {views.searched:,} waveforms, as root mean square in standard "
+            f"The largest residuals among these {searched:,} waveforms, as root mean square in standard "
             "deviations of the noise (1 is noise alone)."
         )
-        if views.searched < views.total:
-            words += f" The other {views.total - views.searched:,} waveforms of the strip were not searched."
-        notes = [f"residual {rms:.2f}" for _, rms in views.worst]
-        worst = draw_sheet([view for view, _ in views.worst], "Worst fits", notes)
-        yield Sheet("Worst fits", [Note(words), *worst])
+        if searched < total:
+            words += f" The other {total - searched:,} waveforms of the strip were not searched."
+        notes = [f"residual {-key:.2f}" for key, _ in worst]
+        yield Sheet("Worst fits", [Note(words), *draw_sheet([view for _, view in worst], "Worst fits", notes)])
