@@ -101,10 +101,6 @@ def compare(
         sys.exit(EXIT_VIOLATED)
 
 
-def _tolerance(options: dict) -> dict[str, float]:
-    return {} if options["within"] is None else {"tolerance_ns": options["within"]}
-
-
 def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
     for name in ("system", "force", "limit"):
         if options[name] not in (None, False):
@@ -116,9 +112,9 @@ def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comp
             raise click.UsageError(f"{side} is a chain; give the strip to run it on with --strip STRIP")
     if b is not None and b.suffix.lower() == ".npz":
         raise click.UsageError(f"{b} looks like a truth file; give it with --truth")
-    if truth:
-        return compare_truth(a, truth, **_tolerance(options), chosen=PointFilter(where=options["where"]))
-    return compare_clouds(a, b, **_tolerance(options), chosen=PointFilter(where=options["where"]))
+    how = {} if options["within"] is None else {"tolerance_ns": options["within"]}
+    how["chosen"] = PointFilter(where=options["where"])
+    return compare_truth(a, truth, **how) if truth else compare_clouds(a, b, **how)
 
 
 def _is_chain(side: Path) -> bool:
@@ -145,7 +141,8 @@ def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: di
             chain = nearest(side.name, [AUTO, *COSTS])
             raise click.UsageError(f"{side.name}: is neither a file nor a shipped chain; {chain}")
     more = {"survey": saved and saved.survey, "force": options["force"], "limit": options["limit"]}
-    return match_sides(strip, *sides, **more, **_tolerance(options))
+    more |= {} if options["within"] is None else {"tolerance_ns": options["within"]}
+    return match_sides(strip, *sides, **more)
 
 
 def _check_thresholds(result: Comparison, options: dict) -> list[str]:

@@ -116,18 +116,15 @@ def _start_processes(options: dict[str, Any]) -> None:
 def _check_options(options: dict[str, Any]) -> None:
     report = options["report"]
     for name, target in (("--report", None if report == "-" else report), ("--html", options["html_file"])):
-        if target is not None and not _is_made(Path(target), options["output"]):
+        if target is None:
+            continue
+        folder, output = Path(os.path.abspath(target)).parent, os.path.abspath(options["output"])
+        if not folder.is_dir() and not folder.is_relative_to(output):  # folders in the output are made
             raise ConfigError(f"{name}: folder {Path(target).parent} does not exist; make it first")
     on_stdout = [*["--report -"][: report == "-"], *["--json"][: options["as_json"]]]
     on_stdout += ["--progress json"][: options["progress"] == "json"]
     if len(on_stdout) > 1:
         raise ConfigError(f"{' and '.join(on_stdout)} would both write to stdout; give the report a file")
-
-
-def _is_made(target: Path, output: Path) -> bool:
-    """Whether the folder of a file exists, or is the output or lies in it, and so is made with it."""
-    folder = Path(os.path.abspath(target)).parent
-    return folder.is_dir() or folder.is_relative_to(os.path.abspath(output))
 
 
 def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str = "--report") -> None:
@@ -155,19 +152,16 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     is_reported = _write_page(result, batch_options.folder, options) and is_reported
-    code = find_exit_code([outcome.error for outcome in result.outcomes]) or _find_warned(result, options["fail_on"])
-    if not code and any(outcome.status == "incomplete" for outcome in result.outcomes):
+    code = find_exit_code([outcome.error for outcome in result.outcomes])
+    # Strips that --resume skipped have their warnings too.
+    codes = set(options["fail_on"] or ())
+    warned = [one.job.path for one in result.outcomes if {w.code for w in one.report.warnings} & codes]
+    if not code and warned:
+        talk(f"error: --fail-on: {count(len(warned), 'strip')} with such a warning, the first is {warned[0]}; the "
+             "clouds are written")  # fmt: skip
+    if not code and (warned or any(outcome.status == "incomplete" for outcome in result.outcomes)):
         code = EXIT_SOME_FAILED
     return code or (0 if is_reported else EXIT_UNREPORTED)
-
-
-def _find_warned(result: Any, codes: tuple[str, ...] | None) -> int:
-    """The exit code for warnings that shall fail; strips that --resume skipped have theirs too."""
-    found = [one.job.path for one in result.outcomes if {w.code for w in one.report.warnings} & set(codes or ())]
-    if found:
-        talk(f"error: --fail-on: {count(len(found), 'strip')} with such a warning, the first is {found[0]}; the clouds "
-             "are written")  # fmt: skip
-    return EXIT_SOME_FAILED if found else 0
 
 
 def _report(document: dict[str, Any], target: str | None) -> bool:

@@ -107,7 +107,12 @@ def _sheet(found: ReturnStats) -> Sheet:
     each = f" (by {found.pulses_by}), {found.returns_per_pulse:.3f} returns each" if found.pulses else ""
     parts += [Fact("pulses", f"{found.pulses}{each}"), Table(("k", "return k", "k returns"), shares, ".2%")]
     if found.separations["all"].pairs:
-        zones = [_list_zone(name, one) for name, one in found.dead_zones.items()]
+        zones = []
+        for name, one in found.dead_zones.items():
+            few = one.pairs < LEAST_PAIRS
+            why = f"fewer than {LEAST_PAIRS} pairs" if few else f"nearly all {BIN * BINS:g} m or more apart"
+            why = f"no-data: {why}" if math.isnan(one.size) else ""
+            zones.append((name, one.pairs, one.size, one.error, one.size / HALF_C, why))
         parts += [Table(("separation", "pairs", "mean m", "least m"), apart, ".3f"),
                   Table(("dead zone", "pairs", "size m", "error m", "ns", ""), zones, (*[".2f"] * 4, ".1f", ""))]
     if found.several:
@@ -122,15 +127,6 @@ def _sheet(found: ReturnStats) -> Sheet:
     head = ("area", "pulses", "each", *(f"{k} of pulse" for k in number), "pairs", "mean m", "least m")
     forms = ("", "", ".3f", *[".2%"] * len(number), "", ".3f", ".3f")
     return Sheet(found.cloud, [*parts, Table(head, rows, forms, shown=SHOWN)])
-
-
-def _list_zone(name: str, one: DeadZone) -> tuple[Any, ...]:
-    """A dead zone, of all pairs or of a return number; or why it is not known."""
-    why = ""
-    if math.isnan(one.size):
-        few = one.pairs < LEAST_PAIRS
-        why = f"no-data: {f'fewer than {LEAST_PAIRS} pairs' if few else f'nearly all {BIN * BINS:g} m or more apart'}"
-    return name, one.pairs, one.size, one.error, one.size / HALF_C, why
 
 
 def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:

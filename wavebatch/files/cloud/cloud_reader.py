@@ -232,7 +232,14 @@ class CloudReader(Closing):
         if column in self.extra:
             return self._describe_extra(column), lambda raw: self.read_extra(raw, column)
         if column in known:
-            return self._describe_standard(column), lambda raw: read_field(raw, self.point_format, column, self._header)
+            fields = STANDARD_DTYPES[self.point_format]
+            step = 0.0 if column in field_names(fields) and fields[column].kind == "f" else 1.0
+            if column in "xyz":
+                step = abs(float(self.scales["xyz".index(column)]))
+            elif column == "scan_angle":
+                step = ANGLE_UNIT
+            facts = ColumnFacts(column, _UNITS.get(column, "-"), "", step, is_standard=True)
+            return facts, lambda raw: read_field(raw, self.point_format, column, self._header)
         missing = resolve(wanted, {name: name for name in COLUMNS})
         if missing:
             raise ConfigError(
@@ -255,15 +262,6 @@ class CloudReader(Closing):
             meaning = COLUMNS[name].meaning
         step = 0.0 if record.dtype.kind == "f" else abs((record.scaling or (1.0,))[0])
         return ColumnFacts(field, unit, meaning, step, self._sources.get("echo_flags") == field)
-
-    def _describe_standard(self, name: str) -> ColumnFacts:
-        fields = STANDARD_DTYPES[self.point_format]
-        step = 0.0 if name in field_names(fields) and fields[name].kind == "f" else 1.0
-        if name in "xyz":
-            step = abs(float(self.scales["xyz".index(name)]))
-        elif name == "scan_angle":
-            step = ANGLE_UNIT
-        return ColumnFacts(name, _UNITS.get(name, "-"), "", step, is_standard=True)
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
         if "ray" in field_names(self.dtype) and self.has_packets:
@@ -419,7 +417,13 @@ class _TableReader(ColumnReader):
 
     def __init__(self, path: Path, columns: Sequence[str] | None) -> None:
         super().__init__(path)
-        names = self._name_columns()
+        # Name of every column in the table -> its name in the file.
+        known = self.list_columns()
+        ours = {field: name for name, field in self._find_ours(COLUMNS).items()}
+        ours |= {name: f"input_{name}" for name in ours.values() if name in known and name not in ours}
+        names = {axis: axis for axis in "xyz"}
+        names |= {name: name for name in known if name not in names and name not in self.extra}
+        names |= {ours.get(field, field): field for field in self.extra}
         chosen = names if columns is None else columns
         try:
             found = {name: self.find_column(names.get(name, name), stored=name in names) for name in chosen}
@@ -429,15 +433,6 @@ class _TableReader(ColumnReader):
         self._readers = {name: read for name, (_, read) in found.items()}
         self._stored = {name: facts.name for name, (facts, _) in found.items()}
         self.dtype = np.dtype([(name, self._choose_dtype(stored)) for name, stored in self._stored.items()])
-
-    def _name_columns(self) -> dict[str, str]:
-        """Name of every column in the table -> its name in the file."""
-        known = self.list_columns()
-        ours = {field: name for name, field in self._find_ours(COLUMNS).items()}
-        ours |= {name: f"input_{name}" for name in ours.values() if name in known and name not in ours}
-        axes = {axis: axis for axis in "xyz"}
-        standard = {name: name for name in known if name not in axes and name not in self.extra}
-        return axes | standard | {ours.get(field, field): field for field in self.extra}
 
     def _choose_dtype(self, stored: str) -> np.dtype:
         if stored in ("x", "y", "z", "scan_angle"):

@@ -162,16 +162,14 @@ def richardson_lucy(
     busy = np.flatnonzero((smooth_121(signal) > np.float32(2.0 * SMOOTH_GAIN) * noise.std).any(axis=0))
     least = threshold / np.sqrt(np.sum(given.taps**2))
     half = spike_reach(system.sigma_ref / block.spacing)
-    found = [(busy[:0], np.empty(0), np.empty(0))]
-    for begin in range(0, len(busy), AT_A_TIME):
-        rows = busy[begin : begin + AT_A_TIME]
-        std = noise.std[rows]
-        profile = deconvolve_richardson_lucy(
-            np.ascontiguousarray(signal[:, rows]), given.taps, BACKGROUND * std, iterations
-        )
+
+    def detect(signal: np.ndarray, std: np.ndarray) -> Peaks:
+        profile = deconvolve_richardson_lucy(signal, given.taps, BACKGROUND * std, iterations)
         waveform, time, amplitude = _find_spikes(profile, half, np.float32(least) * std)
-        found.append((rows[waveform], time + (given.peak - given.middle), amplitude))
-    return candidate_table(block, system, *(np.concatenate(fields) for fields in zip(*found, strict=True)))
+        return waveform, time + (given.peak - given.middle), amplitude
+
+    waveform, time, amplitude = _in_parts(signal[:, busy], noise.std[busy], detect, AT_A_TIME)
+    return candidate_table(block, system, busy[waveform], time, amplitude)
 
 
 def spike_reach(ref: float) -> int:
@@ -200,15 +198,17 @@ def _find_spikes(profile: np.ndarray, half: int, least: np.ndarray) -> tuple[np.
     return waveform[keep], time[keep], amplitude[keep]
 
 
-CorrelationPeaks = tuple[np.ndarray, np.ndarray, np.ndarray]
+Peaks = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Waveform, time [samples], amplitude."""
 
 
-def _in_parts(signal: np.ndarray, std: np.ndarray, detect: Callable[..., CorrelationPeaks]) -> CorrelationPeaks:
-    """Candidates of the columns of signal (s, n), a few hundred at a time, so that arrays stay in the cache."""
-    found: list[CorrelationPeaks] = [(np.empty(0, np.int64), np.empty(0), np.empty(0))]
-    for begin in range(0, signal.shape[1], COLUMNS_AT_A_TIME):
-        part = slice(begin, begin + COLUMNS_AT_A_TIME)
+def _in_parts(
+    signal: np.ndarray, std: np.ndarray, detect: Callable[..., Peaks], most: int = COLUMNS_AT_A_TIME
+) -> Peaks:
+    """Candidates of the columns of signal (s, n), `most` at a time, so that arrays stay in the cache."""
+    found: list[Peaks] = [(np.empty(0, np.int64), np.empty(0), np.empty(0))]
+    for begin in range(0, signal.shape[1], most):
+        part = slice(begin, begin + most)
         waveform, time, amplitude = detect(np.ascontiguousarray(signal[:, part]), std[part])
         found.append((waveform + begin, time, amplitude))
     waveform, time, amplitude = (np.concatenate(fields) for fields in zip(*found, strict=True))
@@ -248,7 +248,7 @@ def correlation(
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     energy = float(np.sum(given.taps**2))
 
-    def detect(signal: np.ndarray, std: np.ndarray) -> CorrelationPeaks:
+    def detect(signal: np.ndarray, std: np.ndarray) -> Peaks:
         padded = pad_samples(signal, given.middle)
         correlations = slide_taps(padded, given.taps)
         waveform, sample = find_peaks(correlations, np.float32(threshold * np.sqrt(energy)) * std)
@@ -303,7 +303,7 @@ def asdf(
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     gain = np.float32(threshold * np.sqrt(np.sum(given.taps**2)))
 
-    def detect(signal: np.ndarray, std: np.ndarray) -> CorrelationPeaks:
+    def detect(signal: np.ndarray, std: np.ndarray) -> Peaks:
         height = signal.max(axis=0)
         difference, correlations = square_differences(signal, given.taps, height)
         values = np.ascontiguousarray(difference.T)

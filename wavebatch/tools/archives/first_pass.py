@@ -283,7 +283,8 @@ def _list_digitizers(codes: Counter[int], ratios: dict[int, float]) -> dict[int,
     """A descriptor per kind of segment; where they are too many, one for several lengths."""
     step = 1
     while True:
-        rounded = {code: _round_up(code, step) for code in codes}
+        # The last 18 bits are the length, which is rounded up.
+        rounded = {code: code + -(code & ((1 << 18) - 1)) % step for code in codes}
         if len(set(rounded.values())) <= MOST_DESCRIPTORS:
             break
         step *= 2
@@ -295,11 +296,6 @@ def _list_digitizers(codes: Counter[int], ratios: dict[int, float]) -> dict[int,
         bits = 16 if channel in ratios and bits == 8 else 32 if channel in ratios else bits
         digitizers[code] = Digitizer(index[wide], bits, length, spacing)
     return digitizers
-
-
-def _round_up(code: int, step: int) -> int:
-    length = code & ((1 << 18) - 1)
-    return code - length + -(-length // step) * step
 
 
 def _learn_outgoing(samples: dict[int, list[tuple[np.ndarray, np.ndarray]]]) -> Outgoing | None:

@@ -236,8 +236,11 @@ def build_points(
     owner, sample, height = [], [], []
     for (places,) in group_rows(segments.take(rows), np.arange(len(rows))):
         code = int(code_segments(segments, rows[places[:1]])[0])
-        samples = _scale(piece.samples(rows[places]), plan, code)
-        digitizer = plan.digitizers[code]
+        # Counts on the scale of the sensitive channel, padded with zeros to the length of their descriptor.
+        samples, digitizer, ratio = piece.samples(rows[places]), plan.digitizers[code], plan.ratios.get(code >> 46)
+        if ratio is not None:
+            samples = np.minimum(np.round(samples * ratio), digitizer.max_count).astype(f"<u{digitizer.width}")
+        samples = np.pad(samples, ((0, 0), (0, digitizer.n_samples - samples.shape[1])))
         offset[places] = writer.write_packets(samples, digitizer.index)
         width[places] = samples.shape[1] * digitizer.width
         found, at = _place_returns(samples, plan.noise, detect=detect)
@@ -268,15 +271,6 @@ def build_points(
     counts.packets += len(rows)
     counts.without_returns += len(piece.pulses) - len(np.unique(chosen.pulse))
     return points
-
-
-def _scale(samples: np.ndarray, plan: Plan, code: int) -> np.ndarray:
-    """Counts on the scale of the sensitive channel, padded with zeros to the length of their descriptor."""
-    digitizer, ratio = plan.digitizers[code], plan.ratios.get(code >> 46)
-    if ratio is not None:
-        samples = np.minimum(np.round(samples * ratio), digitizer.max_count).astype(f"<u{digitizer.width}")
-    lack = digitizer.n_samples - samples.shape[1]
-    return np.pad(samples, ((0, 0), (0, lack))) if lack else samples
 
 
 def _place_returns(samples: np.ndarray, noise: float, *, detect: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -82,7 +82,12 @@ def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5, chosen: Po
             for rows in read_echoes(cloud):
                 task.add(0, rows)
             for piece in reference.read_pieces(*names):
-                task.add(1, _shape_truth(piece))
+                rows = np.zeros(len(piece["gps_time"]), _TRUTH_DTYPE)
+                rows["xyz"] = np.stack([piece[name] for name in "xyz"], axis=1)
+                for name in ("gps_time", "amplitude", "flags", "isolated"):
+                    rows[name] = piece[name]
+                rows["echo_time"], rows["echo_width"] = piece["time"], piece["sigma"] * FWHM_PER_SIGMA
+                task.add(1, rows)
             for piece in reference.read_pieces("packet_gps_time"):
                 task.add(2, piece["packet_gps_time"].view(PACKET_DTYPE))
             return replace(task.finish(str(a), str(truth)), left_out_a=cloud.left_out)
@@ -102,16 +107,6 @@ def _share_times(first: CloudReader, second: CloudReader) -> bool:
         if found.mean() > LEAST_SHARED:
             return True
     return not len(rows)
-
-
-def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
-    rows = np.zeros(len(piece["gps_time"]), _TRUTH_DTYPE)
-    rows["xyz"] = np.stack([piece[name] for name in "xyz"], axis=1)
-    for name in ("gps_time", "amplitude", "flags", "isolated"):
-        rows[name] = piece[name]
-    rows["echo_time"] = piece["time"]
-    rows["echo_width"] = piece["sigma"] * FWHM_PER_SIGMA
-    return rows
 
 
 class CloudTask(Closing):

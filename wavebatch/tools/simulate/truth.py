@@ -107,7 +107,13 @@ class TruthReader(Closing):
         """The named columns, all per echo or all per packet, at most `size` rows at a time."""
         with self._reading(), contextlib.ExitStack() as stack:
             members = {name: stack.enter_context(self._archive.open(f"{name}.npy")) for name in names}
-            lengths = {self._read_length(name, member) for name, member in members.items()}
+            lengths = set()
+            for name, member in members.items():
+                shape, _, dtype = read_array_header(member)
+                if dtype != np.dtype(_DTYPES[name]) or len(shape) != 1:
+                    words = f"column {name} is {dtype}, not {_DTYPES[name]}; simulate the strip again"
+                    raise InputError(f"{self.path}: {words}")
+                lengths.add(shape[0])
             if len(lengths) != 1:
                 raise InputError(f"{self.path}: columns {', '.join(names)} differ in length; simulate the strip again")
             (length,) = lengths
@@ -121,12 +127,6 @@ class TruthReader(Closing):
         if not pieces:
             return {name: np.empty(0, _DTYPES[name]) for name in names}
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
-
-    def _read_length(self, name: str, member: IO[bytes]) -> int:
-        shape, _, dtype = read_array_header(member)
-        if dtype != np.dtype(_DTYPES[name]) or len(shape) != 1:
-            raise InputError(f"{self.path}: column {name} is {dtype}, not {_DTYPES[name]}; simulate the strip again")
-        return shape[0]
 
     def _read_column(self, name: str, member: IO[bytes], rows: int) -> np.ndarray:
         dtype = np.dtype(_DTYPES[name])
