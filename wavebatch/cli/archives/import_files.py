@@ -1,6 +1,6 @@
-"""`wavebatch import`: PulseWaves files as strips; `wavebatch export`: strips for other programs.
+"""`wavebatch import`: PulseWaves files as strips.
 
-Only reads options and prints; the work is in `wavebatch.tools.archives`.
+Only reads options and prints; the work is in `wavebatch.tools.archives.import_file`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, counting, tell
 from wavebatch.cli.program.command import complete_files
 from wavebatch.core.units import count
-from wavebatch.tools.archives import export_strip as exported
-from wavebatch.tools.archives import import_file as imported
+from wavebatch.tools.archives.import_file import SUFFIXES, ImportOptions, ImportSummary, import_file
 
 EXIT_SOME, EXIT_NONE = 3, 4
 """Exit codes of `wavebatch run`: some files failed; no file was written."""
@@ -29,7 +28,7 @@ EXIT_SOME, EXIT_NONE = 3, 4
 @shared.declared("recursive")
 @shared.output_option("Strip to write, .las or .laz, or a folder.  [default: X.las beside each X.pls]", "FILE|DIR",
                       required=False, folder=None)
-@shared.options_of(imported.ImportOptions)
+@shared.options_of(ImportOptions)
 @shared.common_options("overwrite", "json")
 def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **options: Any) -> None:
     """Import PulseWaves FILEs (.pls with the .wvs beside it) as LAS 1.4 strips of point format 9.
@@ -40,9 +39,9 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
 
     Exit code: 0 all written, 2 wrong usage, 3 some files failed, 4 no file was written.
     """  # fmt: skip
-    paths = shared.find_inputs(files, recursive=recursive, kinds=(imported.SUFFIXES,))
+    paths = shared.find_inputs(files, recursive=recursive, kinds=(SUFFIXES,))
     targets = _name_strips(paths, output)
-    chosen = shared.from_options(imported.ImportOptions, options)
+    chosen = shared.from_options(ImportOptions, options)
     # A single file that fails is one line too, with the exit code of a batch.
     results, failed = shared.for_each(
         paths, lambda path: _import(path, targets[path], chosen, options), debug=options["debug"], alone=True
@@ -59,15 +58,18 @@ def _name_strips(paths: list[Path], output: Path | None) -> dict[Path, Path]:
     return shared.name_outputs(paths, output, (".las", ".laz"), ".las")
 
 
-def _import(
-    path: Path, target: Path, chosen: imported.ImportOptions, options: dict[str, Any]
-) -> imported.ImportSummary:
+def _import(path: Path, target: Path, chosen: ImportOptions, options: dict[str, Any]) -> ImportSummary:
     bar = counting("pulses", options["quiet"])
     with bar:
-        summary = imported.import_file(path, target, chosen, bar.update)
+        summary = import_file(path, target, chosen, bar.update)
+    _say(summary)
+    return summary
+
+
+def _say(summary: ImportSummary) -> None:
     if summary.skipped:
         tell(f"{summary.output}: is up to date, skipped")
-        return summary
+        return
     parts = (summary.points, "point"), (summary.packets, "packet"), (summary.pulses, "pulse")
     points, packets, pulses = (count(*part) for part in parts)
     tell(f"{summary.output}: {points} and {packets} of {pulses}")
@@ -78,42 +80,3 @@ def _import(
         tell(f"{summary.output}: outgoing pulses{width} energies vary by {spread:.2f} %, known to {error:.2f} %")
     for note in summary.notes:
         tell(f"{summary.output}: {note}")
-    return summary
-
-
-@click.command()
-@shared.strips_argument
-@shared.output_option("File to write: .las or .laz with a .wdp beside it, or .npz; or a folder, which gets STEM.las "
-                      "for each strip.", "FILE|DIR", folder=None)
-@shared.strip_options
-@shared.common_options("overwrite", "json")
-def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: Any) -> None:
-    """Write STRIPs as other programs need them: LAS with repaired packets, or waveforms as arrays.
-
-    \b
-    LAS, LAZ: packets without compression, of 8, 16 or 32 bits, with descriptors of their true length; vectors toward
-              the sensor in metres per picosecond; true counts and bounds. Points whose packet cannot be used have
-              none. A record of the file says what was repaired.
-    NPZ:      arrays samples and missing, of all waveforms behind each other; waveform p has count[p] of them from
-              first[p] on, at origin[p] + t direction[p] with t = 0, spacing[p], ... ns; its returns are those with
-              return_waveform p.
-
-    Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
-    """  # fmt: skip
-    paths = shared.find_inputs(strips, recursive=recursive)
-    targets = shared.name_outputs(paths, output, exported.SUFFIXES, ".las")
-
-    def work(path: Path) -> exported.ExportSummary:
-        with counting("waveforms", options["quiet"]) as bar:
-            names = ("direction", "headerless", "overwrite")
-            summary = exported.export_strip(
-                path, targets[path], progress=bar.update, **{name: options[name] for name in names}
-            )
-        tell(f"{summary.output}: {count(summary.points, 'point')} and {count(summary.waveforms, 'waveform')}")
-        for line in summary.repaired:
-            tell(f"{summary.output}: repaired: {line}")
-        return summary
-
-    summaries, failed = shared.for_each(paths, work, debug=options["debug"])
-    answer([asdict(one) for one in summaries])
-    sys.exit(1 if failed else 0)
