@@ -17,7 +17,7 @@ from wavebatch.core.system import Defects
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.fit.describe import render_pulses
 from wavebatch.kernels.signal.noise import whitening_filter
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.fit import adaptive
@@ -153,8 +153,8 @@ def simulate_again(
     n, s = len(block), length or block.samples.shape[1]
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
     start = [echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing]
-    amplitude, time, width = model_parameters(shape, limits, np.stack(start, axis=1).astype(np.float64)).T
-    signal = render_echoes(shape, n, s, echoes.waveform, time, amplitude, width)
+    main = model_parameters(shape, limits, np.stack(start, axis=1).astype(np.float64))
+    signal = render_pulses(shape, n, s, echoes.waveform, main)
     # Rounding to whole counts, below, adds this part of the noise again.
     white = max(system.noise.std**2 - QUANTISATION_STD**2, 0.0)
     variance = white + system.noise.gain * np.maximum(signal, 0)

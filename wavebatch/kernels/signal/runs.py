@@ -159,11 +159,13 @@ def walk_down(
 
 def find_stretches(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows, first samples and ends of the stretches of true samples in mask (n, s), in order: int64 (k,) each."""
-    padded = np.zeros((mask.shape[0], mask.shape[1] + 2), np.int8)
-    padded[:, 1:-1] = mask
-    edge = np.diff(padded, axis=1)
-    row, start = np.nonzero(edge == 1)
-    return row, start, np.nonzero(edge == -1)[1]
+    # A sample of rest between rows, so that starts and ends take turns.
+    n, s = mask.shape
+    padded = np.zeros(n * (s + 1) + 1, bool)
+    padded[1:].reshape(n, s + 1)[:, :s] = mask
+    edge = np.flatnonzero(padded[1:] != padded[:-1])
+    row, start = np.divmod(edge[::2], s + 1)
+    return row, start, edge[1::2] - row * (s + 1)
 
 
 def gap_distance(missing: np.ndarray, waveform: np.ndarray, time: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
-from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.fit.describe import render_pulses
 from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.kernels.signal.floor import MOST_LEAST, floor_share
 from wavebatch.kernels.signal.noise import DRIFT, residual_noise
@@ -115,7 +115,7 @@ def render_own(
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
     whole = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1).astype(np.float64)
     main = model_parameters(shape, limits, whole)
-    return render_echoes(shape, number, block.samples.shape[1], rows, main[:, 1], main[:, 0], main[:, 2])
+    return render_pulses(shape, number, block.samples.shape[1], rows, main)
 
 
 def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
