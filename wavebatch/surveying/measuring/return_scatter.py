@@ -20,12 +20,12 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.group_returns import match_returns
 from wavebatch.surveying.measuring.residuals import decompose_sample
 
-RUNS, RUN = 4, 256
+RUNS, RUN = 4, 160
 """Places of a strip that are looked at, and packets in each, one after the other: some hundred returns show a scatter
 to a tenth."""
 
 RUN_SAMPLES = 1 << 18
-"""Most samples in each place: 1,024 of 256, or four of the longest waveforms."""
+"""Most samples in each place: 1,638 of each of 160, or four of the longest waveforms."""
 
 RETURNS = 0.02
 """Scatter of vendors' returns along the ray [m], by data sheets, where a strip does not show it."""
