@@ -1,12 +1,15 @@
 """Sums by key: the same whatever was spilled, and in bounded memory."""
 
 import errno
+import pickle
 import tempfile
+from contextlib import closing
 
 import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
+from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.temp_store import (
     MOST_BUCKETS,
     KeyedSums,
@@ -120,3 +123,37 @@ def test_a_full_disk_is_one_line(monkeypatch, tmp_path):
     with KeyedSums(3, held=10) as sums, pytest.raises(InputError, match="TMPDIR"):
         for key, value in draw_parts(4, 1000):
             sums.add(key, value)
+
+
+def test_a_disk_that_is_full_for_a_moment_doubles_nothing(monkeypatch):
+    """The first pickling finds no room for its entries; the second writes them once."""
+    spool = Spool(3, np.dtype("i8"))
+    numbers = np.arange(400_000)
+    spool.append(numbers % 3, numbers)
+    spool.seal()
+
+    class FullDisk:
+        def __init__(self, *arguments):
+            self.file = open(*arguments)  # noqa: SIM115
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            self.file.close()
+
+        def tell(self):
+            return self.file.tell()
+
+        def write(self, data):
+            self.file.write(bytes(memoryview(data).cast("B")[:100]))
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(temp_store, "open", FullDisk, raising=False)
+        whole = pickle.loads(pickle.dumps(spool))
+    with closing(spool):
+        copy = pickle.loads(pickle.dumps(spool))
+        for bucket in range(3):
+            np.testing.assert_array_equal(whole.read(bucket), numbers[bucket::3])
+            np.testing.assert_array_equal(copy.read(bucket), numbers[bucket::3])

@@ -98,6 +98,11 @@ def test_many_echoes_of_a_long_waveform_take_time_in_proportion(rng):
     assert np.isfinite(length).all() and np.isfinite(volume).all()
 
 
+def test_echoes_that_are_not_sorted_are_refused():
+    with pytest.raises(ValueError, match="not sorted"):
+        render_pulses(PulseShape(), 2, 9, np.array([1, 0]), np.array([[1.0, 4.0, 1.0], [2.0, 4.0, 1.0]]))
+
+
 def test_arrays_that_the_library_would_read_beyond_are_refused(rng):
     sums = _problem(PulseShape(), rng)
     for wrong in (

@@ -19,7 +19,8 @@ from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
-from wavebatch.surveying.matching.setting import _find_fading, compare_ground, compare_scenes, keep_places
+from wavebatch.surveying.matching.setting import NO_CHANGE, _find_fading, compare_ground, compare_scenes, keep_places
+from wavebatch.surveying.matching.strip_conditions import judge_fading
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -271,6 +272,20 @@ def test_ground_that_a_calibrated_strip_saw_shows_another_energy(rng, factor):
     assert level.shift == pytest.approx(np.log(factor), abs=0.03)
     assert (level.chance > 0.5) == (factor != 1.0) and growth.chance < 0.5
     assert factor != 1.0 or level.error < 0.02
+
+
+@pytest.mark.parametrize("fading", [1, 2])
+def test_one_of_two_digitizers_that_fades_is_enough(rng, fading):
+    (x, y), light, time = rng.uniform(0, 1000, (2, 300)), rng.normal(0, 1, 300), np.linspace(-1, 1, 300)
+    places = {
+        digitizer: np.stack([x, y, light + 0.3 * time * (digitizer == fading) + rng.normal(0, 0.05, 300), time])
+        for digitizer in (1, 2)
+    }
+    known = np.concatenate([np.stack([np.full(300, digitizer), x, y, light], axis=1) for digitizer in (1, 2)])
+    channels = [SimpleNamespace(digitizer=digitizer) for digitizer in (1, 2)]
+    calibration = SimpleNamespace(channels=channels, strips=(), places=known.ravel().tolist())
+    growth, lines, _ = judge_fading(calibration, SimpleNamespace(fades=NO_CHANGE, places=places), other=True)
+    assert growth > 0.2 and "a laser that fades" in lines[0]
 
 
 @pytest.mark.parametrize("fade", [-0.3, 0.0, 0.4])

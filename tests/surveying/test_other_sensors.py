@@ -16,6 +16,7 @@ from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey, survey_block, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.measuring import choose_pulse
 from wavebatch.surveying.measuring.choose_pulse import settle
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, load_survey, parse_survey
 
@@ -214,6 +215,23 @@ def test_tails_far_below_a_thousandth_are_known_where_echoes_are_so_high():
 
     block, time, _ = record(tailed, 3, n=600, s=64, width=2.3, amplitude=(4e3, 4e4), dtype="u2")
     assert judge(block, time)[2] > 0.85
+
+
+def test_no_misfit_is_looked_for_below_none(monkeypatch):
+    """Its neighbours may describe shorter, but by less than one error: then it is none, not one beyond the largest."""
+    cost = {0: 0, 1: -5, 2: -12, 3: -13, 4: 0, 6: 0, 8: 40}
+    scatter = np.resize([1.0, -1.0], 100)
+    looked = []
+
+    def describe(block, system, place, changes):
+        looked.append(place)
+        return [np.full(100, cost[place] / 100) + (5.0 if place == 3 else 0.3) * scatter]
+
+    monkeypatch.setattr(choose_pulse, "describe_waveforms", describe)
+    monkeypatch.setattr(choose_pulse, "_explain_between", lambda block, system, found, place: place)
+    block = record(gaussian, 5, n=100)[0]
+    assert choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0) == 0.0
+    assert set(looked) <= set(cost)
 
 
 def test_the_misfit_is_at_least_what_the_pulse_misses_of_the_stack():

@@ -11,7 +11,7 @@ from footprints import EAST, NORTH, Flight, Plane, match, roofs, write_strip
 
 import wavebatch as wb
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.measuring.return_scatter import ReturnScatter, measure_returns
+from wavebatch.surveying.measuring.return_scatter import ReturnScatter, _sample, measure_returns
 
 TOWN = [*roofs([0, 20, 38, 55]), Plane(0.25)]
 HILL = [Plane(slope=(np.tan(np.radians(22.0)), 0.1))]
@@ -89,3 +89,13 @@ def test_without_enough_echoes_a_scatter_is_assumed(tmp_path):
     write_strip(tmp_path / "a.las", TOWN, Flight(light=1e3), 400, 3)
     assert measure(tmp_path / "a.las").source == "assumed"
     assert measure(tmp_path / "a.las").scatter == 0.02
+
+
+def test_no_packet_of_a_small_strip_counts_twice(tmp_path):
+    """Four runs of packets overlapped on a strip of 200: pairs of returns counted up to four times."""
+    write_strip(tmp_path / "a.las", TOWN, Flight(point_error=0.01), 200, 3)
+    with StripReader(tmp_path / "a.las") as reader, reader.scan() as scan:
+        parts = list(_sample(reader, scan, wb.survey(tmp_path / "a.las").system))
+    for kind in zip(*parts, strict=True):
+        residuals = np.concatenate(kind, axis=1)
+        assert residuals.shape == np.unique(residuals, axis=1).shape

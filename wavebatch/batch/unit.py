@@ -246,7 +246,7 @@ def _see_level(
     parameters = angle_parameters(job.chain)
     survey = choice.survey
     saved = job.request.system is not None and not job.request.flight and survey.system.widths.error is not None
-    if parameters is None or sensor is UNKNOWN or saved:
+    if parameters is None or sensor.kind == UNKNOWN.kind or saved:
         return choice, ()
     used = job.calibrate(survey.system)
     divergence = parameters["divergence"] or used.radiometry.divergence

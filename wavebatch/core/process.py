@@ -53,7 +53,8 @@ def keep_freed_memory() -> bool:
 def importing() -> Iterator[None]:
     """Do not look for cyclic garbage while modules are imported, and never in what they leave.
 
-    Nothing there is garbage, and looking for it again and again takes a tenth of the start of a run.
+    Nothing there is garbage, and looking for it again and again takes a tenth of the start of a run. What a process
+    holds already is never looked through again either: for commands and workers, which import before they work.
     """
     was_on = gc.isenabled()
     gc.disable()

@@ -245,10 +245,12 @@ class Spool(Closing):
             if self.path is None:
                 self.path = make_folder() / "spool"
             with open(self.path, "ab") as file:
-                self._segments.append(file.tell())
+                at = file.tell()
                 file.write(starts.data)
                 for part in parts:
                     file.write(np.ascontiguousarray(part).view(np.uint8).data)
+            # Only what is written as a whole is read.
+            self._segments.append(at)
 
 
 PARCEL_KEPT = 1 << 16

@@ -64,6 +64,8 @@ def render_pulses(shape: PulseShape, n: int, s: int, waveform: np.ndarray, main:
     main : float64 (m, 3)
         Amplitude, time and width of the pulse's main component [count, samples].
     """
+    if (waveform[1:] < waveform[:-1]).any():
+        raise ValueError("echoes are not sorted by their waveform")
     out = np.zeros((n, s), np.float32)
     empty = np.zeros((n, s), np.float32)
     sums = Sums(shape, count_echoes(waveform, n), main, empty, empty, np.zeros((n, s), bool))

@@ -183,8 +183,9 @@ def compare_setting(
         more = math.expm1(abs(change.shift) if change.chance > LIKELY else change.error)
         growth = max(growth, more)
         if change.chance <= LIKELY and more > HIDDEN:
+            known = "the ground in common scatters" if ground else "surfaces differ and no ground is common"
             notes.append(
-                f"calibration: surfaces {which} differ and no ground is common, so that another energy under the same "
+                f"calibration: {known} {which}, so that another energy under the same "
                 f"header would not show: {100 * more:.0f} % of error hold it, by an assumed chance of "
                 f"{PRIORS[1][0]:.0%}; calibrate a strip that overlaps this one"
             )
@@ -211,11 +212,12 @@ def judge_fading(calibration: Calibration, found: Setting, *, other: bool) -> tu
     other: a strip that was not calibrated, so that ground in common shows it. Of strips that were calibrated together
     their overlaps do.
     """
-    fades, hidden = found.fades, "surfaces in large patches"
-    for row in calibration.channels if other else ():
-        ground = _compare_places(calibration, found, row.digitizer)
-        if ground and ground[1]:
-            fades, hidden = ground[1], "the scatter of the ground in common"
+    fades, hidden = found.fades, "surfaces in large patches hide"
+    compared = [_compare_places(calibration, found, row.digitizer) for row in calibration.channels if other]
+    seen = [ground[1] for ground in compared if ground and ground[1]]
+    if seen:
+        # One laser that fades is enough.
+        fades, hidden = max(seen, key=lambda one: (one.chance, one.error)), "the scatter of the ground in common hides"
     if fades.chance > LIKELY:
         growth = math.expm1(abs(fades.shift))
         return growth, [
@@ -227,7 +229,7 @@ def judge_fading(calibration: Calibration, found: Setting, *, other: bool) -> tu
     if growth < HIDDEN or not other and len(calibration.strips) > 1:
         return 0.0, [], []
     return growth, [], [
-        f"calibration: {hidden} hide whether the laser fades along the strip: {100 * growth:.0f} % of error hold it; "
+        f"calibration: {hidden} whether the laser fades along the strip: {100 * growth:.0f} % of error hold it; "
         "calibrate strips that overlap this one"
     ]
 

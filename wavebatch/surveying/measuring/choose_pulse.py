@@ -342,7 +342,8 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> fl
     if longer[0] > 1:
         best, longer = look(*(place for place in (best - 1, best + 1) if place < len(MISFITS)))
         first = next(place for place, errors in zip(sorted(lengths), longer, strict=True) if errors <= 1)
-        best, longer = look(first - 1)
+        if first:
+            best, longer = look(first - 1)
     if longer[0] <= 1:
         return 0.0
     places = sorted(lengths)

@@ -141,7 +141,7 @@ def describe_waveforms(
     block : WaveformBlock
     system : SystemPulse
     explained : Explained
-        The block decomposed with this system.
+        The block decomposed with this system, of any misfit.
     changes : sequence of float, k of them
         Of the pulse from shot to shot, as shares of its amplitude (`describe_left`).
 

@@ -150,7 +150,7 @@ def _learn(
     if best.kappa and len(sums) > 1:
         # The same pulse on level ground, so that widened echoes alone decide.
         drawn = stack._replace(value=_draw(best, stack.lag), error=np.full(len(stack.lag), 1.0))
-        other = fit_gaussians(drawn, width)[-1]
+        other = fit_gaussians(drawn, width, TRIAL.get().most_components)[-1]
         return _fit_wide_best(block, system, (chosen, _with_pulse(system, other, stack, block.spacing)))
     return chosen
 
@@ -171,12 +171,15 @@ def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[Syst
     if len(clear) < FEW:
         return pulses[0]
     part, rows = block.rows(clear.waveform), np.arange(len(clear))
-    misfits = []
+    misfits: list[float] = []
     for pulse in pulses:
         noise = pooled_noise(part, pulse)
         alone = replace(clear, waveform=rows.astype(np.int32))
         # In a canopy most of them are several echoes, which no pulse fits: the tenth that fits best is of one.
-        misfits.append(float(np.quantile(adaptive(part, noise, pulse, alone, max_echoes=1).residual, 0.1)))
+        residual = adaptive(part, noise, pulse, alone, max_echoes=1).residual
+        if not len(residual):
+            return pulses[0]
+        misfits.append(float(np.quantile(residual, 0.1)))
     return pulses[1] if misfits[1] < BETTER * misfits[0] else pulses[0]
 
 

@@ -104,8 +104,10 @@ def _sample(reader: StripReader, scan: StripScan, system: SystemPulse) -> Iterat
         unit = reader.read_unit(number, scan)
         rows = np.flatnonzero(unit.packets.owned)
         rows = rows[np.argsort(unit.packets.offset[rows], kind="stable")]
-        size = min(RUN, RUN_SAMPLES // int(unit.packets.n_samples[rows].max(initial=1)))
-        for start in even_places(max(len(rows) - size, 1), RUNS // len(chosen)).tolist():
+        size = max(min(RUN, RUN_SAMPLES // int(unit.packets.n_samples[rows].max(initial=1))), 1)
+        # Runs that overlap would count packets twice.
+        runs = max(min(RUNS // len(chosen), len(rows) // size), 1)
+        for start in even_places(max(len(rows) - size, 0) + 1, runs).tolist():
             for block, _ in reader.read_rows(unit, rows[start : start + size], RUN):
                 if block.returns is not None and len(block.returns):
                     yield _compare(block, block.returns, system.of(block))
