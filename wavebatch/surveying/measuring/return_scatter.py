@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag
-from wavebatch.core.order import even_places
+from wavebatch.core.order import even_places, median
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -77,7 +77,7 @@ def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -
         return ReturnScatter()
     neighbours, pairs, offsets = (np.concatenate(kind, axis=1) for kind in zip(*parts, strict=True))
     phase = HALF_C * float(np.sqrt(np.mean(offsets[0] ** 2))) if offsets.size else 0.0
-    offsets[0] -= np.median(offsets[0]) if offsets.size else 0.0
+    offsets[0] -= median(offsets[0]) if offsets.size else 0.0
     kinds = {"neighbours": neighbours, "pairs of returns": pairs, "locations": offsets}
     found = {name: _measure(residuals) for name, residuals in kinds.items()}
     known = {name: HALF_C * scatter for name, scatter in found.items() if scatter is not None}
@@ -94,7 +94,7 @@ def _measure(residuals: np.ndarray) -> float | None:
     if len(off) < LEAST:
         return None
     scatter = np.quantile(np.abs(off) / np.sqrt(factor), LOWEST) / LOWEST_OF_NORMAL
-    return float(np.sqrt(max(scatter**2 - np.median(error**2 / factor), 0.0)))
+    return float(np.sqrt(max(scatter**2 - median(error**2 / factor), 0.0)))
 
 
 def _sample(reader: StripReader, scan: StripScan, system: SystemPulse) -> Iterator[tuple[np.ndarray, ...]]:
