@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag
-from wavebatch.core.order import even_places, median
+from wavebatch.core.order import even_places, median, quantile
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -93,7 +93,7 @@ def _measure(residuals: np.ndarray) -> float | None:
     off, factor, error = residuals[:, np.argsort(residuals[2], kind="stable")[: max(LEAST, residuals.shape[1] // 2)]]
     if len(off) < LEAST:
         return None
-    scatter = np.quantile(np.abs(off) / np.sqrt(factor), LOWEST) / LOWEST_OF_NORMAL
+    scatter = quantile(np.abs(off) / np.sqrt(factor), LOWEST) / LOWEST_OF_NORMAL
     return float(np.sqrt(max(scatter**2 - median(error**2 / factor), 0.0)))
 
 
