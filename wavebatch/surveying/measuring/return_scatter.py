@@ -94,7 +94,7 @@ def _measure(residuals: np.ndarray) -> float | None:
     if len(off) < LEAST:
         return None
     scatter = quantile(np.abs(off) / np.sqrt(factor), LOWEST) / LOWEST_OF_NORMAL
-    return float(np.sqrt(max(scatter**2 - median(error**2 / factor), 0.0)))
+    return float(np.sqrt(max(scatter**2 - float(median(error**2 / factor)), 0.0)))
 
 
 def _sample(reader: StripReader, scan: StripScan, system: SystemPulse) -> Iterator[tuple[np.ndarray, ...]]:
