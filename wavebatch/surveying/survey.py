@@ -62,7 +62,8 @@ LEAST_LEVELS = 5
 
 NARROWER = 0.85
 """Width of the chosen pulse, over that of isolated echoes, below which quiet samples are looked for once more if there
-were none: those next to signal are not quiet, by widths of the pulse."""
+were none: those next to signal are not quiet, by widths of the pulse. Without isolated echoes they were found with a
+guess of it."""
 
 STRANGE, STRANGE_NOISE = 6.0, 1.3
 """Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
@@ -387,9 +388,11 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         gaussians = (one.typical for one in choice.tried if one.name.startswith("gaussian"))
         figures.gaussian_nats = min(gaussians, default=None)
         part = thin_samples(block, RESIDUAL_LOOK)
-        if not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref:
+        narrower = not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref
+        if narrower or len(main) < ENOUGH_TO_LEARN:
             noise = measure_quiet(block, system.sigma_ref / block.spacing).noise
-            system = replace(system, noise=replace(noise, gain=first.noise.gain))
+            if narrower or noise.by_kind["quiet"]:
+                system = replace(system, noise=replace(noise, gain=first.noise.gain))
         echoes = decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
