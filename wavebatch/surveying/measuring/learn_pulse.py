@@ -164,11 +164,11 @@ def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[Syst
     clear = find_clear(block, system)
     top = system.saturation or float(block.samples.max())
     clear = clear.take(np.flatnonzero(clear.amplitude < FAR_FROM_LIMIT * top))
-    if len(clear) < FEW:
+    if not len(clear):
         return pulses[0]
     clear = clear.take(np.flatnonzero(clear.sigma > WIDENED * find_edge(clear.sigma)))
     clear = clear.take(np.sort(np.argsort(-clear.amplitude, kind="stable")[:MOST_WIDENED]))
-    if len(clear) < FEW:
+    if not len(clear):
         return pulses[0]
     part, rows = block.rows(clear.waveform), np.arange(len(clear))
     misfits: list[float] = []
