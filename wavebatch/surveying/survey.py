@@ -19,7 +19,7 @@ from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_sa
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.hidden_neighbours import measure_hidden
-from wavebatch.surveying.measuring.choose_pulse import Tried, choose_pulse, settle
+from wavebatch.surveying.measuring.choose_pulse import MISFITS, Tried, choose_pulse, settle
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
     find_isolated,
@@ -27,7 +27,7 @@ from wavebatch.surveying.measuring.learn_pulse import (
     learn_pulse,
 )
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import measure_beside, measure_tail
+from wavebatch.surveying.measuring.misfit import limit_faint, measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
@@ -402,6 +402,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system = choose_whitening(part, system, choice.best.change)
         system, mirror = settle(block, system, choice.best.seen, choice.best.missed)
+        system = limit_faint(system, max(choice.best.seen, float(MISFITS[0])), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
