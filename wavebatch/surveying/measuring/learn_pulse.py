@@ -42,9 +42,6 @@ MOST_STRONG = 800
 REACHED = 0.3
 """Misfit of a pulse model, in noise at the strip's strongest amplitudes, that is too small to be seen."""
 
-GOAL = 1.25
-"""Misfit of a pulse model, in errors of the stack, that chance alone makes."""
-
 NEAR_BEST = 1.25
 """Misfit, over that of the best model, at which a simpler one is taken."""
 
@@ -135,7 +132,7 @@ def _learn(
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
     stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
     strongest = float(np.quantile(main.amplitude, 0.99))
-    goal = max(REACHED * system.noise.std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
+    goal = REACHED * system.noise.std / strongest
     small = len(block) < SMALL
     most = min(most, TRIAL.get().most_components)
     sums = fit_gaussians(stack, width, most, 0.0 if small else goal)
