@@ -191,7 +191,7 @@ CORE = 4.0
 
 
 def _draw(fit: PulseFit, lag: np.ndarray) -> np.ndarray:
-    """The pulse of a fit at the lags of its stack, with the height of the stack."""
+    """The pulse of a fit at the lags of its stack, of height 1."""
     weight, delay, sigma = fit.components.T
     if fit.kappa:
         at = np.array([fit.datum])
@@ -213,7 +213,10 @@ def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float
     # What the model misses of the stack's core beyond chance, in the kernel's terms: its energy over
     # that of a Gaussian. Further out are neighbours.
     core = np.abs(stack.lag - fit.datum) < CORE * width
-    missed = max(float(np.mean((_draw(fit, stack.lag) - stack.value)[core] ** 2 - stack.error[core] ** 2)), 0.0)
+    drawn, value = _draw(fit, stack.lag)[core], stack.value[core]
+    # Heights of the stacked echoes are those of Gaussians, which a skewed pulse does not have.
+    drawn *= np.einsum("l,l->", drawn, value) / np.einsum("l,l->", drawn, drawn)
+    missed = max(float(np.mean((drawn - value) ** 2 - stack.error[core] ** 2)), 0.0)
     misfit = float(np.sqrt(missed * 2 * CORE / SQRT_PI))
     system = replace(system, ringing=ringing, kappa=fit.kappa, components=(), misfit=misfit)
     if len(fit.components) > 1:
