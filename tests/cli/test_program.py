@@ -34,7 +34,7 @@ from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import effective, parse_chain
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions
 from wavebatch.tools.slices.segments import SliceOptions
-from wavebatch.tools.voxels.profile import Deconvolution
+from wavebatch.tools.voxels.rays import Deconvolution
 
 
 def invoke(*arguments, **environment):

@@ -18,8 +18,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
-from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
-from wavebatch.files.las.header import LasHeader
+from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.tools import return_stats as module
 from wavebatch.tools import return_stats as returns

@@ -17,7 +17,7 @@ from wavebatch.cli.messages import print_result, talk, tell
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
-from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
+from wavebatch.tools.compare.pairing import Comparison, compare_clouds, compare_truth
 from wavebatch.tools.sheets.compare import comparison_sheet, format_comparison, write_compare_page
 
 if TYPE_CHECKING:

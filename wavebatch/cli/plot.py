@@ -110,7 +110,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values
-    from wavebatch.tools.plots.values import Clouds
+    from wavebatch.tools.rasters.cells import Clouds
 
     column, chosen = options["column"], choose_points(options)
     if Clouds(clouds, (column,), chosen).facts.is_flags:

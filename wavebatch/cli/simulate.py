@@ -29,9 +29,8 @@ from wavebatch.tools.simulate import (
     simulate_returns,
     simulate_strip,
 )
-from wavebatch.tools.simulate.from_returns import SynthesisSummary, synthesize_strip
 from wavebatch.tools.simulate.render import Recording
-from wavebatch.tools.simulate.returns import EQUAL, Radar, SynthesisOptions
+from wavebatch.tools.simulate.returns import EQUAL, Radar, SynthesisOptions, SynthesisSummary, synthesize_strip
 
 _RECORDING = ("n_samples", "spacing", "baseline", "noise_std", "rho", "noise_gain", "saturation")
 """Options that change the recording of the scene."""

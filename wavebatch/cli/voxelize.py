@@ -18,7 +18,7 @@ from wavebatch.cli.messages import answer, counting, talk, tell
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import count, format_measure
 from wavebatch.files.disk.publish import refuse_input
-from wavebatch.tools.voxels.profile import Deconvolution
+from wavebatch.tools.voxels.rays import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions
 
 if TYPE_CHECKING:

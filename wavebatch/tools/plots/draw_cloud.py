@@ -21,8 +21,7 @@ from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, space_ticks
 from wavebatch.files.las.header import CLASS_NAMES
 from wavebatch.tools.even_sample import EvenSample
-from wavebatch.tools.plots.values import Clouds, Tally, name_paths, shown_limits
-from wavebatch.tools.rasters.cells import Raster
+from wavebatch.tools.rasters.cells import Clouds, Raster, Tally, name_paths, shown_limits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -21,18 +21,20 @@ from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, space_ticks
 from wavebatch.files.las.crs import CrsWords
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
-from wavebatch.tools.plots.values import (
+from wavebatch.tools.rasters.cells import (
     MARGIN,
     Clouds,
     Tally,
+    check_crs,
     check_statistic,
+    compute_cells,
     name_paths,
     robust_limits,
     round_up,
     sample_points,
+    survey_places,
 )
-from wavebatch.tools.rasters.cells import check_crs, compute_cells, survey_places
-from wavebatch.tools.voxels.output import VoxelFile
+from wavebatch.tools.voxels.grid import VoxelFile
 
 MOST_POINTS = 200_000
 """Most points of a section that are drawn: more would only cover each other."""

@@ -29,7 +29,7 @@ from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.figure_file import open_picture, plain_text, set_head, space_ticks
 from wavebatch.files.geojson import GeoJsonCrs
 from wavebatch.tools.plots.sections import Profile, place_heights
-from wavebatch.tools.plots.values import Tally, check_statistic, name_paths
+from wavebatch.tools.rasters.cells import Tally, check_statistic, name_paths
 from wavebatch.tools.slices.segments import ScanLine, Segment, Slice, align_times, find_main_axis
 
 MOST_VALUES = 200_000_000

@@ -35,15 +35,24 @@ from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
-from wavebatch.tools.voxels.floor import Ceiling, Floor, find_ceiling
-from wavebatch.tools.voxels.grid import VoxelGrid, energy_unit
-from wavebatch.tools.voxels.output import ProfileWriter, VoxelSpace, check_voxel_target, write_voxels
-from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
+from wavebatch.tools.voxels.grid import (
+    ProfileWriter,
+    VoxelGrid,
+    VoxelSpace,
+    check_voxel_target,
+    energy_unit,
+    write_voxels,
+)
 from wavebatch.tools.voxels.rays import (
     PACKET,
     SAMPLE,
     Batch,
+    Ceiling,
+    Deconvolution,
+    Floor,
     Rays,
+    deconvolve_block,
+    find_ceiling,
     find_rule,
     join_packets,
     list_signal,
