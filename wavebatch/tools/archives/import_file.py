@@ -497,22 +497,31 @@ def list_extra_bytes(plan: Plan) -> list[ExtraRecord]:
 
 
 @dataclass(slots=True)
-class Counts:
-    """What became of the segments of a file."""
+class ImportSummary:
+    """What was made of a file, and what became of its segments."""
 
+    file: str
+    output: str
+    pulses: int
+    skipped: bool = False
+    """The strip was there already and is up to date."""
     points: int = 0
     packets: int = 0
+    descriptors: int = 0
     without_returns: int = 0
     """Pulses without any returning segment: LAS has no place for them."""
     replaced: int = 0
     """Segments of the sensitive channel that are saturated, and whose packet is that of another channel."""
     covered: int = 0
     """Segments of other channels that the sensitive one recorded as well, unsaturated."""
-    unknown_energy: int = 0
-    """Pulses whose outgoing recording shows no pulse."""
+    outgoing: dict[str, float] | None = None
+    """Of the outgoing pulses: fwhm_ns, energy_scatter, energy_error, width_scatter (relative), and unknown: pulses
+    whose outgoing recording shows no pulse."""
+    system_file: str | None = None
+    notes: tuple[str, ...] = ()
 
 
-def choose_segments(piece: PulsePiece, plan: Plan, counts: Counts) -> np.ndarray:
+def choose_segments(piece: PulsePiece, plan: Plan, counts: ImportSummary) -> np.ndarray:
     """Return the rows of the segments that become packets, sorted by pulse and time."""
     segments = piece.segments
     returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
@@ -530,7 +539,7 @@ def choose_segments(piece: PulsePiece, plan: Plan, counts: Counts) -> np.ndarray
 
 
 def build_points(
-    piece: PulsePiece, plan: Plan, writer: FullwaveWriter, header: PulseHeader, counts: Counts, *, detect: bool
+    piece: PulsePiece, plan: Plan, writer: FullwaveWriter, header: PulseHeader, counts: ImportSummary, *, detect: bool
 ) -> np.ndarray:
     """Write the packets of a piece and return its points, sorted by pulse and time."""
     segments = piece.segments
@@ -637,7 +646,7 @@ def _fill_pulses(points: np.ndarray, piece: PulsePiece, pulse: np.ndarray, plan:
         points["gps_time"] = records["time"] * header.time_scale + plan.time_offset
 
 
-def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: Counts) -> tuple[np.ndarray, np.ndarray]:
+def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: ImportSummary) -> tuple[np.ndarray, np.ndarray]:
     """Measure the first outgoing segment of each pulse: the values of SENT over the means of the strip, f8 (4, n), NaN
     where there is none; and the time of its peak after the strip's mean one, f8 (n,) [ns], 0 where it is not known.
 
@@ -658,7 +667,7 @@ def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: Counts) -> tupl
         # Without a stored duration the recording has no place on the clock.
         peak = np.where(start != 0, start + (found.time - outgoing.origin) * spacing, 0.0)
         late[pulse] = np.where(np.isfinite(peak), peak, 0.0)
-    counts.unknown_energy += int(np.count_nonzero(np.isnan(values[0])))
+    counts.outgoing["unknown"] += int(np.count_nonzero(np.isnan(values[0])))
     return values, late
 
 
@@ -684,27 +693,6 @@ class ImportOptions:
     def describe(self) -> dict[str, Any]:
         """Return what changes the strip."""
         return {"internal": self.internal, "returns": self.returns}
-
-
-@dataclass(frozen=True, slots=True)
-class ImportSummary:
-    """What was made of a file."""
-
-    file: str
-    output: str
-    pulses: int
-    skipped: bool = False
-    """The strip was there already and is up to date."""
-    points: int = 0
-    packets: int = 0
-    descriptors: int = 0
-    without_returns: int = 0
-    replaced: int = 0
-    covered: int = 0
-    outgoing: dict[str, float] | None = None
-    """Of the outgoing pulses: fwhm_ns, energy_scatter, energy_error, width_scatter (relative), unknown pulses."""
-    system_file: str | None = None
-    notes: tuple[str, ...] = field(default=())
 
 
 def import_file(
@@ -742,7 +730,8 @@ def import_file(
     refuse_existing(target, overwrite)
     with PulseReader(header) as reader:
         plan, frame = make_plan(reader), find_frame(reader)
-        counts = Counts()
+        counts = ImportSummary(str(path), str(target), header.count, outgoing=_describe_outgoing(plan.outgoing),
+                               descriptors=len({one.index for one in plan.digitizers.values()}))  # fmt: skip
         with _open_writer(target, header, plan, frame, options, account, overwrite) as writer:
             system = _draft_system(writer, path, plan, source, overwrite)
             for piece in reader.pieces():
@@ -752,12 +741,9 @@ def import_file(
                 writer.write_points(points)
                 progress(len(piece.pulses))
             writer.commit()
-    return ImportSummary(
-        str(path), str(target), header.count, points=counts.points, packets=counts.packets,
-        descriptors=len({one.index for one in plan.digitizers.values()}), without_returns=counts.without_returns,
-        replaced=counts.replaced, covered=counts.covered, outgoing=_describe_outgoing(plan.outgoing, counts),
-        system_file=None if system is None else str(system), notes=(*frame.notes, *_note(header, plan, counts)),
-    )  # fmt: skip
+    counts.system_file = None if system is None else str(system)
+    counts.notes = (*frame.notes, *_note(header, plan, counts))
+    return counts
 
 
 def _find_state(target: Path, account: dict[str, Any]) -> str:
@@ -808,7 +794,7 @@ def _draft_system(
     return draft.target
 
 
-def _describe_outgoing(sent: Outgoing | None, counts: Counts) -> dict[str, float] | None:
+def _describe_outgoing(sent: Outgoing | None) -> dict[str, float] | None:
     if sent is None:
         return None
     return {
@@ -816,11 +802,11 @@ def _describe_outgoing(sent: Outgoing | None, counts: Counts) -> dict[str, float
         "energy_scatter": sent.scatter,
         "energy_error": sent.error,
         "width_scatter": sent.width_scatter,
-        "unknown": counts.unknown_energy,
+        "unknown": 0,
     }
 
 
-def _note(header: PulseHeader, plan: Plan, counts: Counts) -> list[str]:
+def _note(header: PulseHeader, plan: Plan, counts: ImportSummary) -> list[str]:
     notes = []
     if plan.one_time:
         notes.append("all pulses have the same time; they get times 0.1 ms apart")
