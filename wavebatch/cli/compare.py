@@ -75,6 +75,14 @@ def compare(
     vendor's returns.
 
     Exit code: 0 done, 1 a threshold (--min-..., --max-...) is not met, 2 wrong usage or a file cannot be read.
+
+    Examples:
+      # a cloud with the vendor's returns
+      wavebatch compare clouds/strip.laz strip.las
+      # two chains on the waveforms of a strip
+      wavebatch compare --strip strip.las fast accurate
+      # with the truth; exit code 1 below 95 %
+      wavebatch compare clouds/strip.laz --truth truth.npz --min-completeness 0.95
     """  # fmt: skip
     shared.check_html(html_file)
     if output is not None:

@@ -78,6 +78,10 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
     of 4, 5, 9 or 10.
 
     Exit code: 0 done, 1 the strip cannot be written, 2 wrong usage.
+
+    Examples:
+      # a strip with known echoes
+      wavebatch simulate forest -o forest.laz --pulses 50000 --truth truth.npz
     """  # fmt: skip
     receiver = _build_receiver(truth, options)
     found = find_scene(scene)
@@ -134,6 +138,12 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     takes a share of the footprint returns that share of the light.
 
     Exit code: 0 done, 1 the cloud cannot be read or the strip cannot be written, 2 wrong usage.
+
+    Examples:
+      # waveforms from the returns of a cloud
+      wavebatch synthesize cloud.laz -o strip.las
+      # by the lidar equation, with partial footprints
+      wavebatch synthesize cloud.laz -o strip.las --intensity reflectance --sensor-height 1200 --shares equal
     """  # fmt: skip
     settings = shared.from_options(SynthesisOptions, options, radar=_build_radar(options))
     with counting("points", options["quiet"]) as bar:

@@ -70,6 +70,10 @@ def stats(
     largest number of returns of the sensor hide.
 
     Exit code: 0 done, 1 a cloud cannot be read (the others are counted), 2 wrong usage.
+
+    Examples:
+      # return numbers, separations and flags of clouds
+      wavebatch stats clouds/*.laz
     """  # fmt: skip
     files = shared.find_inputs(clouds, recursive=recursive)
     if output is not None:
