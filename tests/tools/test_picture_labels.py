@@ -136,7 +136,7 @@ def test_axes_in_metres_have_equal_scales(tmp_path, riegl, monkeypatch):
 
 @pytest.mark.parametrize("compress", [False, True])
 def test_axes_lie_at_round_places(tmp_path, compress):
-    """The solver of the layout gives other last digits in each run, and ids of clip paths in an SVG follow from them."""
+    """The solver of the layout gives other last digits in each run, and ids of clip paths follow from them."""
     drawn = set()
     for _ in range(3):
         with open_picture(tmp_path / "p.svg", (8.6, 6.0), overwrite=True) as figure:
