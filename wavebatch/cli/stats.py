@@ -174,4 +174,5 @@ def _rank_pairs(part: ReturnStats | AreaStats) -> list[Separation]:
 
 
 def _plain(found: ReturnStats) -> dict[str, Any]:
-    return {**asdict(found), "returns_per_pulse": found.returns_per_pulse}
+    areas = [{**asdict(area), "returns_per_pulse": area.returns_per_pulse} for area in found.areas]
+    return {**asdict(found), "areas": areas, "returns_per_pulse": found.returns_per_pulse}

@@ -99,7 +99,8 @@ def set_layout(figure: Figure, **options: Any) -> None:
         def execute(self, fig: Figure) -> Any:
             """Places the axes."""
             found = super().execute(fig)
-            for axes in fig.axes:
+            every: Any = fig.axes
+            for axes in every:
                 for which in ("original", "active"):
                     bounds = axes.get_position(original=which == "original").bounds
                     axes._set_position([round(value, 6) for value in bounds], which=which)
