@@ -29,7 +29,7 @@ from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions, 
 from wavebatch.tools.simulate.returns import Radar, SynthesisOptions
 from wavebatch.tools.slices.output import SegmentWriter
 from wavebatch.tools.slices.segments import Segment, SliceOptions
-from wavebatch.tools.voxels.profile import Deconvolution
+from wavebatch.tools.voxels.rays import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions
 
 RUN, SURVEY, SLICE = "run strip.las -o out", "survey strip.las", "slice strip.las"
