@@ -29,7 +29,7 @@ from wavebatch.kernels.geometry.normals import Gap
 from wavebatch.stages.chain import STAGES, Stage, Step
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.geometry import START_TIME, FlightLine, trace_rays
+from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 
 STAGE = "attribute.incidence_angle_normals"
 COLUMNS = ["incidence_angle_normals", "incidence_angle_normals_err"]

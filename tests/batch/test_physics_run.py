@@ -20,7 +20,7 @@ from wavebatch.surveying.calibration import (
     with_physics,
 )
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.geometry import START_TIME, FlightLine, trace_rays
+from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 
 FOUND = Calibration(2.6e-8, 0.02, 0.3, divergence=1.1, strip="strip.laz", date="2026-11-21",
                     conditions="said by a test")  # fmt: skip

@@ -27,14 +27,14 @@ import wavebatch as wb
 from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.messages import log_is_open
-from wavebatch.cli.program.command import EXAMPLES, GROUPS, ProgramCommand, complete_files, group_options, roff
+from wavebatch.cli.program.command import GROUPS, ProgramCommand, complete_files, group_options, roff
 from wavebatch.cli.program.settings import HARMLESS, NO_VARIABLE, OLD_NAMES
 from wavebatch.core.errors import ConfigError
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import effective, parse_chain
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions
 from wavebatch.tools.slices.segments import SliceOptions
-from wavebatch.tools.voxels.profile import Deconvolution
+from wavebatch.tools.voxels.rays import Deconvolution
 
 
 def invoke(*arguments, **environment):
@@ -54,7 +54,7 @@ def test_every_page_of_help_has_examples_and_every_option_once(title):
     command = dict(_commands())[title]
     shown = invoke(*title.split(), "--help").stdout
     if not isinstance(command, click.Group):
-        assert isinstance(command, ProgramCommand) and "Examples:" in shown and EXAMPLES[title]
+        assert isinstance(command, ProgramCommand) and "Examples:" in shown and command.examples
     shown = shown[re.search(r"(?m)^[A-Z][\w ]+:\n  -", shown).start() :]
     for option in command.params:
         if isinstance(option, click.Option):
@@ -63,7 +63,9 @@ def test_every_page_of_help_has_examples_and_every_option_once(title):
 
 
 @pytest.mark.parametrize(
-    ("title", "line"), [(title, line) for title, lines in EXAMPLES.items() for line, _ in lines], ids=str
+    ("title", "line"),
+    [(title, line) for title, command in _commands() for line, _ in getattr(command, "examples", ())],
+    ids=str,
 )
 def test_examples_are_right_usage(title, line):
     program, *words = shlex.split(line)

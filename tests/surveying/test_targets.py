@@ -16,7 +16,7 @@ from wavebatch.kernels.geometry.planes import fit_planes
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.target_file import Target, load_targets
 from wavebatch.tools.simulate import find_scene, simulate_strip, strip
-from wavebatch.tools.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, FlightLine, trace_rays
+from wavebatch.tools.simulate.render import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, FlightLine, trace_rays
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS
 
 pytestmark = pytest.mark.kept_surveys

@@ -29,7 +29,7 @@ from wavebatch.tools.compare.chains import (
     match_sides,
     measure_fit,
 )
-from wavebatch.tools.compare.clouds import compare_clouds
+from wavebatch.tools.compare.pairing import compare_clouds
 
 
 def make_chain(detector, decomposer, **parameters):

@@ -18,8 +18,7 @@ from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.disk import temp_store
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.tools.compare import pairing
-from wavebatch.tools.compare.clouds import compare_clouds, compare_truth
-from wavebatch.tools.compare.pairing import SPEED, Differences, measure_lag
+from wavebatch.tools.compare.pairing import SPEED, Differences, compare_clouds, compare_truth, measure_lag
 from wavebatch.tools.sheets.compare import HEAD, format_comparison
 from wavebatch.tools.simulate import StripOptions, TruthReader, simulate_strip
 

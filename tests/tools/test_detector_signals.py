@@ -10,8 +10,7 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.kernels.signal.square_differences import find_minima, keep_prominent
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.noise import pooled
-from wavebatch.tools.plots.detector_signals import _SIGNALS, KINDS, choose_step, see_block
-from wavebatch.tools.plots.waveform import build_views
+from wavebatch.tools.plots.waveform import _SIGNALS, KINDS, build_views, choose_step, see_block
 
 
 def run(*words):

@@ -19,10 +19,9 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.group_returns import fit_rays, group_pulses
 from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section, transmit
 from wavebatch.surveying.inspect_strip import check_file
-from wavebatch.tools.compare.clouds import compare_clouds
+from wavebatch.tools.compare.pairing import compare_clouds
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions, returns, simulate_returns
-from wavebatch.tools.simulate.from_returns import synthesize_strip
-from wavebatch.tools.simulate.returns import Radar, SynthesisOptions
+from wavebatch.tools.simulate.returns import Radar, SynthesisOptions, synthesize_strip
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +110,8 @@ def test_measured_widths_come_first(cloud, tmp_path):
 
 def test_pieces_cut_no_pulse(cloud, tmp_path, monkeypatch):
     synthesize_strip(cloud, tmp_path / "whole.las", SynthesisOptions(gain=0.1))
-    monkeypatch.setattr("wavebatch.tools.simulate.from_returns._PIECE", 37)
-    monkeypatch.setattr("wavebatch.tools.simulate.from_returns._PAINTED", 1000)
+    monkeypatch.setattr("wavebatch.tools.simulate.returns._PIECE", 37)
+    monkeypatch.setattr("wavebatch.tools.simulate.returns._PAINTED", 1000)
     summary = synthesize_strip(cloud, tmp_path / "parts.las", SynthesisOptions(gain=0.1))
     assert summary.packets == 2000 and summary.scattered == 0
     whole, parts = read_cloud(tmp_path / "whole.las")[0], read_cloud(tmp_path / "parts.las")[0]

@@ -19,12 +19,10 @@ from wavebatch.files.cloud import cloud_reader as io_cloud
 from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.even_sample import EvenSample
-from wavebatch.tools.plots import values
 from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values, place_edges
 from wavebatch.tools.plots.sections import cut_section
-from wavebatch.tools.plots.values import robust_limits
 from wavebatch.tools.rasters import cells
-from wavebatch.tools.rasters.cells import grid_values
+from wavebatch.tools.rasters.cells import grid_values, robust_limits
 
 
 @pytest.fixture(scope="module")
@@ -536,7 +534,7 @@ def test_real_clouds(riegl, leica, tmp_path):
     pytest.importorskip("matplotlib")
     found = count_values([riegl], "Pulse width")
     assert found.total.values == 2535 and found.percentiles[0][1] == pytest.approx(4.4)
-    assert values.Clouds([riegl], ["amplitude"]).facts.unit == "dB"
+    assert cells.Clouds([riegl], ["amplitude"]).facts.unit == "dB"
     assert run("map", riegl, "--column", "z", "--statistic", "max", "-o", tmp_path / "r.png").exit_code == 0
     assert grid_values([leica], "intensity").total.values == 999
 

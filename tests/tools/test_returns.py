@@ -18,8 +18,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
-from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
-from wavebatch.files.las.header import LasHeader
+from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.tools import return_stats as module
 from wavebatch.tools import return_stats as returns
@@ -474,6 +473,8 @@ def test_table_text_and_json_say_the_same(tmp_path):
     assert len(rows) == 1 + len(found)
     for row, area in zip(rows[1:], found, strict=True):
         assert (row["kind"], row["area"]) == (area["kind"], area["name"])
+        each = area["points"] / area["pulses"]
+        assert area["returns_per_pulse"] == each == pytest.approx(float(row["returns_per_pulse"]))
         for name, key in (("points", "points"), ("mean_m", "mean"), ("least_m", "least"), ("x", "x")):
             assert float(row[name] or "nan") == pytest.approx(
                 float("nan") if area[key] is None else area[key], nan_ok=True

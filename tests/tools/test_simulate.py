@@ -11,10 +11,19 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.physics.radiometry import backscatter
 from wavebatch.tools.simulate import SCENES, PulseModel, Recording, find_pulse, find_scene, shape_pulse, simulate_block
-from wavebatch.tools.simulate.blocks import SEED_BLOCK, flag_truth, simulate_blocks
-from wavebatch.tools.simulate.geometry import AIR_SPEED, GROUND, TERRAINS, FlightLine, trace_rays
-from wavebatch.tools.simulate.render import PULSES, main_lobe, paint_echoes, record_counts, spread_lobes
-from wavebatch.tools.simulate.scenes import HAZARDS
+from wavebatch.tools.simulate.render import (
+    AIR_SPEED,
+    GROUND,
+    PULSES,
+    TERRAINS,
+    FlightLine,
+    main_lobe,
+    paint_echoes,
+    record_counts,
+    spread_lobes,
+    trace_rays,
+)
+from wavebatch.tools.simulate.scenes import HAZARDS, SEED_BLOCK, flag_truth, simulate_blocks
 
 ALL = [*SCENES, *(f"stiff.{name}" for name in HAZARDS)]
 

@@ -8,11 +8,10 @@ import pytest
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.tools.simulate import StripOptions, TruthReader, simulate_strip
-from wavebatch.tools.simulate.blocks import SEED_BLOCK
-from wavebatch.tools.simulate.geometry import AIR_SPEED
+from wavebatch.tools.simulate.render import AIR_SPEED
 from wavebatch.tools.simulate.returns import list_returns
-from wavebatch.tools.simulate.scenes import find_scene
-from wavebatch.tools.simulate.truth import ECHO_COLUMNS
+from wavebatch.tools.simulate.scenes import SEED_BLOCK, find_scene
+from wavebatch.tools.simulate.strip import ECHO_COLUMNS
 
 FORMATS = [(4, "1.3", True), (4, "1.4", False), (5, None, True), (9, None, False), (10, None, True)]
 

@@ -18,7 +18,7 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.geometry import EAST, GROUND, NORTH, FlightLine
+from wavebatch.tools.simulate.render import EAST, GROUND, NORTH, FlightLine
 from wavebatch.tools.slices import output, segments
 from wavebatch.tools.slices.segments import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
 

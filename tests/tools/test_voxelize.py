@@ -24,12 +24,10 @@ from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.blocks import simulate_block
-from wavebatch.tools.simulate.geometry import FlightLine
-from wavebatch.tools.simulate.render import Recording, find_pulse
+from wavebatch.tools.simulate.render import FlightLine, Recording, find_pulse
+from wavebatch.tools.simulate.scenes import simulate_block
 from wavebatch.tools.simulate.strip import WKT, StripOptions
-from wavebatch.tools.voxels.floor import Ceiling, Floor
-from wavebatch.tools.voxels.profile import Deconvolution, _pulse_taps, deconvolve_block
+from wavebatch.tools.voxels.rays import Ceiling, Deconvolution, Floor, _pulse_taps, deconvolve_block
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.4, std=1.05))
@@ -306,7 +304,7 @@ def test_followed_up_to_the_highest_return_rays_count_as_if_from_the_sensor(tmp_
 
 @pytest.mark.parametrize("most", [8, 100, 1 << 18])
 def test_ceilings_are_those_of_a_slow_search(monkeypatch, most):
-    monkeypatch.setattr("wavebatch.tools.voxels.floor.MOST_CELLS", most)
+    monkeypatch.setattr("wavebatch.tools.voxels.rays.MOST_CELLS", most)
     rng = np.random.default_rng(9)
     points = rng.uniform(0, 120, (300, 3)) * [1, 1, 0.3]
     ceiling = Ceiling(np.array([60.0, 60.0, 0.0]), 1.0)
@@ -607,7 +605,7 @@ def test_light_is_normalised_by_range(tmp_path):
 
 @pytest.mark.parametrize("most", [20, 1 << 18])
 def test_the_floor_is_the_ground_below_plants(monkeypatch, most):
-    monkeypatch.setattr("wavebatch.tools.voxels.floor.MOST_CELLS", most)
+    monkeypatch.setattr("wavebatch.tools.voxels.rays.MOST_CELLS", most)
     rng = np.random.default_rng(5)
     xyz = rng.uniform(0, 60, (6000, 3)) * [1, 1, 0]
     ground = 0.3 * xyz[:, 0] - 0.1 * xyz[:, 1] + 0.05 * rng.standard_normal(6000)
