@@ -264,8 +264,17 @@ def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
 
 
 def _decide(found: list[Candidate]) -> Choice:
-    """The candidate with the simplest pulse, then the fewest echoes, that no other one beats surely."""
-    ordered = sorted(found, key=lambda one: (one.gaussians, one.echoes, one.name))
+    """The candidate with the simplest pulse that no other one beats surely.
+
+    Of pulses as simple the shortest description, or that of markedly fewer echoes: one echo more or less is chance.
+    """
+    ordered = []
+    for number in sorted({one.gaussians for one in found}):
+        alike = [one for one in found if one.gaussians == number]
+        shortest = min(alike, key=lambda one: (one.typical, one.name))
+        fewer = [one for one in alike if one.echoes <= FEWER * shortest.echoes and one.exceeds(shortest) < SURE]
+        first = min((shortest, *fewer), key=lambda one: (one.echoes, one.typical))
+        ordered += [first, *(one for one in alike if one is not first)]
     best = ordered[0]
     for one in ordered[1:]:
         doubtful = one.echoes <= FEWER * best.echoes or best.missed > max(COVERED * best.change, one.missed)
