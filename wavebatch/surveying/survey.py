@@ -406,6 +406,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
+        figures.width_in_doubt = choice.spread
         figures.echoes_in_doubt = max(choice.doubt, share_unexplained(system, echoes, block.spacing))
         if len(block) < SMALL:
             figures.echoes_in_doubt = max(figures.echoes_in_doubt, share_repeated(echoes, system.sigma_ref))

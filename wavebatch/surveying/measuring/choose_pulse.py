@@ -134,6 +134,8 @@ class Choice:
     tried: tuple[Candidate, ...]
     doubt: float
     """Share by which the number of echoes differs between candidates that cost the same."""
+    spread: float
+    """Share by which their widths differ from that of the best one."""
 
     def describe(self) -> tuple[Tried, ...]:
         """Return the candidates for people, the best first."""
@@ -280,9 +282,11 @@ def _decide(found: list[Candidate]) -> Choice:
         doubtful = one.echoes <= FEWER * best.echoes or best.missed > max(COVERED * best.change, one.missed)
         if best.exceeds(one) > (HINT if doubtful and not best.known else SURE):
             best = one
-    tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
-    doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
-    return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
+    tied = [one for one in ordered if one.exceeds(best) < SURE]
+    echoes, widths = [one.echoes for one in tied], [one.system.sigma_ref for one in tied]
+    doubt = (max(echoes) - min(echoes)) / max(best.echoes, 1)
+    spread = max(abs(width / best.system.sigma_ref - 1) for width in widths)
+    return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt, spread)
 
 
 def settle(
