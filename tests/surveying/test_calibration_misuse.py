@@ -251,7 +251,7 @@ def test_what_scenes_do_not_show_of_another_gain_or_energy_is_in_the_error():
 
 
 def keep(places):
-    return np.reshape(keep_places({1: places}), (-1, 4))[:, 1:]
+    return np.reshape(keep_places({(1, 0): places}), (-1, 4))[:, 1:]
 
 
 def see_ground(rng, known=None, factor=1.0, fade=0.0, move=0.0, pattern=0.0):
@@ -464,6 +464,61 @@ def test_reflectances_above_one_are_one_line_whatever_the_reason(tmp_path, calib
     report = json.loads((tmp_path / "a.report.json").read_text())
     assert 0.1 < report["quality"]["reflectance_above_one"] / report["counts"]["echoes"] < 1
     assert "exceed 1" not in run(calibrated, tmp_path / "right", "a.las")
+
+
+def bend(monkeypatch, most):
+    """Receivers that record x / (1 + x / most)."""
+    render = facet_strips._render
+
+    def render_bent(*arguments):
+        wave = render(*arguments)
+        return wave / (1.0 + wave / most)
+
+    monkeypatch.setattr(facet_strips, "_render", render_bent)
+
+
+@pytest.mark.parametrize(
+    ("most", "pulse"),
+    [
+        (500.0, ((1.0, 0.0, 2.0),)),
+        pytest.param(500.0, ((1.0, 0.0, 2.0), (0.3, 3.0, 3.0)), marks=pytest.mark.slow),
+        pytest.param(np.inf, ((1.0, 0.0, 2.0),), marks=pytest.mark.slow),
+        (np.inf, ((1.0, 0.0, 2.0), (0.3, 3.0, 3.0))),
+    ],
+)
+def test_one_bright_target_and_a_receiver_that_compresses(tmp_path, monkeypatch, most, pulse):
+    """The constant was 12 % too large, with 3.35 % stated."""
+    bend(monkeypatch, most)
+    ground = [Facet(0.6, inside=box(40, 0, 60, 20)), Facet(fields)]
+    sensor = Sensor(**BASE, light=LIGHT, pulse=pulse, gains={1: 1.0, 2: 0.5})
+    write_strip(tmp_path / "a.las", ground, sensor, 12_000, seed=71)
+    write_targets(tmp_path / "t.csv")
+    (tmp_path / "t.csv").write_text((tmp_path / "t.csv").read_text().replace("field,0.3", "field,0.6"))
+    found, said = calibrate(tmp_path, strips=["a.las"])
+    if np.isinf(most):
+        assert "compresses" not in said and all(row.relative_error < 0.031 for row in found.channels)
+        return
+    assert "the receiver of digitizer 1 compresses, by the shape of its echoes" in said
+    assert "take targets as bright as the surfaces that you measure" in said
+    # The darkest surfaces are off by all of it, those as bright as the target by nothing.
+    for row, gain in zip(found.channels, (1.0, 0.5), strict=True):
+        if len(pulse) < 2:
+            off = row.constant * LIGHT * gain * pulse[0][2] / 4.0 - 1
+            assert 0.1 < off < 0.2 and 0.4 < row.relative_error / off < 1.0
+        assert 0.06 < row.relative_error < 0.13
+
+
+def test_scanner_channels_of_one_digitizer_are_compared_one_by_one(tmp_path):
+    """Their light was one scene: another gain of one of two passed for half of it, and moved the other's places too."""
+    for number, gain in enumerate((0.5, 0.33)):
+        sensor = Sensor(**BASE, light=LIGHT, gains={1: 1.0, 2: gain}, scanners=True, time=START + 600 * number)
+        write_strip(tmp_path / f"{number}.las", GROUND, sensor, 12_000, seed=81 + number)
+    write_targets(tmp_path / "t.csv")
+    found, _ = calibrate(tmp_path, strips=["0.las"])
+    assert {1.0, 1.25} == set(found.places[::4])
+    said = run(tmp_path, tmp_path / "out", "1.las")
+    lines = [line for line in said.splitlines() if "another gain or energy under the same header" in line]
+    assert len(lines) == 1 and "of digitizer 1 scanner channel 1 are brighter by a factor of 0.6" in lines[0]
 
 
 def test_a_constant_without_an_error_is_named(tmp_path, calibrated):

@@ -213,11 +213,15 @@ class Calibration:
     energy_source: Annotated[str, Key()] = ""
     energy_unit: Annotated[str, Key()] = ""
     places: Annotated[tuple[Annotated[float, Range(-1e9, 1e9)], ...], Key(blank=True)] = ()
-    """Ground that other strips may see again: digitizer, east, north, logarithm of its light, and so on."""
+    """Ground that other strips may see again: channel (`setting.number_channel`), east, north, logarithm of its light,
+    and so on."""
     swath: tuple[float, ...] = ()
     """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
     right: tuple[float, float] = (0.0, 0.0)
     """Of the strip's flight, as `Radiometry.right`; not kept in the file."""
+    bent: float = 0.0
+    """By how much the constant is off for echoes unlike the targets', since the receiver compresses, relative; all
+    channels and strips share it. Not kept in the file, whose errors hold it."""
     notes: tuple[str, ...] = ()
     """What is doubtful about it, or would not show in the strip that it is used for; not kept in the file."""
 

@@ -170,7 +170,8 @@ class SensorSource:
 
     def describe(self) -> dict[str, Any]:
         """Return kind, errors and the other values for reports."""
-        returns = {"scatter_m": round(self.returns.scatter, 5), "from": self.returns.source}
+        placed = self.returns
+        returns = {"scatter_m": round(placed.scatter, 5), "from": placed.source, "phase_m": round(placed.phase, 5)}
         error = round(self.error, 6) or None
         report = {"source": self.kind, "range_error_m": error, "returns": returns, **dict(self.facts)}
         return report if self.distance is None else {**report, "distance_m": self.distance}

@@ -106,6 +106,10 @@ _ADJUSTED = 1e9
 _WEEK = 604_800.0
 
 
+_Channel = tuple[int, int]
+"""Index of a digitizer and scanner channel."""
+
+
 class Change(NamedTuple):
     """By how much light is brighter, and what another gain or energy may have to do with it."""
 
@@ -136,13 +140,13 @@ class Setting(NamedTuple):
 
     rate: float | None
     """Pulses per second; None where the times do not show it."""
-    brightest: dict[int, float]
-    """R^2 / eta times the sum of the samples of the strongest waveforms of each digitizer [DN m2]: slopes do not change
+    brightest: dict[_Channel, float]
+    """R^2 / eta times the sum of the samples of the strongest waveforms of each channel [DN m2]: slopes do not change
     it."""
-    scenes: dict[int, tuple[float, ...]]
-    """Logarithms of the QUANTILES of that light, for each digitizer."""
-    places: dict[int, np.ndarray]
-    """East, north, logarithm of that light, and time from -1 to 1 of waveforms of each digitizer, f8 (4, k)."""
+    scenes: dict[_Channel, tuple[float, ...]]
+    """Logarithms of the QUANTILES of that light, for each channel."""
+    places: dict[_Channel, np.ndarray]
+    """East, north, logarithm of that light, and time from -1 to 1 of waveforms of each channel, f8 (4, k)."""
     right: tuple[float, float]
     """Unit vector to the right of the flight."""
     fades: Change
@@ -240,7 +244,7 @@ def measure_setting(
     reader: StripReader, scan: StripScan, sensor: SensorSource, attenuation: float, energy: float = 1.0
 ) -> Setting:
     """Measure the setting of a strip; attenuation: of the air, one way [dB/km], energy: by which light is divided."""
-    parts: dict[int, list[np.ndarray]] = {}
+    parts: dict[_Channel, list[np.ndarray]] = {}
     for block in reader.sample_blocks(scan, SAMPLE):
         block = sensor.fill(block)
         if block.sensor is None:
@@ -251,15 +255,17 @@ def measure_setting(
         distance = np.sqrt((away * away).sum(axis=1))
         whole = np.nansum(above, axis=1) * distance**2 / transmit(distance, attenuation) / energy
         rows = np.stack([block.gps_time, whole, *(away + block.sensor).T, -away[:, 2] / distance, *block.sensor.T[:2]])
-        parts.setdefault(block.digitizer.index, []).append(rows[:, whole > 0])
-    joined = {index: np.concatenate(some, axis=1) for index, some in parts.items()}
-    known = {index: rows for index, rows in joined.items() if rows.size}
+        scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
+        for number in np.unique(scanner).tolist():
+            parts.setdefault((block.digitizer.index, number), []).append(rows[:, (whole > 0) & (scanner == number)])
+    joined = {channel: np.concatenate(some, axis=1) for channel, some in parts.items()}
+    known = {channel: rows for channel, rows in joined.items() if rows.size}
     rate = _measure_rate(reader)
     every = np.concatenate([np.empty((8, 0)), *known.values()], axis=1)
     zone = _find_zone(reader, every, 1e9 * HALF_C / rate) if known and rate else None
-    brightest = {index: float(np.quantile(rows[1], BRIGHT)) for index, rows in known.items()}
-    scenes = {index: _describe_scene(rows[1]) for index, rows in known.items()}
-    places = {index: _list_places(*rows[[2, 3, 1, 0]]) for index, rows in known.items()}
+    brightest = {channel: float(np.quantile(rows[1], BRIGHT)) for channel, rows in known.items()}
+    scenes = {channel: _describe_scene(rows[1]) for channel, rows in known.items()}
+    places = {channel: _list_places(*rows[[2, 3, 1, 0]]) for channel, rows in known.items()}
     fades = max((_find_fading(*rows[:2]) for rows in known.values()), key=lambda one: one.error, default=NO_CHANGE)
     return Setting(rate, brightest, scenes, places, _find_right(every), fades, zone)
 
@@ -317,11 +323,16 @@ def _is_whole(zones: np.ndarray) -> np.ndarray:
     return (number != 0) & (np.abs(number) <= MOST_ZONES) & (np.abs(zones - number) < MOST_BEND)
 
 
-def keep_places(places: Mapping[int, np.ndarray]) -> tuple[float, ...]:
+def number_channel(digitizer: int, scanner: int) -> float:
+    """Return the number of a channel in `Calibration.places`: the digitizer and a quarter of the scanner channel."""
+    return digitizer + scanner / SCANNERS
+
+
+def keep_places(places: Mapping[_Channel, np.ndarray]) -> tuple[float, ...]:
     """Return a part of `Setting.places` as `Calibration.places`, spread evenly over the strip."""
     parts = [
-        np.column_stack([np.full(part.shape[1], index), *part[:2].round(1), part[2].round(3)])
-        for index, part in places.items()
+        np.column_stack([np.full(part.shape[1], number_channel(*channel)), *part[:2].round(1), part[2].round(3)])
+        for channel, part in places.items()
     ]
     joined = np.concatenate([np.empty((0, 4)), *parts])
     return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
