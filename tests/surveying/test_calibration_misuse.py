@@ -3,6 +3,7 @@
 import json
 import struct
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,11 +20,15 @@ from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
-from wavebatch.surveying.matching.setting import NO_CHANGE, _find_fading, compare_ground, compare_scenes, keep_places
+from wavebatch.surveying.matching import setting
+from wavebatch.surveying.matching.setting import NO_CHANGE, keep_places, weigh_change
 from wavebatch.surveying.matching.strip_conditions import judge_fading
 
 pytestmark = pytest.mark.kept_surveys
 
+compare_scenes, compare_ground, _find_fading = (
+    partial(one, chance=0.3) for one in (setting.compare_scenes, setting.compare_ground, setting._find_fading)
+)
 LIGHT = 1.2e8
 BASE = {"speed": 30.0, "rate": 10_000.0, "half_angle": 12.0}
 
@@ -506,6 +511,30 @@ def test_one_bright_target_and_a_receiver_that_compresses(tmp_path, monkeypatch,
             off = row.constant * LIGHT * gain * pulse[0][2] / 4.0 - 1
             assert 0.1 < off < 0.2 and 0.4 < row.relative_error / off < 1.0
         assert 0.06 < row.relative_error < 0.13
+
+
+@pytest.mark.parametrize("spread", [0.04, 0.2, 0.4])
+def test_the_assumed_chance_of_a_change_says_how_much_error_holds_it(spread):
+    errors = [weigh_change(0.0, spread, 0.0, chance=chance).error for chance in (0.0, 0.05, 0.3, 0.6)]
+    assert errors[0] == 0.0 and np.all(np.diff(errors) > 0.002)
+    assert 0.3 < errors[1] / errors[2] < 0.5 and 1.2 < errors[3] / errors[2] < 2.0
+    # What the data show does not hang on it.
+    assert all(weigh_change(0.5, 0.04, 0.5, chance=chance).chance > 0.9 for chance in (0.05, 0.3, 0.6))
+
+
+def test_a_chance_of_zero_in_the_file_takes_the_check_away(tmp_path, calibrated):
+    text = (calibrated / "cal.toml").read_text()
+    assert "\nchange_chance = 0.3" in text
+    write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 600, start=(3000, 0)), 10_000, seed=83)
+    found = {}
+    for chance in (0.3, 0.0):
+        (tmp_path / "cal.toml").write_text(text.replace("change_chance = 0.3", f"change_chance = {chance}"))
+        said = run(tmp_path, tmp_path / "out", "s.las")
+        cloud = wb.read_cloud(tmp_path / "out" / "s.laz")
+        stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
+        found[chance] = stated, "an assumed chance of 30% (change_chance)" in said
+    assert found[0.3][1] and not found[0.0][1]
+    assert found[0.0][0] < 0.035 < found[0.3][0] - 0.015, found
 
 
 def test_scanner_channels_of_one_digitizer_are_compared_one_by_one(tmp_path):

@@ -200,6 +200,13 @@ class Calibration:
     """Channels that have a constant of their own."""
     strips: Annotated[tuple[StripConstant, ...], Key("flight_strip")] = ()
     """Constants of single strips, where several were calibrated together."""
+    change_chance: Annotated[
+        float,
+        Range(0.0, 0.9),
+        Key("change_chance", "assumed: of another energy or gain under the same header; 0: logs exclude it"),
+    ] = 0.3
+    """Chance that a strip has another energy or gain under the same header, or a laser that fades, before its light is
+    seen. Nothing in a strip tells it: it is high, since errors must hold for those who have one."""
     energy_mean: Annotated[
         float | None,
         Range(1e-30, 1e30),

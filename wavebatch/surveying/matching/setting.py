@@ -49,9 +49,9 @@ LIKE_GROUND = 0.5
 """Scatter of the differences of neighbours, over that of surfaces that have nothing to do with each other, up to which
 they are the same surfaces: even ground looks like all even ground, and ground may have changed."""
 
-PRIORS = ((0.7, (0.0, 0.0)), (0.15, (1.0, 0.0)), (0.15, (1.0, 1.0)))
-"""How likely nothing, the energy and the gain are another one before light and noise are seen, and whether light and
-noise change with each. The chance of a change is assumed: it is high, since errors must hold for those who have one."""
+CHANGES = ((1.0, 0.0), (1.0, 1.0))
+"""How another energy and another gain move light and noise; one is as likely as the other, and the chance of both is
+`Calibration.change_chance` before light and noise are seen."""
 
 ZONE_PARTS = 8
 """Parts of a strip whose bend is measured: their scatter tells ground from a wrong pulse zone."""
@@ -155,7 +155,7 @@ class Setting(NamedTuple):
     """None where there is no rate."""
 
 
-def weigh_change(shift: float, spread: float, noise: float | None = None) -> Change:
+def weigh_change(shift: float, spread: float, noise: float | None = None, *, chance: float) -> Change:
     """Weigh whether light differs by its surfaces, or by another energy or gain.
 
     Parameters
@@ -166,6 +166,8 @@ def weigh_change(shift: float, spread: float, noise: float | None = None) -> Cha
         How much surfaces change that (standard deviation).
     noise : float, optional
         Logarithm of the ratio of the noise: a gain changes it as it changes light, an energy does not.
+    chance : float
+        Of another energy or gain before light and noise are seen.
 
     Returns
     -------
@@ -173,12 +175,12 @@ def weigh_change(shift: float, spread: float, noise: float | None = None) -> Cha
 
     Notes
     -----
-    Bayes' rule with PRIORS and normal distributions. docs/algorithms.md 5.2.
+    Bayes' rule with this chance and normal distributions. docs/algorithms.md 5.2.
     """
     seen = np.array([shift, noise or 0.0])
     known = np.diag([spread**2, 1e6 if noise is None else SUNLIGHT**2])
     chances, squares = [], []
-    for prior, moves in PRIORS:
+    for prior, moves in [(1.0 - chance, (0.0, 0.0)), *((chance / len(CHANGES), moves) for moves in CHANGES)]:
         covariance = known + USUAL_CHANGE**2 * np.outer(moves, moves)
         inner = np.linalg.solve(covariance, np.stack([seen, moves], axis=1)).T @ np.stack([seen, moves], axis=1)
         chances.append(prior * np.exp(-0.5 * inner[0, 0]) / np.sqrt(np.linalg.det(covariance)))
@@ -188,17 +190,20 @@ def weigh_change(shift: float, spread: float, noise: float | None = None) -> Cha
     return Change(shift, float(1.0 - share[0]), float(np.sqrt(share @ squares)))
 
 
-def compare_scenes(one: Sequence[float], other: Sequence[float], noise: float | None = None) -> Change:
-    """Weigh by how much one scene is brighter than another; noise: as `weigh_change`.
+def compare_scenes(
+    one: Sequence[float], other: Sequence[float], noise: float | None = None, *, chance: float
+) -> Change:
+    """Weigh by how much one scene is brighter than another; noise, chance: as `weigh_change`.
 
     Another energy or gain shifts the logarithms of all quantiles alike; other surfaces shift each in its own way.
     """
     off = np.subtract(one, other)
-    return weigh_change(float(np.median(off)), float(np.hypot(UNLIKE * np.std(off), LEAST_UNLIKE)), noise)
+    spread = float(np.hypot(UNLIKE * np.std(off), LEAST_UNLIKE))
+    return weigh_change(float(np.median(off)), spread, noise, chance=chance)
 
 
 def compare_ground(
-    places: np.ndarray, known: np.ndarray, noise: float | None = None
+    places: np.ndarray, known: np.ndarray, noise: float | None = None, *, chance: float
 ) -> tuple[Change, Change | None] | None:
     """Weigh by how much the ground that a calibrated strip saw too is brighter, and how that grows along the strip.
 
@@ -209,6 +214,7 @@ def compare_ground(
     known : float array, shape (m, 3)
         East, north and logarithm of the light of places of the calibration.
     noise : float, optional
+    chance : float
         As for `weigh_change`.
 
     Returns
@@ -233,17 +239,25 @@ def compare_ground(
     same = np.abs(off - np.median(off)) <= BORDER * robust_std(off)
     off, time, number = off[same], time[same], len(np.unique(near[rows[same]]))
     error, spread = float(np.std(off)) / number**0.5, float(np.std(time))
-    level = weigh_change(float(np.median(off)), float(np.hypot(MEDIAN_ERROR * error, LEAST_UNLIKE)), noise)
+    doubt = float(np.hypot(MEDIAN_ERROR * error, LEAST_UNLIKE))
+    level = weigh_change(float(np.median(off)), doubt, noise, chance=chance)
     if spread < SPAN:
         return level, None
     slope = float(np.polyfit(time, off, 1)[0])
-    return level, weigh_change(slope, float(np.hypot(error / spread, LEAST_UNLIKE)))
+    return level, weigh_change(slope, float(np.hypot(error / spread, LEAST_UNLIKE)), chance=chance)
 
 
 def measure_setting(
-    reader: StripReader, scan: StripScan, sensor: SensorSource, attenuation: float, energy: float = 1.0
+    reader: StripReader,
+    scan: StripScan,
+    sensor: SensorSource,
+    attenuation: float,
+    energy: float = 1.0,
+    *,
+    chance: float = 0.0,
 ) -> Setting:
-    """Measure the setting of a strip; attenuation: of the air, one way [dB/km], energy: by which light is divided."""
+    """Measure the setting of a strip; attenuation: of the air, one way [dB/km], energy: by which light is divided;
+    chance: of a laser that fades, before the light is seen."""
     parts: dict[_Channel, list[np.ndarray]] = {}
     for block in reader.sample_blocks(scan, SAMPLE):
         block = sensor.fill(block)
@@ -266,7 +280,8 @@ def measure_setting(
     brightest = {channel: float(np.quantile(rows[1], BRIGHT)) for channel, rows in known.items()}
     scenes = {channel: _describe_scene(rows[1]) for channel, rows in known.items()}
     places = {channel: _list_places(*rows[[2, 3, 1, 0]]) for channel, rows in known.items()}
-    fades = max((_find_fading(*rows[:2]) for rows in known.values()), key=lambda one: one.error, default=NO_CHANGE)
+    fading = [NO_CHANGE, *(_find_fading(*rows[:2], chance=chance) for rows in known.values())]
+    fades = max(fading, key=lambda one: one.error)
     return Setting(rate, brightest, scenes, places, _find_right(every), fades, zone)
 
 
@@ -347,7 +362,7 @@ def _describe_scene(light: np.ndarray) -> tuple[float, ...]:
     return tuple(np.log(np.quantile(light, QUANTILES)).tolist())
 
 
-def _find_fading(time: np.ndarray, light: np.ndarray) -> Change:
+def _find_fading(time: np.ndarray, light: np.ndarray, *, chance: float) -> Change:
     """How light grows from the first half of a strip to the second, by a line through the scenes of its parts.
 
     What parts scatter about the line is their surfaces' doing. Fields, forests and towns reach over several parts: such
@@ -366,7 +381,7 @@ def _find_fading(time: np.ndarray, light: np.ndarray) -> Change:
     shared = 1.0 + 2.0 * float(alike[1 : int(np.argmax(alike <= 0.0))].sum())
     error = FEW_PARTS * shared * half * float(np.sqrt(rest @ rest / (FADING_PARTS - 2) * (place @ place)))
     spread = np.sqrt(LEAST_UNLIKE**2 + np.var(slopes) + error**2)
-    return weigh_change(float(np.median(slopes)), float(spread))
+    return weigh_change(float(np.median(slopes)), float(spread), chance=chance)
 
 
 def sum_light(block: WaveformBlock) -> np.ndarray:

@@ -22,7 +22,6 @@ from wavebatch.surveying.calibration import Calibration, ChannelConstant
 from wavebatch.surveying.matching.setting import (
     MOST_ZONES,
     OTHER_PULSE,
-    PRIORS,
     SUNLIGHT,
     Change,
     Setting,
@@ -181,7 +180,7 @@ def compare_setting(
         louder = math.log(noise / row.noise_dn) if noise and row.noise_dn else None
         ground = _compare_places(calibration, found, row, louder)
         seen, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
-        change = change or compare_scenes(scene, row.scene, louder)
+        change = change or compare_scenes(scene, row.scene, louder, chance=calibration.change_chance)
         more = math.expm1(abs(change.shift) if change.chance > LIKELY else change.error)
         growth = max(growth, more)
         if change.chance <= LIKELY and more > HIDDEN:
@@ -189,7 +188,7 @@ def compare_setting(
             notes.append(
                 f"calibration: {known} {which}, so that another energy under the same "
                 f"header would not show: {100 * more:.0f} % of error hold it, by an assumed chance of "
-                f"{PRIORS[1][0]:.0%}; calibrate a strip that overlaps this one"
+                f"{calibration.change_chance:.0%} (change_chance); calibrate a strip that overlaps this one"
             )
         elif change.chance > LIKELY:
             lines.append(
@@ -205,7 +204,8 @@ def _compare_places(
 ) -> tuple[Change, Change | None] | None:
     known = np.reshape(calibration.places[: len(calibration.places) // 4 * 4], (-1, 4))
     seen = found.places.get((row.digitizer, row.scanner), np.empty((4, 0)))
-    return compare_ground(seen, known[known[:, 0] == number_channel(row.digitizer, row.scanner), 1:], noise)
+    mine = known[known[:, 0] == number_channel(row.digitizer, row.scanner), 1:]
+    return compare_ground(seen, mine, noise, chance=calibration.change_chance)
 
 
 def judge_fading(calibration: Calibration, found: Setting, *, other: bool) -> tuple[float, list[str], list[str]]:

@@ -98,7 +98,8 @@ def match_strip(
     if calibration.haze and attenuation is None:
         calibration = replace(calibration, attenuation=calibration.attenuation / calibration.haze * sensor.haze)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
-    setting = measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0)
+    chance = calibration.change_chance
+    setting = measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0, chance=chance)
     refuse_zone(calibration, setting, sensor.distance, reader.facts.path)
     notes: list[str] = []
     measured = {calibration.fingerprint.get("sha256_sampled"), *(row.sha256 for row in calibration.strips)}
