@@ -537,6 +537,67 @@ def test_a_chance_of_zero_in_the_file_takes_the_check_away(tmp_path, calibrated)
     assert found[0.0][0] < 0.035 < found[0.3][0] - 0.015, found
 
 
+def move_points(path, target, move):
+    """The strip with its points moved, f8 (n, 3) to f8 (n, 3), and its packet vectors left as they are."""
+    content = bytearray(path.read_bytes())
+    (begin,), (number,) = struct.unpack_from("<I", content, 96), struct.unpack_from("<I", content, 107)
+    (length,) = struct.unpack_from("<H", content, 105)
+    scale, offset = np.array(struct.unpack_from("<6d", content, 131)).reshape(2, 3)
+    rows = np.frombuffer(content, np.uint8, number * length, begin).reshape(number, length).copy()
+    xyz = move(np.ascontiguousarray(rows[:, :12]).view("<i4") * scale + offset)
+    rows[:, :12] = np.ascontiguousarray(np.rint((xyz - offset) / scale).astype("<i4")).view(np.uint8)
+    content[begin : begin + rows.size] = rows.tobytes()
+    struct.pack_into("<6d", content, 179, *np.stack([xyz.max(axis=0), xyz.min(axis=0)], axis=1).ravel())
+    target.write_bytes(content)
+
+
+def turn(xyz, degrees=2.0):
+    east, north = (xyz[:, :2] - xyz[:, :2].mean(axis=0)).T
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    middle = xyz[:, :2].mean(axis=0)
+    return np.column_stack([c * east - s * north + middle[0], s * east + c * north + middle[1], xyz[:, 2]])
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.4])
+def test_points_of_another_crs_than_their_vectors_are_named(tmp_path, slope):
+    """They had no range, for want of a sensor; and with --flight-height one that no hillside entered the error of."""
+    high = replace(SENSOR, height=900.0)
+    write_strip(tmp_path / "s.las", [Facet(0.3, slope=(0.0, slope))], high, 6000, seed=85)
+    move_points(tmp_path / "s.las", tmp_path / "turned.las", turn)
+    done = call("run", tmp_path / "turned.las", "-o", tmp_path / "a", "--columns", "range,range_error")
+    assert done.exit_code == 0 and "vectors spread by 24 degrees, but do not meet in a path" in done.stderr
+    assert "RuntimeWarning" not in done.output
+    options = ("--columns", "range,range_error", "--flight-height", 900)
+    done = call("run", tmp_path / "turned.las", "-o", tmp_path / "b", *options)
+    assert done.exit_code == 0 and "vectors spread by 24 degrees" in done.stderr
+    cloud = wb.read_cloud(tmp_path / "b" / "turned.laz")
+    off = cloud["range"] * 0.987 - (900.0 - cloud["z"])
+    assert np.mean(np.abs(off) < cloud["range_error"]) > 0.6
+    assert np.nanmedian(cloud["range_error"]) > (60.0 if slope else 40.0)
+    # The same strip with its own vectors is right, and no line doubts it.
+    done = call("run", tmp_path / "s.las", "-o", tmp_path / "c", "--columns", "range,range_error")
+    assert done.exit_code == 0 and "vectors" not in done.stderr
+
+
+def test_a_strip_whose_times_show_no_day_is_said_to_count_as_of_the_same_day(tmp_path, calibrated):
+    write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 90 * 86400), 10_000, seed=87)
+    content = bytearray((tmp_path / "s.las").read_bytes())
+    content[6] &= 0xFE  # seconds of the week
+    (tmp_path / "s.las").write_bytes(content)
+    said = run(calibrated, tmp_path / "out", tmp_path / "s.las")
+    assert "GPS times of this strip are seconds of a week, so they show no day: it counts as the same day" in said
+    assert "show no day" not in run(calibrated, tmp_path / "out", "a.las")
+
+
+def test_a_column_that_is_no_reflectance_of_the_channel_is_named(tmp_path, monkeypatch):
+    write = facet_strips._write
+    monkeypatch.setattr(facet_strips, "_write", lambda *a: write(*a[:10], np.full_like(a[10], 0.6)))
+    write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, vendor="share"), 6000, seed=89)
+    done = call("calibrate", tmp_path / "s.las", "--from-column", "Reflectance", "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 0 and "constants by its dark and its bright echoes differ by 5" in done.stderr
+    assert load_calibration(tmp_path / "cal.toml").relative_error > 0.5
+
+
 def test_scanner_channels_of_one_digitizer_are_compared_one_by_one(tmp_path):
     """Their light was one scene: another gain of one of two passed for half of it, and moved the other's places too."""
     for number, gain in enumerate((0.5, 0.33)):

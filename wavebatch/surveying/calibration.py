@@ -66,6 +66,8 @@ class TargetResult:
     """Standard deviation of the constant from this target alone, relative."""
     air: float | None = None
     """Share of the air that a column of reflectances held, which was taken off; None where it is not known."""
+    apart: float = 0.0
+    """Scatter of the constants by dark and by bright echoes of a column of reflectances, relative."""
     refused: str = ""
     """Why the target gave no constant."""
     channel: str = ""

@@ -37,6 +37,9 @@ from wavebatch.surveying.sensor import SensorSource
 LEAST_BENT = 0.01
 """Error by a compressing receiver from which it is said: a third of that of a target's reflectance."""
 
+MOST_APART = 0.1
+"""How far dark and bright echoes of a column of reflectances may differ: vendors' noise and ours make less than 5 %."""
+
 MOST_ECHOES = 200_000
 """Most echoes that a target uses: the error of its reflectance is far larger than that of so many."""
 
@@ -205,6 +208,11 @@ def _list_doubts(
     """What a person should look at before the calibration is used."""
     yield from filter(None, (source.sensor.doubt(), *source.sent.notes))
     for result in results:
+        if result.apart > MOST_APART:
+            yield (
+                f"{result.name}: constants by its dark and its bright echoes differ by {result.apart:.0%} (standard "
+                "deviation): is it the reflectance, of this channel? The error holds it"
+            )
         if options.column and result.air is None and source.air:
             yield (
                 f"{result.name}: its ranges are too alike to show whether it still holds the air: the error of the "

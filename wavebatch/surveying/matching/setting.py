@@ -287,6 +287,8 @@ def measure_setting(
 
 def _find_right(rows: np.ndarray) -> tuple[float, float]:
     """Unit vector to the right of the mean motion of the sensor; 0 where it does not move."""
+    if not rows.size:
+        return 0.0, 0.0
     time, *place = rows[[0, 6, 7]] - rows[[0, 6, 7]].mean(axis=1, keepdims=True)
     ahead = np.nan_to_num(np.stack(place) @ time)
     return tuple((np.array([ahead[1], -ahead[0]]) / max(float(np.hypot(*ahead)), 1e-30)).tolist())

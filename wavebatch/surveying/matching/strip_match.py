@@ -22,7 +22,7 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import sample_reference
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
-from wavebatch.surveying.matching.setting import measure_setting, see_channels
+from wavebatch.surveying.matching.setting import measure_setting, read_day, see_channels
 from wavebatch.surveying.matching.strip_conditions import (
     compare_air,
     compare_divergence,
@@ -106,6 +106,12 @@ def match_strip(
     if own_strip not in measured:
         more, lines, notes = compare_setting(calibration, setting, system)
         growth, reasons = math.hypot(growth, more), [*reasons, *lines]
+        if not (calibration.flight and read_day(reader)):
+            which = "the calibration" if not calibration.flight else "this strip"
+            notes.append(
+                f"calibration: GPS times of {which} are seconds of a week, so they show no day: it counts as the same "
+                "day; lasers, receivers and air of another day would add to the error"
+            )
     if energy is None:
         more, lines, hidden = judge_fading(calibration, setting, other=own_strip not in measured)
         growth, reasons, notes = math.hypot(growth, more), [*reasons, *lines], [*notes, *hidden]
