@@ -24,8 +24,8 @@ from wavebatch.surveying.matching.setting import SCANNERS
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
 
-SAMPLE = 4096
-"""Waveforms that are looked at."""
+SAMPLE, BLOCK = 4096, 512
+"""Waveforms that are looked at, and so many at a time: each takes 100 bytes per sample."""
 
 CLASSES, LEAST_OF_CLASS = 8, 12
 """Classes of echoes by amplitude whose medians are compared, and fewest echoes of each."""
@@ -69,7 +69,7 @@ def find_compression(reader: StripReader, scan: StripScan, system: SystemPulse) 
     docs/algorithms.md 5.
     """
     parts: dict[int, list[np.ndarray]] = {}
-    for block in reader.sample_blocks(scan, SAMPLE):
+    for block in reader.sample_blocks(scan, SAMPLE, BLOCK):
         own = system.of(block)
         for channel, rows in _describe(clean_block(block, own), own):
             parts.setdefault(channel, []).append(rows)
@@ -95,14 +95,15 @@ def _describe(block: WaveformBlock, system: SystemPulse) -> Iterator[tuple[int, 
     basis *= np.isfinite(left)[:, None]
     left = np.nan_to_num(left) / height
     missing = (basis[:, 0] * height / place[:, :1]) ** 2
-    inner = np.einsum("nis,njs->nij", basis, basis)
+    inner = np.einsum("nis,njs->nij", basis, basis) + 1e-9 * np.eye(3)  # a pulse between two samples has no width
     taken = np.linalg.solve(inner, np.einsum("nis,ns->ni", basis, missing)[..., None])[..., 0]
     rest = missing - np.einsum("ni,nis->ns", taken, basis)
-    share = -np.einsum("ns,ns->n", left, rest) / np.einsum("ns,ns->n", rest, rest)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = -np.einsum("ns,ns->n", left, rest) / np.einsum("ns,ns->n", rest, rest)
     rows = np.stack([place[:, 0], share, taken[:, 0] + taken[:, 2]])
     scanner = np.zeros(len(part), np.int64) if part.scanner is None else part.scanner
     for number in np.unique(scanner).tolist():
-        yield SCANNERS * block.digitizer.index + number, rows[:, scanner == number]
+        yield SCANNERS * block.digitizer.index + number, rows[:, (scanner == number) & np.isfinite(share)]
 
 
 def _judge(amplitude: np.ndarray, share: np.ndarray, light: np.ndarray) -> Compression | None:
