@@ -283,12 +283,12 @@ def test_ground_that_a_calibrated_strip_saw_shows_another_energy(rng, factor):
 def test_one_of_two_digitizers_that_fades_is_enough(rng, fading):
     (x, y), light, time = rng.uniform(0, 1000, (2, 300)), rng.normal(0, 1, 300), np.linspace(-1, 1, 300)
     places = {
-        digitizer: np.stack([x, y, light + 0.3 * time * (digitizer == fading) + rng.normal(0, 0.05, 300), time])
+        (digitizer, 0): np.stack([x, y, light + 0.3 * time * (digitizer == fading) + rng.normal(0, 0.05, 300), time])
         for digitizer in (1, 2)
     }
     known = np.concatenate([np.stack([np.full(300, digitizer), x, y, light], axis=1) for digitizer in (1, 2)])
-    channels = [SimpleNamespace(digitizer=digitizer) for digitizer in (1, 2)]
-    calibration = SimpleNamespace(channels=channels, strips=(), places=known.ravel().tolist())
+    channels = [SimpleNamespace(digitizer=digitizer, scanner=0) for digitizer in (1, 2)]
+    calibration = SimpleNamespace(channels=channels, strips=(), places=known.ravel().tolist(), change_chance=0.3)
     growth, lines, _ = judge_fading(calibration, SimpleNamespace(fades=NO_CHANGE, places=places), other=True)
     assert growth > 0.2 and "a laser that fades" in lines[0]
 
