@@ -20,7 +20,7 @@ import click
 import wavebatch
 from wavebatch.batch.options import describe_options
 from wavebatch.cli import COMMANDS, main
-from wavebatch.cli.program.command import EXAMPLES, group_options
+from wavebatch.cli.program.command import group_options
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.stages.chain import KINDS, STAGES
 from wavebatch.stages.chain_file import format_step
@@ -66,7 +66,7 @@ def _command(command: click.Command, parent: click.Context, name: str, level: in
         lines += [f"| {_code(names)} | {_cell(_plain(text))} |" for names, text in rows]
         if rows:
             yield "\n".join(lines)
-    examples = EXAMPLES.get(context.command_path.removeprefix("wavebatch "), ())
+    examples = getattr(command, "examples", ())
     if examples:
         yield "```sh\n" + "\n".join(f"{line}  # {purpose}" for line, purpose in examples) + "\n```"
     if isinstance(command, click.Group):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.header import ExtraRecord
 from wavebatch.files.strip.writer import FullwaveWriter
 
 SPEED = 0.299792458 * 0.9997 / 2

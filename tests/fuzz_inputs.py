@@ -13,7 +13,7 @@ from commands import run_command
 from pulse_files import Pulse, PulseFile, Sampling, bell
 from strips import vlr
 
-from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
+from wavebatch.files.las.header import ExtraRecord, build_dtype
 from wavebatch.stages.chain_file import effective, load_profile
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.strip import StripOptions

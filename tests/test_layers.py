@@ -161,7 +161,7 @@ def test_no_other_dependency_at_run_time():
     for path in MODULES:
         peers = {"gdecomp"} if path.name == "peers.py" else set()
         peers |= {"matplotlib", "mpl_toolkits"} if _part(path) == "tools" or path.name == "figure_file.py" else set()
-        projecting = ("trajectory_file.py", "geo_keys.py", "geojson.py")
+        projecting = ("trajectory_file.py", "crs.py", "geojson.py")
         peers |= {"pyproj"} if path.name in projecting else set()
         peers |= {"dask", "distributed"} if path.parent.name == "workers" else set()
         peers |= {"setuptools"} if path.name == "build_kernels.py" else set()

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.cloud import layout
-from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.files.cloud import writer as layout
+from wavebatch.files.cloud.writer import OutputLayout
 from wavebatch.files.disk.publish import publish_together
-from wavebatch.files.las.extra_bytes import build_dtype
-from wavebatch.files.las.header import LasHeader, Vlr, encode_evlr_header, read_header
+from wavebatch.files.las.header import LasHeader, Vlr, build_dtype, encode_evlr_header, read_header
 from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.packets import StripFacts

@@ -21,8 +21,7 @@ from wavebatch.kernels.physics.incidence import PAPER_TAU, paper_table, pulse_ta
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.detect.transformed import transform, wavelet
-from wavebatch.tools.simulate.from_returns import synthesize_strip
-from wavebatch.tools.simulate.returns import SynthesisOptions
+from wavebatch.tools.simulate.returns import SynthesisOptions, synthesize_strip
 
 SCALES = (1.0, 2.0, 3.0)
 DEGREES = np.arange(0.0, 76.0, 1.0)

@@ -11,9 +11,8 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.tools.simulate.blocks import flag_truth
 from wavebatch.tools.simulate.render import PulseModel, Recording, paint_echoes, record_counts
-from wavebatch.tools.simulate.scenes import tabulate_echoes
+from wavebatch.tools.simulate.scenes import flag_truth, tabulate_echoes
 
 FINE = 100.0
 """Counts per unit of amplitude of `fine_recording`."""

@@ -25,9 +25,8 @@ from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.tools.return_stats import ReturnStats, count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, simulate_returns
-from wavebatch.tools.simulate.from_returns import synthesize_strip
 from wavebatch.tools.simulate.render import paint_echoes
-from wavebatch.tools.simulate.returns import Radar, SynthesisOptions
+from wavebatch.tools.simulate.returns import Radar, SynthesisOptions, synthesize_strip
 
 FULL = 20_000
 """Pulses that the bands hold for."""

@@ -29,7 +29,7 @@ from wavebatch.kernels.geometry.normals import Gap
 from wavebatch.stages.chain import STAGES, Stage, Step
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.geometry import START_TIME, FlightLine, trace_rays
+from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 
 STAGE = "attribute.incidence_angle_normals"
 COLUMNS = ["incidence_angle_normals", "incidence_angle_normals_err"]
@@ -163,24 +163,6 @@ def test_only_the_error(strips, clouds, tmp_path):
     np.testing.assert_array_equal(
         laspy.read(tmp_path / "slope.laz")[COLUMNS[1]], laspy.read(clouds[0] / "slope.laz")[COLUMNS[1]]
     )
-
-
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        ("radius = -1.0", "radius must lie between 0 and 1000"),
-        ("radius = 1e9", "radius must lie between 0 and 1000"),
-        ("min_points = 3", "min_points must lie between 4 and 10000"),
-        ("max_error = 0.0", "max_error must lie between 0.001 and 180"),
-    ],
-)
-def test_wrong_parameters_are_one_line(strips, tmp_path, value, message):
-    chain = tmp_path / "c.toml"
-    chain.write_text(CHAIN.replace("radius = 2.5", value))
-    done = run_command("run", strips / "slope.las", "-o", tmp_path / "out", "-c", chain)
-    assert done.exit_code == 2
-    assert f"({STAGE}): {message}" in done.stderr and "Traceback" not in done.stderr
-    assert not list((tmp_path / "out").glob("*"))
 
 
 _DIE = """

@@ -18,8 +18,7 @@ import wavebatch
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.geojson import AreaFile, describe_miss, load_polygons, place_rings, plan_crs, read_area_file
-from wavebatch.files.las.crs import read_crs, read_crs_definition
-from wavebatch.files.las.geo_keys import build_utm
+from wavebatch.files.las.crs import build_utm, read_crs, read_crs_definition
 from wavebatch.files.las.header import build_wkt, read_header
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.slices.output import SegmentWriter

@@ -29,8 +29,7 @@ from wavebatch.files.cloud.cloud_reader import CloudReader, ColumnReader, read_c
 from wavebatch.files.cloud.column_names import STYLES
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.publish import remove_stale
-from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, read_header
+from wavebatch.files.las.header import WKT_ID, ExtraRecord, Vlr, build_wkt, find_evlrs, read_header
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 LEICA = "leica-als/simple1_3_full_internal.las"
@@ -595,7 +594,7 @@ import resource, sys
 from pathlib import Path
 import numpy as np
 from wavebatch.core.errors import InputError
-from wavebatch.files.cloud.layout import plan_output
+from wavebatch.files.cloud.writer import plan_output
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.strip.reader import StripReader
 source, target = map(Path, sys.argv[1:3])

@@ -25,20 +25,24 @@ from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.las.crs import (
+    METRES,
     CrsUnits,
+    GeoKeys,
+    build_utm,
+    convert_geotiff,
+    find_code,
+    find_unit,
     looks_geocentric,
     parse_wkt,
     read_crs_definition,
     repair_records,
     repair_wkt,
 )
-from wavebatch.files.las.geo_keys import METRES, GeoKeys, build_utm, convert_geotiff, find_code, find_unit
 from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, is_projection, read_header
-from wavebatch.files.strip.ray_sample import measure_scale
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.reader import StripReader, measure_scale
 from wavebatch.stages.attribute.basic import position
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.geometry import FlightLine
+from wavebatch.tools.simulate.render import FlightLine
 from wavebatch.tools.simulate.strip import WKT
 
 US = 1200 / 3937

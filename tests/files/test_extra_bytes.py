@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype, choose_no_data, read_records
+from wavebatch.files.las.header import ExtraRecord, build_dtype, choose_no_data, read_records
 
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 

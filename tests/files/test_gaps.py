@@ -20,8 +20,8 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import read_header
+from wavebatch.files.strip.packet_check import packed_bytes, unpack_samples
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.files.strip.sample_form import packed_bytes, unpack_samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.kernels.signal.signal import (
     LEAST_LEVEL,
@@ -40,7 +40,7 @@ from wavebatch.tools.compare.chains import measure_fit
 from wavebatch.tools.plots.waveform import build_views
 from wavebatch.tools.simulate import StripOptions, simulate_strip
 from wavebatch.tools.slices.segments import _shape
-from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
+from wavebatch.tools.voxels.rays import Deconvolution, deconvolve_block
 
 DETECTORS = sorted(name for name, stage in STAGES.items() if name.startswith("detect."))
 DECOMPOSERS = sorted(name for name in STAGES if name.startswith("decompose.") and name != "decompose.none")

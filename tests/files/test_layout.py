@@ -9,8 +9,7 @@ from numpy.lib.recfunctions import repack_fields
 from writer_tools import data_file, facts_of, plan_output, random_points, read_raw, write_source, write_strip
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.header import STANDARD_DTYPES, Vlr
+from wavebatch.files.las.header import STANDARD_DTYPES, ExtraRecord, Vlr
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 VERSIONS = {4: (1, 3), 5: (1, 3), 9: (1, 4), 10: (1, 4)}

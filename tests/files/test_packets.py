@@ -17,7 +17,7 @@ from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, record_
 from writer_tools import data_file
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.strip import packets, shared_packets
+from wavebatch.files.strip import packets, scanner
 from wavebatch.files.strip.packets import PacketFile, PacketPlace
 from wavebatch.files.strip.reader import StripReader
 
@@ -513,5 +513,5 @@ def test_returns_that_meet_only_far_apart_still_vote(tmp_path, monkeypatch):
         raw.points[name] = np.rint(xyz[:, axis] / 0.001)
         raw.points[("x_t", "y_t", "z_t")[axis]] = vector[:, axis]
     raw.points = raw.points[np.argsort(raw.points["bit_fields"], kind="stable")]
-    monkeypatch.setattr(shared_packets, "WINDOW", 64)
+    monkeypatch.setattr(scanner, "WINDOW", 64)
     assert scan_of(raw.write(tmp_path / "a.las")).vectors.direction == "toward"

@@ -26,8 +26,7 @@ from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.disk import raw_bytes
 from wavebatch.files.disk.raw_bytes import hiding_panics
 from wavebatch.files.las import header, read_points
-from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
-from wavebatch.files.las.header import LasHeader, read_header
+from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype, read_header
 from wavebatch.files.las.read_points import open_points, read_checked_header
 from wavebatch.files.las.write_points import CHUNK_POINTS, PointFile, Statistics, compress_rows
 from wavebatch.files.strip.reader import StripReader

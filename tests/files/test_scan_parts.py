@@ -10,7 +10,7 @@ import pytest
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.strip import reader as strip_reader
-from wavebatch.files.strip import scanner, shared_packets
+from wavebatch.files.strip import scanner
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.simulate import simulate_strip
 
@@ -20,7 +20,7 @@ UNIT, WINDOW = 700, 200
 @pytest.fixture(autouse=True)
 def small_units(monkeypatch):
     monkeypatch.setattr(strip_reader, "UNIT_POINTS", UNIT)
-    monkeypatch.setattr(shared_packets, "WINDOW", WINDOW)
+    monkeypatch.setattr(scanner, "WINDOW", WINDOW)
     monkeypatch.setattr(scanner, "PART_UNITS", 1)
 
 
@@ -92,7 +92,7 @@ def test_a_part_of_few_points_before_a_border_is_not_cut_off(monkeypatch, strip)
         assert reader.cut_scan(3) == [(0, units // 3), (units // 3, 2 * units // 3), (2 * units // 3, units)]
         monkeypatch.setattr(scanner, "PART_UNITS", 4)
         assert len(reader.cut_scan(1000)) == units // 4
-        monkeypatch.setattr(shared_packets, "WINDOW", UNIT)  # a window of several units
+        monkeypatch.setattr(scanner, "WINDOW", UNIT)  # a window of several units
         assert reader.cut_scan(3) == [(0, units)]
 
 

@@ -14,7 +14,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.publish import protecting, refuse_input
 from wavebatch.files.las import read_points
-from wavebatch.files.strip import scanner, shared_packets
+from wavebatch.files.strip import scanner
 from wavebatch.files.strip.reader import LONG_SAMPLES, StripReader
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
@@ -114,9 +114,9 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
     path = _shuffled(tmp_path, points, orders[order])
     kinds = {1: (16, 60), 2: (16, 120)}
     plain = read_plainly(points[orders[order]], path.with_suffix(".wdp").read_bytes(), kinds)
-    monkeypatch.setattr(shared_packets, "WINDOW", window)
-    monkeypatch.setattr(shared_packets, "BINS", 64)
-    monkeypatch.setattr(shared_packets, "_PER_BUCKET", 500)
+    monkeypatch.setattr(scanner, "WINDOW", window)
+    monkeypatch.setattr(scanner, "BINS", 64)
+    monkeypatch.setattr(scanner, "_PER_BUCKET", 500)
     monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 100)
     assert_same(read_all(path, size=50, unit_points=128), plain)
     assert_same(read_all(path, size=50, owned_only=False, unit_points=128), plain)
@@ -263,7 +263,7 @@ def test_equal_offsets_of_two_descriptors_are_two_packets(tmp_path):
 
 def test_too_many_points_on_one_packet_are_broken_wherever_they_are(tmp_path, monkeypatch):
     for window in (16_384, 64):
-        monkeypatch.setattr(shared_packets, "WINDOW", window)
+        monkeypatch.setattr(scanner, "WINDOW", window)
         raw = make_raw(1000, most_returns=1)
         bad = np.arange(0, 1000, 25)
         raw.points["wavepacket_offset"][bad] = 60

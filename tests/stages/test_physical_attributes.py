@@ -24,9 +24,8 @@ from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_li
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.angle_limits import SLOPE, predict_angles
 from wavebatch.surveying.calibration import with_physics
-from wavebatch.tools.simulate.blocks import simulate_pulses
-from wavebatch.tools.simulate.geometry import AIR_SPEED
-from wavebatch.tools.simulate.scenes import find_scene
+from wavebatch.tools.simulate.render import AIR_SPEED
+from wavebatch.tools.simulate.scenes import find_scene, simulate_pulses
 
 SYSTEM = SystemPulse(
     1.2,

@@ -6,7 +6,7 @@ import pytest
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Digitizer, SystemPulse
-from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.header import ExtraRecord
 from wavebatch.files.pulse_energy import find_pulse_energy
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.writer import FullwaveWriter

@@ -12,8 +12,7 @@ from wavebatch.core.trajectory import ADJUSTED
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
-from wavebatch.files.strip.ray_sample import MOST_SLICES, RAYS_PER_SLICE, RaySample, sample_rays
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.reader import MOST_SLICES, RAYS_PER_SLICE, RaySample, StripReader, sample_rays
 from wavebatch.surveying.sensor import (
     UNKNOWN,
     SensorRequest,
@@ -22,7 +21,7 @@ from wavebatch.surveying.sensor import (
     find_sensor,
     find_turn,
 )
-from wavebatch.tools.simulate.geometry import START_TIME, FlightLine, trace_rays
+from wavebatch.tools.simulate.render import START_TIME, FlightLine, trace_rays
 
 
 def find(path, **request):

@@ -14,9 +14,8 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.flat_ground import Slopes, measure_reference
 from wavebatch.tools.simulate import find_scene, simulate_strip
-from wavebatch.tools.simulate.blocks import simulate_seed_block
-from wavebatch.tools.simulate.geometry import AIR_SPEED, GROUND, NORTH, START_TIME, FlightLine, trace_rays
-from wavebatch.tools.simulate.scenes import GROUND_REFLECTS, ROOFS_REFLECT
+from wavebatch.tools.simulate.render import AIR_SPEED, GROUND, NORTH, START_TIME, FlightLine, trace_rays
+from wavebatch.tools.simulate.scenes import GROUND_REFLECTS, ROOFS_REFLECT, simulate_seed_block
 
 SCENE = find_scene("village")
 

@@ -9,7 +9,7 @@ from commands import run_command
 from plot_tools import PULSE, make_chain, simulate, write_cloud
 
 from wavebatch.files import figure_file
-from wavebatch.files.figure_file import fit_parts, fit_text, open_picture, text_width
+from wavebatch.files.figure_file import fit_parts, fit_text, open_picture, set_layout, text_width
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.tools.plots.draw_waveform import draw_waveform_panels
 from wavebatch.tools.plots.waveform import build_views
@@ -132,6 +132,24 @@ def test_axes_in_metres_have_equal_scales(tmp_path, riegl, monkeypatch):
         axes = figure.axes[0]
         box, (x0, x1), (y0, y1) = axes.get_window_extent(), axes.get_xlim(), axes.get_ylim()
         assert box.width / (x1 - x0) == pytest.approx(box.height / (y1 - y0), rel=0.01)
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_axes_lie_at_round_places(tmp_path, compress):
+    """The solver of the layout gives other last digits in each run, and ids of clip paths follow from them."""
+    drawn = set()
+    for _ in range(3):
+        with open_picture(tmp_path / "p.svg", (8.6, 6.0), overwrite=True) as figure:
+            if compress:
+                set_layout(figure, compress=True)
+            for axes in figure.subplots(3, 2).ravel():
+                axes.set_ylabel("signal [DN]\nof it")
+            figure.colorbar(axes.imshow([[1.0, 2.0]]), ax=axes)
+        for axes in figure.axes:
+            bounds = axes.get_position(original=True).bounds
+            assert bounds == pytest.approx([round(value, 6) for value in bounds], rel=0, abs=1e-12)
+        drawn.add((tmp_path / "p.svg").read_bytes())
+    assert len(drawn) == 1
 
 
 def test_texts_are_shortened_to_their_room(tmp_path):

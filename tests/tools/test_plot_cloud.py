@@ -19,12 +19,10 @@ from wavebatch.files.cloud import cloud_reader as io_cloud
 from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools.even_sample import EvenSample
-from wavebatch.tools.plots import values
 from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values, place_edges
 from wavebatch.tools.plots.sections import cut_section
-from wavebatch.tools.plots.values import robust_limits
 from wavebatch.tools.rasters import cells
-from wavebatch.tools.rasters.cells import grid_values
+from wavebatch.tools.rasters.cells import grid_values, robust_limits
 
 
 @pytest.fixture(scope="module")
@@ -360,49 +358,9 @@ def test_limits_ignore_outliers_only():
     assert robust_limits(np.full(10, 3.0), 3.0, 3.0) == (3.0, 3.0)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"size": 1e-4}, "too many to draw; cells of 0.02 m will do"),
-        ({"size": 0.0}, "at least"),
-        ({"statistic": "mode"}, "mean, median"),
-        ({"bounds": (1.0, 0.0, 0.0, 1.0)}, "WEST"),
-    ],
-)
-def test_wrong_options_of_a_map(cloud, change, message):
-    with pytest.raises(ConfigError, match=message):
-        grid_values([cloud], "amplitude", **{"statistic": "mean", **change})
-
-
 def test_the_size_that_is_proposed_does(cloud):
     found = grid_values([cloud], "amplitude", size=0.02)
     assert found.grid.rows * found.grid.columns <= cells.MOST_CELLS
-
-
-@pytest.mark.parametrize("kind", ["histogram", "map"])
-def test_what_cannot_be_drawn_is_one_line(tmp_path, cloud, kind):
-    empty = write_cloud(tmp_path / "empty.las", n=0)
-    nothing = write_cloud(
-        tmp_path / "nothing.las", n=9, amplitude=(np.full(9, -1, "f4"), np.array([-1.0]), None, "peak [DN]")
-    )
-    broken = tmp_path / "broken.las"
-    broken.write_bytes(cloud.read_bytes()[:3000])
-    cases = [
-        (empty, "z", 1, "holds no points"),
-        (nothing, "amplitude", 1, "9 have no data in amplitude"),
-        (broken, "z", 1, "broken.las"),
-        (tmp_path / "none.las", "z", 1, "none.las"),
-        (cloud, "amplitud", 2, "did you mean 'amplitude'? Columns of the file: amplitude, echo_flags"),
-        (cloud, "qqqqqq", 2, "known are amplitude"),
-        (nothing, "intensity --flags WEAK", 2, "no column echo_flags"),
-        (cloud, "intensity --flags WEEK", 2, "did you mean 'WEAK'"),
-        (cloud, "intensity --flags NO_WAVEFORM", 1, "5000 of 5000 points are left out by their flags"),
-    ]
-    for path, column, code, message in cases:
-        result = run(kind, path, "-o", tmp_path / "p.png", "--column", *column.split())
-        assert (result.exit_code, result.stdout) == (code, ""), result.output
-        assert message in result.stderr and result.stderr.count("\n") == 1, result.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.las", "empty.las", "nothing.las"]
 
 
 def test_one_point_and_one_value_can_be_drawn(tmp_path):
@@ -472,33 +430,6 @@ def test_names_from_files_are_text_and_no_formulas(tmp_path):
     assert "a$\\frac{b$" in text and "&lt;b&gt; &amp;" in text
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["histogram", "--column", "z", "-o", "p.gif"], ".png, .svg, .pdf"),
-        (["histogram", "--column", "z", "-o", "p.png", "--range", "5:1"], "does not go up"),
-        (["histogram", "--column", "z", "-o", "p.png", "--range", "nan:1"], "does not go up"),
-        (["histogram", "--column", "echo_flags", "-o", "p.png", "--bins", "3"], "--bins"),
-        (["map", "--column", "echo_flags", "-o", "p.png"], "cloud.laz: echo_flags are bits, which have no mean; count"),
-        (["map", "-o", "p.png"], "needs a --column"),
-        (["map", "--column", "z", "-o", "p.png", "--bbox", "1,2,3"], "WEST,SOUTH,EAST,NORTH"),
-        (["histgram"], "did you mean 'histogram'?"),
-    ],
-)
-def test_wrong_usage(cloud, tmp_path, monkeypatch, words, message):
-    pytest.importorskip("matplotlib")
-    monkeypatch.chdir(tmp_path)
-    result = run(words[0], cloud, *words[1:])
-    assert result.exit_code == 2 and message in result.stderr and not list(tmp_path.iterdir())
-
-
-def test_without_matplotlib_a_line_says_what_to_install(cloud, tmp_path, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    result = run("histogram", cloud, "--column", "z", "-o", tmp_path / "p.png")
-    assert result.exit_code == 2 and "pictures need matplotlib: " in result.stderr
-    assert "pip install" in result.stderr and "'matplotlib>=3.8'" in result.stderr
-
-
 def test_a_matplotlib_that_does_not_work_is_one_line(cloud, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
@@ -536,7 +467,7 @@ def test_real_clouds(riegl, leica, tmp_path):
     pytest.importorskip("matplotlib")
     found = count_values([riegl], "Pulse width")
     assert found.total.values == 2535 and found.percentiles[0][1] == pytest.approx(4.4)
-    assert values.Clouds([riegl], ["amplitude"]).facts.unit == "dB"
+    assert cells.Clouds([riegl], ["amplitude"]).facts.unit == "dB"
     assert run("map", riegl, "--column", "z", "--statistic", "max", "-o", tmp_path / "r.png").exit_code == 0
     assert grid_values([leica], "intensity").total.values == 999
 

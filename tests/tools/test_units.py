@@ -11,8 +11,7 @@ from commands import run_command
 from strips import add_record
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.las.crs import metres_per_unit, parse_wkt
-from wavebatch.files.las.geo_keys import build_utm
+from wavebatch.files.las.crs import build_utm, metres_per_unit, parse_wkt
 from wavebatch.files.las.header import build_wkt
 from wavebatch.files.strip.packet_check import DirectionTally, decide_direction
 from wavebatch.tools.plots.charts import picture_cloud

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
-from pathlib import Path
 
 import laspy
 import numpy as np
@@ -24,12 +23,10 @@ from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.simulate.blocks import simulate_block
-from wavebatch.tools.simulate.geometry import FlightLine
-from wavebatch.tools.simulate.render import Recording, find_pulse
+from wavebatch.tools.simulate.render import FlightLine, Recording, find_pulse
+from wavebatch.tools.simulate.scenes import simulate_block
 from wavebatch.tools.simulate.strip import WKT, StripOptions
-from wavebatch.tools.voxels.floor import Ceiling, Floor
-from wavebatch.tools.voxels.profile import Deconvolution, _pulse_taps, deconvolve_block
+from wavebatch.tools.voxels.rays import Ceiling, Deconvolution, Floor, _pulse_taps, deconvolve_block
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.4, std=1.05))
@@ -306,7 +303,7 @@ def test_followed_up_to_the_highest_return_rays_count_as_if_from_the_sensor(tmp_
 
 @pytest.mark.parametrize("most", [8, 100, 1 << 18])
 def test_ceilings_are_those_of_a_slow_search(monkeypatch, most):
-    monkeypatch.setattr("wavebatch.tools.voxels.floor.MOST_CELLS", most)
+    monkeypatch.setattr("wavebatch.tools.voxels.rays.MOST_CELLS", most)
     rng = np.random.default_rng(9)
     points = rng.uniform(0, 120, (300, 3)) * [1, 1, 0.3]
     ceiling = Ceiling(np.array([60.0, 60.0, 0.0]), 1.0)
@@ -494,48 +491,6 @@ def test_rays_far_from_all_others_are_counted_and_left_out(forest, tmp_path, edi
     assert np.ptp(found["index"], axis=0).max() < 5000
 
 
-def test_voxels_too_small_for_the_strip_are_one_line(forest, tmp_path):
-    with pytest.raises(ConfigError, match=r"--size 1e-06: too small .* take \S+ m or more"):
-        voxelize(forest[0], tmp_path / "v.npz", 1e-6)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"size": 0.0}, {"size": -1.0}, {"size": float("nan")}, {"size": 1e9}, {"headroom": -1.0}, {"headroom": np.inf},
-     {"ground_height": -1.0}, {"reflectance_ratio": 0.0}, {"reflectance_ratio": float("nan")}],
-)
-def test_wrong_sizes_are_refused(wrong):
-    with pytest.raises(ConfigError):
-        VoxelOptions(**{"size": 1.0, **wrong})
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"method": "clean"}, {"iterations": 0}, {"method": "wiener", "iterations": 5}, {"snr": 5.0},
-        {"method": "wiener", "snr": 0.0}, {"threshold": -1.0},
-    ],
-)  # fmt: skip
-def test_wrong_deconvolutions_are_refused(wrong):
-    with pytest.raises(ConfigError):
-        Deconvolution(**wrong)
-
-
-def test_an_output_is_refused_or_replaced_and_never_the_strip(forest, tmp_path):
-    strip = Path(write_strip(tmp_path / "s.las", [[(100.0, 50.0)]] * 30))
-    (tmp_path / "v.npz").write_text("old")
-    with pytest.raises(InputError, match="exists already"):
-        voxelize(strip, tmp_path / "v.npz", 1.0)
-    voxelize(strip, tmp_path / "v.npz", 1.0, overwrite=True)
-    before = strip.read_bytes()
-    with pytest.raises(ConfigError, match="would replace this input"):
-        voxelize(strip, strip, 1.0, overwrite=True)
-    with pytest.raises(ConfigError, match=r"\.npz, \.las or \.laz"):
-        voxelize(strip, tmp_path / "v.tif", 1.0)
-    assert strip.read_bytes() == before and sorted(p.name for p in tmp_path.iterdir()) == ["s.las", "v.npz"]
-
-
 def test_a_strip_without_any_signal_gives_no_voxel(tmp_path):
     strip = write_strip(tmp_path / "s.las", [[]] * 20)
     for target in ("v.npz", "v.laz", "v.las"):
@@ -607,7 +562,7 @@ def test_light_is_normalised_by_range(tmp_path):
 
 @pytest.mark.parametrize("most", [20, 1 << 18])
 def test_the_floor_is_the_ground_below_plants(monkeypatch, most):
-    monkeypatch.setattr("wavebatch.tools.voxels.floor.MOST_CELLS", most)
+    monkeypatch.setattr("wavebatch.tools.voxels.rays.MOST_CELLS", most)
     rng = np.random.default_rng(5)
     xyz = rng.uniform(0, 60, (6000, 3)) * [1, 1, 0]
     ground = 0.3 * xyz[:, 0] - 0.1 * xyz[:, 1] + 0.05 * rng.standard_normal(6000)
@@ -709,19 +664,6 @@ def test_the_bytes_of_profiles_do_not_depend_on_blocks(forest, tmp_path):
     for name, size in (("a", None), ("b", 137)):
         profiles_of(forest[0], tmp_path, name, block_size=size)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-
-
-def test_wrong_profiles_leave_nothing(level, tmp_path):
-    (tmp_path / "old.npz").write_text("x")
-    for path, kind, words in (
-        (tmp_path / "p.csv", ConfigError, ".npz"),
-        (tmp_path / "v.npz", ConfigError, "another name"),
-        (tmp_path / "old.npz", InputError, "exists"),
-        (tmp_path / "none" / "p.npz", InputError, "none"),
-    ):
-        with pytest.raises(kind, match=words):
-            voxelize(level, tmp_path / "v.npz", 1.0, profiles=path)
-    assert [path.name for path in tmp_path.iterdir()] == ["old.npz"]
 
 
 def test_unknown_cross_sections_of_profiles_are_no_data(level, tmp_path):

@@ -21,8 +21,8 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.column_names import name_standard, read_field, resolve
-from wavebatch.files.cloud.layout import OutputLayout, plan_output
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter
+from wavebatch.files.cloud.writer import OutputLayout, plan_output
 from wavebatch.files.las.header import read_classes
 from wavebatch.files.strip.reader import StripFacts, StripReader
 from wavebatch.stages.chain import STAGES, Chain

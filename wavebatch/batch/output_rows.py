@@ -25,7 +25,7 @@ from wavebatch.files.las.header import locate, split_numbers
 from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, number_returns
 
 if TYPE_CHECKING:
-    from wavebatch.files.cloud.layout import OutputLayout
+    from wavebatch.files.cloud.writer import OutputLayout
     from wavebatch.files.strip.reader import Unit
 
 _REFLECTING = ("level_reflectance", "facing_reflectance")

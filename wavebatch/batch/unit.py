@@ -25,8 +25,8 @@ from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.process import Seconds
 from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
+from wavebatch.files.cloud.writer import OutputLayout
 from wavebatch.files.disk.temp_store import RowParcel
 from wavebatch.files.las.header import split_numbers
 from wavebatch.files.las.write_points import CHUNK_POINTS, Chunk, Statistics, compress_rows

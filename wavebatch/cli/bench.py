@@ -41,6 +41,12 @@ def bench(
     standard error of each figure.
 
     Exit code: 0 done, 1 the strip cannot be read or the folder cannot be written, 2 wrong usage.
+
+    Examples:
+      # all shipped chains on echoes like those of the strip
+      wavebatch bench strip.las -o bench
+      # the cheapest chain with 2 cm of range error
+      wavebatch bench --scene open --tolerance 0.02m
     """
     from wavebatch.tools.bench.report import bench_sheet, format_document, write_bench_page, write_outputs
 

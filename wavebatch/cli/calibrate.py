@@ -65,6 +65,12 @@ def calibrate(
     a target to those with one. Each strip gets its constant, its drift, and their errors.
 
     Exit code: 0 done, 1 the strips or their targets give no constant, 2 wrong usage.
+
+    Examples:
+      # for `run --calibration cal.toml`
+      wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml
+      # with light that falls across the swath
+      wavebatch calibrate *.laz --targets targets.csv --scan-angle --html cal.html -o cal.toml
     """  # fmt: skip
     from wavebatch.files.disk.publish import refuse_existing
     from wavebatch.files.text_file import write_text

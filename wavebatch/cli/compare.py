@@ -17,7 +17,7 @@ from wavebatch.cli.messages import print_result, talk, tell
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
-from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
+from wavebatch.tools.compare.pairing import Comparison, compare_clouds, compare_truth
 from wavebatch.tools.sheets.compare import comparison_sheet, format_comparison, write_compare_page
 
 if TYPE_CHECKING:
@@ -75,6 +75,14 @@ def compare(
     vendor's returns.
 
     Exit code: 0 done, 1 a threshold (--min-..., --max-...) is not met, 2 wrong usage or a file cannot be read.
+
+    Examples:
+      # a cloud with the vendor's returns
+      wavebatch compare clouds/strip.laz strip.las
+      # two chains on the waveforms of a strip
+      wavebatch compare --strip strip.las fast accurate
+      # with the truth; exit code 1 below 95 %
+      wavebatch compare clouds/strip.laz --truth truth.npz --min-completeness 0.95
     """  # fmt: skip
     shared.check_html(html_file)
     if output is not None:

@@ -50,6 +50,14 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     a cell has no data: 1 fewer than 10 rays, 2 no light on the ground.
 
     Exit code: 0 done, 1 a cloud cannot be read or the raster cannot be written, 2 wrong usage.
+
+    Examples:
+      # two bands for GIS
+      wavebatch grid clouds/ --column amplitude --column echo_width --statistic median --size 1 -o x.tif
+      # points per square metre
+      wavebatch grid clouds/ --statistic density --size 5 -o density.tif
+      # without points of noise
+      wavebatch grid clouds/ --column z --statistic max --where 'classification != 7' -o top.tif
     """  # fmt: skip
     from wavebatch.files.geotiff_file import check_raster
 

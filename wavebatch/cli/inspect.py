@@ -53,6 +53,10 @@ def info(
     chain, version and counts. --json prints one object for one file, else a list of them.
 
     Exit code: 0 done, 1 a file or its packets cannot be read (the others, and its points, are shown), 2 wrong usage.
+
+    Examples:
+      # points, packets, descriptors and samples
+      wavebatch info strip.las
     """
     paths, lost = shared.find_inputs(strips, recursive=recursive), 0
 
@@ -109,6 +113,10 @@ def check(
     wavebatch can read.
 
     Exit code: 0 no problems, 1 problems found, 2 wrong usage.
+
+    Examples:
+      # one line per problem; exit code 1 if there is any
+      wavebatch check strip.las mychain.toml
     """
     from wavebatch.surveying.inspect_strip import check_file  # imports all stages
 
@@ -237,6 +245,12 @@ def stages(name: str | None, as_json: bool, quiet: bool, debug: bool) -> None:
     The explanation has its parameters with units and ranges, its source, and an example for a chain file.
 
     Exit code: 0 done, 2 no stage has this name.
+
+    Examples:
+      # list all algorithms
+      wavebatch stages
+      # one with parameters, units, source and a TOML example
+      wavebatch stages decompose.adaptive
     """
     from wavebatch.stages.chain import KINDS, STAGES
     from wavebatch.stages.chain_file import load_plugins

@@ -108,9 +108,15 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
     Several lines (of --by or --each) are drawn as shares of their values, so that they can be compared.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+
+    Examples:
+      # ground only
+      wavebatch plot histogram clouds/*.laz --column z --where "classification == 2" -o ground.png
+      # widths of all clouds
+      wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png
     """  # fmt: skip
     from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values
-    from wavebatch.tools.plots.values import Clouds
+    from wavebatch.tools.rasters.cells import Clouds
 
     column, chosen = options["column"], choose_points(options)
     if Clouds(clouds, (column,), chosen).facts.is_flags:
@@ -151,6 +157,10 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
     the 98th percentile of the cells.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+
+    Examples:
+      # mean amplitude in cells of 1 m
+      wavebatch plot map clouds/ --column amplitude --size 1 -o map.png
     """  # fmt: skip
     from wavebatch.tools.rasters.cells import grid_values
 
@@ -203,6 +213,10 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     that lie far above or below all others are left out and counted as outside.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+
+    Examples:
+      # 2 m wide, along the longer extent
+      wavebatch plot section clouds/ --width 2 --column echo_width -o side.png
     """  # fmt: skip
     from wavebatch.tools.plots.sections import cut_section
 
@@ -236,6 +250,12 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     Heights are those of the coordinates, not above ground. Far outliers in height are left out and counted.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+
+    Examples:
+      # energy by height
+      wavebatch plot profile voxels.npz --column energy -o heights.png
+      # length of surface lines by height
+      wavebatch plot profile lines.csv --column length -o lines.png
     """  # fmt: skip
     from wavebatch.tools.plots.sections import measure_profile
     from wavebatch.tools.slices.output import is_segments, profile_segments
@@ -269,6 +289,10 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
     Each given option adds a slice; without any, the middle ones are drawn, and the time with the most signal.
 
     Exit code: 0 done, 1 the cube cannot be read or the picture cannot be written, 2 wrong usage.
+
+    Examples:
+      # scan line 3, and all pulses at 250 ns
+      wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png
     """  # fmt: skip
     from wavebatch.tools.slices.output import cut_cube
 
@@ -331,6 +355,14 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     the noise, echoes with their errors, and the returns of the file. The chain is chosen and run as by `wavebatch run`.
 
     Exit code: 0 done, 1 the strip cannot be read or the picture cannot be written, 2 wrong usage.
+
+    Examples:
+      # six waveforms, spread over the strip
+      wavebatch plot waveform strip.las -o fits.png
+      # fits to look at
+      wavebatch plot waveform strip.las -o bad.svg --flags NOT_CONVERGED,AT_BOUND
+      # a sheet of 100 random waveforms
+      wavebatch plot waveform strip.las -o sheet.png --random 100 --sheet
     """  # fmt: skip
     from wavebatch.core.condition import read_flags
     from wavebatch.files.cloud.point_filter import PointFilter

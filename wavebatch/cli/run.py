@@ -79,6 +79,18 @@ def run(**options: Any) -> None:
            a strip has a warning of --fail-on
       4    all strips failed
       130  interrupted; --resume continues
+
+    Examples:
+      # one strip; the chain is chosen by a survey of it
+      wavebatch run strip.las -o clouds
+      # a flight on all processors, with a report page
+      wavebatch run strips/ -o clouds --survey flight --jobs 0 --html run.html
+      # go on after an interruption
+      wavebatch run strips/ -o clouds --resume
+      # with a trajectory, and the range as a column
+      wavebatch run strip.las -o clouds --trajectory flight.txt --columns +range
+      # show chain, columns and sizes; write nothing
+      wavebatch run strip.las -o clouds --dry-run
     """  # fmt: skip
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

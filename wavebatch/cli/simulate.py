@@ -29,9 +29,8 @@ from wavebatch.tools.simulate import (
     simulate_returns,
     simulate_strip,
 )
-from wavebatch.tools.simulate.from_returns import SynthesisSummary, synthesize_strip
 from wavebatch.tools.simulate.render import Recording
-from wavebatch.tools.simulate.returns import EQUAL, Radar, SynthesisOptions
+from wavebatch.tools.simulate.returns import EQUAL, Radar, SynthesisOptions, SynthesisSummary, synthesize_strip
 
 _RECORDING = ("n_samples", "spacing", "baseline", "noise_std", "rho", "noise_gain", "saturation")
 """Options that change the recording of the scene."""
@@ -79,6 +78,10 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
     of 4, 5, 9 or 10.
 
     Exit code: 0 done, 1 the strip cannot be written, 2 wrong usage.
+
+    Examples:
+      # a strip with known echoes
+      wavebatch simulate forest -o forest.laz --pulses 50000 --truth truth.npz
     """  # fmt: skip
     receiver = _build_receiver(truth, options)
     found = find_scene(scene)
@@ -135,6 +138,12 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     takes a share of the footprint returns that share of the light.
 
     Exit code: 0 done, 1 the cloud cannot be read or the strip cannot be written, 2 wrong usage.
+
+    Examples:
+      # waveforms from the returns of a cloud
+      wavebatch synthesize cloud.laz -o strip.las
+      # by the lidar equation, with partial footprints
+      wavebatch synthesize cloud.laz -o strip.las --intensity reflectance --sensor-height 1200 --shares equal
     """  # fmt: skip
     settings = shared.from_options(SynthesisOptions, options, radar=_build_radar(options))
     with counting("points", options["quiet"]) as bar:

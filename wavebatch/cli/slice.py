@@ -88,6 +88,10 @@ def slice_(
       weight             sum of its samples [DN]
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
+
+    Examples:
+      # straight surface lines in the scan lines
+      wavebatch slice strip.las -o lines.csv
     """  # fmt: skip
     extras = [path for path in (png, overview, cube) if path is not None]
     if output is None and not extras:

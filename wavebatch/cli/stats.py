@@ -70,6 +70,10 @@ def stats(
     largest number of returns of the sensor hide.
 
     Exit code: 0 done, 1 a cloud cannot be read (the others are counted), 2 wrong usage.
+
+    Examples:
+      # return numbers, separations and flags of clouds
+      wavebatch stats clouds/*.laz
     """  # fmt: skip
     files = shared.find_inputs(clouds, recursive=recursive)
     if output is not None:
@@ -170,4 +174,5 @@ def _rank_pairs(part: ReturnStats | AreaStats) -> list[Separation]:
 
 
 def _plain(found: ReturnStats) -> dict[str, Any]:
-    return {**asdict(found), "returns_per_pulse": found.returns_per_pulse}
+    areas = [{**asdict(area), "returns_per_pulse": area.returns_per_pulse} for area in found.areas]
+    return {**asdict(found), "areas": areas, "returns_per_pulse": found.returns_per_pulse}

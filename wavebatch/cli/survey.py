@@ -60,6 +60,12 @@ def survey(
 
     Exit code: 0 done, 1 a strip cannot be surveyed or does not belong to the others, or a file cannot be written, 2
     wrong usage.
+
+    Examples:
+      # noise, pulse and scene, and which chain the strip needs
+      wavebatch survey strip.las
+      # save both for `run --system` and `--chain`
+      wavebatch survey strip.las -o system.toml --chain chain.toml
     """  # fmt: skip
     from wavebatch.core.errors import ConfigError
     from wavebatch.files.disk.publish import check_target

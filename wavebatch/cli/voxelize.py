@@ -18,7 +18,7 @@ from wavebatch.cli.messages import answer, counting, talk, tell
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import count, format_measure
 from wavebatch.files.disk.publish import refuse_input
-from wavebatch.tools.voxels.profile import Deconvolution
+from wavebatch.tools.voxels.rays import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions
 
 if TYPE_CHECKING:
@@ -85,6 +85,10 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     for the sensor position are for cross sections only.
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
+
+    Examples:
+      # cross sections in voxels of 1 m
+      wavebatch voxelize strip.las --size 1 -o voxels.npz
     """  # fmt: skip
     from wavebatch.batch.options import RunOptions
     from wavebatch.files.cloud.point_filter import PointFilter

@@ -82,9 +82,31 @@ def open_picture(
     """
     check_picture(target, overwrite=overwrite)
     with _style(str(target)), _new_figure(size, dpi) as figure:
-        figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.08)
+        set_layout(figure, w_pad=0.1, h_pad=0.08)
         yield figure
         _save(figure, target, overwrite)
+
+
+def set_layout(figure: Figure, **options: Any) -> None:
+    """Let matplotlib's constrained layout place the axes, at places that are the same in each run.
+
+    options: of ConstrainedLayoutEngine. Its solver goes by addresses in memory: places of two runs differ in their last
+    digits, and so would the ids of clip paths in an SVG. They are rounded to a millionth of the figure.
+    """
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    class Layout(ConstrainedLayoutEngine):
+        def execute(self, fig: Figure) -> Any:
+            """Places the axes."""
+            found = super().execute(fig)
+            every: Any = fig.axes
+            for axes in every:
+                for which in ("original", "active"):
+                    bounds = axes.get_position(original=which == "original").bounds
+                    axes._set_position([round(value, 6) for value in bounds], which=which)
+            return found
+
+    figure.set_layout_engine(Layout(**options))
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.order import even_places
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.header import ExtraRecord
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.files.text_file import read_text
 

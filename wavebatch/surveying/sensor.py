@@ -18,8 +18,7 @@ from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.units import AIR_ATTENUATION, MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.crs import read_crs_definition
-from wavebatch.files.strip.ray_sample import LEAST_PAIRS, RaySample, measure_scale, sample_rays
-from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.reader import LEAST_PAIRS, RaySample, StripReader, StripScan, measure_scale, sample_rays
 from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, measure_extent, range_error, sensor_at
 from wavebatch.kernels.physics.radiometry import mean_haze

@@ -20,9 +20,9 @@ from wavebatch.core.no_data import without_nan
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.las.crs import name_units, read_crs
-from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import (
     WITHOUT_WAVES,
+    ExtraRecord,
     LasHeader,
     decode_text,
     field_names,

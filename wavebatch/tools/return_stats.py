@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -165,8 +165,33 @@ def describe_pairs(pairs: int, total: float, least: float) -> Separation:
     return Separation(int(pairs), float(total) / int(pairs), float(least))
 
 
-@dataclass(frozen=True, slots=True)
-class AreaStats:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PulseStats:
+    """What is counted of the returns of a cloud, and of each of its areas."""
+
+    points: int
+    pulses: int
+    by_number: dict[int, float]
+    """Share of the returns with this return number."""
+    by_count: dict[int, float]
+    """Share of the pulses with exactly this many returns in the cloud."""
+    separations: dict[str, Separation]
+    """By return number, as far as there are pairs, without points passed through without an echo: of a cloud `all`, and
+    `1-2`, `2-3` ...; of an area `1-2`, `2-3`, `3-4` and `4-`."""
+    several: int
+    """Pulses with two or more returns."""
+    depth: float
+    """Mean height of the first above the last return of these pulses [m]: how deep they reach into the vegetation; NaN
+    without any."""
+
+    @property
+    def returns_per_pulse(self) -> float:
+        """Mean number of returns; NaN without pulses."""
+        return self.points / self.pulses if self.pulses else math.nan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AreaStats(PulseStats):
     """Statistics of the returns of one area."""
 
     kind: str
@@ -174,39 +199,33 @@ class AreaStats:
     x: float
     y: float
     """As in Area."""
-    points: int
-    pulses: int
-    returns_per_pulse: float
-    by_number: dict[int, float]
-    """Share of the returns of the area with this return number."""
-    by_count: dict[int, float]
-    """Share of the pulses of the area with exactly this many returns."""
     pairs: int
     """Pairs of consecutive returns of a pulse."""
     mean: float
     least: float
     """Mean and least distance of the pairs [m]; NaN without a pair."""
-    separations: dict[str, Separation]
-    """The same by return number: `1-2`, `2-3`, `3-4` and `4-`, as far as there are pairs."""
-    several: int
-    """Pulses with two or more returns."""
-    depth: float
-    """Mean height of the first above the last return of these pulses [m]: how deep they reach into the vegetation."""
 
 
 class AreaTally:
     """Sums per area of one division; tallies of several clouds can be merged."""
 
     def __init__(self, division: Division, ranks: tuple[str, ...] = RANKS) -> None:
-        self.division, self._ranks = division, ranks
-        n = int(isinstance(division, Whole))
-        self._areas = np.zeros(n, np.int64)
-        self._counts = np.zeros((n, MOST_NUMBER + 1 + MOST_COUNT + 1 + len(ranks) + 1), np.int64)
-        self._sums = np.zeros((n, len(ranks) + 1))
-        self._least = np.full((n, len(ranks)), np.inf)
+        self.division, self._ranks, n = division, ranks, len(ranks)
+        quantities = [("by_number", "i8", (MOST_NUMBER + 1,)), ("by_count", "i8", (MOST_COUNT + 1,)),
+                      ("pairs", "i8", (n,)), ("apart", "f8", (n,)), ("least", "f8", (n,)), ("several", "i8"),
+                      ("depth", "f8")]  # fmt: skip
+        self._dtype = np.dtype(quantities)
+        self._areas = np.zeros(int(isinstance(division, Whole)), np.int64)
+        self._sums = self._begin(len(self._areas))
 
     def __len__(self) -> int:
         return len(self._areas)
+
+    def _begin(self, number: int) -> np.ndarray:
+        """The sums of areas of which nothing was counted."""
+        sums = np.zeros(number, self._dtype)
+        sums["least"] = np.inf
+        return sums
 
     def add(
         self, rows: np.ndarray, first: np.ndarray, pairs: tuple[np.ndarray, ...], depths: tuple[np.ndarray, ...]
@@ -216,45 +235,44 @@ class AreaTally:
         rows: returns sorted by pulse, then number; first: row of the first return of each pulse; pairs: rows that form
         a pair with the next row, and their distances [m]; depths: from `measure_depths`.
         """
-        (before, distance), (pulses, depth), ranks = pairs, depths, len(self._ranks)
+        (before, distance), (pulses, depth) = pairs, depths
         places = rows["xyz"][first]
         areas, area = np.unique(self.division.find(places[:, 0], places[:, 1]), return_inverse=True)
-        n, number = len(areas), np.diff(np.append(first, len(rows)))
+        sums, number = self._begin(len(areas)), np.diff(np.append(first, len(rows)))
         of_row = np.repeat(area, number)
-        by_number = np.bincount(of_row * (MOST_NUMBER + 1) + rows["number"], minlength=n * (MOST_NUMBER + 1))
-        classes = area * (MOST_COUNT + 1) + np.minimum(number, MOST_COUNT)
-        by_count = np.bincount(classes, minlength=n * (MOST_COUNT + 1))
-        rank = np.minimum(rows["number"][before].astype(np.int64), ranks) - 1
-        of_pair, cells = of_row[before] * ranks + rank, n * ranks
-        number_of_pairs = np.bincount(of_pair, minlength=cells).reshape(n, -1)
-        least = np.full(cells, np.inf)
-        np.minimum.at(least, of_pair, distance)
-        several = np.bincount(area[pulses], minlength=n)[:, None]
-        tables = (by_number.reshape(n, -1), by_count.reshape(n, -1), number_of_pairs, several)
-        apart = np.bincount(of_pair, distance, cells).reshape(n, -1)
-        sums = np.concatenate([apart, np.bincount(area[pulses], depth, n)[:, None]], axis=1)
-        self._join(areas, np.concatenate(tables, axis=1), sums, least.reshape(n, -1))
+        rank = np.minimum(rows["number"][before].astype(np.int64), len(self._ranks)) - 1
+
+        def put(name: str, owner: np.ndarray, kind: np.ndarray | int, weights: np.ndarray | None = None) -> None:
+            """Counts, or adds weights, by area and kind."""
+            wide = sums[name].size // max(len(sums), 1)
+            sums[name] = np.bincount(owner * wide + kind, weights, sums[name].size).reshape(sums[name].shape)
+
+        put("by_number", of_row, rows["number"])
+        put("by_count", area, np.minimum(number, MOST_COUNT))
+        put("pairs", of_row[before], rank)
+        put("apart", of_row[before], rank, distance)
+        np.minimum.at(sums["least"], (of_row[before], rank), distance)
+        put("several", area[pulses], 0)
+        put("depth", area[pulses], 0, depth)
+        self._join(areas, sums)
 
     def merge(self, other: AreaTally) -> None:
         """Adds the sums of another cloud."""
-        self._join(other._areas, other._counts, other._sums, other._least)
+        self._join(other._areas, other._sums)
 
-    def _join(self, areas: np.ndarray, counts: np.ndarray, sums: np.ndarray, least: np.ndarray) -> None:
+    def _join(self, areas: np.ndarray, more: np.ndarray) -> None:
         """Adds sums of areas, which are ascending and unique."""
         known = np.union1d(self._areas, areas)
         if len(known) > MOST_AREAS:
             raise ConfigError(f"more than {MOST_AREAS} areas hold pulses; give a larger --area, or fewer clouds")
-        old, new = np.searchsorted(known, self._areas), np.searchsorted(known, areas)
         if len(known) > len(self._areas):
-            kept = self._counts, self._sums, self._least
-            self._counts = np.zeros((len(known), counts.shape[1]), np.int64)
-            self._sums = np.zeros((len(known), sums.shape[1]))
-            self._least = np.full((len(known), least.shape[1]), np.inf)
-            self._counts[old], self._sums[old], self._least[old] = kept
-            self._areas = known
-        self._counts[new] += counts
-        self._sums[new] += sums
-        self._least[new] = np.minimum(self._least[new], least)
+            sums = self._begin(len(known))
+            sums[np.searchsorted(known, self._areas)] = self._sums
+            self._areas, self._sums = known, sums
+        place = np.searchsorted(known, areas)
+        for name in self._dtype.names or ():
+            join = np.minimum if name == "least" else np.add
+            self._sums[name][place] = join(self._sums[name][place], more[name])
 
     def finish(self) -> list[AreaStats]:
         """The statistics: cells by column and row, polygons in the order of their file, `outside` last."""
@@ -262,25 +280,19 @@ class AreaTally:
         return [self._describe(row) for row in order.tolist()]
 
     def _describe(self, row: int) -> AreaStats:
-        edge = MOST_NUMBER + 2 + MOST_COUNT
-        by_number, by_count, pairs, several = np.split(self._counts[row], [MOST_NUMBER + 1, edge, -1])
-        points, pulses, number = int(by_number.sum()), int(by_count.sum()), int(several[0])
-        apart, depth = self._sums[row, :-1], float(self._sums[row, -1])
-        every = describe_pairs(pairs.sum(), apart.sum(), self._least[row].min())
-        ranks = zip(self._ranks, pairs, apart, self._least[row], strict=True)
+        sums, area = self._sums[row], self.division.describe(int(self._areas[row]))
+        several, parts = int(sums["several"]), (sums["pairs"], sums["apart"], sums["least"])
+        ranks = zip(self._ranks, *parts, strict=True)
         return AreaStats(
-            *self.division.describe(int(self._areas[row])),
-            points=points,
-            pulses=pulses,
-            returns_per_pulse=points / pulses if pulses else math.nan,
-            by_number=_share_counts(by_number),
-            by_count=_share_counts(by_count),
-            pairs=every.pairs,
-            mean=every.mean,
-            least=every.least,
+            **area._asdict(),
+            **asdict(describe_pairs(parts[0].sum(), parts[1].sum(), parts[2].min())),
+            points=int(sums["by_number"].sum()),
+            pulses=int(sums["by_count"].sum()),
+            by_number=_share_counts(sums["by_number"]),
+            by_count=_share_counts(sums["by_count"]),
             separations={name: describe_pairs(*values) for name, *values in ranks if values[0]},
-            several=number,
-            depth=depth / number if number else math.nan,
+            several=several,
+            depth=float(sums["depth"]) / several if several else math.nan,
         )
 
 
@@ -356,27 +368,15 @@ _SURE = 3.0
 deviations; without a limit, counts fall with the number of returns."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReturnStats:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReturnStats(PulseStats):
     """Statistics of the returns of one cloud, or of several together."""
 
     cloud: str
-    points: int
-    pulses: int
     incomplete: int
     """Pulses with another number of points than stored in them: cut by the border of a tile, thinned, or merged."""
     pulses_by: str
     """How pulses were found: `gps_time`, or `return_number` if times do not separate pulses."""
-    by_number: dict[int, float]
-    """Share of all returns with this return number."""
-    by_count: dict[int, float]
-    """Share of the pulses with exactly this many returns in the cloud."""
-    separations: dict[str, Separation]
-    """`all`, and `1-2`, `2-3` ... by return number, without points passed through without an echo."""
-    several: int
-    """Pulses with two or more returns."""
-    depth: float
-    """Mean height of the first above the last return of these pulses [m]; NaN without any."""
     dead_zone: float
     """Distance [m] below which only one pair in a thousand lies; NaN with fewer than a hundred pairs, and where nearly
     all of them are farther apart than the histogram reaches, see `DeadZone`."""
@@ -387,15 +387,10 @@ class ReturnStats:
     flags: dict[str, int] | None
     """Points per flag of `echo_flags`; None if no cloud has the column."""
     warnings: tuple[str, ...]
-    areas: tuple[AreaStats, ...] = ()
+    areas: tuple[AreaStats, ...]
     """Areas with a pulse, if divisions are given; together they hold all points and pulses."""
-    left_out: int = 0
+    left_out: int
     """Points that do not meet the condition of --where; `points` are the others."""
-
-    @property
-    def returns_per_pulse(self) -> float:
-        """Mean number of returns; NaN without pulses."""
-        return self.points / self.pulses if self.pulses else float("nan")
 
 
 def count_returns(
@@ -574,17 +569,14 @@ class _Tally:
         above = slice(0, 0) if math.isnan(zone) else slice(round(zone / BIN), round(2 * zone / BIN))
         hidden = math.nan if math.isnan(zone) else int(bins[:, above].sum()) / whole.pulses
         names = list(EchoFlag.__members__)
+        found = {one.name: getattr(whole, one.name) for one in fields(PulseStats)}
+        found["separations"] = {"all": Separation(whole.pairs, whole.mean, whole.least), **whole.separations}
+        found["depth"] = self.depth / whole.several if whole.several else math.nan
         return ReturnStats(
             cloud=cloud,
-            points=whole.points,
-            pulses=whole.pulses,
+            **found,
             incomplete=self.incomplete,
             pulses_by=" and ".join(sorted(self.methods)),
-            by_number=whole.by_number,
-            by_count=whole.by_count,
-            separations={"all": Separation(whole.pairs, whole.mean, whole.least), **whole.separations},
-            several=whole.several,
-            depth=self.depth / whole.several if whole.several else math.nan,
             dead_zone=zone,
             dead_zones=zones,
             hidden=hidden,

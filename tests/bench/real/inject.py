@@ -15,7 +15,7 @@ from bench.real.templates import Template, bare_block, digitizer_kind
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.strip.shared_packets import expand
+from wavebatch.files.strip.scanner import expand
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 

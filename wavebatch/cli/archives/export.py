@@ -36,6 +36,12 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
               return_waveform p.
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
+
+    Examples:
+      # packets as the LAS specification has them
+      wavebatch export strip.las -o repaired.laz
+      # waveforms with their geometry as arrays
+      wavebatch export strip.las -o strip.npz
     """  # fmt: skip
     paths = shared.find_inputs(strips, recursive=recursive)
     targets = shared.name_outputs(paths, output, SUFFIXES, ".las")

@@ -38,6 +38,12 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
     damaged or cut gives one line and no output.
 
     Exit code: 0 all written, 2 wrong usage, 3 some files failed, 4 no file was written.
+
+    Examples:
+      # flight.las and flight.wdp, and flight.system.toml
+      wavebatch import flight.pls -o flight.las
+      # all files of a folder; go on after an interruption
+      wavebatch import archive/ -o strips --resume
     """  # fmt: skip
     paths = shared.find_inputs(files, recursive=recursive, kinds=(SUFFIXES,))
     targets = _name_strips(paths, output)

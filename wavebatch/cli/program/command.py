@@ -1,7 +1,7 @@
 """The class of all commands: help with examples and groups, options that settings can give, completion, man pages.
 
-`LazyGroup` gives each command this class when it is loaded, so that a new command only declares itself. The examples
-and groups are those of --help, of the manual pages and of the page Commands.
+`LazyGroup` gives each command this class when it is loaded, so that a new command only declares itself. A command has
+its examples in its docstring. They and the groups are those of --help, of the manual pages and of the page Commands.
 """
 
 from __future__ import annotations
@@ -20,97 +20,6 @@ from wavebatch import __version__
 from wavebatch.batch.options import AIR, CHAIN, HEADINGS, OPTIONS, OUTPUT, READING, RUNNING, WHICH
 from wavebatch.cli.messages import talk
 from wavebatch.cli.program.settings import OLD_NAMES, add_variables, drop_rivals, read_settings, tell_settings
-
-EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
-    "run": (
-        ("wavebatch run strip.las -o clouds", "one strip; the chain is chosen by a survey of it"),
-        ("wavebatch run strips/ -o clouds --survey flight --jobs 0 --html run.html",
-         "a flight on all processors, with a report page"),
-        ("wavebatch run strips/ -o clouds --resume", "go on after an interruption"),
-        ("wavebatch run strip.las -o clouds --trajectory flight.txt --columns +range",
-         "with a trajectory, and the range as a column"),
-        ("wavebatch run strip.las -o clouds --dry-run", "show chain, columns and sizes; write nothing"),
-    ),
-    "info": (("wavebatch info strip.las", "points, packets, descriptors and samples"),),
-    "check": (
-        ("wavebatch check strip.las mychain.toml", "one line per problem; exit code 1 if there is any"),
-    ),
-    "survey": (
-        ("wavebatch survey strip.las", "noise, pulse and scene, and which chain the strip needs"),
-        ("wavebatch survey strip.las -o system.toml --chain chain.toml", "save both for `run --system` and `--chain`"),
-    ),
-    "import": (
-        ("wavebatch import flight.pls -o flight.las", "flight.las and flight.wdp, and flight.system.toml"),
-        ("wavebatch import archive/ -o strips --resume", "all files of a folder; go on after an interruption"),
-    ),
-    "export": (
-        ("wavebatch export strip.las -o repaired.laz", "packets as the LAS specification has them"),
-        ("wavebatch export strip.las -o strip.npz", "waveforms with their geometry as arrays"),
-    ),
-    "stages": (
-        ("wavebatch stages", "list all algorithms"),
-        ("wavebatch stages decompose.adaptive", "one with parameters, units, source and a TOML example"),
-    ),
-    "simulate": (
-        ("wavebatch simulate forest -o forest.laz --pulses 50000 --truth truth.npz", "a strip with known echoes"),
-    ),
-    "compare": (
-        ("wavebatch compare clouds/strip.laz strip.las", "a cloud with the vendor's returns"),
-        ("wavebatch compare --strip strip.las fast accurate", "two chains on the waveforms of a strip"),
-        ("wavebatch compare clouds/strip.laz --truth truth.npz --min-completeness 0.95",
-         "with the truth; exit code 1 below 95 %"),
-    ),
-    "stats": (("wavebatch stats clouds/*.laz", "return numbers, separations and flags of clouds"),),
-    "synthesize": (
-        ("wavebatch synthesize cloud.laz -o strip.las", "waveforms from the returns of a cloud"),
-        ("wavebatch synthesize cloud.laz -o strip.las --intensity reflectance --sensor-height 1200 --shares equal",
-         "by the lidar equation, with partial footprints"),
-    ),
-    "slice": (("wavebatch slice strip.las -o lines.csv", "straight surface lines in the scan lines"),),
-    "voxelize": (("wavebatch voxelize strip.las --size 1 -o voxels.npz", "cross sections in voxels of 1 m"),),
-    "plot": (),
-    "plot waveform": (
-        ("wavebatch plot waveform strip.las -o fits.png", "six waveforms, spread over the strip"),
-        ("wavebatch plot waveform strip.las -o bad.svg --flags NOT_CONVERGED,AT_BOUND", "fits to look at"),
-        ("wavebatch plot waveform strip.las -o sheet.png --random 100 --sheet", "a sheet of 100 random waveforms"),
-    ),
-    "plot histogram": (
-        ('wavebatch plot histogram clouds/*.laz --column z --where "classification == 2" -o ground.png', "ground only"),
-        ("wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png", "widths of all clouds"),
-    ),
-    "plot map": (
-        ("wavebatch plot map clouds/ --column amplitude --size 1 -o map.png", "mean amplitude in cells of 1 m"),
-    ),
-    "plot section": (
-        ("wavebatch plot section clouds/ --width 2 --column echo_width -o side.png",
-         "2 m wide, along the longer extent"),
-    ),
-    "plot profile": (
-        ("wavebatch plot profile voxels.npz --column energy -o heights.png", "energy by height"),
-        ("wavebatch plot profile lines.csv --column length -o lines.png", "length of surface lines by height"),
-    ),
-    "plot cube": (
-        ("wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png", "scan line 3, and all pulses at 250 ns"),
-    ),
-    "grid": (
-        ("wavebatch grid clouds/ --column amplitude --column echo_width --statistic median --size 1 -o x.tif",
-         "two bands for GIS"),
-        ("wavebatch grid clouds/ --statistic density --size 5 -o density.tif", "points per square metre"),
-        ("wavebatch grid clouds/ --column z --statistic max --where 'classification != 7' -o top.tif",
-         "without points of noise"),
-    ),
-    "calibrate": (
-        ("wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml",
-         "for `run --calibration cal.toml`"),
-        ("wavebatch calibrate *.laz --targets targets.csv --scan-angle --html cal.html -o cal.toml",
-         "with light that falls across the swath"),
-    ),
-    "bench": (
-        ("wavebatch bench strip.las -o bench", "all shipped chains on echoes like those of the strip"),
-        ("wavebatch bench --scene open --tolerance 0.02m", "the cheapest chain with 2 cm of range error"),
-    ),
-}  # fmt: skip
-"""Per command: a line to type, and what it is for."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "Options": ("grid columns", "slice most"),
@@ -219,6 +128,8 @@ class ProgramCommand(click.Command):
 
     title: str = ""
     """Name with that of its group, e.g. `plot map`."""
+    examples: tuple[tuple[str, str], ...] = ()
+    """A line to type, and what it is for: the last part of the function's docstring."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parses the arguments; options that they do not give come from settings, if there are any.
@@ -255,10 +166,9 @@ class ProgramCommand(click.Command):
         for heading, records in group_options(self, ctx):
             with formatter.section(heading):
                 formatter.write_dl(records)
-        examples = EXAMPLES.get(self.title, ())
-        if examples:
+        if self.examples:
             with formatter.section("Examples"):
-                for line, purpose in examples:
+                for line, purpose in self.examples:
                     formatter.write_text(f"# {purpose}")
                     formatter.write(f"{'':{formatter.current_indent}}{line}\n")
 
@@ -298,6 +208,11 @@ def dress(command: click.Command, title: str) -> click.Command:
              "add_help_option", "no_args_is_help", "hidden", "deprecated")  # fmt: skip
     dressed = ProgramCommand(**{name: getattr(command, name) for name in names})
     dressed.title = title
+    # Pairs of lines: `# purpose`, and what is typed.
+    text, _, last = inspect.cleandoc(command.help or "").partition("\nExamples:\n")
+    lines = [line.strip() for line in last.splitlines()]
+    dressed.help = text.rstrip()
+    dressed.examples = tuple((line, why.removeprefix("# ")) for why, line in zip(lines[::2], lines[1::2], strict=True))
     add_variables(dressed, title)
     return dressed
 
@@ -374,7 +289,7 @@ def _page(command: click.Command, ctx: click.Context, title: str) -> str:
     lines = [_heading(name), ".SH NAME", f"{roff(name)} \\- {roff(_first_line(command.help))}", ".SH SYNOPSIS",
              f"\\fB{roff(ctx.command_path)}\\fR {roff(' '.join(command.collect_usage_pieces(ctx)))}",
              ".SH DESCRIPTION", *_describe(command.help or ""), *_options(command, ctx)]  # fmt: skip
-    examples = EXAMPLES.get(title, ())
+    examples = getattr(command, "examples", ())
     if examples:
         lines.append(".SH EXAMPLES")
         for line, purpose in examples:

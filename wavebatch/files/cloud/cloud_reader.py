@@ -23,10 +23,10 @@ from wavebatch.files.cloud.column_names import STYLES, find_written, name_standa
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.disk.raw_bytes import Closing, widen_integers
 from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
-from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import (
     ANGLE_UNIT,
     STANDARD_DTYPES,
+    ExtraRecord,
     field_names,
     list_dimensions,
     read_angles,

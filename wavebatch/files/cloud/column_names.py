@@ -22,8 +22,14 @@ from wavebatch.core.echoes import COLUMNS, Column
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.disk.raw_bytes import widen_integers
-from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.header import STANDARD_DTYPES, LasHeader, field_names, list_dimensions, read_angles
+from wavebatch.files.las.header import (
+    STANDARD_DTYPES,
+    ExtraRecord,
+    LasHeader,
+    field_names,
+    list_dimensions,
+    read_angles,
+)
 
 USER_ID = "wavebatch"
 """User id of the records."""

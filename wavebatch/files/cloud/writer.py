@@ -1,7 +1,17 @@
-"""Writer of output clouds: points, the records of the input, and the cloud's provenance.
+"""Writer of output clouds: layout and rows of the points, the records of the input, and the cloud's provenance.
 
 The batch opens one `CloudWriter` per strip. Equal input and options must give equal bytes: write no time of day, no
 path and nothing that depends on the number of processes into the file.
+
+The batch plans the layout once per strip, workers make the rows of each unit, and `CloudWriter` writes them. A row
+depends only on its input point and echo, never on the block or unit that it is made in.
+
+`choose_version` gives the LAS version, point format and CRS record. PDAL, and all that reads with it, sees extra bytes
+only in LAS 1.4, and writers of COPC take only point formats 6 to 8: that is what a cloud gets, whatever the strip is.
+
+Extra bytes of a strip are copied unchanged, every dimension. An added echo has none in the input: it gets the "no data"
+value of a dimension, or, where no value is free for that, the value of the nearest return of its packet, as the
+standard fields do. Before you change it: a dimension must never be dropped, vendors have no other place for their data.
 """
 
 from __future__ import annotations
@@ -10,40 +20,394 @@ import hashlib
 import io
 import json
 import struct
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.column_names import USER_ID
-from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.cloud.column_names import USER_ID, WrittenColumn, style_columns
 from wavebatch.files.disk.publish import Draft, protecting, reporting
-from wavebatch.files.las.crs import repair_evlr
-from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
+from wavebatch.files.las.crs import convert_geotiff, repair_evlr, repair_records
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
+    EXTRA_BYTES_RECORD_ID,
     GEOTIFF_ID,
     MAX_EVLRS,
+    MODERN,
     PROJECTION,
     SOFTWARE,
+    STANDARD_DTYPES,
     WAVEFORM_RECORD_ID,
     WAVES_EXTERNAL,
     WAVES_INTERNAL,
     WKT_BIT,
     WKT_ID,
     Evlr,
+    ExtraRecord,
     LasHeader,
     Vlr,
+    build_dtype,
     build_wkt,
+    choose_format,
+    choose_no_data,
+    copy_standard,
     decode_text,
+    field_names,
     find_evlrs,
     has_record,
+    tell_apart,
 )
+from wavebatch.files.las.read_points import CheckedHeader
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
+from wavebatch.files.strip.packets import PacketPlace, StripFacts
+
+LAS_VERSIONS = ("1.4", "1.3", "keep")
+"""Values of --las-version."""
+
+
+@dataclass(frozen=True, slots=True)
+class Version:
+    """What `choose_version` chose."""
+
+    version: tuple[int, int]
+    point_format: int
+    wkt: str | None = None
+    """WKT record to write in place of those of the strip."""
+    notes: tuple[str, ...] = ()
+    """Lines for the user."""
+
+
+def choose_version(path: Path, header: LasHeader, wanted: str, point_format: int | None, keep: bool) -> Version:
+    """Return version and point format of the cloud of a strip.
+
+    wanted: one of LAS_VERSIONS. point_format: that which the user wants, or None. keep: packets are kept, and with them
+    the format's waveform fields. Raises ConfigError for options that contradict each other, InputError for a strip that
+    cannot be written in this way.
+    """
+    if wanted not in LAS_VERSIONS:
+        raise ConfigError(f"las_version {wanted!r}: must be one of {', '.join(LAS_VERSIONS)}")
+    target = choose_format(path, header, point_format, keep)
+    if wanted == "1.3":
+        return _as_1_3(path, header, target)
+    evlrs, _ = find_evlrs(path, header)
+    records: list[Any] = [*header.vlrs, *evlrs]
+    only_keys = has_record(records, PROJECTION, GEOTIFF_ID) and not has_record(records, PROJECTION, WKT_ID)
+    repaired, notes = _repair(path, header, evlrs)
+    if wanted == "1.4" and point_format is None and not keep:
+        modern = MODERN.get(target, target)
+        wkt = convert_geotiff(path, header.vlrs, asked=False) if only_keys else None
+        if only_keys and wkt is None:
+            return Version(max(header.version, (1, 4)), target, notes=(_explain_keys(target, modern), *notes))
+        return Version(max(header.version, (1, 4)), modern, wkt or repaired, notes)
+    wkt = repaired
+    if only_keys and target >= 6:
+        wkt = convert_geotiff(path, header.vlrs, asked=header.point_format < 6)
+    oldest = (1, 4) if wanted == "1.4" or target >= 6 else header.version
+    return Version(max(header.version, oldest), target, wkt, notes)
+
+
+_REPAIRED = (
+    "the strip's WKT says metres where it means degrees, as RiPROCESS writes it: GIS programs show the strip "
+    "in a wrong place; the cloud's WKT is right"
+)
+
+
+def _repair(path: Path, header: LasHeader, evlrs: Sequence[Evlr] = ()) -> tuple[str | None, tuple[str, ...]]:
+    """The repaired WKT of the header, None where it is right or not there, and the line for the user.
+
+    The writer of the cloud repairs extended records as it copies them; the line is for them too.
+    """
+    pairs = zip(header.vlrs, repair_records(header.vlrs), strict=True)
+    wkt = next((new.payload.rstrip(b"\0").decode() for old, new in pairs if new is not old), None)
+    wrong = wkt is not None or any(repair_evlr(path, evlr) is not None for evlr in evlrs)
+    return wkt, (_REPAIRED,) * wrong
+
+
+def _explain_keys(target: int, modern: int) -> str:
+    reason = "its CRS is given by GeoTIFF keys that wavebatch cannot turn into WKT, which point formats 6 to 10 need"
+    if target < 6:
+        return (
+            f"written in point format {target} of LAS 1.4 in place of {modern}: {reason}; --point-format {modern} tries"
+        )
+    return f"{reason}: PDAL will not read the cloud unless readers.las gets nosrs=true; add a WKT record to the strip"
+
+
+def _as_1_3(path: Path, header: LasHeader, target: int) -> Version:
+    """LAS 1.3, if it can hold all that the strip has."""
+    if target >= 6:
+        needed = header.point_format >= 6
+        what = "leave --las-version out" if needed else "leave one of the two out"
+        reason = f", and the strip's points of format {header.point_format} fit into no other" if needed else ""
+        raise ConfigError(f"{path}: --las-version 1.3 has no point format {target}{reason}; {what}")
+    evlrs, _ = find_evlrs(path, header)
+    if any(evlr.record_id != WAVEFORM_RECORD_ID for evlr in evlrs):
+        raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")
+    if has_record(header.vlrs, PROJECTION, WKT_ID) and not has_record(header.vlrs, PROJECTION, GEOTIFF_ID):
+        raise InputError(f"{path}: its CRS is given as WKT, which LAS 1.3 does not have; leave --las-version out")
+    repaired, notes = _repair(path, header)
+    return Version((1, 3), target, repaired, notes)
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """An extra dimension of the input that is copied to the output."""
+
+    record: ExtraRecord
+    source: int
+    """Byte offset in the input record; the output's dtype has the offset there."""
+    copied: bool = False
+    """Whether added echoes get the value of the nearest return, because no value is free for "no data"."""
+
+
+def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[Carried, ...]:
+    """Return the extra dimensions of the input; all are copied.
+
+    whole: every output row comes from an input point, so no value for "no data" is needed.
+    """
+    at = STANDARD_DTYPES[checked.header.point_format].itemsize
+    carried = []
+    readable = [record.with_readable_texts() for record in checked.records]
+    for record in tell_apart(readable, checked.header.point_format):
+        empty = None if whole else choose_no_data(record)
+        marked = record if empty is None else record.with_no_data(empty)
+        carried.append(Carried(marked, at, copied=not whole and empty is None))
+        at += record.dtype.itemsize
+    return tuple(carried)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OutputLayout:
+    """Layout of the output points of one strip; picklable, so that workers can make rows with it."""
+
+    source: CheckedHeader
+    """Of the input; the output has its scales and offsets."""
+    version: tuple[int, int]
+    point_format: int
+    dtype: np.dtype
+    """One output record: the standard fields with laspy's names, then the extra dimensions."""
+    carried: tuple[Carried, ...]
+    written: tuple[WrittenColumn, ...]
+    whole: bool
+    """Whether all rows keep the input's extra bytes (returns), or only matched rows (echoes)."""
+    packets: PacketPlace | None
+    """The packets of the input, if the output keeps them."""
+    wkt: str | None = None
+    """WKT in place of that of the input: where this gives GeoTIFF keys only, or a WKT that GIS misunderstand."""
+    notes: tuple[str, ...] = ()
+    """What the user should know about the format."""
+
+    @property
+    def copied(self) -> tuple[str, ...]:
+        """Extra bytes of the input that added echoes copy from the nearest return."""
+        fields = self.extra_fields
+        return tuple(name for name, carried in zip(fields, self.carried, strict=False) if carried.copied)
+
+    @property
+    def max_return(self) -> int:
+        """Largest return number that the point format can hold; larger ones are written as this."""
+        return 15 if self.point_format >= 6 else 7
+
+    @property
+    def extra_records(self) -> tuple[ExtraRecord, ...]:
+        """Records of all extra dimensions of the output, in order."""
+        return (*(carried.record for carried in self.carried), *(column.record for column in self.written))
+
+    @property
+    def extra_fields(self) -> tuple[str, ...]:
+        """Names of the fields of `dtype` with extra dimensions, in order."""
+        names = field_names(self.dtype)
+        return names[len(names) - len(self.carried) - len(self.written) :]
+
+    def rows(
+        self,
+        source: np.ndarray,
+        *,
+        xyz: np.ndarray | None = None,
+        return_number: np.ndarray | None = None,
+        number_of_returns: np.ndarray | None = None,
+        columns: Mapping[str, np.ndarray] | None = None,
+        matched: np.ndarray | None = None,
+        time: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return output records, one per input record.
+
+        Parameters
+        ----------
+        source : structured array (m,)
+            Input records; never changed.
+        xyz : f8 (m, 3), m
+            New coordinates; NaN, or None for all rows, keeps the integers of the input exactly.
+        return_number, number_of_returns : integers (m,)
+            None keeps those of the input; values above `max_return` are written as `max_return`.
+        columns : mapping of str to array (m,)
+            Physical values by name in COLUMNS; missing columns and values that are not finite become no-data.
+        matched : bool (m,)
+            Rows that keep the input's extra bytes; in other rows those that can become no-data. None: all rows.
+        time : float (m,), ns
+            Echo times; with kept packets they become the return location of rows with a new position.
+
+        Returns
+        -------
+        structured array (m,) of `dtype`
+
+        Raises
+        ------
+        InputError
+            If a coordinate does not fit the scale and offset of the file.
+        """
+        columns = columns or {}
+        rows = np.zeros(len(source), self.dtype)
+        copy_standard(np.ascontiguousarray(source), rows, self.source.header.point_format, self.point_format)
+        if xyz is not None and len(rows):
+            self._set_coordinates(rows, np.asarray(xyz, np.float64))
+        self._set_returns(rows, return_number, number_of_returns)
+        self._carry(rows, source, matched)
+        if self.packets is not None:
+            self._point_at_packets(self.packets, rows, None if xyz is None else xyz[:, 0], time)
+        self.fill(rows, columns)
+        for field, column in self._columns:
+            if column.column not in columns:
+                rows[field] = 0 if column.record.no_data is None else column.record.no_data[0]
+        return rows
+
+    def fill(self, rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
+        """Write columns into rows; arguments as for `rows`."""
+        for field, column in self._columns:
+            if column.column in columns:
+                rows[field] = column.encode(columns[column.column])
+
+    @property
+    def _columns(self) -> list[tuple[str, WrittenColumn]]:
+        return list(zip(self.extra_fields[len(self.carried) :], self.written, strict=True))
+
+    def _set_coordinates(self, rows: np.ndarray, xyz: np.ndarray) -> None:
+        new = ~np.isnan(xyz).all(axis=1)
+        header = self.source.header
+        for axis, (name, scale, offset) in enumerate(zip("XYZ", header.scales, header.offsets, strict=True)):
+            with np.errstate(all="ignore"):
+                counts = np.rint((xyz[:, axis] - offset) / np.float64(scale))
+            bad = new & ~(np.abs(counts) <= 2**31 - 1)
+            if bad.any():
+                row = int(np.argmax(bad))
+                raise InputError(
+                    f"{self.source.path}: {name.lower()} = {xyz[row, axis]:.3f} of output row {row} does not fit "
+                    f"32-bit integers at scale {scale:g} and offset {offset:g}; rescale the strip (las2las "
+                    "-rescale ... -reoffset ...) and run again"
+                )
+            rows[name] = np.where(new, counts, rows[name])
+
+    def _set_returns(self, rows: np.ndarray, number: np.ndarray | None, count: np.ndarray | None) -> None:
+        bits = 4 if self.point_format >= 6 else 3
+        limit = self.max_return
+        for shift, values in ((0, number), (bits, count)):
+            if values is not None:
+                cut = np.minimum(values, limit).astype(np.uint8)
+                rows["bit_fields"] = (rows["bit_fields"] & np.uint8(255 ^ (limit << shift))) | (cut << np.uint8(shift))
+
+    def _carry(self, rows: np.ndarray, source: np.ndarray, matched: np.ndarray | None) -> None:
+        if not self.carried:
+            return
+        names = self.extra_fields[: len(self.carried)]
+        formats = [carried.record.dtype for carried in self.carried]
+        places = [carried.source for carried in self.carried]
+        fields: Any = {"names": list(names), "formats": formats, "offsets": places, "itemsize": source.dtype.itemsize}
+        values = np.ascontiguousarray(source).view(np.dtype(fields))
+        for carried, name in zip(self.carried, names, strict=True):
+            rows[name] = values[name]
+            empty = carried.record.no_data
+            if not (self.whole or matched is None or empty is None):
+                rows[name][~np.asarray(matched)] = empty if len(empty) > 1 else empty[0]
+
+    @staticmethod
+    def _point_at_packets(
+        packets: PacketPlace, rows: np.ndarray, x: np.ndarray | None, time: np.ndarray | None
+    ) -> None:
+        if packets.shift:
+            has_packet = rows["wavepacket_index"] > 0
+            offset = rows["wavepacket_offset"]
+            offset[has_packet] = offset[has_packet] + np.uint64(packets.shift)
+        if time is not None and x is not None:
+            new = np.isfinite(time) & np.isfinite(x)
+            rows["return_point_wave_location"][new] = np.asarray(time)[new] * 1000.0
+
+
+def plan_output(
+    checked: CheckedHeader,
+    columns: Sequence[str],
+    *,
+    point_format: int | None = None,
+    las_version: str = "1.4",
+    packets: StripFacts | None = None,
+    names: str = "wavebatch",
+    no_data: str = "-9999",
+    points: str = "echoes",
+    strict: bool = False,
+) -> OutputLayout:
+    """Return the layout of the output of a strip.
+
+    Parameters
+    ----------
+    checked : CheckedHeader
+        Header of the strip, or of any LAS or LAZ file.
+    columns : sequence of str
+        Names in COLUMNS, in the order in which they are written.
+    point_format : int or None
+        None: that of `las_version` with the fields of the input, without its waveform fields unless packets are kept.
+    las_version : {"1.4", "1.3", "keep"}
+        Of the output. "1.4" also turns point formats 0 to 5 into 6 and 7, unless packets are kept; LAS 1.5 stays 1.5.
+    packets : StripFacts or None
+        Facts of the strip, to keep its packets; None leaves them out.
+    names : str
+        Style of the column names, a key of STYLES.
+    no_data : str
+        What floating-point columns hold where there is no value, a key of NO_DATA.
+    points : {"echoes", "returns"}
+        Whether extra bytes of the input are kept in matched rows only, or in all rows.
+    strict : bool
+        Refuse a strip whose extra bytes cannot be marked as missing for added echoes.
+
+    Raises
+    ------
+    InputError
+        For a strip that cannot be written in this way.
+    ConfigError
+        For wrong options.
+    """
+    if points not in ("echoes", "returns"):
+        raise ConfigError(f"points {points!r}: must be echoes or returns")
+    path = checked.path
+    chosen = choose_version(path, checked.header, las_version, point_format, packets is not None)
+    carried = plan_carried(checked, points == "returns")
+    written = style_columns(columns, names, [entry.record.name for entry in carried], no_data)
+    records = [*(entry.record for entry in carried), *(entry.record for entry in written)]
+    dtype = build_dtype(chosen.point_format, records)
+    if dtype.itemsize > 65535:
+        raise InputError(f"{path}: its extra bytes leave no room for the columns in a 65535-byte record; choose fewer")
+    if packets is not None and packets.packets.file is None:
+        raise InputError(f"{path}: has no packets to keep; leave --keep-packets out")
+    layout = OutputLayout(
+        source=checked,
+        version=chosen.version,
+        point_format=chosen.point_format,
+        dtype=dtype,
+        carried=carried,
+        written=tuple(written),
+        whole=points == "returns",
+        packets=None if packets is None else packets.packets,
+        wkt=chosen.wkt,
+        notes=chosen.notes,
+    )
+    if strict and layout.copied:
+        raise InputError(
+            f"{path}: --strict: no value is free to mark added echoes in its extra bytes {', '.join(layout.copied)}; "
+            "leave --strict out to give them the value of the nearest return, or write --points returns"
+        )
+    return layout
+
 
 _DESCRIPTORS = range(100, 356)
 MOST_PAYLOAD = 65535

@@ -21,16 +21,19 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_panics, read_exactly, reading
-from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord, build_dtype, read_records
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
+    EXTRA_BYTES_RECORD_ID,
     STANDARD_DTYPES,
     WAVES_EXTERNAL,
     WAVES_INTERNAL,
+    ExtraRecord,
     LasHeader,
+    build_dtype,
     field_names,
     has_record,
     read_header,
+    read_records,
 )
 
 WAVEFORM_FORMATS = (4, 5, 9, 10)

@@ -25,10 +25,11 @@ from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
-from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord
 from wavebatch.files.las.header import (
+    EXTRA_BYTES_RECORD_ID,
     STANDARD_DTYPES,
     WAVEFORM_RECORD_ID,
+    ExtraRecord,
     LasHeader,
     Vlr,
     encode_evlr_header,

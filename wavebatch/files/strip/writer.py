@@ -15,8 +15,16 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
-from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
-from wavebatch.files.las.header import EVLR_HEADER_SIZE, STANDARD_TIME, WAVES_EXTERNAL, WAVES_INTERNAL, LasHeader, Vlr
+from wavebatch.files.las.header import (
+    EVLR_HEADER_SIZE,
+    STANDARD_TIME,
+    WAVES_EXTERNAL,
+    WAVES_INTERNAL,
+    ExtraRecord,
+    LasHeader,
+    Vlr,
+    build_dtype,
+)
 from wavebatch.files.las.write_points import PointFile, waveform_head
 from wavebatch.files.strip.packets import DESCRIPTOR
 

@@ -15,8 +15,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.raw_bytes import take_fingerprint
-from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
-from wavebatch.files.las.header import STANDARD_TIME, Vlr, decode_text, has_record, is_projection
+from wavebatch.files.las.header import EXTRA_BYTES_RECORD_ID, STANDARD_TIME, Vlr, decode_text, has_record, is_projection
 from wavebatch.files.strip.describe import audit_header
 from wavebatch.files.strip.packet_check import VECTORS, read_toward
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit

@@ -25,7 +25,7 @@ from wavebatch.core.schema import Range, option
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.files.strip.shared_packets import expand
+from wavebatch.files.strip.scanner import expand
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import effective, load_chain_file, load_profile
 from wavebatch.surveying import SAMPLE, Survey, survey_blocks

@@ -28,8 +28,15 @@ from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.api.strip import AUTO, load_chain
-from wavebatch.tools.compare.clouds import PACKET_DTYPE, open_task, read_echoes
-from wavebatch.tools.compare.pairing import SPEED, Comparison, Pairing, check_tolerance
+from wavebatch.tools.compare.pairing import (
+    PACKET_DTYPE,
+    SPEED,
+    Comparison,
+    Pairing,
+    check_tolerance,
+    open_task,
+    read_echoes,
+)
 from wavebatch.tools.even_sample import EvenSample
 
 

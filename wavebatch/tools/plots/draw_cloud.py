@@ -18,11 +18,10 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, space_ticks
+from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.las.header import CLASS_NAMES
 from wavebatch.tools.even_sample import EvenSample
-from wavebatch.tools.plots.values import Clouds, Tally, name_paths, shown_limits
-from wavebatch.tools.rasters.cells import Raster
+from wavebatch.tools.rasters.cells import Clouds, Raster, Tally, name_paths, shown_limits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -399,7 +398,7 @@ def draw_cloud_map(found: Raster, target: Path, *, overwrite: bool = False) -> N
         narrow = ratio > _NARROW
         if not narrow:
             # Axes with equal scales do not fill their places; this layout brings the colour bar next to them.
-            figure.set_layout_engine("compressed")
+            set_layout(figure, compress=True)
         rest = found.total.list_rest(found.outside, "outside the map")
         parts = _title(found.names, found.total, found.facts.name, rest).replace("\n", "   ").split("   ")
         parts.append(f"{found.statistic} in cells of {grid.size:g} {found.crs.unit}")

@@ -17,8 +17,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.files.figure_file import fit_parts, fit_text, open_picture, plain_text, set_head
 from wavebatch.kernels.signal.runs import find_stretches
-from wavebatch.tools.plots.detector_signals import DetectorSignal
-from wavebatch.tools.plots.waveform import WaveformView, list_echoes
+from wavebatch.tools.plots.waveform import DetectorSignal, WaveformView, list_echoes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

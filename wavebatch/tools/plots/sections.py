@@ -18,21 +18,23 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, space_ticks
+from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.las.crs import CrsWords
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
-from wavebatch.tools.plots.values import (
+from wavebatch.tools.rasters.cells import (
     MARGIN,
     Clouds,
     Tally,
+    check_crs,
     check_statistic,
+    compute_cells,
     name_paths,
     robust_limits,
     round_up,
     sample_points,
+    survey_places,
 )
-from wavebatch.tools.rasters.cells import check_crs, compute_cells, survey_places
-from wavebatch.tools.voxels.output import VoxelFile
+from wavebatch.tools.voxels.grid import VoxelFile
 
 MOST_POINTS = 200_000
 """Most points of a section that are drawn: more would only cover each other."""
@@ -292,7 +294,7 @@ def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite
         flat = width > _NARROW
         if flat:
             # As tall as the axes with equal scales are: constrained layout would leave them alone in the middle.
-            figure.set_layout_engine("compressed")
+            set_layout(figure, compress=True)
         axes, place = (figure.subplots(), None) if flat else figure.subplots(1, 2, width_ratios=(1, 0.05))
         axes.set_anchor("C" if flat else "E")
         shown, values = _draw_voxels(axes, found) if found.voxel else _draw_points(axes, found)

@@ -26,8 +26,17 @@ from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
 from wavebatch.files.las.read_points import read_checked_header
-from wavebatch.tools.plots.values import Clouds, check_statistic
-from wavebatch.tools.rasters.cells import LARGEST_SIZE, Box, Grid, Placed, check_cells, compute_tiles, is_in_bounds
+from wavebatch.tools.rasters.cells import (
+    LARGEST_SIZE,
+    Box,
+    Clouds,
+    Grid,
+    Placed,
+    check_cells,
+    check_statistic,
+    compute_tiles,
+    is_in_bounds,
+)
 from wavebatch.tools.voxels.rays import ASSUMED_ERROR
 
 COLUMNS = ("x", "y", "height", "light", "path", "share", "ground", "free_path", "attenuation", "attenuation_error")

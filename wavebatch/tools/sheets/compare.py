@@ -143,16 +143,18 @@ def format_comparison(document: Mapping[str, Any]) -> str:
 def _list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     for name, value in document.items():
         if name in _TABLES:
-            yield from _list_classes(name, value)
+            # Echoes without a partner by return number, amplitude, flags and company.
+            title, side = _TABLES[name]
+            for kind, classes in value.items():
+                for each, (alone, of) in classes.items():
+                    for figure, number in (("echoes", alone), ("of", of), ("share", alone / of if of else math.nan)):
+                        yield title, side, kind, str(each), figure, number
         elif name in ("counts_a", "counts_b"):
             for number, pulses in value.items():
                 yield "echoes per pulse", name[-1].upper(), "", str(number), "pulses", pulses
         elif name == "differences_by":
             for kind, groups in value.items():
-                for group, quantities in groups.items():
-                    for quantity, spread in quantities.items():
-                        for figure, number in spread.items():
-                            yield "differences by " + kind, "", group, quantity, figure, number
+                yield from _list_nested(f"differences by {kind}", groups)
         elif name == "between":
             yield from _list_rows(value)
         elif name == "vendor":
@@ -164,15 +166,6 @@ def _list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
             yield from _list_nested(name, value)
         elif not isinstance(value, list | tuple):
             yield "all", "", "", "", name, value
-
-
-def _list_classes(name: str, tables: Mapping[str, Any]) -> Iterator[Row]:
-    """Echoes without a partner by return number, amplitude, flags and company."""
-    title, side = _TABLES[name]
-    for kind, classes in tables.items():
-        for each, (alone, of) in classes.items():
-            for figure, value in (("echoes", alone), ("of", of), ("share", alone / of if of else math.nan)):
-                yield title, side, kind, str(each), figure, value
 
 
 def _list_nested(table: str, values: Mapping[str, Any], *path: str) -> Iterator[Row]:

@@ -26,10 +26,10 @@ from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.disk.npz import read_npz
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import Closing
-from wavebatch.files.figure_file import open_picture, plain_text, set_head, space_ticks
+from wavebatch.files.figure_file import open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.geojson import GeoJsonCrs
 from wavebatch.tools.plots.sections import Profile, place_heights
-from wavebatch.tools.plots.values import Tally, check_statistic, name_paths
+from wavebatch.tools.rasters.cells import Tally, check_statistic, name_paths
 from wavebatch.tools.slices.segments import ScanLine, Segment, Slice, align_times, find_main_axis
 
 MOST_VALUES = 200_000_000
@@ -382,7 +382,7 @@ def draw_slice(
     tall = (extent[3] - extent[2]) / (extent[1] - extent[0]) if plane else 0.4
     width = min(11.0, _TALLEST / tall)
     with open_picture(target, (max(width + 1.0, 6.0), max(width * tall, 0.6) + 2.2), overwrite=overwrite) as figure:
-        figure.set_layout_engine("compressed")
+        set_layout(figure, compress=True)
         axes = figure.subplots()
         axes.grid(visible=False)
         axes.set_facecolor(NO_SAMPLE)

@@ -20,7 +20,7 @@ from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.files.strip.shared_packets import expand
+from wavebatch.files.strip.scanner import expand
 from wavebatch.kernels.geometry.group_returns import find_pulses
 from wavebatch.kernels.geometry.slice_lines import HoughLine, find_lines, find_sweeps
 

@@ -9,26 +9,378 @@ Batches do not depend on processes, and results must not depend on batches.
 
 `find_rule` finds the reflectance ratio of canopy and ground. Without the right one, the share of a voxel is no
 interception: leaves of .5 over ground of .15 hide a gap probability of .61 as one of .41.
+
+`deconvolve_block` makes profiles of the waveforms: deconvolved, noise removed, placed by the returns of their packets.
+A profile does not depend on the other waveforms of its block.
+
+`Floor` and `find_ceiling` are maps of the lowest and of the highest returns of a strip. The floor divides the signal of
+a ray into ground and canopy, without any classification: light of a ray is shared between them, so signal that is
+wrongly taken for ground changes gap probabilities by the ratio of both reflectances only. Above the ceiling rays cross
+only air; without --headroom each ray is counted from there, so that voxels near the surface get all light that crossed
+them, whether recorded or not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter
 from wavebatch.files.las.header import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit, read_scanner
-from wavebatch.files.strip.shared_packets import expand
+from wavebatch.files.strip.scanner import expand
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, along_ray, find_rays, group_times, on_ray
+from wavebatch.kernels.geometry.planes import fit_planes
 from wavebatch.kernels.physics import radiometry
 from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
-from wavebatch.tools.voxels.floor import Floor
-from wavebatch.tools.voxels.profile import Profiles
+from wavebatch.kernels.signal.deconvolve import (
+    deconvolve_gold,
+    deconvolve_richardson_lucy,
+    deconvolve_wiener,
+    fit_height,
+    keep_signal,
+    measure_offsets,
+    wiener_taps,
+    window_signal,
+)
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121, widen
+from wavebatch.stages.detect.candidates import signal_above
+from wavebatch.stages.noise import pooled
+from wavebatch.stages.pulse_tables import clip_level, reference_pulse
+from wavebatch.surveying.measuring.learn_pulse import AFTER, BEFORE
+
+ITERATIONS = {"richardson_lucy": 40, "gold": 100}
+"""Default iterations: Gold converges more slowly (docs/algorithms.md 2.5)."""
+
+SNR = 20.0
+"""Default ratio of amplitude to noise for the Wiener filter."""
+
+SUPPORT = 2.0
+"""Smoothed samples above this many standard deviations of their noise may hold signal."""
+
+FLOOR = 0.1
+"""Deconvolved samples below this share of the least signal, spread over the pulse, are set to zero."""
+
+BACKGROUND = 3.0
+"""Level added to waveform and model of the Richardson-Lucy iteration, which needs positive values [noise std]."""
+
+TOLERANCE = 2.5
+"""Largest distance between the location of a return and its signal [ns], beyond half a sample."""
+
+AT_A_TIME = 1024
+"""Waveforms deconvolved together: few enough for the cache."""
+
+_PULSE_REACH = 4.0
+"""Half length of a Gaussian pulse, and margin around signal, in widths of the system pulse."""
+
+
+@dataclass(frozen=True, slots=True)
+class Deconvolution:
+    """How waveforms are deconvolved, and how much signal counts as noise."""
+
+    method: Literal["richardson_lucy", "gold", "wiener"] = option(
+        "richardson_lucy", "How waveforms are deconvolved with the system pulse."
+    )
+    iterations: Annotated[int | None, Range(1, 10_000)] = option(
+        None, "Iterations: more resolve closer surfaces, but take longer.", form="N", unset="40; gold: 100"
+    )
+    snr: Annotated[float | None, Above(0.0, 1e9)] = option(
+        None, "wiener: amplitude over noise for which the filter is designed.", form="RATIO", unset="20"
+    )
+    threshold: Annotated[float, Range(0.0, 1e9)] = option(
+        4.27, "Ignore signal weaker than a single echo of this many standard deviations of the noise.", form="STD"
+    )
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.iterations is not None and self.method == "wiener":
+            raise ConfigError("--method wiener has no --iterations")
+        if self.snr is not None and self.method != "wiener":
+            raise ConfigError("--snr needs --method wiener")
+
+    @property
+    def steps(self) -> int | None:
+        """Iterations; None for the linear filter."""
+        return self.iterations or ITERATIONS.get(self.method)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profiles:
+    """Signal of n waveforms along their rays."""
+
+    value: np.ndarray
+    """Heights of system pulses, one at every sample, whose sum is the waveform, f8 (n, s) [count]; 0: no signal."""
+    area: float
+    """Integral of a system pulse of height 1 [ns]."""
+    seen: np.ndarray
+    """Waveforms with any signal, bool (n,)."""
+    offset: np.ndarray
+    """Delay of the signal after the returns of its packet, f8 (n,) [ns]; 0 where unknown."""
+    anchored: np.ndarray
+    """Waveforms with a known offset, bool (n,)."""
+    clipped: np.ndarray
+    """Waveforms with samples at the digitizer's limit, bool (n,)."""
+
+
+def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvolution) -> Profiles:
+    """Profiles of a block: waveforms without baseline and noise, deconvolved with the system pulse.
+
+    Runs of samples whose sum is less than `threshold` standard deviations of a lone echo's amplitude are dropped.
+    """
+    system = system.of(block)
+    taps, area = _pulse_taps(system, block.spacing)
+    noise = pooled(block, system)
+    signal = signal_above(block, noise)
+    n, s = block.samples.shape
+    support = widen(smooth_121(signal) > np.float32(SUPPORT * SMOOTH_GAIN) * noise.std, 1)
+    width = system.sigma_ref / block.spacing
+    first, length = window_signal(support, int(np.ceil(_PULSE_REACH * width)))
+    least = options.threshold * _lone_error(taps, width, options)
+    floor = FLOOR * max(least, 1e-3) / max(width, 1.0)
+    value, seen = np.zeros((n, s)), np.zeros(n, bool)
+    for rows in _group_rows(length):
+        place = first[rows] + np.arange(length[rows[0]])[:, None]
+        std = noise.std[rows].astype(np.float64)
+        part = signal[place, rows]
+        profile = _deconvolve(part, taps, noise.std[rows], options)
+        near = np.ascontiguousarray(support[place, rows].T)
+        kept, seen[rows] = keep_signal(np.ascontiguousarray(profile.T), near, least * std, floor * std)
+        if options.method != "richardson_lucy":  # that iteration keeps the energy, the others do not
+            kept = fit_height(kept, part, taps, near)
+        if block.missing is not None:
+            kept = np.where(block.missing[rows[:, None], place.T], 0.0, kept)
+        value[rows[:, None], place.T] = kept
+    offset, anchored = _find_offsets(block, value)
+    clipped = (block.samples >= clip_level(block, system)).any(axis=1)
+    return Profiles(value, area, seen, offset, anchored, clipped)
+
+
+def _group_rows(length: np.ndarray) -> Iterator[np.ndarray]:
+    """Rows of waveforms with windows of equal length, AT_A_TIME at most; those without signal are left out."""
+    order = np.argsort(length, kind="stable")
+    edges = np.append(np.flatnonzero(np.diff(length[order], prepend=0)), len(order))
+    for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        for begin in range(low, high, AT_A_TIME):
+            yield order[begin : min(begin + AT_A_TIME, high)]
+
+
+def _lone_error(taps: np.ndarray, width: float, options: Deconvolution) -> float:
+    """Standard deviation of the sum of a lone echo's profile, in units of that of a sample.
+
+    That of the iterations is near the matched filter's; that of the linear filter follows from its taps.
+    """
+    if options.method != "wiener":
+        return float(1.0 / np.sqrt(np.sum(taps**2)))
+    inverse = wiener_taps(taps, (options.snr or SNR) ** -2.0, 4 * len(taps))
+    box = np.ones(2 * max(int(round(width)), 1) + 1)
+    return float(np.sqrt(np.sum(np.convolve(inverse, box) ** 2)))
+
+
+def _deconvolve(signal: np.ndarray, taps: np.ndarray, std: np.ndarray, options: Deconvolution) -> np.ndarray:
+    if options.method == "wiener":
+        return deconvolve_wiener(signal, taps, (options.snr or SNR) ** -2.0)
+    if options.method == "gold":
+        return deconvolve_gold(signal, taps, options.steps)
+    return deconvolve_richardson_lucy(signal, taps, np.float32(BACKGROUND) * std, options.steps)
+
+
+def _pulse_taps(system: SystemPulse, spacing: float) -> tuple[np.ndarray, float]:
+    """Samples of the system pulse of height 1, with tail and after-pulses, and its integral [ns].
+
+    A learned pulse is cut where the echoes it was learned from were cut: beyond, its Gaussians are extrapolated.
+    """
+    if not system.components:
+        taps = reference_pulse(system, spacing, "system", _PULSE_REACH).taps
+        return taps, float(np.sum(taps)) * spacing
+    width = system.sigma_ref / spacing
+    unit = max(width / 2, 1.0)
+    given = reference_pulse(system, spacing, "system", AFTER * unit / width)
+    lag = np.arange(len(given.taps)) - given.middle
+    taps = np.where((lag >= -BEFORE * unit) & (lag <= AFTER * unit), given.taps, 0.0)
+    return taps, float(np.sum(taps)) * spacing
+
+
+def _find_offsets(block: WaveformBlock, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets of the profiles from the returns of their packets [ns], and where they are known."""
+    returns = block.returns
+    if returns is None or not len(returns):
+        return np.zeros(len(block)), np.zeros(len(block), bool)
+    reach = int(np.ceil(TOLERANCE / block.spacing + 0.5))
+    row = returns.waveform.astype(np.int64)
+    offset, known = measure_offsets(value, row, returns.time / block.spacing, reach)
+    return offset * block.spacing, known
+
+
+MOST_CELLS = 1 << 18
+"""Largest number of cells."""
+
+_REACH = 1 << 28
+_SHIFT = np.int64(1 << 30)
+AROUND = np.array([a * _SHIFT + b for a in (-1, 0, 1) for b in (-1, 0, 1)])
+"""From the key of a cell to those of the cell and of the eight around it, i8 (9,)."""
+
+
+class CellMap:
+    """The lowest or the highest return of each cell.
+
+    middle: a position in the strip; returns more than 2^28 cells from it are ignored. cell: side of the cells [m].
+    highest: keep the highest returns.
+    """
+
+    def __init__(self, middle: np.ndarray, cell: float, *, highest: bool) -> None:
+        self._middle = np.array([middle[0], middle[1], 0.0])
+        self.cell = cell
+        self._sign = -1.0 if highest else 1.0
+        self._key = np.empty(0, np.int64)
+        self._kept = np.empty((0, 3))
+        """Returns from the middle, one per key, f8 (n, 3) [m]."""
+
+    def add(self, xyz: np.ndarray) -> None:
+        """Adds returns (m, 3) [m]."""
+        local = xyz - self._middle
+        index = np.floor(local[:, :2] / self.cell)
+        good = (np.abs(index) < _REACH).all(axis=1) & np.isfinite(xyz[:, 2])
+        self._keep_outermost(np.concatenate([self._kept, local[good]]))
+        while len(self._key) > MOST_CELLS:
+            self.cell *= 2.0
+            self._keep_outermost(self._kept)
+
+    def _keep_outermost(self, local: np.ndarray) -> None:
+        key = self._key_of(local)
+        order = np.lexsort((local[:, 1], local[:, 0], self._sign * local[:, 2], key))
+        first = np.append(True, np.diff(key[order]) != 0)[: len(key)]
+        self._key, self._kept = key[order][first], local[order][first]
+
+    def _key_of(self, local: np.ndarray) -> np.ndarray:
+        """Keys of the cells, i8 (m,), of positions from the middle (m, 3)."""
+        index = np.clip(np.nan_to_num(np.floor(local[:, :2] / self.cell)), -_REACH, _REACH).astype(np.int64)
+        return index[:, 0] * _SHIFT + index[:, 1]
+
+    def _row_of(self, key: np.ndarray) -> np.ndarray:
+        """Rows of cells, -1 where there is none."""
+        if not len(self._key):
+            return np.full(key.shape, -1)
+        at = np.minimum(np.searchsorted(self._key, key), len(self._key) - 1)
+        return np.where(self._key[at] == key, at, -1)
+
+
+CELL = 5.0
+"""Cell of the map [m]: in each, some return should have reached the ground."""
+
+STEEPEST = 0.5
+"""Least vertical part of the normal of a cell's ground: steeper planes are no ground, the cell is level."""
+
+LEAST_AROUND = 4
+"""Least number of lowest returns in a cell and the eight around it for a slope."""
+
+LEAST_WIDTH = 0.1
+"""Least standard deviation of these returns across their longest direction [cells]: a single row has no slope."""
+
+
+class Floor(CellMap):
+    """Ground below a strip: a plane through the lowest returns of each cell and of the eight around it.
+
+    middle: as for CellMap.
+    """
+
+    def __init__(self, middle: np.ndarray) -> None:
+        super().__init__(middle, CELL, highest=False)
+        self._slope = np.empty((0, 2))
+
+    def finish(self) -> Floor:
+        """Fits the planes; returns the map."""
+        row = self._row_of(self._key[:, None] + AROUND)
+        cell, number = np.nonzero(row >= 0)
+        offset = self._kept[row[cell, number]] - self._kept[cell]
+        planes = fit_planes(offset, cell, len(row))
+        normal = np.where(planes.normal[:, 2:] < 0, -planes.normal, planes.normal)
+        usable = (planes.kept >= LEAST_AROUND) & (normal[:, 2] >= STEEPEST)
+        usable &= planes.spreads[:, 1] > (LEAST_WIDTH * self.cell) ** 2
+        up = np.where(usable, normal[:, 2], 1.0)[:, None]
+        self._slope = np.where(usable[:, None], -normal[:, :2] / up, 0.0)
+        # The plane, not the lowest return itself: that may lie below the ground.
+        base = planes.centre[:, 2] - (self._slope * planes.centre[:, :2]).sum(axis=1)
+        self._kept[:, 2] += np.where(usable, base, 0.0)
+        return self
+
+    def measure_height(self, place: np.ndarray) -> np.ndarray:
+        """Height (n,) of positions (n, 3) above the ground [m]; infinite where there is no map."""
+        local = place - self._middle
+        row = self._row_of(self._key_of(local))
+        if not len(self._key):
+            return np.full(len(place), np.inf)
+        low, slope = self._kept[row], self._slope[row]
+        ground = low[:, 2] + ((local[:, :2] - low[:, :2]) * slope).sum(axis=1)
+        height = local[:, 2] - ground
+        return np.where((row >= 0) & np.isfinite(height), height, np.inf)
+
+
+LEAST_CELL = 4.0
+"""Least cell of the map [m]."""
+
+VOXELS_PER_CELL = 4.0
+"""Least cell of the map, in voxels."""
+
+MARGIN = 3.0
+"""Height above the highest return up to which there can be signal without a return [m]."""
+
+STEEP = 0.1
+"""Least vertical part of a ray: flatter rays are not followed upwards."""
+
+MOST_STEPS = 1024
+"""Cells over which a ray is followed at most."""
+
+
+class Ceiling(CellMap):
+    """Highest return of each cell of a map and its eight neighbours.
+
+    middle: as for CellMap. size: of the voxels [m].
+    """
+
+    def __init__(self, middle: np.ndarray, size: float) -> None:
+        super().__init__(middle, max(LEAST_CELL, VOXELS_PER_CELL * size), highest=True)
+        self._top = np.empty(0)
+
+    def finish(self) -> Ceiling:
+        """Raises every cell to the highest around it; returns the map."""
+        self._key, row = np.unique(self._key[:, None] + AROUND, return_inverse=True)
+        self._top = np.full(len(self._key), -np.inf)
+        np.maximum.at(self._top, row.ravel(), np.repeat(self._kept[:, 2] + MARGIN, len(AROUND)))
+        return self
+
+    def measure_headroom(self, start: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Distance (n,) [m] from positions (n, 3) back along the rays to where they are above all returns."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            up = -step / np.sqrt((step * step).sum(axis=1))[:, None]
+        headroom = np.zeros(len(start))
+        rows = np.flatnonzero((up[:, 2] >= STEEP) & np.isfinite(start).all(axis=1))
+        for number in range(MOST_STEPS):
+            way = number * self.cell
+            place = start[rows] + up[rows] * way
+            rows, place = (values[place[:, 2] < self._top.max(initial=-np.inf)] for values in (rows, place))
+            if not len(rows):
+                break
+            row = self._row_of(self._key_of(place - self._middle))
+            below = place[:, 2] < np.where(row >= 0, self._top[row], -np.inf)
+            headroom[rows[below]] = way + self.cell
+        return headroom
+
+
+def find_ceiling(reader: StripReader, scan: StripScan, middle: np.ndarray, size: float, floor: Floor) -> Ceiling:
+    """The ceiling of a strip; reads all of its points, and adds them to `floor` too."""
+    ceiling = Ceiling(middle, size)
+    for begin, end in zip(scan.borders[:-1].tolist(), scan.borders[1:].tolist(), strict=True):
+        xyz = locate(reader.read_points(begin, end), reader.facts.header)
+        ceiling.add(xyz)
+        floor.add(xyz)
+    return ceiling.finish()
+
 
 BATCH_SAMPLES = 1 << 20
 """Samples read at a time."""

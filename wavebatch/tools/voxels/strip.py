@@ -6,7 +6,6 @@ output must not depend on batches, so nothing here may mix pulses of a batch.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import MISSING, asdict, dataclass, field, replace
@@ -35,15 +34,24 @@ from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
-from wavebatch.tools.voxels.floor import Ceiling, Floor, find_ceiling
-from wavebatch.tools.voxels.grid import VoxelGrid, energy_unit
-from wavebatch.tools.voxels.output import ProfileWriter, VoxelSpace, check_voxel_target, write_voxels
-from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
+from wavebatch.tools.voxels.grid import (
+    ProfileWriter,
+    VoxelGrid,
+    VoxelSpace,
+    check_voxel_target,
+    energy_unit,
+    write_voxels,
+)
 from wavebatch.tools.voxels.rays import (
     PACKET,
     SAMPLE,
     Batch,
+    Ceiling,
+    Deconvolution,
+    Floor,
     Rays,
+    deconvolve_block,
+    find_ceiling,
     find_rule,
     join_packets,
     list_signal,
@@ -96,60 +104,69 @@ class VoxelOptions:
         check_options(self)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class VoxelSummary:
     """Counts and facts of a voxelized strip."""
 
     strip: str
     output: str
-    size: float
-    voxels: int
-    shape: tuple[int, int, int]
-    """Voxels along x, y and z of the smallest box around them."""
-    origin: tuple[float, float, float]
-    """Lower corner of that box [m]."""
-    waveforms: int
-    """Packets with samples: a pulse has one or several."""
-    pulses: int
-    several_packets: int
-    """Pulses of several packets; between them nothing was recorded, which counts as empty air."""
-    lost_packets: int
-    """Pulses with a packet that is missing or broken: their light is known up to it, not beyond."""
-    with_signal: int
-    """Pulses with signal."""
-    anchored: int
-    """Pulses with signal placed by a return of each packet; the others are placed by the raw location."""
-    clipped: int
-    """Pulses with samples at the digitizer's limit: their energy is too low."""
-    outside: int
-    """Pulses left out: their position is not a number, or too far from all others."""
-    energy: float
-    """[DN ns]."""
     method: str
     pulse_fwhm: float
     """Full width at half maximum of the Gaussian that is as wide as the system pulse [ns]."""
     noise: float
     """Noise of a sample [DN]."""
-    sensor: str | None = None
+    sensor: str | None
     """Source of the sensor's positions; None without calibration."""
-    unknown: int = 0
-    """Pulses with signal of unknown cross section: channels without a constant, pulses without a sensor position."""
-    reflectance_ratio: float = 1.0
+    warnings: tuple[str, ...]
+    """Why cross sections may be less sure than the calibration says."""
+    reflectance_ratio: float
     """Reflectance of canopy over that of ground, by which light is shared between them."""
-    reflectance_ratio_err: float | None = None
+    reflectance_ratio_err: float | None
     """Its standard deviation; None where it was given or assumed."""
-    reflectance_ratio_source: str = "assumed"
+    reflectance_ratio_source: str
     """`given`, `strip`, `assumed` (1, because the strip does not show it), or `no canopy`."""
-    hidden_light: float | None = None
+    hidden_light: float | None
     """Most of a pulse's light that may hide between two of its packets: 5 % of the recorded packets have less."""
-    profiles: str | None = None
+    size: float
+    profiles: str | None
     """File with the profiles of single pulses."""
     profile_samples: int = 0
     """Samples with signal in that file."""
+    voxels: int = 0
+    shape: tuple[int, int, int] = (0, 0, 0)
+    """Voxels along x, y and z of the smallest box around them."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Lower corner of that box [m]."""
+    waveforms: int = 0
+    """Packets with samples: a pulse has one or several."""
+    pulses: int = 0
+    several_packets: int = 0
+    """Pulses of several packets; between them nothing was recorded, which counts as empty air."""
+    lost_packets: int = 0
+    """Pulses with a packet that is missing or broken: their light is known up to it, not beyond."""
+    with_signal: int = 0
+    """Pulses with signal."""
+    anchored: int = 0
+    """Pulses with signal placed by a return of each packet; the others are placed by the raw location."""
+    clipped: int = 0
+    """Pulses with samples at the digitizer's limit: their energy is too low."""
+    outside: int = 0
+    """Pulses left out: their position is not a number, or too far from all others."""
+    unknown: int = 0
+    """Pulses with signal of unknown cross section: channels without a constant, pulses without a sensor position."""
     left_out: int = 0
     """Waveforms of pulses without a return that meets the condition of --where; `waveforms` are the others."""
-    warnings: tuple[str, ...] = ()
-    """Why cross sections may be less sure than the calibration says."""
+    energy: float = 0.0
+    """[DN ns]."""
+
+    def add(self, table: np.ndarray) -> None:
+        """Counts the pulses of a table of rays."""
+        self.waveforms += int(table["packets"].sum())
+        self.pulses += len(table)
+        found = {"with_signal": table["count"], "anchored": table["anchored"], "clipped": table["clipped"],
+                 "several_packets": table["packets"] > 1, "lost_packets": table["known"] < np.inf}  # fmt: skip
+        for name, has in found.items():
+            setattr(self, name, getattr(self, name) + int(np.count_nonzero(has)))
 
 
 def voxelize_strip(
@@ -216,22 +233,23 @@ def voxelize_strip(
                 else nullcontext()
             ) as writer,
         ):
-            counts: Counter[str] = Counter(waveforms=0, pulses=0, with_signal=0, anchored=0, clipped=0)
-            counts.update(several_packets=0, lost_packets=0)
+            summary = VoxelSummary(
+                strip=str(strip), output=str(target), size=grid.size, method=options.deconvolution.method,
+                pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA, noise=pulse.noise.std, warnings=doubts,
+                sensor=None if calibration is None else source.kind, reflectance_ratio=rule.ratio,
+                reflectance_ratio_err=rule.error, reflectance_ratio_source=rule.source, hidden_light=rule.hidden_light,
+                profiles=None if profiles is None else str(profiles),
+            )  # fmt: skip
             for batch in read_batches(reader, scan, keep=keep, block_size=block_size):
                 rays = tracer.trace(batch)
                 grid.add(rays, rule)
                 if writer is not None:
                     writer.add_rays(rays)
-                table, packets = rays.table, int(rays.table["packets"].sum())
-                counts.update({name: int(np.count_nonzero(table[name])) for name in ("anchored", "clipped")})
-                counts.update(waveforms=packets, pulses=len(table), with_signal=int(np.count_nonzero(table["count"])))
-                counts["several_packets"] += int(np.count_nonzero(table["packets"] > 1))
-                counts["lost_packets"] += int(np.count_nonzero(table["known"] < np.inf))
+                summary.add(rays.table)
                 if progress is not None:
                     progress(sum(len(rows) for _, rows, *_ in batch.parts), scan.packets)
             grid.measure_spread()
-            counts["left_out"] = 0 if keep is None else scan.packets - counts["waveforms"]
+            summary.left_out = 0 if keep is None else scan.packets - summary.waveforms
             meta = _describe(strip, options, grid, pulse, calibration) | {
                 "reflectance_ratio": {"ratio": rule.ratio, "error": rule.error, "source": rule.source},
                 "hidden_light": rule.hidden_light,
@@ -243,30 +261,12 @@ def voxelize_strip(
             if writer is not None:
                 known = {name: value for name, value in meta.items() if name not in ("columns", "size_m", "headroom_m")}
                 others.append(writer.complete_profiles(known, space.facts.crs or ""))
-            voxels = write_voxels(target, space, grid.pieces(rule.log_error), others=others, overwrite=overwrite)
-            return VoxelSummary(
-                **counts,
-                strip=str(strip),
-                output=str(target),
-                voxels=voxels,
-                profiles=None if profiles is None else str(profiles),
-                profile_samples=0 if writer is None else writer.samples,
-                method=options.deconvolution.method,
-                pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA,
-                noise=pulse.noise.std,
-                sensor=None if calibration is None else source.kind,
-                warnings=doubts,
-                size=grid.size,
-                shape=tuple(grid.shape.tolist()),
-                origin=tuple((grid.low * grid.size).tolist()),
-                outside=grid.outside,
-                energy=grid.energy,
-                unknown=grid.unknown,
-                reflectance_ratio=rule.ratio,
-                reflectance_ratio_err=rule.error,
-                reflectance_ratio_source=rule.source,
-                hidden_light=rule.hidden_light,
-            )
+            summary.voxels = write_voxels(target, space, grid.pieces(rule.log_error), others=others,
+                                          overwrite=overwrite)  # fmt: skip
+            summary.profile_samples = 0 if writer is None else writer.samples
+            summary.shape, summary.origin = tuple(grid.shape.tolist()), tuple((grid.low * grid.size).tolist())
+            summary.outside, summary.energy, summary.unknown = grid.outside, grid.energy, grid.unknown
+            return summary
 
 
 def _plan(strip: Path, chosen: PointFilter) -> PlannedFilter | None:
