@@ -256,23 +256,12 @@ def draw_segments(
         # A long box is seen along its diagonal, and leaves more room around it than a cube.
         space.set_box_aspect(sides, zoom=0.85 + 0.35 * (1.0 - np.sort(sides)[1] / sides.max()))
         for axis, side in zip("xyz", sides / sides.max(), strict=True):
-            _place_ticks(getattr(space, f"{axis}axis"), 5.0 * side)
+            space_ticks(getattr(space, f"{axis}axis"), 5.0 * side, 1.0)
         for flat, side in zip((plan.xaxis, plan.yaxis), extent[:2] / extent.max(), strict=True):
-            _place_ticks(flat, 7.0 * side)
+            space_ticks(flat, 7.0 * side, 1.0)
         factor = tall / extent[2]
         scales = "equal scales" if factor < 1.01 else f"heights {factor:.2g} times exaggerated"
         space.set_title(f"{scales}; z above {base[2]:.10g} m", fontsize=9)
-
-
-def _place_ticks(axis, number: float) -> None:
-    """Sets about so many ticks, or only one in the middle of a short axis: more would cover each other."""
-    if number < 1.5:
-        low, high = axis.get_view_interval()
-        step = 10.0 ** np.floor(np.log10(0.5 * (high - low)))
-        axis.set_ticks([step * np.round(0.5 * (low + high) / step)])
-        axis.set_major_formatter("{x:.6g}")
-    else:
-        axis.get_major_locator().set_params(nbins=max(int(number), 2))
 
 
 def draw_cube(slices: Sequence[CubeSlice], target: Path, *, name: str, overwrite: bool = False) -> None:
