@@ -27,8 +27,16 @@ import wavebatch as wb
 from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.messages import log_is_open
-from wavebatch.cli.program.command import GROUPS, ProgramCommand, complete_files, group_options, roff
-from wavebatch.cli.program.settings import HARMLESS, NO_VARIABLE, OLD_NAMES
+from wavebatch.cli.program.command import (
+    GROUPS,
+    HARMLESS,
+    NO_VARIABLE,
+    OLD_NAMES,
+    ProgramCommand,
+    complete_files,
+    group_options,
+    roff,
+)
 from wavebatch.core.errors import ConfigError
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import effective, parse_chain
@@ -401,7 +409,7 @@ def test_python_is_refused_what_the_command_line_is():
 def test_no_command_loads_linear_algebra_before_it_runs():
     """To explain a variable that no command reads, all commands load; SciPy's BLAS may wait for memory for ever."""
     script = (
-        "import sys, click; from wavebatch.cli import main; from wavebatch.cli.program.settings import _load_all; "
+        "import sys, click; from wavebatch.cli import main; from wavebatch.cli.program.command import _load_all; "
         "assert len(dict(_load_all(click.Context(main)))) > 15; print('scipy.linalg' in sys.modules)"
     )
     shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
