@@ -447,8 +447,7 @@ def _place_ticks(axes: Axes, width: float, height: float, unit: str) -> None:
     space_ticks(axes.yaxis, height, 0.5)
     if narrow:
         axes.tick_params(axis="x", labelrotation=90)
-    axes.set_xlabel(f"x [{unit}]")
-    axes.set_ylabel(f"y [{unit}]")
+    axes.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]")
 
 
 def _title(names: tuple[str, ...], total: Tally, column: str, rest: Sequence[str]) -> str:

@@ -286,11 +286,8 @@ def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite
         axes, place = (figure.subplots(), None) if flat else figure.subplots(1, 2, width_ratios=(1, 0.05))
         axes.set_anchor("C" if flat else "E")
         shown, values = _draw_voxels(axes, found) if found.voxel else _draw_points(axes, found)
-        axes.set_xlim(0.0, length)
-        axes.set_ylim(low, high)
-        axes.set_aspect(aspect)
-        axes.set_xlabel(f"along the line [{found.crs.unit}]")
-        axes.set_ylabel(f"{found.crs.upright} [{found.crs.upright_unit}]")
+        axes.set(xlim=(0.0, length), ylim=(low, high), aspect=aspect, xlabel=f"along the line [{found.crs.unit}]",
+                 ylabel=f"{found.crs.upright} [{found.crs.upright_unit}]")  # fmt: skip
         axes.ticklabel_format(useOffset=False)
         space_ticks(axes.yaxis, width * tall, 0.3)
         label = ("mean of " if found.voxel else "") + found.facts.label
@@ -369,8 +366,8 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
         axes.set_ylim(found.edges[0], found.edges[-1])
         axes.ticklabel_format(axis="y", useOffset=False, style="plain")
-        axes.set_xlabel(fit_text(figure, plain_text(found.label, 300), 5.0, size=9.5))
-        axes.set_ylabel(f"{found.upright} [{found.unit}]")
+        across = fit_text(figure, plain_text(found.label, 300), 5.0, size=9.5)
+        axes.set(xlabel=across, ylabel=f"{found.upright} [{found.unit}]")
         parts = [name_clouds(found.names), f"{found.total.values:,} {found.noun}"]
         parts[1:1] = [found.facts.name] if found.facts.name != found.noun else []
         set_head(figure, [*parts, *found.total.list_rest(found.outside)])
