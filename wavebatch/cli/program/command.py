@@ -505,24 +505,12 @@ def _heading(name: str) -> str:
 
 def _front_page(group: click.Group, ctx: click.Context) -> str:
     lines = [_heading("wavebatch"), ".SH NAME", f"wavebatch \\- {roff(_first_line(group.help))}", ".SH SYNOPSIS",
-             ".B wavebatch", "COMMAND [OPTIONS] ...", ".SH COMMANDS"]  # fmt: skip
+             ".B wavebatch", "COMMAND [OPTIONS] ...", ".SH DESCRIPTION", *_describe(group.help or ""), ".SH COMMANDS"]
     for name in group.list_commands(ctx):
         command = group.get_command(ctx, name)
         text = _first_line(None if command is None else command.help)
         lines += [".TP", f"\\fB{roff(f'wavebatch-{name}(1)')}\\fR", roff(text)]
-    return "\n".join([*lines, *_options(group, ctx), *SETTINGS_PAGE]) + "\n"
-
-
-SETTINGS_PAGE = (
-    ".SH ENVIRONMENT",
-    "WAVEBATCH_OPTION is the default of an option of every command, WAVEBATCH_COMMAND_OPTION that of one command, for "
-    "example WAVEBATCH_RUN_JOBS=4.",
-    ".SH FILES",
-    "A settings file holds defaults of options in a table per command, for example [run] with jobs = 4. That of "
-    "--config FILE or WAVEBATCH_CONFIG is the only one; without it, wavebatch.toml beside the inputs counts before "
-    "that in the folder for settings of the user. The one beside the inputs can change numbers only. "
-    "Options on the command line count first, then variables, then files.",
-)
+    return "\n".join([*lines, *_options(group, ctx)]) + "\n"
 
 
 def _page(command: click.Command, ctx: click.Context, title: str) -> str:
