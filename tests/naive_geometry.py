@@ -1,23 +1,9 @@
 """Slow, plain references for kernels/geometry: one pulse, point or direction after the other."""
 
 from collections import defaultdict
-from itertools import groupby, pairwise
 
 import numpy as np
 from scipy.optimize import least_squares
-
-
-def find_pulses(gps_time, longest=64):
-    """First row of the run of equal times of each point; rows of a long run, or of time 0, are alone."""
-    first = []
-    for row, time in enumerate(gps_time):
-        start = end = row
-        while start and gps_time[start - 1] == time:
-            start -= 1
-        while end < len(gps_time) and gps_time[end] == time:
-            end += 1
-        first.append(row if time == 0 or end - start >= longest else start)
-    return first
 
 
 def group_times(gps_time, longest=64):
@@ -44,11 +30,6 @@ def find_rays(group, scanner, start, step, aligned=1e-4, beside=0.1):
     return heads
 
 
-def group_pulses(time, number):
-    """Rows at which the time changes or the return number does not rise."""
-    return [i for i in range(len(time)) if i == 0 or time[i] != time[i - 1] or number[i] <= number[i - 1]]
-
-
 def thin_out(xyz, row, radius, fineness, most):
     """At most so many points of each cell: those with the least hash of their place in the file."""
     cells = defaultdict(list)
@@ -59,60 +40,6 @@ def thin_out(xyz, row, radius, fineness, most):
         members.sort(key=lambda i: int(row[i]) * 0x9E3779B97F4A7C15 % 2**64)
         kept[members[:most]] = True
     return kept
-
-
-def variety(u, v, directions=24):
-    """Least kurtosis - skewness^2 - 1 of the places across any of the directions: 0 for two lines."""
-    found = []
-    for angle in np.pi * np.arange(directions) / directions:
-        across = np.cos(angle) * u + np.sin(angle) * v
-        second, third, fourth = (np.mean((across - across.mean()) ** power) for power in (2, 3, 4))
-        found.append(fourth / second**2 - third**2 / second**3 - 1)
-    return min(found)
-
-
-def find_nearest(echo_waveform, echo_time, return_waveform, return_time):
-    """Row of the nearest return of the same waveform, -1 without one."""
-    rows = []
-    for w, t in zip(echo_waveform, echo_time, strict=True):
-        gaps = [(abs(u - t), u, j) for j, (v, u) in enumerate(zip(return_waveform, return_time, strict=True)) if v == w]
-        rows.append(min(gaps)[2] if gaps else -1)
-    return rows
-
-
-def _runs_of(values):
-    """[value, length] of each run of equal values."""
-    return [[value, len(list(run))] for value, run in groupby(values)]
-
-
-def find_turns(angle, lag):
-    """Pulses at which the angle turns: runs of one direction, the short ones joined with what is around them."""
-    if len(angle) <= 2 * lag:
-        return []
-    runs = _runs_of([bool(angle[i + lag] > angle[i]) for i in range(len(angle) - lag)])
-    while len(runs) > 1 and min(length for _, length in runs) < lag:
-        short = [length for _, length in runs].index(min(length for _, length in runs))
-        around = runs[max(short - 1, 0) : short + 2]
-        direction = next(value for value, _ in around if value != runs[short][0])
-        runs[max(short - 1, 0) : short + 2] = [[direction, sum(length for _, length in around)]]
-    turns, edge = [], 0
-    for rising, length in runs[:-1]:
-        edge += length
-        near = range(max(edge - lag, 0), min(edge + 2 * lag, len(angle)))
-        turns.append((max if rising else min)(near, key=lambda i: angle[i]))
-    return turns
-
-
-def find_sweeps(angle, time, lag):
-    """First pulse of every scan line: after jumps, pauses and times that run backwards, and where the angle turns."""
-    steps = [abs(b - a) for a, b in pairwise(angle)]
-    waits = [b - a for a, b in pairwise(time)]
-    moving, passing = [step for step in steps if step > 0], [wait for wait in waits if wait > 0]
-    jump = max(20 * np.median(moving), 0.25 * (max(angle) - min(angle))) if moving else np.inf
-    pause = 20 * np.median(passing) if passing else np.inf
-    starts = [i for i in range(len(angle)) if not i or steps[i - 1] > jump or not 0 <= waits[i - 1] <= pause]
-    turns = [a + i for a, b in pairwise([*starts, len(angle)]) for i in find_turns(angle[a:b], lag)]
-    return sorted({*starts, *turns})
 
 
 def strongest_line(points, weight):

@@ -3,8 +3,7 @@
 import math
 
 import numpy as np
-from scipy.integrate import quad
-from scipy.optimize import brentq, curve_fit
+from scipy.optimize import brentq
 from scipy.special import log_ndtr
 
 from wavebatch.kernels.physics.incidence import RADIUS
@@ -17,65 +16,6 @@ def median(values):
     return (values[(len(values) - 1) // 2] + values[len(values) // 2]) / 2
 
 
-def transmit(distance, attenuation):
-    """Share of light that is left after a way there and back through air that takes so many dB per kilometre."""
-    return 10 ** (-2 * distance / 1000 * attenuation / 10)
-
-
-def backscatter(constant, distance, amplitude, sigma, attenuation):
-    if not 0 < distance < math.inf:
-        return math.nan
-    return constant * distance**2 * amplitude * sigma / transmit(distance, attenuation)
-
-
-def compute_cross_section(gamma, distance, divergence):
-    """Gamma times the area of the footprint."""
-    return gamma * math.pi * (distance * divergence / 2) ** 2 if 0 < distance < math.inf else math.nan
-
-
-def diffuse_reflectance(gamma, incidence):
-    return gamma / (4 * math.cos(incidence)) if math.cos(incidence) > math.cos(math.radians(85)) else math.nan
-
-
-def energy_error(amplitude, sigma, amplitude_err, sigma_err):
-    """By the covariance of both, whose correlation is -1 / sqrt(3)."""
-    if not (amplitude > 0 and sigma > 0):
-        return math.nan
-    shared = -amplitude_err * sigma_err / math.sqrt(3)
-    slope = np.array([1 / amplitude, 1 / sigma])
-    return math.sqrt(slope @ [[amplitude_err**2, shared], [shared, sigma_err**2]] @ slope)
-
-
-def backscatter_error(energy_err, distance, distance_err, constant_err, attenuation, power, attenuation_err):
-    """From differences of the logarithm of R^power / transmission."""
-    if not 0 < distance < math.inf:
-        return math.nan
-
-    def logarithm(r, a):
-        return power * math.log(r) - math.log(transmit(r, a))
-
-    step = 1e-4 * distance
-    by_range = (logarithm(distance + step, attenuation) - logarithm(distance - step, attenuation)) / (2 * step)
-    by_air = (logarithm(distance, attenuation + 0.01) - logarithm(distance, attenuation - 0.01)) / 0.02
-    parts = energy_err, constant_err, by_range * distance_err, by_air * attenuation_err
-    return math.sqrt(sum(part * part for part in parts))
-
-
-def reflectance_error(relative, incidence, incidence_err):
-    return math.sqrt(relative**2 + (math.tan(incidence) * incidence_err) ** 2)
-
-
-def receive_power(section, distance, transmitted, aperture, divergence, efficiency, attenuation):
-    """Light on the footprint, scattered over the sphere, caught by the lens."""
-    density = transmitted / (math.pi * (distance * divergence / 2) ** 2)
-    caught = density * section / (4 * math.pi * distance**2) * math.pi * (aperture / 2) ** 2
-    return caught * efficiency * transmit(distance, attenuation)
-
-
-def spread_cross_section(reflectance, distance, divergence):
-    return 4 * reflectance * math.pi * (distance * divergence / 2) ** 2
-
-
 def slope_error(incidence, slope, directions=3600):
     """Root mean square of cos(incidence) / cos(true angle) - 1 over surfaces that slope in any direction."""
     ray = np.array([np.sin(incidence), 0.0, np.cos(incidence)])
@@ -84,11 +24,6 @@ def slope_error(incidence, slope, directions=3600):
         normal = np.array([np.sin(slope) * np.cos(turn), np.sin(slope) * np.sin(turn), np.cos(slope)])
         off.append(ray[2] / (ray @ normal) - 1)
     return np.sqrt(np.mean(np.square(off)))
-
-
-def spread_of_angle(angle, distance, divergence):
-    """Two-way time of the slant across half a footprint."""
-    return 2 * (distance * divergence / 4) * math.tan(angle) / LIGHT
 
 
 def angle_of_spread(spread, distance, divergence):
@@ -108,15 +43,6 @@ def radius(variance, error):
     return (low + (high - low) * (place - a) / (b - a)) * math.sqrt(error)
 
 
-def angle_of_variance(variance, error, distance, divergence):
-    """Angle of one echo and its error."""
-    if not (math.isfinite(variance) and math.isfinite(error) and error > 0 and distance > 0):
-        return math.nan, math.nan
-    spread, around = math.sqrt(max(variance, 0.0)), radius(variance, error)
-    low, angle, high = (angle_of_spread(spread + step, distance, divergence) for step in (-around, 0.0, around))
-    return (angle, (high - low) / 2) if angle <= math.radians(80) else (math.nan, math.nan)
-
-
 def mean_above(over, share):
     """Mean of the normal law of which so many of the draws above 0 lie above `over`."""
     return brentq(lambda mean: log_ndtr(mean - over) - log_ndtr(mean) - math.log(share), -3000, over + 9, xtol=1e-10)
@@ -133,40 +59,6 @@ def angle_above(variance, error, distance, divergence, threshold):
     facing = angle_of_spread(radius(0.0, error), distance, divergence)
     off = (high - low) / 2 if angle > 0 else max(high, facing)
     return (angle, off) if angle <= math.radians(80) else (math.nan, math.nan)
-
-
-def spread_pulse(time, exponent, spread, tau, causal=False):
-    """t^exponent exp(-t) spread by a Gaussian, at one time; of any height."""
-
-    def product(delay):
-        late = (time - delay) / tau
-        return late**exponent * math.exp(-late - 0.5 * (delay / spread) ** 2) if late > 0 else 0.0
-
-    first, last = max(-8 * spread, time - 60 * tau, 0.0 if causal else -math.inf), min(8 * spread, time)
-    return quad(product, first, last, limit=200)[0] if first < last else 0.0
-
-
-def fitted_width(time, curve, spacing):
-    """Width of the Gaussian that scipy fits to samples of a curve, mean of four places of the first sample."""
-    widths = []
-    for phase in (0.0, 0.25, 0.5, 0.75):
-        at = np.arange(time[0] + phase * spacing, time[-1], spacing)
-        start = 1.0, time[np.argmax(curve)], (curve > 0.5).sum() * (time[1] - time[0]) / 2.3548
-        bell = lambda x, a, t, s: a * np.exp(-0.5 * ((x - t) / s) ** 2)  # noqa: E731
-        widths.append(abs(curve_fit(bell, at, np.interp(at, time, curve), start)[0][2]))
-    return np.mean(widths)
-
-
-def spread_variance(spread, width, cut, measured):
-    """Variance of one measured width: what the pulse adds is interpolated, and constant beyond the ends."""
-    own = [w * w - s * s for s, w in zip(spread, width, strict=True)]
-    if measured > width[-1]:
-        return math.nan if cut else measured**2 - own[-1]
-    if measured <= width[0]:
-        return measured**2 - own[0]
-    right = next(i for i, w in enumerate(width) if w >= measured)
-    share = (measured - width[right - 1]) / (width[right] - width[right - 1])
-    return measured**2 - (own[right - 1] + share * (own[right] - own[right - 1]))
 
 
 def light_slope(pulses, ratio):

@@ -10,15 +10,6 @@ from wavebatch.kernels.signal import noise
 QUANTISATION_STD = 1 / np.sqrt(12)
 
 
-def recorded_length(waveform, least_padding=8, least_recorded=16, least_level=3):
-    """Samples of one waveform without the zeros that fill its packet."""
-    end = len(waveform)
-    while end and waveform[end - 1] == 0:
-        end -= 1
-    padded = len(waveform) - end >= least_padding and end >= least_recorded and min(waveform[:end]) >= least_level
-    return end if padded else len(waveform)
-
-
 def widen_after(mask, reach):
     """Boolean (s, n) with `reach` samples marked after every true one."""
     wide = np.zeros_like(mask)
@@ -296,31 +287,6 @@ def refine_peak(waveform, at):
         return at, waveform[at]
     shift = min(max(-c1 / (2 * c2), -0.5), 0.5)
     return at + shift, np.exp(c0 + 0.5 * c1 * shift)
-
-
-def measure_offset(profile, places, reach):
-    """Mean distance of the signal near the returns of one waveform from them, searched twice; None without signal."""
-    offset = 0.0
-    for _ in range(2):
-        weight = moment = 0.0
-        for place in places:
-            middle = round(place + offset)
-            for i in range(max(middle - reach, 0), min(middle + reach + 1, len(profile))):
-                weight += profile[i]
-                moment += profile[i] * (i - place)
-        offset = moment / weight if weight > 0 else 0.0
-    return offset if weight > 0 else None
-
-
-def keep_runs(profile, support, least, floor):
-    """Signal of one profile: its runs on the support whose sum reaches the least, without what is below the floor."""
-    signal = np.zeros(len(profile))
-    for _, first, end in find_stretches(support[None]):
-        part = profile[first:end]
-        high = np.where(part > floor, part, 0.0)
-        if part.sum() >= least and high.sum() > 0:
-            signal[first:end] = high * part.sum() / high.sum()
-    return signal
 
 
 def find_reference(samples, quiet_widths=3.5, lags=4):

@@ -119,27 +119,6 @@ def test_names_of_columns_are_read_in_linear_time(tmp_path):
     assert done.exit_code == 4 and "t.txt" in done.stderr and time.process_time() - start < 10
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("{", "no JSON at line 1, column 2"),
-        ('{"features": 3}', 'needs "features"'),
-        ('{"features": [3]}', "feature 1: not GeoJSON of a polygon"),
-        ('{"features": [{"geometry": {"type": "Point", "coordinates": []}}]}', "feature 1 is a Point"),
-        ('{"features": [{"geometry": {"type": "Polygon", "coordinates": [[["x", 1]]]}}]}', "feature 1: not GeoJSON"),
-        ('{"features": [{"geometry": {"type": "Polygon", "coordinates": [[]]}}]}', "no corner"),
-        ("[" * 100_000, "list of polygons"),
-    ],
-)
-def test_polygons_that_are_none_are_told_without_the_words_of_python(tmp_path, text, why):
-    strip, path = tmp_path / "a.las", tmp_path / "p.geojson"
-    simulate_strip("flat", strip, pulses=60, seed=1)
-    path.write_text(text)
-    done = run_command("stats", strip, "--polygon", path)
-    assert done.exit_code == 2 and why in done.stderr and done.stderr.count("\n") == 1
-    assert "Error:" not in done.stderr and "object" not in done.stderr
-
-
 def test_stats_writes_no_table_that_lacks_a_cloud(tmp_path):
     simulate_strip("flat", tmp_path / "a.las", pulses=60, seed=1)
     (tmp_path / "b.las").write_bytes(b"nothing")
@@ -175,23 +154,6 @@ def test_names_are_printed_without_escapes_of_the_terminal(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX systems")
-@pytest.mark.parametrize(
-    ("option", "code", "why"),
-    [("--chain", 2, "nothing writes into this pipe"), ("--system", 2, "nothing writes into this pipe"),
-     ("--calibration", 2, "nothing writes into this pipe"), ("--polygon", 2, "nothing writes into this pipe"),
-     ("--log-file", 2, "is a pipe; choose a file"), ("--trajectory", 2, "is a folder, a pipe or a device; give a file"),
-     ("--report", 1, "cannot be written")],
-)  # fmt: skip
-def test_a_pipe_without_another_end_is_refused(tmp_path, option, code, why):
-    """Each of them would wait for ever."""
-    strip, pipe = make_raw(60).write(tmp_path / "a.las"), tmp_path / "fifo"
-    os.mkfifo(pipe)
-    words = ["run", str(strip), "-o", str(tmp_path / "out"), option, str(pipe)]
-    done = run_command(*words if option == "--chain" else [*words, "--profile", "fast"])
-    assert done.exit_code == code and "fifo" in done.stderr and why in done.stderr, done.stderr
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX systems")
 def test_a_chain_can_come_through_a_pipe(tmp_path, monkeypatch):
     """As in --chain <(sed ... chain.toml); also from a writer that takes its time."""
     monkeypatch.setattr(text_file, "_PATIENCE", 60.0)  # on a busy machine the writer begins late
@@ -202,35 +164,6 @@ def test_a_chain_can_come_through_a_pipe(tmp_path, monkeypatch):
     done = run_command("check", strip, "-q")  # the command line itself is fine
     text = text_file.read_text(pipe, "chain file")
     assert writer.wait() == 0 and text.startswith("xy = 1#") and len(text) == 200_006, done.output
-
-
-@pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="a device that never ends")
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [("run {a} -o {o} --chain /dev/zero", 2), ("run @/dev/zero -o {o}", 2), ("info /dev/zero", 1),
-     ("run {a} -o {o} --trajectory /dev/zero", 2), ("stats {a} --polygon /dev/zero", 2)],
-)  # fmt: skip
-def test_a_device_that_never_ends_is_no_input(tmp_path, words, code):
-    strip = make_raw(60).write(tmp_path / "a.las")
-    done = run_command(*words.format(a=strip, o=tmp_path / "out").split())
-    assert done.exit_code == code and "device" in done.stderr and done.stderr.count("\n") == 1, done.stderr
-
-
-def test_packets_in_a_pipe_are_refused(tmp_path):
-    strip = make_raw(60, internal=False).write(tmp_path / "a.las")
-    strip.with_suffix(".wdp").unlink()
-    os.mkfifo(strip.with_suffix(".wdp"))
-    done = run_command("info", strip)
-    assert done.exit_code == 1 and "pipe" in done.stderr
-
-
-@pytest.mark.parametrize("text", ["a = " + "9" * 5000, "a." * 5000 + "a = 1", "a = " + "[" * 5000, "a = [", "run = 3"])
-def test_damaged_settings_are_wrong_usage(tmp_path, text):
-    """tomllib would fail in words of Python."""
-    strip = make_raw(60).write(tmp_path / "a.las")
-    (tmp_path / "wavebatch.toml").write_text(text)
-    done = run_command("run", strip, "-o", tmp_path / "out")
-    assert done.exit_code == 2 and "wavebatch.toml" in done.stderr and done.stderr.count("\n") == 1, done.stderr
 
 
 def test_damaged_arrays_are_one_line(tmp_path):

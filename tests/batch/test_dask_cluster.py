@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shutil
 import signal
 import socket
@@ -172,19 +171,6 @@ def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatc
     assert not (tmp_path / "out").exists()
 
 
-def test_without_distributed_the_line_says_what_to_install(strips, tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.batch.workers.dask_cluster.importlib.util.find_spec", lambda name: None)
-    done = run_command("run", strips, "-o", tmp_path / "out", "--scheduler", "tcp://a:1")
-    assert done.exit_code == 2 and re.search(r"pip install .*'distributed>=", done.stderr)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("option", [["--jobs", "2"], ["--jobs", "0"], ["--memory", "2G"]])
-def test_the_cluster_decides_jobs_and_memory(strips, tmp_path, option):
-    done = run_command("run", strips, "-o", tmp_path, "--scheduler", "tcp://a:1", *option)
-    assert done.exit_code == 2 and f"--scheduler and {option[0]} exclude each other" in done.stderr
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("package", "words"),
@@ -293,13 +279,6 @@ def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path, t
     assert process.returncode == 130
     assert said.startswith("interrupted") and said.count("\n") == 1
     assert {path.name for path in tmp_path.iterdir()} <= {"a.laz", "a.report.json", "b.laz", "b.report.json"}
-
-
-@pytest.mark.parametrize("address", ["", " "])
-def test_an_empty_address_is_wrong_usage(strips, tmp_path, address):
-    done = run_command("run", strips, "-o", tmp_path / "out", "--scheduler", address)
-    assert done.exit_code == 2 and "--scheduler: the address is empty" in done.stderr
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -122,13 +122,6 @@ def test_a_dry_run_writes_nothing_and_knows_what_is_done(strips, flown, tmp_path
     assert new.exit_code == 0 and ": write " in new.stdout and not (tmp_path / "new").exists()
 
 
-def test_system_and_flight_exclude_each_other(strips, flown, tmp_path):
-    folder, _ = flown
-    system = folder / "flight.system.toml"
-    result = _run(strips["a"], "-o", tmp_path / "out", "--survey", "flight", "--system", system)
-    assert result.exit_code == 2 and "exclude each other" in result.stderr and not (tmp_path / "out").exists()
-
-
 def test_a_gain_that_no_digitizer_has_does_not_stop_the_flight(strips, tmp_path):
     data = bytearray(strips["a"].read_bytes())
     place = data.index(b"LASF_Spec\0") + 52  # body of the first descriptor
@@ -163,13 +156,6 @@ def test_a_survey_of_an_interrupted_run_is_kept_for_the_next(strips, tmp_path, m
     monkeypatch.setattr("wavebatch.batch.run._Batch.run", interrupt)
     assert _run(strips["a"], "-o", tmp_path, "--survey", "flight", "--profile", "fast").exit_code != 0
     assert [path.name for path in tmp_path.iterdir()] == ["flight.system.toml"]
-
-
-def test_no_strip_that_can_be_read(tmp_path):
-    (tmp_path / "bad.las").write_bytes(b"LASF")
-    result = _run(tmp_path / "bad.las", "-o", tmp_path / "out", "--survey", "flight")
-    assert result.exit_code == 4 and result.stderr.count("\n") == 1
-    assert not (tmp_path / "out" / "flight.system.toml").exists()
 
 
 def test_a_batch_whose_surveys_agree_says_so_in_its_report_and_with_v(strips, tmp_path):

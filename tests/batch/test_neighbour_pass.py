@@ -165,24 +165,6 @@ def test_only_the_error(strips, clouds, tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        ("radius = -1.0", "radius must lie between 0 and 1000"),
-        ("radius = 1e9", "radius must lie between 0 and 1000"),
-        ("min_points = 3", "min_points must lie between 4 and 10000"),
-        ("max_error = 0.0", "max_error must lie between 0.001 and 180"),
-    ],
-)
-def test_wrong_parameters_are_one_line(strips, tmp_path, value, message):
-    chain = tmp_path / "c.toml"
-    chain.write_text(CHAIN.replace("radius = 2.5", value))
-    done = run_command("run", strips / "slope.las", "-o", tmp_path / "out", "-c", chain)
-    assert done.exit_code == 2
-    assert f"({STAGE}): {message}" in done.stderr and "Traceback" not in done.stderr
-    assert not list((tmp_path / "out").glob("*"))
-
-
 _DIE = """
 import os, sys
 from wavebatch.batch import neighbour_pass

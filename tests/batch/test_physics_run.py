@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from commands import run_command
 
-from wavebatch.core.errors import ConfigError
 from wavebatch.core.system import Radiometry
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile
-from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.calibrating.calibration_file import format_calibration, parse_calibration
 from wavebatch.surveying.calibration import (
     Calibration,
     with_physics,
@@ -179,20 +178,6 @@ def test_resume_makes_it_anew_when_the_calibration_changes(tmp_path, tiny_strip)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--lever-arm", "1,2"), "invalid value for '--lever-arm': '1,2' is not X,Y,Z"),
-        (("--lever-arm", "1,2,3"), "--lever-arm is of no use without --trajectory"),
-        (("--calibration", "none.toml"), "none.toml: calibration file cannot be read"),
-    ],
-)
-def test_wrong_options(tmp_path, tiny_strip, arguments, message):
-    done = run(tiny_strip, "-o", tmp_path / "out", *arguments)
-    assert done.exit_code == 2
-    assert message in done.stderr
-
-
-@pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         ((), {"range": "no stage attribute.range", "reflectance": "not calibrated", "incidence_angle": "divergence"}),
@@ -231,23 +216,6 @@ def test_relative_columns_are_written_on_request_and_say_so_in_the_file(tmp_path
     assert any("cross_section: none of" in line and "relative_backscatter" in line for line in told["remarks"])
 
 
-def test_options_that_the_chain_ignores(tmp_path, tiny_strip):
-    chain = tmp_path / "c.toml"
-    stages = ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.position")
-    chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
-    done = run(tiny_strip, "-o", tmp_path / "out", "-c", chain, "--flight-height", "800")
-    assert done.exit_code == 2
-    assert "--flight-height: chain" in done.stderr and "give --columns +range, or add stage" in done.stderr
-
-
-def test_a_wrong_trajectory_fails_its_strip_in_one_line(tmp_path, tiny_strip):
-    path = tmp_path / "t.csv"
-    path.write_text("time,x,y,z\n1,2,3,4\n2,3,4,5\n")
-    done = run(tiny_strip, "-o", tmp_path / "out", "--trajectory", path)
-    assert done.exit_code == 4
-    assert "do not overlap on any clock" in done.stderr
-
-
 @pytest.mark.parametrize("name", ["Stra\u00dfe.las", "\U0001f6f0 strip.las", '\x7f"\\.las'])
 def test_a_calibration_of_a_strip_of_any_name_comes_back(name):
     assert parse_calibration(format_calibration(replace(FOUND, strip=name)), "cal").strip == name
@@ -264,31 +232,6 @@ def test_calibration_files():
     given = system.radiometry
     assert (given.constant, given.divergence, given.attenuation) == (2.6e-8, 1.1, 0.3)
     assert FOUND.apply(SystemPulse(2.0, radiometry=Radiometry(divergence=0.5))).radiometry.divergence == 0.5
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("x = ", "not valid TOML"),
-        ('schema = "wavebatch.calibration/1"\nconstnt = 1.0', "unknown key 'constnt'; did you mean 'constant'"),
-        ('schema = "other"', "schema is 'other'"),
-        ('schema = "wavebatch.calibration/1"', "key 'constant' is missing"),
-        ('schema = "wavebatch.calibration/1"\nconstant = "a"\nrelative_error = 1', "constant must be a number"),
-        ('schema = "wavebatch.calibration/1"\nconstant = 0\nrelative_error = 1', "must lie between 1e-30 and"),
-        ('schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0\nsection_constant = 1e-15', "no div"),
-        (
-            'schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0\ndivergence_mrad = 1\n'
-            "section_constant = 8e-15",
-            "but there is 7.853981633974",
-        ),
-    ],
-)
-def test_wrong_calibration_files_are_one_line(tmp_path, text, message):
-    path = tmp_path / "cal.toml"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=message) as caught:
-        load_calibration(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_chains_get_what_is_known_and_nothing_twice():

@@ -11,7 +11,7 @@ from writer_tools import read_provenance
 
 from wavebatch.batch.job import choose_columns
 from wavebatch.batch.options import RunOptions
-from wavebatch.batch.run import LEAST_MEMORY, check_outputs, plan_memory, plan_strip, run_batch
+from wavebatch.batch.run import LEAST_MEMORY, plan_memory, plan_strip, run_batch
 from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import ConfigError, InputError
@@ -214,19 +214,6 @@ def test_a_strip_that_changes_while_it_is_read_is_not_written(tiny_strip, tmp_pa
         task.finish()
     task.drop()
     assert _files(tmp_path) == ["tiny.las"]
-
-
-def test_outputs_never_replace_inputs(tiny_strip, riegl, tmp_path):
-    options = RunOptions(tiny_strip.parent)
-    with pytest.raises(ConfigError, match="would replace this input"):
-        check_outputs([make_job(tiny_strip, format="las")], options)
-    check_outputs([make_job(tiny_strip)], options)
-    with pytest.raises(ConfigError, match=r"\.wdp: the output would replace"):
-        check_outputs([make_job(riegl, keep_packets=True)], RunOptions(riegl.parent))
-    link = tmp_path / "link"
-    link.symlink_to(tiny_strip.parent)
-    with pytest.raises(ConfigError, match="would replace this input"):
-        run_batch([make_job(tiny_strip, format="las")], RunOptions(link, overwrite=True))
 
 
 def test_memory_decides_jobs_and_blocks():

@@ -1,8 +1,6 @@
 """What `run` writes with --where and its like: the points of a full run, and all others counted."""
 
 import json
-import re
-import shlex
 
 import laspy
 import numpy as np
@@ -16,7 +14,6 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.stages.chain_file import effective, load_profile
 
 
 def _run(strip, folder, **options):
@@ -228,30 +225,6 @@ def test_resume_redoes_a_cloud_of_another_selection(riegl, tmp_path):
 def test_an_area_in_another_crs_is_named(riegl, tmp_path):
     _, report = _run(riegl, tmp_path, bbox=(9, 47, 10, 48))
     assert any("outside the strip" in one["text"] and "another CRS" in one["text"] for one in report["warnings"])
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ("--where 'ecko_width < 5'", "--where: character 1: .*no column 'ecko_width'; did you mean 'echo_width'"),
-        ("--where 'z <'", "--where: character 4: a column or a number is missing"),
-        ("--drop-flags RINGING", "--drop-flags: flag 'RINGING' does not exist; did you mean 'RINGING_SUSPECT'"),
-        ("--classes 2,x", "'2,x' is no list of numbers"),
-        ("--classes 2,300", "--classes: .* must be numbers from 0 to 255"),
-        ("--bbox 1,2,3", "is not WEST,SOUTH,EAST,NORTH"),
-        ("--bbox 5,2,3,9", "--bbox: .* west < east"),
-        ("--polygon none.geojson", "none.geojson"),
-        ("--chain CHAIN --where 'incidence_angle_normals < 5'", "does not compute it; add stage"),
-    ],
-)
-def test_wrong_selections_are_one_line(riegl, tmp_path, options, text):
-    chain = tmp_path / "x.toml"
-    chain.write_text(effective(load_profile("fast")))
-    words = [str(chain) if word == "CHAIN" else word for word in shlex.split(options)]
-    result = run_command("run", riegl, "-o", tmp_path / "out", *words)
-    assert result.exit_code == 2, result.output
-    assert re.search(text, result.output), result.output
-    assert len(result.output.splitlines()) == 1
 
 
 def test_the_summary_says_what_is_left_out(riegl, tmp_path):

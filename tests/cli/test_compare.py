@@ -72,23 +72,6 @@ def test_a_figure_that_does_not_exist_meets_no_threshold(strips):
     assert "has nan" in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["a.las"], "--truth"),
-        (["a.las", "b.las", "--truth", "a.npz"], "--truth"),
-        (["a.las", "a.npz"], "--truth"),
-        (["a.las", "--truth", "b.las"], "no truth file"),
-        (["a.las", "none.las"], "none.las"),
-        (["a.las", "b.las", "--within", "-1"], "tolerance"),
-    ],
-)
-def test_wrong_usage_has_exit_code_2(strips, arguments, words):
-    result = run(*(strips / a if a.endswith(("las", "npz")) else a for a in arguments))
-    assert result.exit_code == 2
-    assert words in result.stderr
-
-
 def test_text_table_and_page_have_the_classes_and_the_numbers_of_echoes(strips, tmp_path):
     """Ground and plants of two simulated strips: the same figures everywhere."""
     files = ("-o", tmp_path / "t.csv", "--html", tmp_path / "p.html")

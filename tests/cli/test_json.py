@@ -146,9 +146,3 @@ def test_every_command_with_json_is_in_the_page_and_tested():
     for path in paths:
         assert re.search(rf"`{path}(?: [^`]*)? ?--json`", text), path
         assert any(line == path or line.startswith(f"{path} ") for line in CASES), path
-
-
-def test_only_one_document_goes_to_stdout(riegl, tmp_path):
-    for more in (["--report", "-"], ["--progress", "json"]):
-        result = run_command("run", riegl, "-o", tmp_path, "--json", *more)
-        assert result.exit_code == 2 and "would both write to stdout" in result.output

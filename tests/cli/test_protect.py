@@ -29,6 +29,7 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "area.json").write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
     (tmp_path / "empty").mkdir()
     os.symlink("s.las", "link.las")
+    os.symlink(".", "here")
     os.link("s.las", "hard.las")
     os.symlink("s.wdp", "link.wdp")
     return tmp_path
@@ -50,6 +51,7 @@ _CASES = [
     "run s.las -o empty --report empty/s.laz",
     "run s.las -o empty --report empty/s.report.json",
     "run s.las -o . --format las --overwrite",
+    "run s.las -o here --format las --overwrite",
     "run s.las -o . --keep-packets --overwrite",
     "survey s.las -o s.las --overwrite",
     "survey s.las -o s.wdp --overwrite",

@@ -6,7 +6,6 @@ import sys
 
 import laspy
 import numpy as np
-import pytest
 from click.testing import CliRunner
 
 from wavebatch.cli.simulate import simulate
@@ -61,36 +60,6 @@ def test_every_option_reaches_the_recording(tmp_path):
     assert np.asarray(cloud.z_t).min() < 0
     assert 0.35 < (np.asarray(cloud.wavepacket_index) == 0).mean() < 0.65
     assert (tmp_path / "s.wdp").stat().st_size == 60 + meta["packets"] * 240
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["forrest"], "did you mean 'forest'"),
-        (["flat", "--rho", "0.3"], "rho must be"),
-        (["flat", "--kappa", "3"], "kappa"),
-        (["flat", "--pulses", "0"], "at least one pulse"),
-        (["flat", "--las-version", "1.3", "--point-format", "9"], "1.3"),
-        (["flat", "--baseline", "255"], "baseline must lie"),
-    ],
-)
-def test_wrong_usage_is_one_line_and_exit_code_2(tmp_path, arguments, words):
-    result = run(*arguments, "-o", tmp_path / "s.las")
-    assert result.exit_code == 2
-    assert words in result.stderr
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert not list(tmp_path.iterdir())
-
-
-def test_what_exists_is_kept_unless_told_otherwise(tmp_path):
-    run("flat", "-o", tmp_path / "s.las", "--pulses", 20)
-    before = (tmp_path / "s.las").read_bytes()
-    result = run("flat", "-o", tmp_path / "s.las", "--pulses", 30)
-    assert result.exit_code == 1
-    assert "overwrite" in result.stderr
-    assert (tmp_path / "s.las").read_bytes() == before
-    assert run("flat", "-o", tmp_path / "s.las", "--pulses", 30, "--overwrite").exit_code == 0
-    assert (tmp_path / "s.las").read_bytes() != before
 
 
 def test_help_lists_every_scene():

@@ -100,17 +100,6 @@ def test_json_for_programs(flat_strip, surveyed):
     assert told["direction"]["sign"] == "toward"
 
 
-def test_existing_files_are_kept_unless_told(flat_strip, tmp_path):
-    system, chain = tmp_path / "SYSTEM.toml", tmp_path / "CHAIN.toml"
-    chain.write_text("mine")
-    refused = _survey(flat_strip, "-o", system, "--chain", chain)
-    assert refused.exit_code == 1 and "--overwrite" in refused.stderr and refused.stderr.count("\n") == 1
-    assert not system.exists() and chain.read_text() == "mine" and refused.stdout == ""
-    assert _survey(flat_strip, "-o", system, "--chain", chain, "--overwrite").exit_code == 0
-    assert load_chain_file(chain) and load_survey(system)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["CHAIN.toml", "SYSTEM.toml"]
-
-
 def test_fewer_waveforms_on_request(flat_strip):
     assert json.loads(_survey(flat_strip, "--json", "--waveforms", 300).stdout)["waveforms"] == 300
 
@@ -120,14 +109,6 @@ def test_too_few_echoes_for_a_pulse_are_said(tmp_path):
     simulate_strip("flat", path, pulses=15, seed=1)
     result = _survey(path)
     assert result.exit_code == 0 and "too few isolated echoes, " in result.stdout
-
-
-def test_what_is_no_strip_gives_one_line(tmp_path, data):
-    for path in (tmp_path / "none.las", data / "no-packets" / "pdrf4-1.3.laz"):
-        result = _survey(path, "-o", tmp_path / "SYSTEM.toml")
-        assert result.exit_code == 1 and result.stdout == ""
-        assert result.stderr.count("\n") == 1 and path.name in result.stderr
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_figures_have_the_digits_that_they_deserve():

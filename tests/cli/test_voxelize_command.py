@@ -68,59 +68,6 @@ def test_calibrated_strips_have_cross_sections(strip, tmp_path):
     assert json.loads(result.stdout)["sensor"] == "direction vectors"
     with np.load(tmp_path / "v.npz") as file:
         assert (file["cross_section"] > 0).all()
-    path.write_text(format_calibration(Calibration(2.5e-8, 0.03)))
-    result = voxelize(strip, "--size", 2, "-o", tmp_path / "w.npz", "--calibration", path)
-    assert result.exit_code == 2 and "divergence" in result.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "said"),
-    [
-        (("-o", "v.npz"), 2, "--size"),
-        (("--size", 1), 2, "--output"),
-        (("--size", 0, "-o", "v.npz"), 2, "not in the range 0<x"),
-        (("--size", "nan", "-o", "v.npz"), 2, "'--size': nan"),
-        (("--size", 1e-7, "-o", "v.npz"), 2, "too small"),
-        (("--size", 1, "-o", "v.tif"), 2, ".npz, .las or .laz"),
-        (("--size", 1, "-o", "nowhere/v.npz"), 1, "make the folder first"),
-        (("--size", 1, "-o", "v.npz", "--snr", 5), 2, "--snr needs --method wiener"),
-        (("--size", 1, "-o", "v.npz", "--method", "wiener", "--iterations", 5), 2, "has no --iterations"),
-        (("--size", 1, "-o", "v.npz", "--flight-height", 500), 2, "of no use without --calibration"),
-        (("--size", 1, "-o", "v.npz", "--trajectory", "t.txt"), 2, "of no use without --calibration"),
-        (("--size", 1, "-o", "v.npz", "--calibration", "none.toml", "--crs", "EPSG:25832"), 2, "--trajectory"),
-        (("--size", 1, "-o", "v.npz", "--calibration", "none.toml"), 2, "cannot be read"),
-        (("--size", 1, "-o", "v.npz", "--system", "none.toml"), 2, "cannot be read"),
-    ],
-)
-def test_wrong_usage_is_one_line_and_writes_nothing(strip, tmp_path, monkeypatch, arguments, code, said):
-    monkeypatch.chdir(tmp_path)
-    result = voxelize(strip, *arguments)
-    assert result.exit_code == code and said in result.stderr, result.output
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_output_is_kept_without_overwrite(strip, tmp_path):
-    target = tmp_path / "v.laz"
-    target.write_text("old")
-    result = voxelize(strip, "--size", 1, "-o", target)
-    assert result.exit_code == 1 and "--overwrite" in result.stderr and target.read_text() == "old"
-    assert voxelize(strip, "--size", 1, "-o", target, "--overwrite").exit_code == 0
-    assert target.read_bytes()[:4] == b"LASF"
-
-
-def test_strips_without_packets_are_one_line(data, tmp_path):
-    for path in sorted((data / "no-packets").iterdir()):
-        result = voxelize(path, "--size", 1, "-o", tmp_path / "v.npz")
-        assert result.exit_code == 1 and result.stderr.startswith("error: "), path
-        assert result.stderr.count("\n") == 1 and path.name in result.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_no_strip_is_one_line(tmp_path):
-    (tmp_path / "x.las").write_text("no strip")
-    for name in ("x.las", "missing.las"):
-        result = voxelize(tmp_path / name, "--size", 1, "-o", tmp_path / "v.npz")
-        assert result.exit_code == 1 and result.stderr.count("\n") == 1 and name in result.stderr
 
 
 def test_help_says_what_a_voxel_holds():

@@ -132,32 +132,6 @@ def test_text_with_a_lever_arm(tmp_path):
         read_trajectory(write_text(tmp_path / "u.csv", "time,x,y,z", ",", "txyz", time, xyz), lever_arm=(1, 0, 0))
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("1,2,3,4\n5,6,7,8\n", "no line names the columns"),
-        ("time,x,y\n1,2,3\n", "no line names the columns"),
-        ("time,x,y,z\nonly,words,here,now\n", "no line of numbers follows the header in line 1"),
-        ("time,x,y,z\n1,2,3,4\n", "1 usable positions"),
-        ("\n\n", "neither text nor SBET"),
-        ("\0\1\2", "neither text nor SBET"),
-        ("time,lat,lon,h\n1,48,11,500\n2,48,11,500\n", "in degrees, but the strip has no CRS"),
-    ],
-)
-def test_refusals_are_one_line(tmp_path, text, message):
-    path = tmp_path / "t.txt"
-    path.write_text(text)
-    with pytest.raises(InputError, match=message) as caught:
-        read_trajectory(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_missing_file(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
-        read_trajectory(tmp_path / "none.txt")
-
-
 def write_sbet(path, latitude=48.0, number=400):
     records = np.zeros(number, SBET_RECORD)
     records["time"] = 259_200.0 + 0.005 * np.arange(number)

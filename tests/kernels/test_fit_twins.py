@@ -24,10 +24,8 @@ from wavebatch.kernels.fit.pulse_shape import (
     tail_reach,
 )
 from wavebatch.kernels.fit.render import render_echoes
-from wavebatch.kernels.signal.deconvolve import keep_signal, measure_offsets
 from wavebatch.kernels.signal.filters import refine_peaks
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
-from wavebatch.kernels.signal.signal import recorded_lengths
 
 
 def test_functions_are_those_of_the_math_module(rng):
@@ -69,14 +67,6 @@ def test_starts_are_those_of_single_peaks(rng):
     found = estimate_starts(smoothed.astype(np.float32), waveform, sample, 2.0)
     for row, (w, at) in enumerate(zip(waveform, sample, strict=True)):
         assert [part[row] for part in found] == pytest.approx(naive.log_parabola(smoothed[:, w], at, 2.0), rel=1e-3)
-
-
-def test_recorded_lengths_are_those_of_single_packets(rng):
-    samples = rng.integers(3, 200, (200, 60)).astype(np.uint8)
-    for row, end in enumerate(rng.integers(0, 61, 200)):
-        samples[row, end:] = 0
-        samples[row, rng.integers(0, 60)] = rng.integers(0, 9)
-    assert recorded_lengths(samples).tolist() == [naive_signal.recorded_length(y) for y in samples]
 
 
 def test_errors_of_starts_are_those_of_each_sample():
@@ -226,21 +216,6 @@ def test_refined_peaks_are_those_of_single_waveforms(rng):
     time, height = refine_peaks(filtered, waveform, sample)
     expected = [naive_signal.refine_peak(filtered[:, w], i) for w, i in zip(waveform, sample, strict=True)]
     assert time == pytest.approx([t for t, _ in expected]) and height == pytest.approx([h for _, h in expected])
-
-
-def test_offsets_and_signal_of_profiles_are_those_of_single_ones(rng):
-    profile = np.maximum(rng.normal(0, 1, (40, 50)), 0) * (rng.random((40, 50)) < 0.3)
-    row = np.sort(rng.integers(0, 40, 70))
-    sample = rng.uniform(-30, 80, 70)
-    offset, known = measure_offsets(profile, row, sample, 4)
-    raw, support = rng.normal(0.3, 1, (40, 50)), rng.random((40, 50)) < 0.6
-    least, floor = rng.uniform(0, 2, 40), rng.uniform(0, 0.5, 40)
-    signal, seen = keep_signal(raw, support, least, floor)
-    for n in range(40):
-        expected = naive_signal.measure_offset(profile[n], sample[row == n], 4)
-        assert known[n] == (expected is not None) and offset[n] == pytest.approx(expected or 0.0)
-        kept = naive_signal.keep_runs(raw[n], support[n], least[n], floor[n])
-        assert signal[n] == pytest.approx(kept) and seen[n] == kept.any()
 
 
 def test_outgoing_pulses_are_measured_as_by_a_loop(rng):

@@ -6,22 +6,11 @@ import numpy as np
 from wavebatch.kernels.geometry import normals
 from wavebatch.kernels.geometry.group_returns import (
     LONGEST_PULSE,
-    find_pulses,
     find_rays,
-    fit_rays,
-    group_pulses,
     group_times,
 )
 from wavebatch.kernels.geometry.normals import thin_out
-from wavebatch.kernels.geometry.planes import LEAST_VARIETY, in_two_lines
 from wavebatch.kernels.physics.radiometry import known_distance, slope_error
-
-
-def test_pulses_are_those_of_a_loop(rng):
-    time = np.repeat(rng.integers(0, 5, 60), rng.integers(1, 80, 60)).astype(float)
-    assert find_pulses(time).tolist() == naive_geometry.find_pulses(time)
-    number = rng.integers(1, 4, len(time))
-    assert group_pulses(time, number).tolist() == naive_geometry.group_pulses(time, number)
 
 
 def test_packets_of_equal_time_are_those_of_a_loop(rng):
@@ -54,38 +43,6 @@ def test_dense_points_are_thinned_as_by_a_loop(rng):
     expected = naive_geometry.thin_out(xyz, row, 2.0, normals.FINENESS, normals.MOST_PER_CELL)
     np.testing.assert_array_equal(kept, expected)
     assert 0.1 < kept.mean() < 0.9
-
-
-def test_two_lines_are_told_by_skewness_and_kurtosis(rng):
-    sets = 80
-    group = np.repeat(np.arange(sets), 14)
-    u, v = rng.uniform(-2, 2, (2, len(group)))
-    some = group % 2 == 0
-    v[some] = np.where(rng.random(some.sum()) < 0.4, -0.7, 0.6) + rng.normal(0, 0.1, some.sum())
-    turn = rng.uniform(0, np.pi, sets)[group]
-    u, v = np.cos(turn) * u - np.sin(turn) * v, np.sin(turn) * u + np.cos(turn) * v
-    expected = np.array([naive_geometry.variety(u[group == k], v[group == k]) for k in range(sets)])
-    np.testing.assert_array_equal(in_two_lines(u, v, group, sets), expected < LEAST_VARIETY)
-    assert 0.2 < (expected < LEAST_VARIETY).mean() < 0.8
-
-
-def test_rays_of_single_returns_are_on_the_line_through_those_of_pairs(rng):
-    """Two flight lines; half of the pulses have two returns far apart, some of which are wrong."""
-    k = 400
-    angle, source = rng.uniform(-25, 25, k).round(), rng.integers(0, 2, k)
-    slope = np.stack([np.where(source == 0, 1, -1) * np.tan(np.radians(angle)), np.full(k, 0.03)], axis=1)
-    way = np.column_stack([slope, -np.ones(k)])
-    apart = np.where(np.arange(k) % 2, 5.0, 0.2)
-    wrong = np.arange(k) % 20 == 1
-    starts = 2 * np.arange(k)
-    xyz = np.zeros((2 * k, 3))
-    xyz[1::2] = way * apart[:, None]
-    xyz[1::2][wrong, 0] += 3.0
-    rays = fit_rays(xyz, starts, np.repeat(angle, 2), np.repeat(source, 2))
-    true = way / np.linalg.norm(way, axis=1)[:, None]
-    np.testing.assert_allclose(rays[~wrong], true[~wrong], atol=1e-9)
-    own = xyz[1::2][wrong]
-    np.testing.assert_allclose(rays[wrong], own / np.linalg.norm(own, axis=1)[:, None], atol=1e-12)
 
 
 def test_surfaces_struck_from_behind_have_large_errors():

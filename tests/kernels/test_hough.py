@@ -119,6 +119,10 @@ def test_scan_lines_end_where_the_mirror_jumps_back_or_pauses():
     assert find_sweeps(np.linspace(0, 1, 600), time).tolist() == [0, 40]
     time[300:] -= 800
     assert find_sweeps(np.linspace(0, 1, 600), time).tolist() == [0, 40, 300]
+    # 60 usual steps but a tenth of the range, and three steps but a third of it, are no jumps.
+    shifted = np.linspace(0, 1, 600) + 0.1 * (np.arange(600) > 299)
+    for angle in (shifted, np.r_[0:4, 6:10].astype(float)):
+        assert find_sweeps(angle, np.arange(float(len(angle)))).tolist() == [0]
 
 
 def test_a_sinusoidal_mirror_and_lost_pulses(rng):

@@ -4,20 +4,8 @@ import naive_geometry
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry.slice_lines import LAG, find_lines, find_sweeps
+from wavebatch.kernels.geometry.slice_lines import find_lines
 from wavebatch.kernels.geometry.tiles import cut_tiles, is_inside, sort_into_tiles
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.003, 0.02, 0.1])
-def test_scan_lines_are_those_of_a_loop(rng, noise):
-    """Mirrors that swing, rotate or stand still, with jitter, lost pulses, pauses and clocks that run backwards."""
-    for _ in range(40):
-        n = int(rng.integers(0, 400))
-        phase = np.cumsum(rng.choice([1, 1, 1, 5], n)) / rng.integers(20, 150)
-        shape = [np.sin(phase), np.abs(phase % 2 - 1), phase % 1, np.zeros(n)][rng.integers(0, 4)]
-        angle = shape + noise * rng.standard_normal(n)
-        time = np.cumsum(rng.choice([1.0, 1.0, 1.0, 0.0, 40.0, -3.0], n, p=[0.5, 0.2, 0.2, 0.08, 0.01, 0.01]))
-        assert find_sweeps(angle, time).tolist() == naive_geometry.find_sweeps(angle, time, LAG)
 
 
 def slice_of(rng, kind):

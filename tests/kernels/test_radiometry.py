@@ -12,7 +12,9 @@ from wavebatch.kernels.physics.radiometry import (
     diffuse_reflectance,
     energy_error,
     mean_haze,
+    receive_power,
     reflectance_error,
+    spread_cross_section,
     transmit,
 )
 
@@ -57,6 +59,7 @@ def test_what_is_not_known_is_nan():
     assert np.isfinite(gamma).tolist() == [False] * 4 + [True]
     assert np.isnan(compute_cross_section(gamma, distance, BETA)[:4]).all()
     assert np.isnan(diffuse_reflectance(1.0, np.radians([86.0, 90.0, 120.0]))).all()
+    assert np.isnan(energy_error(np.array([0.0, -3.0, 9.0]), np.array([2.0, 2.0, 0.0]), 0.1, 0.1)).all()
 
 
 def test_float32_input_keeps_the_fourth_power():
@@ -69,6 +72,9 @@ def test_a_wrong_range_counts_four_times():
     section = backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.0, power=4)
     gamma = backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.0)
     assert section[0] == pytest.approx(0.008) and gamma[0] == pytest.approx(0.004)
+    per_db = 2e-4 * np.log(10)  # air that is thicker than thought, and light that a wrong range sends through it
+    in_air = backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.5, attenuation_err=0.01)
+    assert in_air[0] == pytest.approx(np.hypot(0.004 + 0.5 * per_db, 0.01 * 500 * per_db))
 
 
 def test_errors_are_those_of_repeated_measurements():
@@ -125,6 +131,18 @@ def test_light_that_is_shared_alike_tells_no_ratio(rng):
     assert estimate_canopy_ratio(np.zeros(0), np.zeros(0)) is None
     assert estimate_canopy_ratio(np.full(500, np.nan), ground) is None
     assert estimate_canopy_ratio(np.zeros(500), ground) is None
+
+
+def test_received_power_is_that_of_light_on_its_way():
+    """Light on the footprint, scattered over the sphere, caught by the lens."""
+    distance, reflectance, air = 900.0, 0.3, 0.4
+    footprint = np.pi * (distance * BETA / 2) ** 2
+    section = spread_cross_section(reflectance, distance, BETA)
+    assert section == pytest.approx(4 * reflectance * footprint)
+    caught = 3.0 / footprint * section / (4 * np.pi * distance**2) * np.pi * (0.1 / 2) ** 2
+    found = receive_power(section, distance, transmitted=3.0, aperture=0.1, divergence=BETA, efficiency=0.7,
+                          attenuation=air)  # fmt: skip
+    assert found == pytest.approx(caught * 0.7 * 10 ** (-2 * distance / 1000 * air / 10))
 
 
 def test_haze_is_the_mean_of_its_layers():

@@ -51,7 +51,9 @@ def test_all_models_and_options_are_fitted(plain):
 
 
 @on_x86
-@pytest.mark.parametrize("flags", [["-mavx2", "-mfma"], ["-march=x86-64-v4"], ["-O0"], ["-O2"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "flags", [["-mavx2", "-mfma"], ["-march=x86-64-v4"], ["-O0"], ["-O2"], ["-DONLY_FOUR"]], ids=" ".join
+)
 def test_instructions_and_optimisation_do_not_change_a_bit(plain, tmp_path, flags):
     if flags == ["-march=x86-64-v4"] and not has(("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")):
         pytest.skip("this processor has no AVX-512")

@@ -10,7 +10,7 @@ from scipy.linalg import toeplitz
 from wavebatch.kernels.signal import noise as noise_kernels
 from wavebatch.kernels.signal.deconvolve import correlate_pulse, deconvolve_wiener, fit_height, wiener_taps
 from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
-from wavebatch.kernels.signal.filters import curvature_taps, filter_autocorrelation, gaussian_taps, smooth_b3
+from wavebatch.kernels.signal.filters import curvature_taps, filter_autocorrelation, gaussian_taps
 from wavebatch.kernels.signal.noise import (
     PooledNoise,
     colour_factors,
@@ -26,7 +26,7 @@ from wavebatch.kernels.signal.noise import (
     whitening_filter,
 )
 from wavebatch.kernels.signal.runs import find_stretches, lobe_edges
-from wavebatch.kernels.signal.signal import NARROW, accumulate, find_quiet, sum_samples, widen_after
+from wavebatch.kernels.signal.signal import NARROW, accumulate, sum_samples, widen_after
 
 PULSE = np.exp(-0.5 * (np.arange(-5, 6) / 1.7) ** 2)
 
@@ -42,14 +42,6 @@ def record(rng, n=40, s=64, level=12.0, std=1.2, amplitude=60.0):
 def test_masks_widened_to_one_side(rng, reach):
     mask = rng.random((30, 50)) < 0.04
     np.testing.assert_array_equal(widen_after(mask, reach), naive_signal.widen_after(mask, reach))
-
-
-@pytest.mark.parametrize("recovery", [0, 2, 4, 9])
-def test_quiet_samples_keep_away_from_the_tails_of_strong_signal(rng, recovery):
-    above = record(rng, amplitude=rng.uniform(2, 60, 40)) - 12
-    quiet = find_quiet(above, 3.0, 2, recovery)
-    np.testing.assert_array_equal(quiet, naive_signal.find_quiet(above, 3.0, 2, recovery))
-    assert recovery < 9 or (find_quiet(above, 3.0, 2) & ~quiet).sum() > 100
 
 
 @pytest.mark.parametrize("n", [1, 2, NARROW - 1, NARROW, 300])
@@ -294,12 +286,3 @@ def test_heights_of_profiles_have_the_energy_of_their_waveform(rng):
         expected = naive_signal.fit_height(profile[w], signal[:, w].astype(float), PULSE, support[w])
         assert found[w] == pytest.approx(expected, rel=1e-4)
     assert not found[4:].any() and found[:4].any()
-
-
-@pytest.mark.parametrize("step", [1, 2, 8])
-def test_b3_smoothing_is_that_of_a_loop(rng, step):
-    signal = rng.normal(0, 1, (20, 3))
-    for w in range(3):
-        padded = [signal[min(max(i, 0), 19), w] for i in range(-2 * step, 20 + 2 * step)]
-        expected = [sum(h * padded[i + k * step] for k, h in enumerate((1, 4, 6, 4, 1))) / 16 for i in range(20)]
-        assert smooth_b3(signal, step)[:, w] == pytest.approx(expected)

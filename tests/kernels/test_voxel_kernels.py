@@ -164,6 +164,9 @@ def test_runs_below_the_least_are_noise_and_the_sum_of_a_run_stays():
     assert not signal[1].any() and seen.tolist() == [True, False]
     nothing, seen = keep_signal(profile, np.zeros_like(support), np.zeros(2), np.zeros(2))
     assert not nothing.any() and not seen.any()
+    # Runs of two waveforms that touch are two, and a sum counts with its negative samples.
+    apart = np.array([[0, 0, 5], [5, 0, 0], [4, -3, 0]], np.float32)
+    assert not keep_signal(apart, apart != 0, np.array([8.0, 8.0, 2.0]), np.full(3, 0.3))[1].any()
 
 
 def test_windows_hold_all_support(rng):
@@ -187,5 +190,7 @@ def test_offsets_are_those_of_the_returns_of_a_packet():
     offset, known = measure_offsets(profile, row, sample, 3)
     assert known.tolist() == [True, False, False]
     assert offset == pytest.approx([0.4, 0.0, 0.0])
+    profile[1, [37, 39]] = 1.0  # the second search, around what the first one found, sees both
+    assert measure_offsets(profile, row, sample, 3)[0][1] == pytest.approx(3.0)
     profile[2, 0] = 7.0
     assert not measure_offsets(profile, np.array([2]), np.array([-30.0]), 3)[1].any()

@@ -150,23 +150,6 @@ def test_no_chain_that_meets_the_tolerance_is_2_and_one_line(strips, tmp_path):
     assert some.exit_code == 3 and (tmp_path / "flat.laz").exists() and not (tmp_path / "forest.laz").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--tolerance", "2"], "'2' is no length"),
-        (["--tolerance", "-2cm"], "is no length"),
-        (["--tolerance", "2cm", "--profile", "fast"], "exclude each other"),
-        (["--tolerance", "2cm", "--chain", "x.toml"], "exclude each other"),
-        (["--profile", "autp"], "did you mean 'auto'"),
-        (["--system", "none.toml"], "none.toml: system file cannot be read"),
-    ],
-)
-def test_wrong_usage(strips, tmp_path, arguments, words):
-    result = _run(strips, "-o", tmp_path / "out", *arguments)
-    assert result.exit_code == 2 and words in result.stderr and "Traceback" not in result.stderr
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_dry_run_says_that_the_strip_decides(strips, tmp_path):
     result = _run(strips, "-o", tmp_path, "--dry-run")
     assert result.exit_code == 0 and "chosen per strip (auto)" in result.stdout

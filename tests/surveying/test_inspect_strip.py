@@ -75,32 +75,11 @@ def test_info_of_a_strip_that_cannot_be_processed_still_tells_what_it_holds(tmp_
     assert result.stderr.startswith(f"error: {path}: no packet can be used")
 
 
-def test_info_of_something_else_is_one_line_and_exit_1(tmp_path):
-    path = tmp_path / "a.las"
-    path.write_bytes(b"nothing")
-    result = run("info", path)
-    assert result.exit_code == 1 and result.stdout == ""
-    assert result.stderr == f"error: {path}: not a LAS or LAZ file (it does not begin with LASF)\n"
-    with pytest.raises(InputError):
-        describe_strip(path)
-
-
 def test_check_of_clean_files_is_0():
     result = run("check", data_file(RIEGL), data_file("leica-als/simple1_3_full_internal.las"))
     assert result.exit_code == 0
     assert result.stdout.count(": ok (") == 2
     assert "note: points lie outside the bounds" in result.stdout
-
-
-@pytest.mark.parametrize(
-    "name", ["fullwave.laz", "pdrf9-1.4.laz", "pdrf10-1.4.laz", "pdrf4-1.3.laz", "pdrf5-1.3.laz", "simple1_3.las"]
-)
-def test_check_gives_files_without_packets_one_line(name):
-    path = data_file(f"no-packets/{name}")
-    result = run("check", path)
-    assert result.exit_code == 1
-    assert len(result.stdout.splitlines()) == 1
-    assert result.stdout.startswith(f"{path}: ")
 
 
 def make_bad(tmp_path):
@@ -174,10 +153,6 @@ def test_check_takes_chain_files(tmp_path):
     assert result.exit_code == 1
     assert len(result.stdout.splitlines()) == 1 and "detect.nothing" in result.stdout
     assert run("check", missing).exit_code == 1
-
-
-def test_check_without_files_is_wrong_usage():
-    assert run("check").exit_code == 2
 
 
 def test_packets_of_another_strip_are_a_problem(tmp_path):

@@ -66,19 +66,6 @@ def test_command_writes_and_draws(riegl, tmp_path):
     assert "incidence angle [deg]" in (tmp_path / "a.svg").read_text("utf-8")
 
 
-def test_a_strip_without_level_ground_has_no_table(tiny_strip, tmp_path):
-    result = run(tiny_strip, "--divergence", 0.5, "--angles", tmp_path / "a.csv")
-    assert result.exit_code == 1 and "which width a surface has that faces the sensor" in result.stderr
-    assert not (tmp_path / "a.csv").exists()
-
-
-def test_two_strips_have_no_common_table(tiny_strip, tmp_path):
-    other = tmp_path / "other.las"
-    other.write_bytes(tiny_strip.read_bytes())
-    result = run(tiny_strip, other, "--divergence", 0.5, "--angles", tmp_path / "b.csv")
-    assert result.exit_code == 2 and "is for one strip" in result.stderr and not (tmp_path / "b.csv").exists()
-
-
 @pytest.mark.parametrize("amplitude", [20.0, 100.0, 1000.0])
 def test_errors_are_those_of_many_echoes_through_the_stage_and_do_not_jump(amplitude):
     """Widths of echoes with noise at the bound go through the stage; the scatter of their angles is the error."""

@@ -197,25 +197,6 @@ def test_plot_is_written_where_matplotlib_is(tmp_path, document):
     assert (tmp_path / "bench-flat.png").read_bytes()[:4] == b"\x89PNG"
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["a.las", "b.las"], "one strip at a time"),
-        (["--waveforms", "0"], "--waveforms': 0 is not in the range"),
-        (["--tolerance", "2"], "no length"),
-        (["missing.toml"], "cannot be read"),
-    ],
-)
-def test_wrong_usage(words, message):
-    result = run_command("bench", *words)
-    assert result.exit_code == 2 and message in result.stderr
-
-
-def test_strip_that_is_none(tmp_path):
-    result = run_command("bench", tmp_path / "none.las")
-    assert result.exit_code == 1 and "none.las" in result.stderr
-
-
 def test_scene_is_shaped_like_the_strip(tmp_path):
     recording = Recording(noise_std=1.6, baseline=30.0, bits=16, n_samples=64)
     scene = replace(find_scene("open"), recording=recording)

@@ -185,30 +185,6 @@ def test_text_has_every_table(mixed):
     call("compare", "--strip", mixed / "s.las", "fast", "accurate", "--min-completeness", 1.0, code=1)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["fast", "accurate"], "--strip STRIP"),
-        (["none.toml", "s.las"], "--strip STRIP"),
-        (["s.las", "s.las", "--limit", 5], "--limit is for chains"),
-        (["s.las", "s.las", "--system", "x.toml"], "--system is for chains"),
-        (["fast", "--strip", "s.las", "--truth", "t.npz"], "--truth is for a cloud"),
-        (["fast", "fast/s.laz", "--strip", "s.las", "--limit", 5], "leave --limit out"),
-        (["fast/s.laz", "--strip", "s.las"], "without --strip"),
-        (["fast/s.laz", "accurate/s.laz", "--strip", "s.las"], "without --strip"),
-        (["fast", "none.toml", "--strip", "s.las"], "none.toml"),
-        (["fast", "none.las", "--strip", "s.las"], "none.las"),
-        (["fast", "accurate", "--strip", "none.las"], "none.las"),
-        (["fast", "accurate", "--strip", "fast/s.laz"], "s.laz"),
-        (["fast", "accurate", "--strip", "s.las", "--tolerance", 0], "tolerance"),
-    ],
-)
-def test_wrong_use_is_one_line_and_exit_code_2(mixed, monkeypatch, arguments, words):
-    monkeypatch.chdir(mixed)
-    result = call("compare", *arguments, code=2)
-    assert words in result.stderr.splitlines()[-1]
-
-
 @pytest.mark.slow
 def test_what_the_readme_says_of_the_real_strip(riegl):
     """The after-pulse of nearly every echo is a second maximum: the ASDF passes over it, the pulse explains it."""

@@ -112,10 +112,3 @@ def test_pictures_have_the_signal_and_its_rule(tiny_strip, tmp_path, show):
     text = (tmp_path / "p.svg").read_text("utf-8")
     assert "found by the detector" in text and "std" in text
     assert ("which the chain does not use" in text) == (show != "detector")
-
-
-def test_an_unknown_signal_is_one_line(tiny_strip, tmp_path):
-    pytest.importorskip("matplotlib")
-    result = run(tiny_strip, "-o", tmp_path / "p.svg", "--show", "asdff")
-    assert result.exit_code == 2 and "must be one of" in result.stderr and result.stderr.count("\n") == 1
-    assert run(tiny_strip, "-o", tmp_path / "p.svg", "--sheet", "--show", "asdf").exit_code == 2

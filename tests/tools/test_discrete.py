@@ -47,12 +47,6 @@ def test_receiver_without_echoes_has_no_returns():
     assert [len(part) for part in DiscreteReceiver().fire(empty.astype(int), empty, empty)] == [0, 0, 0]
 
 
-@pytest.mark.parametrize("wrong", [{"dead_zone": 0.0}, {"threshold": -1.0}, {"most": 0}, {"most": 16}])
-def test_wrong_receivers_are_refused(wrong):
-    with pytest.raises(ConfigError, match="must lie"):
-        DiscreteReceiver(**wrong)
-
-
 @pytest.mark.parametrize("stand", list(RETURN_TABLES))
 def test_published_return_numbers_are_reproduced(stand, tmp_path):
     dead_zone, exact = RETURN_TABLES[stand]
@@ -120,9 +114,6 @@ def test_command_line(tmp_path):
         fixed = ("canopy.corn", "-o", str(tmp_path / "c.laz"), "--pulses", "50")
         return CliRunner().invoke(simulate, [*fixed, *arguments])
 
-    assert run("--dead-zone", "1").exit_code == 2
-    assert run("--sensor", "discrete", "--truth", str(tmp_path / "t.npz")).exit_code == 2
-    assert run("--sensor", "discrete", "--dead-zone", "-1").exit_code == 2
     assert run("--sensor", "discrete", "--dead-zone", "1").exit_code == 0
     assert run("--sensor", "discrete").exit_code == 1
     assert run("--sensor", "discrete", "--overwrite", "--json").exit_code == 0

@@ -186,13 +186,6 @@ def test_the_command_says_what_it_wrote(even, tmp_path):
     arguments = ["grid", even[1], "--forest", "--size", 10, "--bbox", "0,0,20,20", "-o", tmp_path / "f.tif"]
     result = run_command(*arguments)
     assert result.exit_code == 0 and "2 x 2 cells of 10 m: 4 with metrics, 0 with fewer" in result.output
-    for more, words in (
-        (["--forest", "--column", "share"], "--forest and --column exclude each other"),
-        (["--forest", "--statistic", "max"], "exclude each other"),
-        (["--layer", "2", "--column", "share"], "--layer is of no use without --forest"),
-    ):
-        result = run_command("grid", even[1], *more, "-o", tmp_path / "g.tif")
-        assert result.exit_code == 2 and words in result.output
 
 
 @pytest.mark.parametrize(("option", "words"), [

@@ -73,13 +73,6 @@ def test_the_epsg_code_of_geotiff_keys_and_wkt_is_found(rng, tmp_path):
         assert read_crs_definition(tmp_path / name, read_header(tmp_path / name)) == wanted
 
 
-def test_without_rasterio_one_line_says_what_to_install(rng, tmp_path, monkeypatch):
-    _cloud(tmp_path / "a.las", rng, 10)
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    result = _run(tmp_path / "a.las", "--column", "height", "-o", tmp_path / "x.tif", code=2)
-    assert "pip install" in result.stderr and "'rasterio>=1.3'" in result.stderr and result.stderr.count("\n") == 1
-
-
 @pytest.fixture
 def rasterio():
     return pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
@@ -160,39 +153,12 @@ def test_a_cloud_without_a_crs_beside_others_is_named(rasterio, rng, tmp_path):
     assert "without a CRS" not in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["-o", "x.tif"], "needs a --column"), (["--column", "heigt", "-o", "x.tif"], "did you mean 'height'"),
-        (["--column", "height", "-o", "x.png"], "use .tif"),
-        (["--column", "height", "--size", "0", "-o", "x.tif"], "not in the range 0<x"),
-        (["--column", "height", "--crs", "EPSG:4978", "-o", "x.tif"], "geocentric"),
-        (["--column", "height", "--crs", "EPSG:0", "-o", "x.tif"], "write the code of a CRS"),
-        (["--column", "height", "--no-data", "1e39", "-o", "x.tif"], "float32"),
-        (["--statistic", "count", "--no-data", "1", "-o", "x.tif"], "choose another with --no-data"),
-        (["--statistic", "count", "--flags", "WEAK", "-o", "x.tif"], "has no column echo_flags"),
-    ],
-)  # fmt: skip
-def test_wrong_use_is_one_line_and_writes_nothing(rasterio, rng, tmp_path, monkeypatch, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    _cloud(tmp_path / "a.las", rng, 100)
-    result = _run("a.las", *arguments, code=2)
-    assert words in result.stderr and result.stderr.count("\n") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.las"]
-
-
 @pytest.mark.parametrize("degree", ["1e308", "0"])
 def test_a_crs_that_gdal_reads_but_cannot_write_is_one_line(rasterio, rng, tmp_path, degree):
     _cloud(tmp_path / "a.las", rng, 50, wkt=UTM.replace("0.0174532925199433", degree))
     result = _run(tmp_path / "a.las", "--statistic", "count", "-o", tmp_path / "x.tif", code=2)
     assert "the CRS cannot be" in result.stderr and result.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
-
-
-def test_a_code_that_is_no_crs_is_not_answered_with_the_same_option(rasterio, rng, tmp_path):
-    _cloud(tmp_path / "a.las", rng, 50)
-    words = (tmp_path / "a.las", "--statistic", "count", "-o", tmp_path / "x.tif", "--crs", "EPSG:99999")
-    assert _run(*words, code=2).stderr.endswith("; write the code of a CRS, e.g. EPSG:32632\n")
 
 
 def test_a_crs_with_heights_is_written_without_them(rasterio, rng, tmp_path):

@@ -358,49 +358,9 @@ def test_limits_ignore_outliers_only():
     assert robust_limits(np.full(10, 3.0), 3.0, 3.0) == (3.0, 3.0)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"size": 1e-4}, "too many to draw; cells of 0.02 m will do"),
-        ({"size": 0.0}, "at least"),
-        ({"statistic": "mode"}, "mean, median"),
-        ({"bounds": (1.0, 0.0, 0.0, 1.0)}, "WEST"),
-    ],
-)
-def test_wrong_options_of_a_map(cloud, change, message):
-    with pytest.raises(ConfigError, match=message):
-        grid_values([cloud], "amplitude", **{"statistic": "mean", **change})
-
-
 def test_the_size_that_is_proposed_does(cloud):
     found = grid_values([cloud], "amplitude", size=0.02)
     assert found.grid.rows * found.grid.columns <= cells.MOST_CELLS
-
-
-@pytest.mark.parametrize("kind", ["histogram", "map"])
-def test_what_cannot_be_drawn_is_one_line(tmp_path, cloud, kind):
-    empty = write_cloud(tmp_path / "empty.las", n=0)
-    nothing = write_cloud(
-        tmp_path / "nothing.las", n=9, amplitude=(np.full(9, -1, "f4"), np.array([-1.0]), None, "peak [DN]")
-    )
-    broken = tmp_path / "broken.las"
-    broken.write_bytes(cloud.read_bytes()[:3000])
-    cases = [
-        (empty, "z", 1, "holds no points"),
-        (nothing, "amplitude", 1, "9 have no data in amplitude"),
-        (broken, "z", 1, "broken.las"),
-        (tmp_path / "none.las", "z", 1, "none.las"),
-        (cloud, "amplitud", 2, "did you mean 'amplitude'? Columns of the file: amplitude, echo_flags"),
-        (cloud, "qqqqqq", 2, "known are amplitude"),
-        (nothing, "intensity --flags WEAK", 2, "no column echo_flags"),
-        (cloud, "intensity --flags WEEK", 2, "did you mean 'WEAK'"),
-        (cloud, "intensity --flags NO_WAVEFORM", 1, "5000 of 5000 points are left out by their flags"),
-    ]
-    for path, column, code, message in cases:
-        result = run(kind, path, "-o", tmp_path / "p.png", "--column", *column.split())
-        assert (result.exit_code, result.stdout) == (code, ""), result.output
-        assert message in result.stderr and result.stderr.count("\n") == 1, result.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.las", "empty.las", "nothing.las"]
 
 
 def test_one_point_and_one_value_can_be_drawn(tmp_path):
@@ -468,33 +428,6 @@ def test_names_from_files_are_text_and_no_formulas(tmp_path):
     assert run("histogram", path, "--column", "odd", "-o", tmp_path / "p.svg").exit_code == 0
     text = (tmp_path / "p.svg").read_text("utf-8")
     assert "a$\\frac{b$" in text and "&lt;b&gt; &amp;" in text
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["histogram", "--column", "z", "-o", "p.gif"], ".png, .svg, .pdf"),
-        (["histogram", "--column", "z", "-o", "p.png", "--range", "5:1"], "does not go up"),
-        (["histogram", "--column", "z", "-o", "p.png", "--range", "nan:1"], "does not go up"),
-        (["histogram", "--column", "echo_flags", "-o", "p.png", "--bins", "3"], "--bins"),
-        (["map", "--column", "echo_flags", "-o", "p.png"], "cloud.laz: echo_flags are bits, which have no mean; count"),
-        (["map", "-o", "p.png"], "needs a --column"),
-        (["map", "--column", "z", "-o", "p.png", "--bbox", "1,2,3"], "WEST,SOUTH,EAST,NORTH"),
-        (["histgram"], "did you mean 'histogram'?"),
-    ],
-)
-def test_wrong_usage(cloud, tmp_path, monkeypatch, words, message):
-    pytest.importorskip("matplotlib")
-    monkeypatch.chdir(tmp_path)
-    result = run(words[0], cloud, *words[1:])
-    assert result.exit_code == 2 and message in result.stderr and not list(tmp_path.iterdir())
-
-
-def test_without_matplotlib_a_line_says_what_to_install(cloud, tmp_path, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    result = run("histogram", cloud, "--column", "z", "-o", tmp_path / "p.png")
-    assert result.exit_code == 2 and "pictures need matplotlib: " in result.stderr
-    assert "pip install" in result.stderr and "'matplotlib>=3.8'" in result.stderr
 
 
 def test_a_matplotlib_that_does_not_work_is_one_line(cloud, tmp_path, monkeypatch):

@@ -200,32 +200,6 @@ def test_without_a_wish_a_few_are_spread_over_the_strip(tiny_strip):
         assert [place.packet for place in places] == np.linspace(0, scan.packets - 1, 5).round().astype(int).tolist()
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "message"),
-    [
-        ("--packet 99999", 2, "there is no packet 99999; packets are 0 to"),
-        ("--packet 5:3", 2, "'5:3' is empty; END is the number after the last one"),
-        ("--packet x", 2, "neither a number nor FIRST:END"),
-        (f"--packet 0:{MOST + 1}", 2, f"{MOST} fit"),
-        ("--point 99999", 2, "there is no point 99999"),
-        ("--gps-time 3", 2, "no pulse lies within"),
-        ("--flags SATURATED --packet 3", 2, "--flags"),
-        ("--flags SATURATD", 2, "did you mean 'SATURATED'"),
-        ("--where amplitude>1 --point 3", 2, "--where chooses the waveforms"),
-        ("--where amplitud>1", 2, "did you mean 'amplitude'"),
-        ("--where amplitude>1e6", 1, "no echo meets"),
-        ("--profile fastt", 2, "did you mean 'fast'"),
-        ("--times 5", 2, "LOW:HIGH"),
-        ("--chain none.toml", 2, "none.toml"),
-    ],
-)
-def test_wrong_usage_is_one_line(tiny_strip, tmp_path, words, code, message):
-    pytest.importorskip("matplotlib")
-    result = run(tiny_strip, "-o", tmp_path / "p.png", *words.split())
-    assert result.exit_code == code and message in result.stderr, result.output
-    assert "Traceback" not in result.stderr and not list(tmp_path.iterdir())
-
-
 def test_strips_without_waveforms(tmp_path, riegl, data):
     pytest.importorskip("matplotlib")
     raw = make_raw(4)
@@ -413,8 +387,6 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
     first = target.read_bytes()
     assert first.decode().count("packet ") == 9 and "returns of the file" in first.decode()
     assert run(*words).exit_code == 0 and target.read_bytes() == first
-    clash = run(tiny_strip, "-o", tmp_path / "p.png", "--random", 3, "--packet", 2)
-    assert clash.exit_code == 2 and "--random chooses the waveforms" in clash.stderr
 
 
 def test_titles_name_every_flag_of_many_echoes(tmp_path):

@@ -377,10 +377,8 @@ def test_places_that_are_none_are_outside():
     assert AreaGrid(0.25).describe(int(AreaGrid(0.25).find(np.array([-0.1]), np.array([0.3]))[0])).name == "-0.25 0.25"
 
 
-def test_too_many_and_too_small_cells_are_one_line(tmp_path, monkeypatch):
+def test_too_many_cells_are_one_line(tmp_path, monkeypatch):
     make_cloud(tmp_path / "c.las")
-    tiny = CliRunner().invoke(stats, [str(tmp_path / "c.las"), "--area", "1e-5"])
-    assert tiny.exit_code == 2 and "too small for these coordinates" in tiny.stderr and tiny.stderr.count("\n") == 1
     monkeypatch.setattr(module, "MOST_AREAS", 50)
     many = CliRunner().invoke(stats, [str(tmp_path / "c.las"), "--area", "2"])
     assert many.exit_code == 2 and "more than 50 areas" in many.stderr and many.stderr.count("\n") == 1
@@ -388,9 +386,6 @@ def test_too_many_and_too_small_cells_are_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(returns, "MOST_AREAS", 50)
     with pytest.raises(ConfigError, match="more than 50 areas with it"):
         count_returns([tmp_path / "c.las"] * 4, divisions=[AreaGrid(30)])
-    for wrong in ("0", "-3", "nan", "inf"):
-        result = CliRunner().invoke(stats, [str(tmp_path / "c.las"), "--area", wrong])
-        assert result.exit_code == 2 and "must be above 0" in result.stderr
 
 
 def write_features(path, *features):
@@ -413,25 +408,6 @@ def test_polygons_of_a_file(tmp_path):
     x, y = np.array([1.0, 3, 29, -1]), np.array([1.0, 3, 5, 1])
     assert find_inside(lawn.rings, x, y).tolist() == [True, False, False, False]
     assert find_inside(two.rings, x, y).tolist() == [True, True, True, False]
-
-
-@pytest.mark.parametrize(
-    ("features", "words"),
-    [
-        ([], "holds no polygon"),
-        ([feature("Point", [1, 2])], "is a Point"),
-        ([feature("Polygon", [])], "has no ring"),
-        ([feature("Polygon", [[[0, 0], [1, 1]]])], "three corners"),
-        ([feature("Polygon", [[[0, 0], [1, 1], [float("nan"), 2]]])], "finite"),
-        ([feature("Polygon", [[[0], [1, 1], [2, 2]]])], "not GeoJSON"),
-        ([3], "not GeoJSON"),
-    ],
-)
-def test_wrong_polygons_are_one_line(tmp_path, features, words):
-    path = write_features(tmp_path / "p.json", *features)
-    with pytest.raises(ConfigError, match=words) as caught:
-        load_polygons(path)
-    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
 def test_separations_by_rank_and_depth_of_pulses(tmp_path):

@@ -80,31 +80,6 @@ def test_sections_of_voxels(voxels):
     assert found.facts.unit == next(column.unit for column in COLUMNS if column.name == "energy")
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "message"),
-    [
-        ("section {cloud} --line 1,2,3", 2, "X0,Y0,X1,Y1"),
-        ("section {cloud} --line 1,2,1,2", 2, "two different points"),
-        ("section {cloud} --line 0,0,1,1", 1, "of 5000 points lies within"),
-        ("section {cloud} --width 0", 2, "above 0"),
-        ("section {voxels} --column reflectance", 2, "has no column"), ("section {voxels} {cloud}", 2, "drawn alone"),
-        ("section {voxels} --flags WEAK", 2, "no echo_flags"), ("profile {cloud} --size -1", 2, "above 0"),
-        ("profile {cloud} --size 1e-9", 2, "more than 5000 bins"),
-        ("profile {cloud} --statistic sum", 2, "needs a --column"),
-        ("section {cloud} --where z<-99", 1, "5000 of 5000 points are left out by --where"),
-        ("section s.csv", 2, "segments have no side view"),
-        ("section {cube}", 1, "holds no voxels"), ("cube {voxels}", 1, "holds no cube"),
-    ],
-)  # fmt: skip
-def test_wrong_usage_is_one_line(cloud, voxels, tmp_path, words, code, message):
-    pytest.importorskip("matplotlib")
-    np.savez(tmp_path / "cube.npz", values=np.zeros((2, 2, 2)))
-    words = words.format(cloud=cloud, voxels=voxels[0], cube=tmp_path / "cube.npz").split()
-    result = run("plot", *words, "-o", tmp_path / "p.png")
-    assert result.exit_code == code and message in result.stderr, result.output
-    assert result.stderr.count("\n") == 1 and not (tmp_path / "p.png").exists()
-
-
 def test_profiles_count_sum_and_average(cloud, voxels):
     las = laspy.read(cloud)
     height, value = np.array(las.z), np.array(las["amplitude"], np.float64)
@@ -202,7 +177,6 @@ def test_slice_writes_cube_and_overview_once(riegl, tmp_path):
     assert refused.exit_code == 1 and "--overwrite" in refused.stderr
     assert run(*words, tmp_path / "o.png", "--overwrite").exit_code == 0
     assert (tmp_path / "c.npz").read_bytes() == first, "the same input gives the same bytes"
-    assert run("slice", riegl, "--cube", tmp_path / "c.txt").exit_code == 2
     assert sorted(path.name for path in Path(tmp_path).iterdir()) == ["c.npz", "o.png"]
 
 
@@ -250,41 +224,6 @@ def test_profile_of_the_segments_of_a_strip(riegl, tmp_path):
     number = (tmp_path / "s.csv").read_text().count("\n") - 1
     assert result.exit_code == 0 and f"{number} segments" in result.stderr, result.output
     assert "sum of length" in (tmp_path / "p.svg").read_text("utf-8")
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "message"),
-    [
-        ("s.csv c.las", 2, "without clouds"), ("s.csv --where z<3", 2, "--where selects points"),
-        ("s.csv --flags WEAK", 2, "--flags selects points"), ("s.csv --column lenght", 2, "'length'"),
-        ("s.csv --statistic mean", 2, "needs a --column"), ("empty.csv", 1, "holds no segment"),
-        ("other.csv", 1, "'z1' is missing"), ("bad.csv", 1, "holds no segments"), ("nan.csv", 1, "segment 1 holds"),
-        ("bad.geojson", 1, "holds no segments"), ("list.geojson", 1, "holds no segments"),
-        ("none.csv", 1, "none.csv: cannot be read: No such file"),
-        ("flat.geojson", 1, "holds no segments"), ("x*.csv", 2, "x*.csv: matches no .las, .laz, .csv or .geojson file"),
-        ("deep.geojson", 1, "holds no segments"), ("folder.csv", 2, "the folder holds no"),
-    ],
-)  # fmt: skip
-def test_wrong_segments_are_one_line(cloud, tmp_path, monkeypatch, words, code, message):
-    monkeypatch.chdir(tmp_path)
-    _write_segments(tmp_path / "s.csv", [(1, 2), (3, 4)], [1, 2])
-    head = (tmp_path / "s.csv").read_text().splitlines()[0]
-    row = (tmp_path / "s.csv").read_text().splitlines()[1].split(",")
-    texts = {"empty.csv": head + "\n", "other.csv": "a,b\n1,2\n", "bad.geojson": "{", "list.geojson": "[1]",
-             "bad.csv": f"{head}\n" + ",".join([*row[:4], "x", *row[5:]]) + "\n",
-             "nan.csv": f"{head}\n" + ",".join([*row[:4], "nan", *row[5:]]) + "\n",
-             "flat.geojson": '{"features": [{"properties": {}, "geometry": {"coordinates": [[1, 2], [3, 4]]}}]}',
-             }  # fmt: skip
-    texts["deep.geojson"] = "[" * 100_000
-    (tmp_path / "folder.csv").mkdir()
-    for name, text in texts.items():
-        (tmp_path / name).write_text(text)
-    result = run("plot", "profile", *words.split(), "-o", "p.png")
-    assert result.exit_code == code and message in result.stderr, result.output
-    assert result.stderr.count("\n") == 1 and not (tmp_path / "p.png").exists()
-    damaged = code == 1 and words not in ("none.csv", "empty.csv")
-    assert result.stderr.endswith("; make it again with `wavebatch slice`\n") == damaged
-    assert ("holds no segments of" in result.stderr) == (damaged and words != "nan.csv")
 
 
 @pytest.mark.parametrize("given", ["s*.csv", "segs", "@list.txt", "segs/*.*", "segs/s.csv segs/../segs/t.csv"])

