@@ -486,7 +486,7 @@ _LARGEST = 1e12
 class VoxelFile:
     """The voxels of an .npz of `wavebatch voxelize`, read as the points at their centres.
 
-    Has the interface of `values.Clouds`. Raises InputError for a file that holds no voxels, ConfigError without the
+    Has the interface of `cells.Clouds`. Raises InputError for a file that holds no voxels, ConfigError without the
     column.
     """
 
