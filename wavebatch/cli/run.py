@@ -139,7 +139,7 @@ def _place(strip: str, line: str) -> str:
 
 
 def _sensor_lines(sensor: dict[str, Any]) -> Iterator[str]:
-    """The sensor position and its source."""
+    """The sensor's position and how exactly returns were placed, with their sources."""
     words = {
         "distance_m": "{:.0f} m away",
         "height_m": "{:.0f} m above the points",
@@ -151,6 +151,11 @@ def _sensor_lines(sensor: dict[str, Any]) -> Iterator[str]:
     parts = [text.format(sensor[key]) for key, text in words.items() if sensor.get(key) is not None]
     if parts:
         yield f"sensor from {sensor['source']}: {', '.join(parts)}"
+    if returns := sensor.get("returns"):
+        yield (
+            f"returns were placed to {returns['scatter_m']:.3f} m, by {returns['from']}; an echo without a return is "
+            f"off by {returns['phase_m']:.3f} m"
+        )
 
 
 def _reasons(no_data: dict[str, dict[str, int]]) -> Iterator[str]:
