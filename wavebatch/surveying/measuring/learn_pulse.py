@@ -42,8 +42,9 @@ MOST_STRONG = 800
 REACHED = 0.3
 """Misfit of a pulse model, in noise at the strip's strongest amplitudes, that is too small to be seen."""
 
-NEAR_BEST = 1.25
-"""Misfit, over that of the best model, at which a simpler one is taken."""
+GOAL, NEAR_BEST = 1.25, 1.25
+"""Root of chi2 of a pulse model to the stack that chance alone makes; and chi over that of the best model, at which a
+simpler one is taken."""
 
 WIDENED = 1.1
 """Width of an echo, over that of the strip's pulse, from which its target has widened it."""
@@ -139,7 +140,7 @@ def _learn(
     skewed = fit_skewed(stack, width)
     figures.misfit_goal, figures.misfit_skewed, figures.kappa = goal, skewed.rms, skewed.kappa
     figures.misfit_gaussians = {len(fit.components): fit.rms for fit in sums}
-    best = sums[-1] if small else _simplest([sums[0], skewed, *sums[1:]], goal)
+    best = sums[-1] if small else _simplest(stack, [sums[0], skewed, *sums[1:]], goal)
     if len(best.components) > 1:
         # All components that were worth fitting: fewer would save nothing, and tiles would disagree on their number.
         best = sums[-1]
@@ -180,10 +181,15 @@ def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[Syst
     return pulses[1] if misfits[1] < BETTER * misfits[0] else pulses[0]
 
 
-def _simplest(fits: list[PulseFit], goal: float) -> PulseFit:
-    """The first fit that reaches the goal, or comes near the best of all."""
-    enough = max(goal, NEAR_BEST * min(fit.rms for fit in fits))
-    return next(fit for fit in fits if fit.rms <= enough)
+def _simplest(stack: Stack, fits: list[PulseFit], goal: float) -> PulseFit:
+    """The first fit whose misfit is below the goal, or that the errors of the stack allow, or that is near the best.
+
+    By its errors: what a few lags of the tail show for sure is nothing in the mean of all.
+    """
+    error = np.maximum(stack.error, 0.25 * np.median(stack.error))
+    chi = [float(np.sqrt(np.mean((_draw_scaled(fit, stack) / error - stack.value / error) ** 2))) for fit in fits]
+    enough = max(GOAL, NEAR_BEST * min(chi))
+    return next(fit for fit, one in zip(fits, chi, strict=True) if one <= enough or fit.rms <= goal)
 
 
 CORE = 4.0
@@ -202,6 +208,12 @@ def _draw(fit: PulseFit, lag: np.ndarray) -> np.ndarray:
     return drawn / drawn.max()
 
 
+def _draw_scaled(fit: PulseFit, stack: Stack) -> np.ndarray:
+    """The pulse of a fit at the height of the stack: those of its echoes are of Gaussians, which few pulses are."""
+    drawn = _draw(fit, stack.lag)
+    return drawn * np.einsum("l,l->", drawn, stack.value) / np.einsum("l,l->", drawn, drawn)
+
+
 def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float) -> SystemPulse:
     """The system with a learned pulse in ns; its ringing is the largest value beyond 4 widths.
 
@@ -213,10 +225,8 @@ def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float
     # What the model misses of the stack's core beyond chance, in the kernel's terms: its energy over
     # that of a Gaussian. Further out are neighbours.
     core = np.abs(stack.lag - fit.datum) < CORE * width
-    drawn, value = _draw(fit, stack.lag)[core], stack.value[core]
-    # Heights of the stacked echoes are those of Gaussians, which a skewed pulse does not have.
-    drawn *= np.einsum("l,l->", drawn, value) / np.einsum("l,l->", drawn, drawn)
-    missed = max(float(np.mean((drawn - value) ** 2 - stack.error[core] ** 2)), 0.0)
+    rest = _draw_scaled(fit, stack) - stack.value
+    missed = max(float(np.mean(rest[core] ** 2 - stack.error[core] ** 2)), 0.0)
     misfit = float(np.sqrt(missed * 2 * CORE / SQRT_PI))
     system = replace(system, ringing=ringing, kappa=fit.kappa, components=(), misfit=misfit)
     if len(fit.components) > 1:
