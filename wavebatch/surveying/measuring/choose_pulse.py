@@ -61,6 +61,9 @@ a learned pulse's echoes, or where that is known to miss the stacked echoes by m
 Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes so many errors once in fifteen times.
 """
 
+AS_FEW = 0.98
+"""Share of its echoes to which another number of them is the same: a fiftieth of them comes and goes with the noise."""
+
 FEWEST = 48
 """Waveforms on which each candidate is judged first."""
 
@@ -268,14 +271,15 @@ def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
 def _decide(found: list[Candidate]) -> Choice:
     """The candidate with the simplest pulse that no other one beats surely.
 
-    Of pulses as simple the shortest description, or that of markedly fewer echoes: one echo more or less is chance.
+    Of pulses as simple the one with the fewest echoes, or the shortest description of those within AS_FEW of it.
     """
     ordered = []
     for number in sorted({one.gaussians for one in found}):
         alike = [one for one in found if one.gaussians == number]
         shortest = min(alike, key=lambda one: (one.typical, one.name))
-        fewer = [one for one in alike if one.echoes <= FEWER * shortest.echoes and one.exceeds(shortest) < SURE]
-        first = min((shortest, *fewer), key=lambda one: (one.echoes, one.typical))
+        level = [one for one in alike if one.exceeds(shortest) < SURE]
+        fewest = min(one.echoes for one in level)
+        first = min((one for one in level if AS_FEW * one.echoes <= fewest), key=lambda one: (one.typical, one.name))
         ordered += [first, *(one for one in alike if one is not first)]
     best = ordered[0]
     for one in ordered[1:]:
