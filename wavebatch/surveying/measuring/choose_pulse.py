@@ -253,8 +253,9 @@ def _try_changes(block: WaveformBlock, found: list[Candidate]) -> list[Candidate
 
 
 def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
-    """The pulse with the least change of shape that no other one beats surely, of those that its echoes show.
+    """The pulse with the least change of shape that no other one beats by HINT, of those that its echoes show.
 
+    By SURE one half of a strip had a change that the other, as likely, had not: its echoes were described by more.
     Neighbours too close to be found change the shape of some echoes, which is no change from shot to shot.
     """
     tried: list[Candidate] = []
@@ -265,7 +266,7 @@ def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
         tried.append(judged if same else _judge(block, judged.name, judged.system, change, known=judged.known))
     tried = [one for one in tried if one.change <= STEP_OF_CHANGES * one.seen]
     best = min(tried, key=lambda one: one.typical)
-    return next(one for one in tried if one.exceeds(best) < SURE)
+    return next(one for one in tried if one.exceeds(best) < HINT)
 
 
 def _decide(found: list[Candidate]) -> Choice:
