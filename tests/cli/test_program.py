@@ -26,8 +26,8 @@ import wavebatch as wb
 from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.messages import log_is_open
+from wavebatch.cli.program import command as program
 from wavebatch.cli.program.command import GROUPS, ProgramCommand, complete_files, group_options, roff
-from wavebatch.cli.program.settings import HARMLESS, NO_VARIABLE, OLD_NAMES
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import effective, parse_chain
 
@@ -75,7 +75,7 @@ def test_groups_name_options_that_exist_and_each_once():
     assert {tuple(name.rsplit(" ", 1)) for names in GROUPS.values() for name in names if " " in name} <= titled
     assert len(named) == len(set(named)) and not set(named) & set(OPTIONS)
     rivals = {name for group in (*EXCLUSIVE, *NEEDS.values(), NEEDS) for name in group}
-    assert [name for name in {*rivals, *NO_VARIABLE, *ELSEWHERE} if name not in known] == []
+    assert [name for name in {*rivals, *program.NO_VARIABLE, *ELSEWHERE} if name not in known] == []
     assert set(named) - known == set()
 
 
@@ -142,10 +142,10 @@ def test_options_of_several_commands_mean_the_same():
     read_or_written = {"--chain", "--truth", "--angles"}
     numbers = {"--point-format", "--no-data", "--pulses", "--width", "--most"}
     assert mixed.keys() <= read_or_written | numbers
-    assert set(OLD_NAMES.values()) <= seen.keys()
+    assert set(program.OLD_NAMES.values()) <= seen.keys()
     for title, command in _commands():
         names = {name for option in command.params for name in option.opts}
-        assert not any({old, new} <= names for old, new in OLD_NAMES.items()), title
+        assert not any({old, new} <= names for old, new in program.OLD_NAMES.items()), title
 
 
 def test_options_that_share_a_name_stand_where_they_belong():
@@ -276,11 +276,12 @@ def test_a_file_beside_the_strips_gives_only_the_options_on_the_list(folder):
     """A new option is refused until it is listed; one that names a file must not be listed."""
     options = [(title, max(option.opts, key=len).removeprefix("--"), isinstance(option.type, click.Path))
                for title, command in _commands() for option in command.params if isinstance(option, click.Option)]
-    assert not {name for _, name, is_path in options if is_path} & HARMLESS
-    assert {name for _, name, _ in options} >= HARMLESS, "all of the list exist"
-    assert not HARMLESS & {"energy", "crs", "scheduler", "memory", "jobs", "block-size", "format", "survey", "force",
-                           "quiet", "log-level", "debug", "resume", "overwrite", "recursive", "json"}  # fmt: skip
-    for name in sorted({name for title, name, _ in options if title == "run"} - HARMLESS - {"config"}):
+    assert not {name for _, name, is_path in options if is_path} & program.HARMLESS
+    assert {name for _, name, _ in options} >= program.HARMLESS, "all of the list exist"
+    harmful = {"energy", "crs", "scheduler", "memory", "jobs", "block-size", "format", "survey", "force", "quiet",
+               "log-level", "debug", "resume", "overwrite", "recursive", "json"}  # fmt: skip
+    assert not program.HARMLESS & harmful
+    for name in sorted({name for title, name, _ in options if title == "run"} - program.HARMLESS - {"config"}):
         (folder / "wavebatch.toml").write_text(f'[run]\n{name} = "{folder}/x"\n')
         done = _dry(folder)
         assert done.exit_code == 2 and f"must not set {name} so" in done.stderr, (name, done.stderr)
@@ -336,7 +337,7 @@ def test_outputs_replace_neither_the_log_nor_the_settings(folder, tmp_path):
 def test_no_command_loads_linear_algebra_before_it_runs():
     """To explain a variable that no command reads, all commands load; SciPy's BLAS may wait for memory for ever."""
     script = (
-        "import sys, click; from wavebatch.cli import main; from wavebatch.cli.program.settings import _load_all; "
+        "import sys, click; from wavebatch.cli import main; from wavebatch.cli.program.command import _load_all; "
         "assert len(dict(_load_all(click.Context(main)))) > 15; print('scipy.linalg' in sys.modules)"
     )
     shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)

@@ -269,3 +269,22 @@ def test_echoes_over_noise_that_is_not_seen_whole_have_right_errors(rng, level, 
 def test_noise_below_count_0_is_a_guess(level, quiet, spread, weak, said):
     kinds = {"quiet": quiet, "weak_echoes": weak}
     assert hides_noise(ReceiverNoise(level, spread, std=max(quiet, weak), by_kind=kinds)) is said
+
+
+@pytest.mark.parametrize("spread", [0.0, 4.0])
+def test_weak_echoes_of_a_wide_pulse_are_no_slow_noise(spread):
+    """Of canopies, one to three noises high: single samples do not show them. They made this noise 1.9 times as large
+    to the pulse, and hid echoes of nine standard deviations.
+    """
+    rng = np.random.default_rng(12)
+    s, n, width, std = 100, 3000, 6.0, 3.0
+    y = 200 + spread * rng.standard_normal(n) + std * rng.standard_normal((s, n))
+    first = rng.uniform(35, 70, n)
+    for height in (rng.uniform(1, 3, n), rng.uniform(1, 40, n), rng.uniform(1, 3, n)):
+        time = first + rng.uniform(-15, 15, n)
+        y += std * height * np.exp(-0.5 * ((np.arange(s)[:, None] - time) / width) ** 2)
+    pooled = estimate_noise(np.rint(y).astype(np.float32), int(3 * width))
+    lags = np.arange(1, len(pooled.correlation) + 1)
+    gain = 1 + 2 * np.sum(pooled.correlation * np.exp(-0.25 * (lags / width) ** 2))
+    assert pooled.std * np.sqrt(gain) == pytest.approx(std, rel=0.08)
+    assert pooled.level == pytest.approx(200, abs=0.1 * std + 0.1 * spread)

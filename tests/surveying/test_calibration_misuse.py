@@ -3,6 +3,7 @@
 import json
 import struct
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,11 +20,15 @@ from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
-from wavebatch.surveying.matching.setting import NO_CHANGE, _find_fading, compare_ground, compare_scenes, keep_places
+from wavebatch.surveying.matching import setting
+from wavebatch.surveying.matching.setting import NO_CHANGE, keep_places, weigh_change
 from wavebatch.surveying.matching.strip_conditions import judge_fading
 
 pytestmark = pytest.mark.kept_surveys
 
+compare_scenes, compare_ground, _find_fading = (
+    partial(one, chance=0.3) for one in (setting.compare_scenes, setting.compare_ground, setting._find_fading)
+)
 LIGHT = 1.2e8
 BASE = {"speed": 30.0, "rate": 10_000.0, "half_angle": 12.0}
 
@@ -251,7 +256,7 @@ def test_what_scenes_do_not_show_of_another_gain_or_energy_is_in_the_error():
 
 
 def keep(places):
-    return np.reshape(keep_places({1: places}), (-1, 4))[:, 1:]
+    return np.reshape(keep_places({(1, 0): places}), (-1, 4))[:, 1:]
 
 
 def see_ground(rng, known=None, factor=1.0, fade=0.0, move=0.0, pattern=0.0):
@@ -278,12 +283,12 @@ def test_ground_that_a_calibrated_strip_saw_shows_another_energy(rng, factor):
 def test_one_of_two_digitizers_that_fades_is_enough(rng, fading):
     (x, y), light, time = rng.uniform(0, 1000, (2, 300)), rng.normal(0, 1, 300), np.linspace(-1, 1, 300)
     places = {
-        digitizer: np.stack([x, y, light + 0.3 * time * (digitizer == fading) + rng.normal(0, 0.05, 300), time])
+        (digitizer, 0): np.stack([x, y, light + 0.3 * time * (digitizer == fading) + rng.normal(0, 0.05, 300), time])
         for digitizer in (1, 2)
     }
     known = np.concatenate([np.stack([np.full(300, digitizer), x, y, light], axis=1) for digitizer in (1, 2)])
-    channels = [SimpleNamespace(digitizer=digitizer) for digitizer in (1, 2)]
-    calibration = SimpleNamespace(channels=channels, strips=(), places=known.ravel().tolist())
+    channels = [SimpleNamespace(digitizer=digitizer, scanner=0) for digitizer in (1, 2)]
+    calibration = SimpleNamespace(channels=channels, strips=(), places=known.ravel().tolist(), change_chance=0.3)
     growth, lines, _ = judge_fading(calibration, SimpleNamespace(fades=NO_CHANGE, places=places), other=True)
     assert growth > 0.2 and "a laser that fades" in lines[0]
 
@@ -464,6 +469,146 @@ def test_reflectances_above_one_are_one_line_whatever_the_reason(tmp_path, calib
     report = json.loads((tmp_path / "a.report.json").read_text())
     assert 0.1 < report["quality"]["reflectance_above_one"] / report["counts"]["echoes"] < 1
     assert "exceed 1" not in run(calibrated, tmp_path / "right", "a.las")
+
+
+def bend(monkeypatch, most):
+    """Receivers that record x / (1 + x / most)."""
+    render = facet_strips._render
+
+    def render_bent(*arguments):
+        wave = render(*arguments)
+        return wave / (1.0 + wave / most)
+
+    monkeypatch.setattr(facet_strips, "_render", render_bent)
+
+
+@pytest.mark.parametrize(
+    ("most", "pulse"),
+    [
+        (500.0, ((1.0, 0.0, 2.0),)),
+        pytest.param(500.0, ((1.0, 0.0, 2.0), (0.3, 3.0, 3.0)), marks=pytest.mark.slow),
+        pytest.param(np.inf, ((1.0, 0.0, 2.0),), marks=pytest.mark.slow),
+        (np.inf, ((1.0, 0.0, 2.0), (0.3, 3.0, 3.0))),
+    ],
+)
+def test_one_bright_target_and_a_receiver_that_compresses(tmp_path, monkeypatch, most, pulse):
+    """The constant was 12 % too large, with 3.35 % stated."""
+    bend(monkeypatch, most)
+    ground = [Facet(0.6, inside=box(40, 0, 60, 20)), Facet(fields)]
+    sensor = Sensor(**BASE, light=LIGHT, pulse=pulse, gains={1: 1.0, 2: 0.5})
+    write_strip(tmp_path / "a.las", ground, sensor, 12_000, seed=71)
+    write_targets(tmp_path / "t.csv")
+    (tmp_path / "t.csv").write_text((tmp_path / "t.csv").read_text().replace("field,0.3", "field,0.6"))
+    found, said = calibrate(tmp_path, strips=["a.las"])
+    if np.isinf(most):
+        assert "compresses" not in said and all(row.relative_error < 0.031 for row in found.channels)
+        return
+    assert "the receiver of digitizer 1 compresses, by the shape of its echoes" in said
+    assert "take targets as bright as the surfaces that you measure" in said
+    # The darkest surfaces are off by all of it, those as bright as the target by nothing.
+    for row, gain in zip(found.channels, (1.0, 0.5), strict=True):
+        if len(pulse) < 2:
+            off = row.constant * LIGHT * gain * pulse[0][2] / 4.0 - 1
+            assert 0.1 < off < 0.2 and 0.4 < row.relative_error / off < 1.0
+        assert 0.06 < row.relative_error < 0.13
+
+
+@pytest.mark.parametrize("spread", [0.04, 0.2, 0.4])
+def test_the_assumed_chance_of_a_change_says_how_much_error_holds_it(spread):
+    errors = [weigh_change(0.0, spread, 0.0, chance=chance).error for chance in (0.0, 0.05, 0.3, 0.6)]
+    assert errors[0] == 0.0 and np.all(np.diff(errors) > 0.002)
+    assert 0.3 < errors[1] / errors[2] < 0.5 and 1.2 < errors[3] / errors[2] < 2.0
+    # What the data show does not hang on it.
+    assert all(weigh_change(0.5, 0.04, 0.5, chance=chance).chance > 0.9 for chance in (0.05, 0.3, 0.6))
+
+
+def test_a_chance_of_zero_in_the_file_takes_the_check_away(tmp_path, calibrated):
+    text = (calibrated / "cal.toml").read_text()
+    assert "\nchange_chance = 0.3" in text
+    write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 600, start=(3000, 0)), 10_000, seed=83)
+    found = {}
+    for chance in (0.3, 0.0):
+        (tmp_path / "cal.toml").write_text(text.replace("change_chance = 0.3", f"change_chance = {chance}"))
+        said = run(tmp_path, tmp_path / "out", "s.las")
+        cloud = wb.read_cloud(tmp_path / "out" / "s.laz")
+        stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
+        found[chance] = stated, "an assumed chance of 30% (change_chance)" in said
+    assert found[0.3][1] and not found[0.0][1]
+    assert found[0.0][0] < 0.035 < found[0.3][0] - 0.015, found
+
+
+def move_points(path, target, move):
+    """The strip with its points moved, f8 (n, 3) to f8 (n, 3), and its packet vectors left as they are."""
+    content = bytearray(path.read_bytes())
+    (begin,), (number,) = struct.unpack_from("<I", content, 96), struct.unpack_from("<I", content, 107)
+    (length,) = struct.unpack_from("<H", content, 105)
+    scale, offset = np.array(struct.unpack_from("<6d", content, 131)).reshape(2, 3)
+    rows = np.frombuffer(content, np.uint8, number * length, begin).reshape(number, length).copy()
+    xyz = move(np.ascontiguousarray(rows[:, :12]).view("<i4") * scale + offset)
+    rows[:, :12] = np.ascontiguousarray(np.rint((xyz - offset) / scale).astype("<i4")).view(np.uint8)
+    content[begin : begin + rows.size] = rows.tobytes()
+    struct.pack_into("<6d", content, 179, *np.stack([xyz.max(axis=0), xyz.min(axis=0)], axis=1).ravel())
+    target.write_bytes(content)
+
+
+def turn(xyz, degrees=2.0):
+    east, north = (xyz[:, :2] - xyz[:, :2].mean(axis=0)).T
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    middle = xyz[:, :2].mean(axis=0)
+    return np.column_stack([c * east - s * north + middle[0], s * east + c * north + middle[1], xyz[:, 2]])
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.4])
+def test_points_of_another_crs_than_their_vectors_are_named(tmp_path, slope):
+    """They had no range, for want of a sensor; and with --flight-height one that no hillside entered the error of."""
+    high = replace(SENSOR, height=900.0)
+    write_strip(tmp_path / "s.las", [Facet(0.3, slope=(0.0, slope))], high, 6000, seed=85)
+    move_points(tmp_path / "s.las", tmp_path / "turned.las", turn)
+    done = call("run", tmp_path / "turned.las", "-o", tmp_path / "a", "--columns", "range,range_error")
+    assert done.exit_code == 0 and "vectors spread by 24 degrees, but do not meet in a path" in done.stderr
+    assert "RuntimeWarning" not in done.output
+    options = ("--columns", "range,range_error", "--flight-height", 900)
+    done = call("run", tmp_path / "turned.las", "-o", tmp_path / "b", *options)
+    assert done.exit_code == 0 and "vectors spread by 24 degrees" in done.stderr
+    cloud = wb.read_cloud(tmp_path / "b" / "turned.laz")
+    off = cloud["range"] * 0.987 - (900.0 - cloud["z"])
+    assert np.mean(np.abs(off) < cloud["range_error"]) > 0.6
+    assert np.nanmedian(cloud["range_error"]) > (60.0 if slope else 40.0)
+    # The same strip with its own vectors is right, and no line doubts it.
+    done = call("run", tmp_path / "s.las", "-o", tmp_path / "c", "--columns", "range,range_error")
+    assert done.exit_code == 0 and "vectors" not in done.stderr
+
+
+def test_a_strip_whose_times_show_no_day_is_said_to_count_as_of_the_same_day(tmp_path, calibrated):
+    write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 90 * 86400), 10_000, seed=87)
+    content = bytearray((tmp_path / "s.las").read_bytes())
+    content[6] &= 0xFE  # seconds of the week
+    (tmp_path / "s.las").write_bytes(content)
+    said = run(calibrated, tmp_path / "out", tmp_path / "s.las")
+    assert "GPS times of this strip are seconds of a week, so they show no day: it counts as the same day" in said
+    assert "show no day" not in run(calibrated, tmp_path / "out", "a.las")
+
+
+def test_a_column_that_is_no_reflectance_of_the_channel_is_named(tmp_path, monkeypatch):
+    write = facet_strips._write
+    monkeypatch.setattr(facet_strips, "_write", lambda *a: write(*a[:10], np.full_like(a[10], 0.6)))
+    write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, vendor="share"), 6000, seed=89)
+    done = call("calibrate", tmp_path / "s.las", "--from-column", "Reflectance", "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 0 and "constants by its dark and its bright echoes differ by 5" in done.stderr
+    assert load_calibration(tmp_path / "cal.toml").relative_error > 0.5
+
+
+def test_scanner_channels_of_one_digitizer_are_compared_one_by_one(tmp_path):
+    """Their light was one scene: another gain of one of two passed for half of it, and moved the other's places too."""
+    for number, gain in enumerate((0.5, 0.33)):
+        sensor = Sensor(**BASE, light=LIGHT, gains={1: 1.0, 2: gain}, scanners=True, time=START + 600 * number)
+        write_strip(tmp_path / f"{number}.las", GROUND, sensor, 12_000, seed=81 + number)
+    write_targets(tmp_path / "t.csv")
+    found, _ = calibrate(tmp_path, strips=["0.las"])
+    assert {1.0, 1.25} == set(found.places[::4])
+    said = run(tmp_path, tmp_path / "out", "1.las")
+    lines = [line for line in said.splitlines() if "another gain or energy under the same header" in line]
+    assert len(lines) == 1 and "of digitizer 1 scanner channel 1 are brighter by a factor of 0.6" in lines[0]
 
 
 def test_a_constant_without_an_error_is_named(tmp_path, calibrated):

@@ -11,7 +11,7 @@ from footprints import EAST, NORTH, Flight, Plane, match, roofs, write_strip
 
 import wavebatch as wb
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.measuring.return_scatter import ReturnScatter, _sample, measure_returns
+from wavebatch.surveying.measuring.return_scatter import ReturnScatter, _measure, _sample, measure_returns
 
 TOWN = [*roofs([0, 20, 38, 55]), Plane(0.25)]
 HILL = [Plane(slope=(np.tan(np.radians(22.0)), 0.1))]
@@ -76,6 +76,22 @@ def test_a_phase_of_the_pulse_is_no_scatter(tiny_strip):
     """Locations of simulated returns are up to half a sample off, their points are true."""
     found = measure(tiny_strip)
     assert found.scatter < 0.005 and 0.03 < found.phase < 0.07
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.6, 2.0])
+@pytest.mark.parametrize("number", [40, 400])
+def test_few_residuals_never_say_that_returns_are_exact(rng, ratio, number):
+    """Of strips with 40 residuals and large errors of fits, 40 % had a scatter of 0."""
+    found = np.empty(300)
+    for i in range(len(found)):
+        fits = 0.01 * np.exp(0.5 * rng.standard_normal(number))
+        off = np.hypot(0.01 * ratio * 1.5**0.5, fits) * rng.standard_normal(number)
+        found[i] = _measure(np.stack([off, np.full(number, 1.5), fits]))
+    assert np.mean(found < 0.2 * 0.01 * ratio) < 0.05
+    assert 0.95 < np.sqrt(np.mean(found**2)) / (0.01 * ratio) < (2.2 if ratio < 0.5 and number < 100 else 1.5)
+    # A clear echo: its fit has a fifth of the usual error.
+    off = np.hypot(0.01 * ratio, 0.002) * rng.standard_normal(len(found))
+    assert 0.6 < np.mean(np.abs(off) < np.hypot(found, 0.002)) < 0.86
 
 
 def test_real_strips(riegl, leica):

@@ -380,3 +380,54 @@ def test_a_pulse_is_chosen_where_no_echo_stands_clear():
     block = WaveformBlock.from_samples(np.full((40, 60), 12, np.uint8))
     one, other = SystemPulse(2.0, kappa=0.1), SystemPulse(2.0, components=((0.1, 3.0, 1.0),))
     assert learn_pulse._fit_wide_best(block, one, (one, other)) is one
+
+
+def skewed(widening=0.0, skew=0.25):
+    """A log-normal pulse of width 1, convolved with a Gaussian target of this width, by distance from its peak."""
+    x = np.arange(-20, 40, 0.01)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        pulse = np.nan_to_num(bell(np.log(1 + skew * x) / skew))
+    if widening:
+        pulse = np.convolve(pulse, bell(np.arange(-6 * widening, 6 * widening, 0.01) / widening), mode="same")
+    pulse /= pulse.max()
+    return lambda z: np.interp(z, x - x[np.argmax(pulse)], pulse, 0, 0)
+
+
+def test_few_widened_echoes_of_a_skewed_pulse_stay_one():
+    """Of 400 echoes ten are widened. The pulse was stretched where less than 20 are: each of them was split."""
+    signal, rows, time, _ = render(skewed(), 31, n=400, s=160, amplitude=(500, 3000), width=4.0)
+    wide, _, _, _ = render(skewed(1.0), 31, n=400, s=160, amplitude=(500, 3000), width=4.0)
+    signal[::40] = wide[::40]
+    _, echoes = decompose(digitize(signal, 31, noise=2.0, top=65535))
+    complete, correct, _ = compare(echoes, rows, time, 5.0)
+    assert complete == 1 and correct > 0.995
+
+
+def test_an_after_pulse_that_few_lags_show_is_learned():
+    """2 % of the pulse, in a stack whose widths scatter. It was below the stack's mean error, and made echoes."""
+    rng = np.random.default_rng(32)
+    width = 0.55 * (1 + np.abs(rng.normal(0, 0.1, 400)))[:, None]
+
+    def pulse(z):
+        return bell(z / width) + 0.02 * bell((z - 4.4) / width)
+
+    signal, rows, time, _ = render(pulse, 32, n=400, s=120, amplitude=(50, 2000), width=1.0)
+    system, echoes = decompose(digitize(signal, 32, noise=3.0, top=65535))
+    complete, correct, _ = compare(echoes, rows, time)
+    assert complete == 1 and correct > 0.995
+    assert max(system.components, key=lambda one: one[1])[:2] == pytest.approx((0.02, 4.4), rel=0.1)
+
+
+def test_echoes_of_a_hundredth_beside_strong_ones_are_found():
+    """The pulse is known to a few per mille there. Less than 2 % of a neighbour was none, 40 noises high or not."""
+
+    def pulse(z):
+        return bell(z) + 0.3 * bell((z - 2.0) / 1.4)
+
+    signal, rows, time, height = render(pulse, 33, n=600, s=160, amplitude=(2000, 20000), place=(0.2, 0.4), width=4.0)
+    later = time[:60] + np.random.default_rng(33).uniform(24, 60, 60)
+    signal[:60] += 0.01 * height[:60, None] * pulse((np.arange(160) - later[:, None]) / 4.0)
+    system, echoes = decompose(digitize(signal, 33, noise=1.0, top=65535))
+    complete, correct, _ = compare(echoes, np.r_[rows, rows[:60]], np.r_[time, later], 5.0)
+    assert complete > 0.995 and correct > 0.995
+    assert system.faint_share < 0.01

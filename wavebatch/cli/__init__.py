@@ -95,6 +95,7 @@ def main() -> None:
     `wavebatch COMMAND --help` explains a command, with examples.
 
     Defaults of options can be given by variables (WAVEBATCH_JOBS=4, or for one command WAVEBATCH_RUN_JOBS=4) and in
-    a settings file (--config FILE; a table per command: [run] with jobs = 4). Options on the command line count first,
-    then variables, then the file. A wavebatch.toml beside the inputs can change numbers only.
+    a settings file (a table per command: [run] with jobs = 4): only in that of --config FILE or WAVEBATCH_CONFIG, if
+    given; else in wavebatch.toml beside the inputs, which can change numbers only, and in that in the folder for
+    settings of the user. Options on the command line count first, then variables, then files in this order.
     """  # fmt: skip

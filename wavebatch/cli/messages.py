@@ -138,9 +138,11 @@ _PLAIN = {
 class _OneLine(click.ClickException):
     """An error that is printed as one line."""
 
+    kind = "error: "
+
     def show(self, file: IO[Any] | None = None) -> None:
         """The line on stderr."""
-        click.echo(printable(f"error: {self.message}"), file=file, err=file is None)
+        click.echo(printable(f"{self.kind}{self.message}"), file=file, err=file is None)
 
 
 class WrongUsage(_OneLine):
@@ -166,14 +168,10 @@ class Unprinted(_OneLine):
         super().__init__(f"stdout: cannot be written: {error.strerror or error}")
 
 
-class Interrupted(click.ClickException):
+class Interrupted(_OneLine):
     """Ctrl-C or SIGTERM as one line and an exit code; click would say `Aborted!` and give 1."""
 
-    exit_code = interrupts.EXIT_INTERRUPTED
-
-    def show(self, file: IO[Any] | None = None) -> None:
-        """The line on stderr."""
-        click.echo(self.message, file=file, err=file is None)
+    kind, exit_code = "", interrupts.EXIT_INTERRUPTED
 
 
 @contextlib.contextmanager

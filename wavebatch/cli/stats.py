@@ -23,20 +23,7 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
-from wavebatch.tools.return_stats import (
-    BIN,
-    BINS,
-    LEAST_PAIRS,
-    RANKS,
-    AreaGrid,
-    AreaStats,
-    DeadZone,
-    PolygonSet,
-    ReturnStats,
-    Separation,
-    count_returns,
-    describe_pairs,
-)
+from wavebatch.tools import return_stats as returns
 from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv
 
 EXIT_UNREADABLE = 1
@@ -78,8 +65,8 @@ def stats(
     files = shared.find_inputs(clouds, recursive=recursive)
     if output is not None:
         check_target(output, overwrite=overwrite)
-    divisions = [] if size is None else [AreaGrid(size)]
-    divisions += [] if polygon is None else [PolygonSet(load_polygons(polygon))]
+    divisions = [] if size is None else [returns.AreaGrid(size)]
+    divisions += [] if polygon is None else [returns.PolygonSet(load_polygons(polygon))]
     failed: list[InputError] = []
 
     def skip(error: InputError) -> None:
@@ -88,7 +75,7 @@ def stats(
         failed.append(error)
         talk(f"error: {error}")
 
-    each, total = count_returns(files, skip, divisions=divisions, chosen=PointFilter(where=where))
+    each, total = returns.count_returns(files, skip, divisions=divisions, chosen=PointFilter(where=where))
     if output is not None and failed:
         talk(f"error: {output}: not written, because {count(len(failed), 'cloud')} of {len(files)} cannot be read")
     elif output is not None:
@@ -102,7 +89,7 @@ def stats(
     sys.exit(EXIT_UNREADABLE if failed else 0)
 
 
-def _sheet(found: ReturnStats) -> Sheet:
+def _sheet(found: returns.ReturnStats) -> Sheet:
     """The result of one cloud."""
     numbers = sorted({*found.by_number, *found.by_count})
     shares = [(k, found.by_number.get(k, 0.0), found.by_count.get(k, 0.0)) for k in numbers]
@@ -113,8 +100,9 @@ def _sheet(found: ReturnStats) -> Sheet:
     if found.separations["all"].pairs:
         zones = []
         for name, one in found.dead_zones.items():
-            few = one.pairs < LEAST_PAIRS
-            why = f"fewer than {LEAST_PAIRS} pairs" if few else f"nearly all {BIN * BINS:g} m or more apart"
+            few = one.pairs < returns.LEAST_PAIRS
+            far = f"nearly all {returns.BIN * returns.BINS:g} m or more apart"
+            why = f"fewer than {returns.LEAST_PAIRS} pairs" if few else far
             why = f"no-data: {why}" if math.isnan(one.size) else ""
             zones.append((name, one.pairs, one.size, one.error, one.size / HALF_C, why))
         parts += [Table(("separation", "pairs", "mean m", "least m"), apart, ".3f"),
@@ -133,7 +121,7 @@ def _sheet(found: ReturnStats) -> Sheet:
     return Sheet(found.cloud, [*parts, Table(head, rows, forms, shown=SHOWN)])
 
 
-def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:
+def _format_table(each: Sequence[returns.ReturnStats], total: returns.ReturnStats) -> str:
     """CSV: one row per cloud and per area of it; for several clouds also the total."""
     every = [*each, total] if len(each) > 1 else each
     parts = [(one.cloud, part) for one in every for part in (one, *one.areas)]
@@ -142,37 +130,37 @@ def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:
     return format_csv(list(rows[0]), (row.values() for row in rows))
 
 
-def _table_row(cloud: str, part: ReturnStats | AreaStats, most_number: int, most_count: int) -> dict[str, Any]:
+def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_count: int) -> dict[str, Any]:
     """Values of a cloud or an area by column; most_...: largest return number and number of returns of the table."""
-    is_area = isinstance(part, AreaStats)
+    is_area = isinstance(part, returns.AreaStats)
     place = (part.kind, part.name, part.x, part.y) if is_area else ("cloud", "", math.nan, math.nan)
     found: dict[str, Any] = dict(zip(("cloud", "kind", "area", "x", "y"), (cloud, *place), strict=True))
     found |= {"points": part.points, "pulses": part.pulses, "returns_per_pulse": part.returns_per_pulse}
     found |= {f"return_{k}": part.by_number.get(k, 0.0) for k in range(1, 1 + most_number)}
     found |= {f"pulses_with_{k}": part.by_count.get(k, 0.0) for k in range(1, 1 + most_count)}
-    ends = ["", *(f"_{pair.replace('-', '_').rstrip('_')}" for pair in RANKS)]
+    ends = ["", *(f"_{pair.replace('-', '_').rstrip('_')}" for pair in returns.RANKS)]
     for end, one in zip(ends, [part if is_area else part.separations["all"], *_rank_pairs(part)], strict=True):
         found |= {f"pairs{end}": one.pairs, f"mean_m{end}": one.mean, f"least_m{end}": one.least}
     found |= {"pulses_with_several": part.several, "first_above_last_m": part.depth}
     # Distances are collected per cloud only: a histogram per area would need too much memory.
     zones = {} if is_area else part.dead_zones
-    for end, name in zip(ends, ("all", *RANKS), strict=True):
-        zone = zones.get(name, DeadZone(0, math.nan, math.nan))
+    for end, name in zip(ends, ("all", *returns.RANKS), strict=True):
+        zone = zones.get(name, returns.DeadZone(0, math.nan, math.nan))
         found |= {f"dead_zone_m{end}": zone.size, f"dead_zone_err_m{end}": zone.error}
     return found
 
 
-def _rank_pairs(part: ReturnStats | AreaStats) -> list[Separation]:
+def _rank_pairs(part: returns.PulseStats) -> list[returns.Separation]:
     """Distances per class of RANKS; a cloud has more classes above the third, which are joined here."""
     found = {}
-    for pair in RANKS[:-1]:
-        found[pair] = part.separations.get(pair, Separation(0, math.nan, math.nan))
+    for pair in returns.RANKS[:-1]:
+        found[pair] = part.separations.get(pair, returns.Separation(0, math.nan, math.nan))
     rest = [one for name, one in part.separations.items() if name not in (*found, "all") and one.pairs]
     pairs = sum(one.pairs for one in rest)
     least = min((one.least for one in rest), default=math.nan)
-    return [*found.values(), describe_pairs(pairs, sum(one.pairs * one.mean for one in rest), least)]
+    return [*found.values(), returns.describe_pairs(pairs, sum(one.pairs * one.mean for one in rest), least)]
 
 
-def _plain(found: ReturnStats) -> dict[str, Any]:
+def _plain(found: returns.ReturnStats) -> dict[str, Any]:
     areas = [{**asdict(area), "returns_per_pulse": area.returns_per_pulse} for area in found.areas]
     return {**asdict(found), "areas": areas, "returns_per_pulse": found.returns_per_pulse}

@@ -312,6 +312,10 @@ class SystemPulse:
             blank=True, form="[lag, share]"),
     ] = ()  # fmt: skip
     """(lag after the peak [ns], share of the amplitude): what the pulse leaves unexplained around strong echoes."""
+    faint_share: Annotated[
+        float, Range(0.0, 1.0), Key("faint_share", "of a stronger echo that one beside it must exceed")
+    ] = 0.02
+    """Share of a stronger echo that one beside it must exceed where the pulse was learned: no more is known of it."""
     beside: Annotated[
         tuple[tuple[_Lag, Annotated[float, Range(0.0, 1e4)]], ...],
         Key("beside", "(lag [ns], variance over that of the noise) of what fits leave beside strong echoes",

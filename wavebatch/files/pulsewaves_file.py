@@ -305,7 +305,7 @@ class PulsePiece:
     first: int
     """Index of the first pulse in the file."""
     pulses: np.ndarray
-    """Pulse records (n,), see `header.PULSE`."""
+    """Pulse records (n,), see `PULSE`."""
     anchor: np.ndarray
     """f8 (n, 3), in the unit of the coordinates."""
     direction: np.ndarray

@@ -43,9 +43,6 @@ CLIPPED_TAIL = 0.005
 range were never measured, and 0.2 % of four times the range is many times the noise.
 """
 
-LEAST_RATIO = 0.02
-"""Share of a stronger neighbour that an echo must exceed: no learned pulse is better known (docs/algorithms.md R3)."""
-
 UNRELIABLE_BELOW = 0.15
 """Below this share of an echo under the digitizer's limit its amplitude is a guess (docs/algorithms.md H6)."""
 
@@ -93,7 +90,7 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
     table : EchoTable
         Fitted echoes.
     system : SystemPulse
-        With the components of the learned pulse, and the misfit of its tail.
+        With the components of the learned pulse, what is known of it, and the misfit of its tail.
     top : float
         Height above the baseline from which echoes are clipped [count].
 
@@ -105,7 +102,7 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
     faint = np.zeros(len(table), bool)
     if system.components:
         delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
-        faint = _faint_beside(table, LEAST_RATIO, 0.0, max([4 * system.sigma_ref, *delays]), before=True)
+        faint = _faint_beside(table, system.faint_share, 0.0, max([4 * system.sigma_ref, *delays]), before=True)
         clipped = np.where(table.amplitude >= top, CLIPPED_TAIL * table.amplitude, 0)
         for row, other, _ in list_neighbours(table) if clipped.any() else ():
             faint[row] |= table.amplitude[row] < clipped[other]

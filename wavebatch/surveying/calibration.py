@@ -66,6 +66,8 @@ class TargetResult:
     """Standard deviation of the constant from this target alone, relative."""
     air: float | None = None
     """Share of the air that a column of reflectances held, which was taken off; None where it is not known."""
+    apart: float = 0.0
+    """Scatter of the constants by dark and by bright echoes of a column of reflectances, relative."""
     refused: str = ""
     """Why the target gave no constant."""
     channel: str = ""
@@ -200,6 +202,13 @@ class Calibration:
     """Channels that have a constant of their own."""
     strips: Annotated[tuple[StripConstant, ...], Key("flight_strip")] = ()
     """Constants of single strips, where several were calibrated together."""
+    change_chance: Annotated[
+        float,
+        Range(0.0, 0.9),
+        Key("change_chance", "assumed: of another energy or gain under the same header; 0: logs exclude it"),
+    ] = 0.3
+    """Chance that a strip has another energy or gain under the same header, or a laser that fades, before its light is
+    seen. Nothing in a strip tells it: it is high, since errors must hold for those who have one."""
     energy_mean: Annotated[
         float | None,
         Range(1e-30, 1e30),
@@ -213,11 +222,15 @@ class Calibration:
     energy_source: Annotated[str, Key()] = ""
     energy_unit: Annotated[str, Key()] = ""
     places: Annotated[tuple[Annotated[float, Range(-1e9, 1e9)], ...], Key(blank=True)] = ()
-    """Ground that other strips may see again: digitizer, east, north, logarithm of its light, and so on."""
+    """Ground that other strips may see again: channel (`setting.number_channel`), east, north, logarithm of its light,
+    and so on."""
     swath: tuple[float, ...] = ()
     """How the constant grows with the scan angle, as `Radiometry.swath`; empty where it was not fitted."""
     right: tuple[float, float] = (0.0, 0.0)
     """Of the strip's flight, as `Radiometry.right`; not kept in the file."""
+    bent: float = 0.0
+    """By how much the constant is off for echoes unlike the targets', since the receiver compresses, relative; all
+    channels and strips share it. Not kept in the file, whose errors hold it."""
     notes: tuple[str, ...] = ()
     """What is doubtful about it, or would not show in the strip that it is used for; not kept in the file."""
 

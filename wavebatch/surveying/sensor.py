@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.order import robust_std
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.units import AIR_ATTENUATION, MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.reader import LEAST_PAIRS, RaySample, StripReader, StripScan, measure_scale, sample_rays
 from wavebatch.files.trajectory_file import read_trajectory
-from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
+from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, measure_extent, range_error, sensor_at
 from wavebatch.kernels.physics.radiometry import mean_haze
 from wavebatch.surveying.measuring.return_scatter import ReturnScatter
 
@@ -66,7 +67,11 @@ LEAST_PAIR, SURE_TURN = 5.0, 4.0
 their median shows that packet vectors are turned."""
 
 HEIGHT_ERROR = 0.05
-"""Error of the range, relative, where only the height of the flight is known."""
+"""Error of the range, relative, where only the height of the flight is known; and scatter of the points' heights, over
+it, from which one height for all is doubted."""
+
+LEAST_RAYS, LEAST_SPREAD = 100, np.radians(4.0)
+"""So many packet vectors, which cover so wide an angle, meet in a path, or contradict their points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +156,18 @@ class SensorSource:
 
     def doubt(self) -> str:
         """Return the line about a trajectory that contradicts the packet vectors; empty where it does not."""
-        late, behind = (dict(self.facts).get(name) or 0.0 for name in ("late_s", "behind_m"))
+        facts = dict(self.facts)
+        if spread := facts.get("do_not_meet_deg"):
+            return (
+                f"range: the packets' vectors spread by {spread:.0f} degrees, but do not meet in a path of the sensor: "
+                "points and vectors are of two CRSs, axes are swapped, or times are wrong; new echoes lie along them"
+            )
+        if self.height and facts["relief_m"] > HEIGHT_ERROR * self.height:
+            return (
+                f"range: --flight-height is one number, but heights scatter by {facts['relief_m']:.0f} m: the "
+                f"error of the ranges, {self.error:.2g} m, holds it; give --trajectory"
+            )
+        late, behind = (facts.get(name) or 0.0 for name in ("late_s", "behind_m"))
         if abs(behind) > max(MOST_LAG * (self.distance or 0.0), 10.0 * (self.vectors_error or 0.0)):
             return (
                 f"range: the trajectory is {abs(behind):.1f} m {'behind' if late > 0 else 'ahead of'} the packets' "
@@ -169,7 +185,8 @@ class SensorSource:
 
     def describe(self) -> dict[str, Any]:
         """Return kind, errors and the other values for reports."""
-        returns = {"scatter_m": round(self.returns.scatter, 5), "from": self.returns.source}
+        placed = self.returns
+        returns = {"scatter_m": round(placed.scatter, 5), "from": placed.source, "phase_m": round(placed.phase, 5)}
         error = round(self.error, 6) or None
         report = {"source": self.kind, "range_error_m": error, "returns": returns, **dict(self.facts)}
         return report if self.distance is None else {**report, "distance_m": self.distance}
@@ -213,10 +230,21 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
             if rays is vectors and found.trajectory is not None:
                 turn = find_turn(pairs, found.trajectory)
             return found if turn is None else replace(found, facts=(*found.facts, ("angle_to_pairs_deg", turn)))
-    if request.height is not None:
-        error = HEIGHT_ERROR * request.height
-        return SensorSource("flight height", height=request.height, distance=request.height, error=error)
-    return UNKNOWN
+    facts: dict[str, float] = {}
+    if len(vectors.time) >= LEAST_RAYS and vectors.time[0] < vectors.time[-1]:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            unit = vectors.direction / np.sqrt((vectors.direction**2).sum(axis=1))[:, None]
+        spread = measure_extent(unit)
+        if spread > LEAST_SPREAD:
+            facts["do_not_meet_deg"] = round(float(np.degrees(spread)), 1)
+    if request.height is None:
+        return replace(UNKNOWN, facts=tuple(facts.items()))
+    # An aircraft does not follow hills: their heights are in the error.
+    facts["relief_m"] = round(robust_std(vectors.point[:, 2]), 1) if len(vectors.point) else 0.0
+    error = float(np.hypot(HEIGHT_ERROR * request.height, facts["relief_m"]))
+    return SensorSource(
+        "flight height", height=request.height, distance=request.height, error=error, facts=tuple(facts.items())
+    )
 
 
 def refuse_units(reader: StripReader, scan: StripScan) -> None:

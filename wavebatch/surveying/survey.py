@@ -19,7 +19,7 @@ from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_sa
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.hidden_neighbours import measure_hidden
-from wavebatch.surveying.measuring.choose_pulse import Tried, choose_pulse, settle
+from wavebatch.surveying.measuring.choose_pulse import MISFITS, Tried, choose_pulse, settle
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
     find_isolated,
@@ -27,7 +27,7 @@ from wavebatch.surveying.measuring.learn_pulse import (
     learn_pulse,
 )
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import measure_beside, measure_tail
+from wavebatch.surveying.measuring.misfit import limit_faint, measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
@@ -62,7 +62,8 @@ LEAST_LEVELS = 5
 
 NARROWER = 0.85
 """Width of the chosen pulse, over that of isolated echoes, below which quiet samples are looked for once more if there
-were none: those next to signal are not quiet, by widths of the pulse."""
+were none: those next to signal are not quiet, by widths of the pulse. Without isolated echoes they were found with a
+guess of it."""
 
 STRANGE, STRANGE_NOISE = 6.0, 1.3
 """Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
@@ -387,9 +388,11 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         gaussians = (one.typical for one in choice.tried if one.name.startswith("gaussian"))
         figures.gaussian_nats = min(gaussians, default=None)
         part = thin_samples(block, RESIDUAL_LOOK)
-        if not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref:
+        narrower = not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref
+        if narrower or len(main) < ENOUGH_TO_LEARN:
             noise = measure_quiet(block, system.sigma_ref / block.spacing).noise
-            system = replace(system, noise=replace(noise, gain=first.noise.gain))
+            if narrower or noise.by_kind["quiet"]:
+                system = replace(system, noise=replace(noise, gain=first.noise.gain))
         echoes = decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
@@ -399,9 +402,11 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system = choose_whitening(part, system, choice.best.change)
         system, mirror = settle(block, system, choice.best.seen, choice.best.missed)
+        system = limit_faint(system, max(choice.best.seen, float(MISFITS[0])), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
+        figures.width_in_doubt = choice.spread
         figures.echoes_in_doubt = max(choice.doubt, share_unexplained(system, echoes, block.spacing))
         if len(block) < SMALL:
             figures.echoes_in_doubt = max(figures.echoes_in_doubt, share_repeated(echoes, system.sigma_ref))

@@ -19,19 +19,8 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.column_names import read_provenance
+from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import name_units, read_crs
-from wavebatch.files.las.header import (
-    WITHOUT_WAVES,
-    ExtraRecord,
-    LasHeader,
-    decode_text,
-    field_names,
-    find_evlrs,
-    locate,
-    read_angles,
-    read_classes,
-    split_numbers,
-)
 from wavebatch.files.las.read_points import CheckedHeader, read_checked_header
 from wavebatch.files.strip.describe import describe_strip
 
@@ -53,7 +42,7 @@ def describe_file(path: Path, *, direction: str = "auto", headerless: bool = Fal
     checked = read_checked_header(path, waveforms=False)
     header = checked.header
     facts: dict[str, Any] = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
-    if header.point_format in WITHOUT_WAVES and header.version >= (1, 3):
+    if header.point_format in las.WITHOUT_WAVES and header.version >= (1, 3):
         facts |= _describe_waveforms(path, direction, headerless)
     facts |= _describe_header(path, checked)
     runs = read_provenance(header)
@@ -75,7 +64,7 @@ def _describe_waveforms(path: Path, direction: str, headerless: bool) -> dict[st
 
 def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
     header = checked.header
-    evlrs, _ = find_evlrs(path, header, 1000)
+    evlrs, _ = las.find_evlrs(path, header, 1000)
     day, year = header.creation
     crs, units = read_crs(path, header)
     return {
@@ -86,15 +75,15 @@ def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
         "coordinates": name_units(units),
         "scales": list(header.scales),
         "offsets": list(header.offsets),
-        "system_identifier": decode_text(header.system_identifier),
-        "generating_software": decode_text(header.generating_software),
+        "system_identifier": las.decode_text(header.system_identifier),
+        "generating_software": las.decode_text(header.generating_software),
         "created": f"day {day} of {year}" if day or year else None,
         "file_source_id": header.file_source_id,
         "points": header.point_count,
         "header_bounds": {"least": list(header.mins), "largest": list(header.maxs)},
         "records": [
             *({"user": one.user, "id": one.record_id, "bytes": len(one.payload), "extended": False,
-               "description": decode_text(one.description)} for one in header.vlrs),
+               "description": las.decode_text(one.description)} for one in header.vlrs),
             *({"user": one.user, "id": one.record_id, "bytes": one.length, "extended": True, "description": ""}
               for one in evlrs),
         ],
@@ -122,7 +111,7 @@ def _table(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _describe_extra(record: ExtraRecord) -> dict[str, Any]:
+def _describe_extra(record: las.ExtraRecord) -> dict[str, Any]:
     dtype, no_data = record.dtype, record.no_data
     return {
         "name": record.name,
@@ -151,18 +140,18 @@ class _Totals:
             least, largest = self.extremes.get(name, (np.inf, -np.inf))
             self.extremes[name] = min(least, float(values.min())), max(largest, float(values.max()))
 
-    def add(self, raw: np.ndarray, header: LasHeader, flags: np.ndarray | None) -> None:
+    def add(self, raw: np.ndarray, header: las.LasHeader, flags: np.ndarray | None) -> None:
         self.count += len(raw)
-        for name, values in zip("xyz", locate(raw, header).T, strict=True):
+        for name, values in zip("xyz", las.locate(raw, header).T, strict=True):
             self.widen(name, values)
-        self.widen("scan_angle_deg", read_angles(raw))
+        self.widen("scan_angle_deg", las.read_angles(raw))
         self.widen("intensity", raw["intensity"])
-        if "gps_time" in field_names(raw.dtype):
+        if "gps_time" in las.field_names(raw.dtype):
             self.widen("gps_time", raw["gps_time"])
-        number, total = split_numbers(raw)
+        number, total = las.split_numbers(raw)
         self.returns += np.bincount(number, minlength=16)
         self.totals += np.bincount(total, minlength=16)
-        kinds = read_classes(raw)
+        kinds = las.read_classes(raw)
         _count(self.classes, kinds)
         _count(self.sources, raw["point_source_id"])
         if flags is not None:
@@ -176,7 +165,7 @@ def _count(counter: Counter[int], values: np.ndarray) -> None:
     counter.update(dict(zip(found.tolist(), numbers.tolist(), strict=True)))
 
 
-def _describe_points(path: Path, header: LasHeader, is_ours: bool) -> dict[str, Any]:
+def _describe_points(path: Path, header: las.LasHeader, is_ours: bool) -> dict[str, Any]:
     """Sums over all points; counts of echoes only of a cloud with provenance, whose flags are known to be ours."""
     totals = _Totals()
     with CloudReader(path, np.dtype([("flags", "<u2")])) as reader:
@@ -207,7 +196,7 @@ def _describe_points(path: Path, header: LasHeader, is_ours: bool) -> dict[str, 
     }
 
 
-def _describe_time(header: LasHeader, found: tuple[float, float] | None) -> dict[str, Any] | None:
+def _describe_time(header: las.LasHeader, found: tuple[float, float] | None) -> dict[str, Any] | None:
     """First and last GPS time, its kind, and the dates; None for a point format without times."""
     if found is None:
         return None

@@ -1,1 +1,1 @@
-"""What all commands have in common as a program: help, manual pages, version, settings, log file, progress."""
+"""What all commands have in common as a program: help, manual pages, version, settings."""

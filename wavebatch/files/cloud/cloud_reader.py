@@ -22,17 +22,8 @@ from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_names import STYLES, find_written, name_standard, read_field, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.disk.raw_bytes import Closing, widen_integers
+from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
-from wavebatch.files.las.header import (
-    ANGLE_UNIT,
-    STANDARD_DTYPES,
-    ExtraRecord,
-    field_names,
-    list_dimensions,
-    read_angles,
-    read_classes,
-    split_numbers,
-)
 from wavebatch.files.las.read_points import open_points, read_checked_header
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
@@ -129,7 +120,7 @@ class CloudReader(Closing):
         self.unit = name_units(units)
         self.bounds = checked.header.mins, checked.header.maxs
         self.point_format: int = checked.header.point_format
-        fields = field_names(STANDARD_DTYPES[self.point_format])
+        fields = las.field_names(las.STANDARD_DTYPES[self.point_format])
         self.has_gps_time = "gps_time" in fields
         self.has_packets = "wavepacket_index" in fields
         self.extra = {field: record for field, record in checked.extra.items() if not record.dtype.shape}
@@ -139,8 +130,8 @@ class CloudReader(Closing):
         self.written = {column: name for column, name in written.items() if _may_hold(self.extra[name], column)}
         """The file's name of each wavebatch column, by its provenance; empty without one. Columns that another
         program has stored as several numbers, or flags as signed ones, are none."""
-        self._sources = self._find_ours((*field_names(dtype), "echo_flags"))
-        self.columns = tuple(name for name in field_names(dtype) if name in self._sources)
+        self._sources = self._find_ours((*las.field_names(dtype), "echo_flags"))
+        self.columns = tuple(name for name in las.field_names(dtype) if name in self._sources)
         """The wavebatch columns among the fields that the cloud has."""
         self.has_flags = "echo_flags" in self._sources
         self.records = np.empty(0)
@@ -181,7 +172,7 @@ class CloudReader(Closing):
         standard = {
             "x": lambda raw: read_field(raw, self.point_format, "x", self._header),
             "y": lambda raw: read_field(raw, self.point_format, "y", self._header),
-            "classification": read_classes,
+            "classification": las.read_classes,
             **({"echo_flags": self.read_flags} if self.has_flags else {}),
         }
         return chosen.plan(standard, self.find_value, str(self.path))
@@ -209,7 +200,7 @@ class CloudReader(Closing):
 
     def list_columns(self) -> list[str]:
         """Return the names of all columns of the file."""
-        standard = [name for name in list_dimensions(self.point_format) if name not in ("X", "Y", "Z")]
+        standard = [name for name in las.list_dimensions(self.point_format) if name not in ("X", "Y", "Z")]
         return [*self.extra, "x", "y", "z", *standard]
 
     def find_value(self, column: str) -> ReadColumn:
@@ -232,12 +223,12 @@ class CloudReader(Closing):
         if column in self.extra:
             return self._describe_extra(column), lambda raw: self.read_extra(raw, column)
         if column in known:
-            fields = STANDARD_DTYPES[self.point_format]
-            step = 0.0 if column in field_names(fields) and fields[column].kind == "f" else 1.0
+            fields = las.STANDARD_DTYPES[self.point_format]
+            step = 0.0 if column in las.field_names(fields) and fields[column].kind == "f" else 1.0
             if column in "xyz":
                 step = abs(float(self.scales["xyz".index(column)]))
             elif column == "scan_angle":
-                step = ANGLE_UNIT
+                step = las.ANGLE_UNIT
             facts = ColumnFacts(column, _UNITS.get(column, "-"), "", step, is_standard=True)
             return facts, lambda raw: read_field(raw, self.point_format, column, self._header)
         missing = resolve(wanted, {name: name for name in COLUMNS})
@@ -264,10 +255,10 @@ class CloudReader(Closing):
         return ColumnFacts(field, unit, meaning, step, self._sources.get("echo_flags") == field)
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
-        if "ray" in field_names(self.dtype) and self.has_packets:
+        if "ray" in las.field_names(self.dtype) and self.has_packets:
             raw = raw[raw["wavepacket_index"] != 0]
         rows = np.zeros(len(raw), self.dtype)
-        for name in field_names(self.dtype):
+        for name in las.field_names(self.dtype):
             values = self._read_named(raw, name)
             if values is not None:
                 rows[name] = values
@@ -286,11 +277,11 @@ class CloudReader(Closing):
         readers = {
             "xyz": lambda: np.stack([read_field(raw, self.point_format, axis, self) for axis in "xyz"], axis=1),
             "flags": lambda: self.read_flags(raw),
-            "number": lambda: split_numbers(raw)[0],
-            "total": lambda: split_numbers(raw)[1],
-            "classification": lambda: read_classes(raw),
+            "number": lambda: las.split_numbers(raw)[0],
+            "total": lambda: las.split_numbers(raw)[1],
+            "classification": lambda: las.read_classes(raw),
             "intensity": lambda: raw["intensity"],
-            "scan_angle": lambda: read_angles(raw),
+            "scan_angle": lambda: las.read_angles(raw),
             "source": lambda: raw["point_source_id"],
         }
         return readers[name]() if name in readers else None
@@ -330,7 +321,7 @@ class ColumnReader(CloudReader):
         return rows
 
 
-def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> dict[str, str]:
+def find_columns(extra: Mapping[str, las.ExtraRecord], columns: Iterable[str]) -> dict[str, str]:
     """Return the field of each column that the cloud has, by the names of its extra dimensions alone.
 
     For clouds without provenance, which other programs may drop. wavebatch's name is preferred to those of
@@ -350,7 +341,7 @@ def find_columns(extra: Mapping[str, ExtraRecord], columns: Iterable[str]) -> di
     return found
 
 
-def _may_hold(record: ExtraRecord, column: str) -> bool:
+def _may_hold(record: las.ExtraRecord, column: str) -> bool:
     """Whether numbers of a dimension may be a column: flags are unsigned integers."""
     return column != "echo_flags" or record.dtype.kind == "u"
 
@@ -439,7 +430,7 @@ class _TableReader(ColumnReader):
             return np.dtype(np.float64)
         record = self.extra.get(stored)
         if record is None:
-            fields: Mapping[str, Any] = STANDARD_DTYPES[self.point_format].fields or {}
+            fields: Mapping[str, Any] = las.STANDARD_DTYPES[self.point_format].fields or {}
             return fields[stored][0] if stored in fields else np.dtype(np.uint8)  # a part of a field
         kept = record.scaling is None and (record.dtype.kind == "f" or record.no_data is None)
         return record.dtype if kept else np.dtype(np.float64)

@@ -22,20 +22,13 @@ from wavebatch.core.echoes import COLUMNS, Column
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.disk.raw_bytes import widen_integers
-from wavebatch.files.las.header import (
-    STANDARD_DTYPES,
-    ExtraRecord,
-    LasHeader,
-    field_names,
-    list_dimensions,
-    read_angles,
-)
+from wavebatch.files.las import header as las
 
 USER_ID = "wavebatch"
 """User id of the records."""
 
 
-def read_provenance(header: LasHeader) -> list[dict[str, Any]]:
+def read_provenance(header: las.LasHeader) -> list[dict[str, Any]]:
     """Return the runs that made a cloud, by its header, oldest first; empty for a file that is not of wavebatch."""
     records = sorted((vlr for vlr in header.vlrs if vlr.user == USER_ID), key=lambda vlr: vlr.record_id)
     runs = []
@@ -49,7 +42,7 @@ def read_provenance(header: LasHeader) -> list[dict[str, Any]]:
     return runs
 
 
-def find_written(header: LasHeader, extra: Collection[str]) -> dict[str, str]:
+def find_written(header: las.LasHeader, extra: Collection[str]) -> dict[str, str]:
     """Return the file's name of each wavebatch column, by the latest run.
 
     extra: names of the extra dimensions of the file. Another program may have renamed or left out some since then; if
@@ -141,8 +134,8 @@ _SHORT = {
 
 _STANDARD = frozenset(
     re.sub("[_ ]", "", name.casefold())
-    for number in STANDARD_DTYPES
-    for name in (*list_dimensions(number), *field_names(STANDARD_DTYPES[number]))
+    for number in las.STANDARD_DTYPES
+    for name in (*las.list_dimensions(number), *las.field_names(las.STANDARD_DTYPES[number]))
 )
 """Normalised names of the standard LAS dimensions."""
 
@@ -153,7 +146,7 @@ class WrittenColumn:
 
     column: str
     """Name in COLUMNS."""
-    record: ExtraRecord
+    record: las.ExtraRecord
     naming: Naming
 
     def encode(self, values: np.ndarray) -> np.ndarray:
@@ -205,7 +198,7 @@ def name_standard(point_format: int) -> dict[str, str]:
 
     The scan angle also has the name that other point formats give it.
     """
-    names = ("x", "y", "z", *(name for name in list_dimensions(point_format) if name not in ("X", "Y", "Z")))
+    names = ("x", "y", "z", *(name for name in las.list_dimensions(point_format) if name not in ("X", "Y", "Z")))
     angle = next(name for name in names if name in ("scan_angle", "scan_angle_rank"))
     return {**{name: name for name in names}, "scan_angle": angle, "scan_angle_rank": angle}
 
@@ -226,7 +219,7 @@ def read_field(raw: np.ndarray, point_format: int, name: str, placing: Placing) 
         axis = "xyz".index(name)
         return raw[name.upper()] * placing.scales[axis] + placing.offsets[axis]
     if name.startswith("scan_angle"):
-        return read_angles(raw)
+        return las.read_angles(raw)
     import laspy
 
     values = widen_integers(np.asarray(laspy.PackedPointRecord(raw, laspy.PointFormat(point_format))[name]))
@@ -276,7 +269,7 @@ def style_columns(
         empty = column.no_data if naming.no_data is None else naming.no_data
         if empty is not None and np.dtype(dtype).kind == "f":
             empty = NO_DATA[no_data]
-        record = ExtraRecord.build(name, dtype, describe(column, naming.unit), no_data=empty, scale=naming.scale)
+        record = las.ExtraRecord.build(name, dtype, describe(column, naming.unit), no_data=empty, scale=naming.scale)
         written.append(WrittenColumn(key, record, naming))
     return written
 

@@ -31,36 +31,8 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.column_names import USER_ID, WrittenColumn, style_columns
 from wavebatch.files.disk.publish import Draft, protecting, reporting
+from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import convert_geotiff, repair_evlr, repair_records
-from wavebatch.files.las.header import (
-    EVLR_HEADER_SIZE,
-    EXTRA_BYTES_RECORD_ID,
-    GEOTIFF_ID,
-    MAX_EVLRS,
-    MODERN,
-    PROJECTION,
-    SOFTWARE,
-    STANDARD_DTYPES,
-    WAVEFORM_RECORD_ID,
-    WAVES_EXTERNAL,
-    WAVES_INTERNAL,
-    WKT_BIT,
-    WKT_ID,
-    Evlr,
-    ExtraRecord,
-    LasHeader,
-    Vlr,
-    build_dtype,
-    build_wkt,
-    choose_format,
-    choose_no_data,
-    copy_standard,
-    decode_text,
-    field_names,
-    find_evlrs,
-    has_record,
-    tell_apart,
-)
 from wavebatch.files.las.read_points import CheckedHeader
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
 from wavebatch.files.strip.packets import PacketPlace, StripFacts
@@ -81,7 +53,7 @@ class Version:
     """Lines for the user."""
 
 
-def choose_version(path: Path, header: LasHeader, wanted: str, point_format: int | None, keep: bool) -> Version:
+def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format: int | None, keep: bool) -> Version:
     """Return version and point format of the cloud of a strip.
 
     wanted: one of LAS_VERSIONS. point_format: that which the user wants, or None. keep: packets are kept, and with them
@@ -90,15 +62,15 @@ def choose_version(path: Path, header: LasHeader, wanted: str, point_format: int
     """
     if wanted not in LAS_VERSIONS:
         raise ConfigError(f"las_version {wanted!r}: must be one of {', '.join(LAS_VERSIONS)}")
-    target = choose_format(path, header, point_format, keep)
+    target = las.choose_format(path, header, point_format, keep)
     if wanted == "1.3":
         return _as_1_3(path, header, target)
-    evlrs, _ = find_evlrs(path, header)
+    evlrs, _ = las.find_evlrs(path, header)
     records: list[Any] = [*header.vlrs, *evlrs]
-    only_keys = has_record(records, PROJECTION, GEOTIFF_ID) and not has_record(records, PROJECTION, WKT_ID)
+    only_keys = _tell_crs(records) == (False, True)
     repaired, notes = _repair(path, header, evlrs)
     if wanted == "1.4" and point_format is None and not keep:
-        modern = MODERN.get(target, target)
+        modern = las.MODERN.get(target, target)
         wkt = convert_geotiff(path, header.vlrs, asked=False) if only_keys else None
         if only_keys and wkt is None:
             return Version(max(header.version, (1, 4)), target, notes=(_explain_keys(target, modern), *notes))
@@ -116,7 +88,7 @@ _REPAIRED = (
 )
 
 
-def _repair(path: Path, header: LasHeader, evlrs: Sequence[Evlr] = ()) -> tuple[str | None, tuple[str, ...]]:
+def _repair(path: Path, header: las.LasHeader, evlrs: Sequence[las.Evlr] = ()) -> tuple[str | None, tuple[str, ...]]:
     """The repaired WKT of the header, None where it is right or not there, and the line for the user.
 
     The writer of the cloud repairs extended records as it copies them; the line is for them too.
@@ -136,17 +108,23 @@ def _explain_keys(target: int, modern: int) -> str:
     return f"{reason}: PDAL will not read the cloud unless readers.las gets nosrs=true; add a WKT record to the strip"
 
 
-def _as_1_3(path: Path, header: LasHeader, target: int) -> Version:
+def _tell_crs(records: Sequence[Any]) -> tuple[bool, bool]:
+    """Whether records, extended or not, have the CRS as WKT, and as GeoTIFF keys."""
+    has = (las.has_record(records, las.PROJECTION, number) for number in (las.WKT_ID, las.GEOTIFF_ID))
+    return next(has), next(has)
+
+
+def _as_1_3(path: Path, header: las.LasHeader, target: int) -> Version:
     """LAS 1.3, if it can hold all that the strip has."""
     if target >= 6:
         needed = header.point_format >= 6
         what = "leave --las-version out" if needed else "leave one of the two out"
         reason = f", and the strip's points of format {header.point_format} fit into no other" if needed else ""
         raise ConfigError(f"{path}: --las-version 1.3 has no point format {target}{reason}; {what}")
-    evlrs, _ = find_evlrs(path, header)
-    if any(evlr.record_id != WAVEFORM_RECORD_ID for evlr in evlrs):
+    evlrs, _ = las.find_evlrs(path, header)
+    if any(evlr.record_id != las.WAVEFORM_RECORD_ID for evlr in evlrs):
         raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")
-    if has_record(header.vlrs, PROJECTION, WKT_ID) and not has_record(header.vlrs, PROJECTION, GEOTIFF_ID):
+    if _tell_crs(header.vlrs) == (True, False):
         raise InputError(f"{path}: its CRS is given as WKT, which LAS 1.3 does not have; leave --las-version out")
     repaired, notes = _repair(path, header)
     return Version((1, 3), target, repaired, notes)
@@ -156,7 +134,7 @@ def _as_1_3(path: Path, header: LasHeader, target: int) -> Version:
 class Carried:
     """An extra dimension of the input that is copied to the output."""
 
-    record: ExtraRecord
+    record: las.ExtraRecord
     source: int
     """Byte offset in the input record; the output's dtype has the offset there."""
     copied: bool = False
@@ -168,11 +146,11 @@ def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[Carried, ...]:
 
     whole: every output row comes from an input point, so no value for "no data" is needed.
     """
-    at = STANDARD_DTYPES[checked.header.point_format].itemsize
+    at = las.STANDARD_DTYPES[checked.header.point_format].itemsize
     carried = []
     readable = [record.with_readable_texts() for record in checked.records]
-    for record in tell_apart(readable, checked.header.point_format):
-        empty = None if whole else choose_no_data(record)
+    for record in las.tell_apart(readable, checked.header.point_format):
+        empty = None if whole else las.choose_no_data(record)
         marked = record if empty is None else record.with_no_data(empty)
         carried.append(Carried(marked, at, copied=not whole and empty is None))
         at += record.dtype.itemsize
@@ -212,14 +190,14 @@ class OutputLayout:
         return 15 if self.point_format >= 6 else 7
 
     @property
-    def extra_records(self) -> tuple[ExtraRecord, ...]:
+    def extra_records(self) -> tuple[las.ExtraRecord, ...]:
         """Records of all extra dimensions of the output, in order."""
         return (*(carried.record for carried in self.carried), *(column.record for column in self.written))
 
     @property
     def extra_fields(self) -> tuple[str, ...]:
         """Names of the fields of `dtype` with extra dimensions, in order."""
-        names = field_names(self.dtype)
+        names = las.field_names(self.dtype)
         return names[len(names) - len(self.carried) - len(self.written) :]
 
     def rows(
@@ -261,7 +239,7 @@ class OutputLayout:
         """
         columns = columns or {}
         rows = np.zeros(len(source), self.dtype)
-        copy_standard(np.ascontiguousarray(source), rows, self.source.header.point_format, self.point_format)
+        las.copy_standard(np.ascontiguousarray(source), rows, self.source.header.point_format, self.point_format)
         if xyz is not None and len(rows):
             self._set_coordinates(rows, np.asarray(xyz, np.float64))
         self._set_returns(rows, return_number, number_of_returns)
@@ -384,7 +362,7 @@ def plan_output(
     carried = plan_carried(checked, points == "returns")
     written = style_columns(columns, names, [entry.record.name for entry in carried], no_data)
     records = [*(entry.record for entry in carried), *(entry.record for entry in written)]
-    dtype = build_dtype(chosen.point_format, records)
+    dtype = las.build_dtype(chosen.point_format, records)
     if dtype.itemsize > 65535:
         raise InputError(f"{path}: its extra bytes leave no room for the columns in a 65535-byte record; choose fewer")
     if packets is not None and packets.packets.file is None:
@@ -444,9 +422,9 @@ class CloudWriter(PointFile):
     def _append_records(self) -> None:
         with reporting(self._layout.source.path), open(self._layout.source.path, "rb") as source:
             for evlr in self._evlrs:
-                start = evlr.start + EVLR_HEADER_SIZE
+                start = evlr.start + las.EVLR_HEADER_SIZE
                 source.seek(evlr.start)
-                head = source.read(EVLR_HEADER_SIZE)
+                head = source.read(las.EVLR_HEADER_SIZE)
                 head = head[:2] + _as_text(head[2:18]) + head[18:28] + _as_text(head[28:])
                 repaired = repair_evlr(self._layout.source.path, evlr)
                 if repaired is None:
@@ -470,44 +448,44 @@ class CloudWriter(PointFile):
             copy_bytes(source, packets.start, packets.end, draft.file)
 
 
-def _choose_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], dict[str, str]]:
+def _choose_evlrs(path: Path, header: las.LasHeader) -> tuple[list[las.Evlr], dict[str, str]]:
     """Extended records to copy, and the names of the others with the reason."""
-    found, missing = find_evlrs(path, header)
-    kept: list[Evlr] = []
+    found, missing = las.find_evlrs(path, header)
+    kept: list[las.Evlr] = []
     dropped: dict[str, str] = {}
     for evlr in found:
         name = f"EVLR {evlr.user} {evlr.record_id}"
-        is_waveforms = evlr.user.startswith("LAS") and evlr.record_id == WAVEFORM_RECORD_ID
+        is_waveforms = evlr.user.startswith("LAS") and evlr.record_id == las.WAVEFORM_RECORD_ID
         if is_waveforms or evlr.start == header.waveform_start:
             continue
         if evlr.user == "copc":
             dropped[name] = "the output is not a COPC file"
-        elif has_record([evlr], "LASF_Spec", EXTRA_BYTES_RECORD_ID):
+        elif las.has_record([evlr], "LASF_Spec", las.EXTRA_BYTES_RECORD_ID):
             dropped[name] = "extra bytes are described in the header"
         else:
             kept.append(evlr)
     if missing:
-        dropped[f"{missing} EVLRs"] = f"they lie outside the file, or after the first {MAX_EVLRS}"
+        dropped[f"{missing} EVLRs"] = f"they lie outside the file, or after the first {las.MAX_EVLRS}"
     return kept, dropped
 
 
-def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: list[Evlr]) -> LasHeader:
+def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: list[las.Evlr]) -> las.LasHeader:
     source = layout.source.header
     vlrs = [vlr for vlr in source.vlrs if _is_carried(vlr, layout)]
     earlier = sum(vlr.user == USER_ID for vlr in vlrs)
     if layout.wkt is not None:
-        vlrs = [vlr for vlr in vlrs if not has_record([vlr], PROJECTION, WKT_ID)]
-        vlrs.append(build_wkt(layout.wkt))
+        vlrs = [vlr for vlr in vlrs if not las.has_record([vlr], las.PROJECTION, las.WKT_ID)]
+        vlrs.append(las.build_wkt(layout.wkt))
     vlrs.append(_encode_provenance(layout, provenance, earlier + 1))
-    encoding = source.global_encoding & ~(WAVES_INTERNAL | WAVES_EXTERNAL)
+    encoding = source.global_encoding & ~(las.WAVES_INTERNAL | las.WAVES_EXTERNAL)
     if layout.packets is not None:
-        encoding |= WAVES_INTERNAL if layout.packets.internal else WAVES_EXTERNAL
-    has_wkt, has_keys = has_record([*vlrs, *evlrs], PROJECTION, WKT_ID), has_record(vlrs, PROJECTION, GEOTIFF_ID)
+        encoding |= las.WAVES_INTERNAL if layout.packets.internal else las.WAVES_EXTERNAL
+    has_wkt, has_keys = _tell_crs([*vlrs, *evlrs])[0], _tell_crs(vlrs)[1]
     if layout.version < (1, 4):
-        encoding &= ~WKT_BIT  # a reserved bit there
+        encoding &= ~las.WKT_BIT  # a reserved bit there
     elif not has_keys and (has_wkt or layout.point_format >= 6) or has_wkt and layout.point_format >= 6:
-        encoding |= WKT_BIT
-    return LasHeader(
+        encoding |= las.WKT_BIT
+    return las.LasHeader(
         version=layout.version,
         point_format=layout.point_format,
         point_length=layout.dtype.itemsize,
@@ -520,13 +498,13 @@ def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: li
         global_encoding=encoding,
         project_id=source.project_id,
         system_identifier=b"MODIFICATION",
-        generating_software=SOFTWARE,
+        generating_software=las.SOFTWARE,
         creation=source.creation,
         gps_offset=source.gps_offset,
     )
 
 
-def _clean_ids(vlrs: list[Vlr]) -> list[str]:
+def _clean_ids(vlrs: list[las.Vlr]) -> list[str]:
     """Make ids and descriptions UTF-8, in place, and name the records: laspy opens no file with others."""
     changed = []
     for place, vlr in enumerate(vlrs):
@@ -547,7 +525,7 @@ def _as_text(field: bytes) -> bytes:
     return field
 
 
-def _is_carried(vlr: Vlr, layout: OutputLayout) -> bool:
+def _is_carried(vlr: las.Vlr, layout: OutputLayout) -> bool:
     if vlr.user == "copc":
         return False
     descriptor = vlr.user.startswith("LAS") and vlr.user.endswith("_Spec") and vlr.record_id in _DESCRIPTORS
@@ -559,13 +537,13 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else str(value)
 
 
-def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], number: int) -> Vlr:
+def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], number: int) -> las.Vlr:
     """JSON with sorted keys and no time of day; it also keeps which program wrote the input, and names the columns.
 
     What a VLR cannot hold, for example the pulses of 180 digitizers, is left out and named; the report has it.
     """
     path, source = layout.source.path, layout.source.header
-    made_by = {key: decode_text(getattr(source, key)) for key in ("system_identifier", "generating_software")}
+    made_by = {key: las.decode_text(getattr(source, key)) for key in ("system_identifier", "generating_software")}
     columns = {written.column: written.record.name for written in layout.written}
     whole = {"wavebatch": __version__, "input_header": made_by, "columns": columns, **provenance}
     payload = _encode_json(whole)
@@ -575,7 +553,7 @@ def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], numb
         raise ConfigError(
             f"{path}: the provenance takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}"
         )
-    return Vlr(USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
+    return las.Vlr(USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
 
 
 def _encode_json(value: Any) -> bytes:

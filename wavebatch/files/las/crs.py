@@ -30,18 +30,7 @@ from typing import NamedTuple
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.optional import advise_install
-from wavebatch.files.las.header import (
-    EVLR_HEADER_SIZE,
-    GEOTIFF_ID,
-    WKT_ID,
-    Evlr,
-    LasHeader,
-    Vlr,
-    build_wkt,
-    find_evlrs,
-    is_projection,
-    read_header,
-)
+from wavebatch.files.las import header as las
 
 DOUBLES_ID = 34736
 
@@ -144,9 +133,9 @@ class GeoKeys:
         return size if math.isfinite(size) and size > 0 else math.nan
 
 
-def find_code(vlrs: Iterable[Vlr]) -> int | None:
+def find_code(vlrs: Iterable[las.Vlr]) -> int | None:
     """Return the `sure_code` of the GeoTIFF keys in the records of a header."""
-    directory = next((v.payload for v in vlrs if is_projection(v) and v.record_id == GEOTIFF_ID), b"")
+    directory = next((v.payload for v in vlrs if las.is_projection(v) and v.record_id == las.GEOTIFF_ID), b"")
     return GeoKeys.parse(directory).sure_code
 
 
@@ -235,7 +224,7 @@ _UTM = (
 """EPSG codes of UTM zones, the code of zone 0, the hemisphere and the datum."""
 
 
-def convert_geotiff(path: Path, vlrs: Iterable[Vlr], *, asked: bool) -> str | None:
+def convert_geotiff(path: Path, vlrs: Iterable[las.Vlr], *, asked: bool) -> str | None:
     """Return the WKT of the CRS in the GeoTIFF keys of `vlrs`; None where it cannot be converted surely.
 
     asked: the user wants a format that needs WKT, so pyproj is used where wavebatch does not know the CRS.
@@ -369,17 +358,17 @@ def _is_one(number: str) -> bool:
         return False
 
 
-def repair_records(vlrs: Iterable[Vlr]) -> list[Vlr]:
+def repair_records(vlrs: Iterable[las.Vlr]) -> list[las.Vlr]:
     """Return the records with the WKT among them as `repair_wkt` gives it; records that are right stay as they are."""
     found = []
     for vlr in vlrs:
-        wrong = is_projection(vlr) and vlr.record_id == WKT_ID
+        wrong = las.is_projection(vlr) and vlr.record_id == las.WKT_ID
         text = _repair_payload(vlr.payload) if wrong else None
-        found.append(vlr if text is None else build_wkt(text))
+        found.append(vlr if text is None else las.build_wkt(text))
     return found
 
 
-def repair_evlr(path: Path, evlr: Evlr) -> bytes | None:
+def repair_evlr(path: Path, evlr: las.Evlr) -> bytes | None:
     """Return the payload of an extended record with the WKT as `repair_wkt` gives it.
 
     Parameters
@@ -393,12 +382,12 @@ def repair_evlr(path: Path, evlr: Evlr) -> bytes | None:
     bytes or None
         None where the record is right, or no WKT.
     """
-    if not is_projection(evlr) or evlr.record_id != WKT_ID or evlr.length > LONGEST_WKT:
+    if not las.is_projection(evlr) or evlr.record_id != las.WKT_ID or evlr.length > LONGEST_WKT:
         return None
     with open(path, "rb") as file:
-        file.seek(evlr.start + EVLR_HEADER_SIZE)
+        file.seek(evlr.start + las.EVLR_HEADER_SIZE)
         text = _repair_payload(file.read(evlr.length))
-    return None if text is None else build_wkt(text).payload
+    return None if text is None else las.build_wkt(text).payload
 
 
 def _repair_payload(payload: bytes) -> str | None:
@@ -409,7 +398,7 @@ def _repair_payload(payload: bytes) -> str | None:
 
 
 CITATION_ID = 34737
-_IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
+_IDS = (las.WKT_ID, las.GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
 
 _SHORT = {"metres": "m", "international feet": "ft", "US survey feet": "us-ft"}
 """Units of pictures and tables."""
@@ -499,19 +488,19 @@ def _name_unit(metres: float | None) -> str:
     return f"units of {metres:.10g} m" if math.isfinite(metres) else "an unknown unit"
 
 
-def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits, ...]]:
+def read_crs(path: Path, header: las.LasHeader) -> tuple[str | None, tuple[CrsUnits, ...]]:
     """Return the WKT of a strip, else code or name of its GeoTIFF keys, else None, and the units that each gives.
 
     Where none gives a kind or a unit, coordinates that are geocentric by their size are one more entry.
     """
     records = _read_records(path, header)
     units, text = [], None
-    if WKT_ID in records:
-        text = records[WKT_ID].split(b"\0")[0].decode("utf-8", "replace") or None
+    if las.WKT_ID in records:
+        text = records[las.WKT_ID].split(b"\0")[0].decode("utf-8", "replace") or None
         units.append(parse_wkt(text or ""))
-    if GEOTIFF_ID in records:
+    if las.GEOTIFF_ID in records:
         citation = records.get(CITATION_ID, b"").split(b"\0")[0].decode("latin-1").strip("| ")
-        keys = GeoKeys.parse(records[GEOTIFF_ID], records.get(DOUBLES_ID, b""), records.get(CITATION_ID, b""))
+        keys = GeoKeys.parse(records[las.GEOTIFF_ID], records.get(DOUBLES_ID, b""), records.get(CITATION_ID, b""))
         text = text or keys.name or (f"GeoTIFF: {citation}" if citation else "GeoTIFF keys")
         units.append(CrsUnits(keys.kind, *keys.read_units()))
     if all(unit == CrsUnits() for unit in units) and looks_geocentric(header.mins, header.maxs):
@@ -519,7 +508,7 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
     return text, tuple(units)
 
 
-def read_crs_definition(path: Path, header: LasHeader, *, heights: bool = False) -> str | None:
+def read_crs_definition(path: Path, header: las.LasHeader, *, heights: bool = False) -> str | None:
     """Return the CRS of a file as GIS libraries take it: its WKT, else `EPSG:n` from its GeoTIFF keys, else None.
 
     The WKT is that of `repair_wkt`. heights: with the code of the heights, `EPSG:n+m`; rasters have no place for it.
@@ -533,15 +522,15 @@ def read_crs_definition(path: Path, header: LasHeader, *, heights: bool = False)
     return f"EPSG:{code}" if code else None
 
 
-def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
+def _read_records(path: Path, header: las.LasHeader) -> dict[int, bytes]:
     """Payloads of the CRS records by number; VLRs of the header come before EVLRs after the points."""
-    found = {vlr.record_id: vlr.payload for vlr in header.vlrs if is_projection(vlr)}
-    evlrs, _ = find_evlrs(path, header)
+    found = {vlr.record_id: vlr.payload for vlr in header.vlrs if las.is_projection(vlr)}
+    evlrs, _ = las.find_evlrs(path, header)
     for evlr in evlrs:
-        new = is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in found
+        new = las.is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in found
         if new and evlr.length <= LONGEST_WKT:
             with open(path, "rb") as file:
-                file.seek(evlr.start + EVLR_HEADER_SIZE)
+                file.seek(evlr.start + las.EVLR_HEADER_SIZE)
                 found[evlr.record_id] = file.read(evlr.length)
     return found
 
@@ -611,7 +600,7 @@ class CrsWords(NamedTuple):
 
 def describe_crs(path: Path) -> CrsWords:
     """Return the words for a file's CRS; raises InputError for a file that is not LAS."""
-    header = read_header(path)
+    header = las.read_header(path)
     text, units = read_crs(path, header)
     kinds = {one.kind for one in units}
     along, _, up = (_SHORT.get(_name_unit(metres), "units") for metres in metres_per_unit(units))

@@ -21,20 +21,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_panics, read_exactly, reading
-from wavebatch.files.las.header import (
-    EVLR_HEADER_SIZE,
-    EXTRA_BYTES_RECORD_ID,
-    STANDARD_DTYPES,
-    WAVES_EXTERNAL,
-    WAVES_INTERNAL,
-    ExtraRecord,
-    LasHeader,
-    build_dtype,
-    field_names,
-    has_record,
-    read_header,
-    read_records,
-)
+from wavebatch.files.las import header as las
 
 WAVEFORM_FORMATS = (4, 5, 9, 10)
 LEAST_SCALE, LARGEST_SCALE, LARGEST_OFFSET = 1e-12, 1e6, 1e12
@@ -48,10 +35,10 @@ class CheckedHeader:
     path: Path
     size: int
     """Bytes of the file."""
-    header: LasHeader
+    header: las.LasHeader
     dtype: np.dtype
     """One point record with laspy's field names, extra bytes included."""
-    records: tuple[ExtraRecord, ...]
+    records: tuple[las.ExtraRecord, ...]
     points_end: int
     """Byte at which the points end: exact for LAS; for LAZ the start of what follows them."""
     warnings: tuple[str, ...]
@@ -62,9 +49,9 @@ class CheckedHeader:
         return "{}.{}".format(*self.header.version)
 
     @property
-    def extra(self) -> dict[str, ExtraRecord]:
+    def extra(self) -> dict[str, las.ExtraRecord]:
         """The record of each extra dimension by its field of `dtype`, in order."""
-        names = field_names(self.dtype)
+        names = las.field_names(self.dtype)
         return dict(zip(names[len(names) - len(self.records) :], self.records, strict=True))
 
 
@@ -74,29 +61,29 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     waveforms: False accepts any LAS or LAZ file, of any version and point format.
     Raises InputError if it is not a LAS or LAZ file with waveforms, or contradicts itself.
     """
-    header = read_header(path, (1, 3) if waveforms else (1, 0))
+    header = las.read_header(path, (1, 3) if waveforms else (1, 0))
     if waveforms:
         _check_waveforms(path, header)
     _check_format(path, header)
     for axis, scale, offset in zip("xyz", header.scales, header.offsets, strict=True):
         if not (LEAST_SCALE <= abs(scale) <= LARGEST_SCALE and abs(offset) <= LARGEST_OFFSET):
             raise damaged(path, f"scale {scale} and offset {offset} of {axis} give no usable coordinates")
-    payloads = [vlr.payload for vlr in header.vlrs if has_record([vlr], "LASF_Spec", EXTRA_BYTES_RECORD_ID)]
-    extra = header.point_length - STANDARD_DTYPES[header.point_format].itemsize
-    records = tuple(read_records(payloads[0] if payloads else b"", extra))
-    dtype = build_dtype(header.point_format, records)
+    payloads = [vlr.payload for vlr in header.vlrs if las.has_record([vlr], "LASF_Spec", las.EXTRA_BYTES_RECORD_ID)]
+    extra = header.point_length - las.STANDARD_DTYPES[header.point_format].itemsize
+    records = tuple(las.read_records(payloads[0] if payloads else b"", extra))
+    dtype = las.build_dtype(header.point_format, records)
     points_end = _find_points_end(path, header)
     return CheckedHeader(path, header.file_size, header, dtype, records, points_end, _find_warnings(header))
 
 
-def _check_waveforms(path: Path, header: LasHeader) -> None:
+def _check_waveforms(path: Path, header: las.LasHeader) -> None:
     number = header.point_format
     if any(vlr.user == "lascompatible" for vlr in header.vlrs):
         restore = f"laszip -i {path.name} -o {path.stem}_restored.las"
         raise InputError(f"{path}: written in LAStools' LAS 1.4 compatibility mode; restore it first: {restore}")
     if number not in WAVEFORM_FORMATS:
         raise InputError(f"{path}: point format {number} has no waveforms; wavebatch needs format 4, 5, 9 or 10")
-    both = WAVES_INTERNAL | WAVES_EXTERNAL
+    both = las.WAVES_INTERNAL | las.WAVES_EXTERNAL
     if header.global_encoding & both == both:
         raise InputError(
             f"{path}: the header claims packets both in the file and in a .wdp (global encoding bits 1 and 2); clear "
@@ -104,19 +91,19 @@ def _check_waveforms(path: Path, header: LasHeader) -> None:
         )
 
 
-def _check_format(path: Path, header: LasHeader) -> None:
+def _check_format(path: Path, header: las.LasHeader) -> None:
     number = header.point_format
-    if number not in STANDARD_DTYPES:
+    if number not in las.STANDARD_DTYPES:
         raise damaged(path, f"point format {number} is not known")
     if number >= 6 and header.version < (1, 4):
         major, minor = header.version
         raise damaged(path, f"point format {number} needs LAS 1.4, but the header has version {major}.{minor}")
-    least = STANDARD_DTYPES[number].itemsize
+    least = las.STANDARD_DTYPES[number].itemsize
     if header.point_length < least:
         raise damaged(path, f"point records of {header.point_length} bytes are too short for format {number} ({least})")
 
 
-def _find_warnings(header: LasHeader) -> tuple[str, ...]:
+def _find_warnings(header: las.LasHeader) -> tuple[str, ...]:
     legacy, count = header.counts
     if header.version < (1, 4) or not legacy or legacy == count:
         return ()
@@ -124,15 +111,15 @@ def _find_warnings(header: LasHeader) -> tuple[str, ...]:
     return (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
 
 
-def _find_points_end(path: Path, header: LasHeader) -> int:
+def _find_points_end(path: Path, header: las.LasHeader) -> int:
     """Byte at which the points end; raises InputError if the claimed points do not fit before what follows them."""
     start = header.offset_to_points
     room, limit = header.file_size, "it ends"
     followers = {"its EVLRs begin": header.evlr_start if header.evlr_count else 0}
-    if not header.global_encoding & WAVES_EXTERNAL:
+    if not header.global_encoding & las.WAVES_EXTERNAL:
         followers["its waveform record begins"] = header.waveform_start
     for what, at in followers.items():
-        if start <= at <= header.file_size - EVLR_HEADER_SIZE and at < room:
+        if start <= at <= header.file_size - las.EVLR_HEADER_SIZE and at < room:
             room, limit = at, what
     if header.compressed:
         return room
@@ -201,8 +188,8 @@ class _Coding(NamedTuple):
     """Layers of a chunk; 0 in point formats 0 to 5."""
 
 
-def _read_coding(path: Path, header: LasHeader) -> _Coding:
-    payload = next((vlr.payload for vlr in header.vlrs if has_record([vlr], LASZIP_USER, LASZIP_ID)), b"")
+def _read_coding(path: Path, header: las.LasHeader) -> _Coding:
+    payload = next((vlr.payload for vlr in header.vlrs if las.has_record([vlr], LASZIP_USER, LASZIP_ID)), b"")
     broken = damaged(path, 'its "laszip encoded" record is missing or wrong')
     if len(payload) < _LASZIP.size:
         raise broken

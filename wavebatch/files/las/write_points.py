@@ -25,17 +25,7 @@ from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
-from wavebatch.files.las.header import (
-    EXTRA_BYTES_RECORD_ID,
-    STANDARD_DTYPES,
-    WAVEFORM_RECORD_ID,
-    ExtraRecord,
-    LasHeader,
-    Vlr,
-    encode_evlr_header,
-    field_names,
-    has_record,
-)
+from wavebatch.files.las import header as las
 
 _WAVE_ITEM, _BROKEN_VERSION, _READABLE_VERSION = 9, 2, 1
 CHUNK_POINTS = 50_000
@@ -78,7 +68,7 @@ def compress_rows(rows: np.ndarray, point_format: int) -> Chunk:
 class PointEncoder:
     """Writes header, VLRs and records to the file as they are; `finish` ends the points and must be called once."""
 
-    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
+    def __init__(self, file: BinaryIO, header: las.LasHeader) -> None:
         self._file = file
         file.write(header.encode())
 
@@ -96,9 +86,9 @@ class PointEncoder:
 class _LazEncoder(PointEncoder):
     """Compresses records; adds the "laszip encoded" record to `header.vlrs`."""
 
-    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
+    def __init__(self, file: BinaryIO, header: las.LasHeader) -> None:
         self._format, self._coding = header.point_format, _encode_coding(header.point_format, header.point_length)
-        header.vlrs.append(Vlr(b"laszip encoded", 22204, self._coding, b"http://laszip.org"))
+        header.vlrs.append(las.Vlr(b"laszip encoded", 22204, self._coding, b"http://laszip.org"))
         super().__init__(file, header)
         self._start = file.tell()
         file.write(bytes(8))
@@ -147,7 +137,7 @@ def _check_channel(rows: np.ndarray) -> None:
 
 def _encode_coding(point_format: int, point_length: int) -> bytes:
     """The content of the "laszip encoded" record."""
-    extra = point_length - STANDARD_DTYPES[point_format].itemsize
+    extra = point_length - las.STANDARD_DTYPES[point_format].itemsize
     return _patch_wave_item(bytes(lazrs.LazVlr.new_for_compression(point_format, extra).record_data()))
 
 
@@ -162,7 +152,7 @@ def _patch_wave_item(payload: bytes) -> bytes:
 
 
 _COPY_SIZE = 1 << 22
-_EXTRA_BYTES = ("LASF_Spec", EXTRA_BYTES_RECORD_ID)
+_EXTRA_BYTES = ("LASF_Spec", las.EXTRA_BYTES_RECORD_ID)
 
 
 class PointFile(contextlib.AbstractContextManager):
@@ -177,9 +167,9 @@ class PointFile(contextlib.AbstractContextManager):
     def __init__(
         self,
         target: Path,
-        header: LasHeader,
+        header: las.LasHeader,
         dtype: np.dtype,
-        records: Sequence[ExtraRecord],
+        records: Sequence[las.ExtraRecord],
         *,
         overwrite: bool,
     ) -> None:
@@ -192,7 +182,7 @@ class PointFile(contextlib.AbstractContextManager):
             raise ConfigError(f"{self.target}: an output's name must end in .las or .laz")
         header.compressed = suffix == ".laz"
         header.point_length = dtype.itemsize
-        header.vlrs = [vlr for vlr in header.vlrs if not has_record([vlr], "laszip encoded", 22204)]
+        header.vlrs = [vlr for vlr in header.vlrs if not las.has_record([vlr], "laszip encoded", 22204)]
         self._place_extra_bytes()
         self._statistics = Statistics(dtype, self._records)
         refuse_existing(self.target, overwrite)
@@ -290,16 +280,16 @@ class PointFile(contextlib.AbstractContextManager):
         for draft in self.drafts:
             draft.discard()
 
-    def _place_extra_bytes(self, records: Sequence[ExtraRecord] | None = None) -> None:
+    def _place_extra_bytes(self, records: Sequence[las.ExtraRecord] | None = None) -> None:
         records = self._records if records is None else records
         vlrs = self._header.vlrs
-        old = next((vlr for vlr in vlrs if has_record([vlr], *_EXTRA_BYTES)), None)
-        self._header.vlrs = [vlr for vlr in vlrs if not has_record([vlr], *_EXTRA_BYTES)]
+        old = next((vlr for vlr in vlrs if las.has_record([vlr], *_EXTRA_BYTES)), None)
+        self._header.vlrs = [vlr for vlr in vlrs if not las.has_record([vlr], *_EXTRA_BYTES)]
         payload = b"".join(record.data for record in records)
         if len(payload) > 65535:
             raise InputError(f"{self.target}: a LAS file can describe at most 341 extra bytes, not {len(records)}")
         if records:
-            new = replace(old or Vlr(b"LASF_Spec", EXTRA_BYTES_RECORD_ID, b"", b"Extra bytes"), payload=payload)
+            new = replace(old or las.Vlr(b"LASF_Spec", las.EXTRA_BYTES_RECORD_ID, b"", b"Extra bytes"), payload=payload)
             self._header.vlrs.insert(vlrs.index(old) if old else len(vlrs), new)
 
     @contextlib.contextmanager
@@ -317,9 +307,9 @@ class PointFile(contextlib.AbstractContextManager):
 class Statistics:
     """Counts, bounds and extremes of all rows written, for the header and the extra-bytes records."""
 
-    def __init__(self, dtype: np.dtype, records: Sequence[ExtraRecord]) -> None:
+    def __init__(self, dtype: np.dtype, records: Sequence[las.ExtraRecord]) -> None:
         self.count = 0
-        names = field_names(dtype)
+        names = las.field_names(dtype)
         fields = names[len(names) - len(records) :]
         self._records = dict(zip(fields, records, strict=True))
         self._bits = np.zeros(256, np.int64)
@@ -359,7 +349,7 @@ class Statistics:
                 least, largest = self._extremes.get((name, element), (low, high))
                 self._extremes[name, element] = min(low, least), max(high, largest)
 
-    def fill(self, header: LasHeader) -> None:
+    def fill(self, header: las.LasHeader) -> None:
         """Set counts and bounds of the header; an empty file gets zeros."""
         header.point_count = self.count
         number = np.arange(256) & ((1 << self._format_bits) - 1)
@@ -375,11 +365,11 @@ class Statistics:
             least, largest = self._extremes.get(("gps_time", 0), (0.0, 0.0))
             header.gps_range = (float(largest), float(least))
 
-    def ranged(self) -> list[ExtraRecord]:
+    def ranged(self) -> list[las.ExtraRecord]:
         """Return the records with the extremes of the written values; a column without any value declares none."""
         return [self._range(field, record) for field, record in self._records.items()]
 
-    def _range(self, field: str, record: ExtraRecord) -> ExtraRecord:
+    def _range(self, field: str, record: las.ExtraRecord) -> las.ExtraRecord:
         found = [self._extremes.get((field, element)) for element in range(*record.dtype.shape or (1,))]
         if None in found:
             return record.with_range(None, None)
@@ -401,4 +391,4 @@ def copy_bytes(source: BinaryIO, start: int, end: int, target: BinaryIO) -> None
 
 def waveform_head(length: int) -> bytes:
     """Return the 60 bytes before the packets, in the cloud itself or in a `.wdp`."""
-    return encode_evlr_header(b"LASF_Spec", WAVEFORM_RECORD_ID, length, b"wave packets")
+    return las.encode_evlr_header(b"LASF_Spec", las.WAVEFORM_RECORD_ID, length, b"wave packets")

@@ -23,15 +23,8 @@ from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.publish import list_packet_files
 from wavebatch.files.disk.raw_bytes import damaged, open_regular, read_exactly, reporting_reads
+from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import CrsUnits, read_crs
-from wavebatch.files.las.header import (
-    EVLR_HEADER_SIZE,
-    WAVEFORM_RECORD_ID,
-    WAVES_EXTERNAL,
-    WAVES_INTERNAL,
-    LasHeader,
-    find_evlrs,
-)
 from wavebatch.files.las.read_points import CheckedHeader, open_points, read_checked_header
 from wavebatch.kernels.packets import MOST_BYTES, decode_packets
 
@@ -116,10 +109,10 @@ class PacketPlace:
     @property
     def shift(self) -> int:
         """What a copy of the packets adds to byte offsets that count from the first byte of a .wdp without header."""
-        return max(0, EVLR_HEADER_SIZE - self.offsets[0])
+        return max(0, las.EVLR_HEADER_SIZE - self.offsets[0])
 
 
-def read_descriptors(header: LasHeader) -> tuple[dict[int, Digitizer], dict[int, int], list[str]]:
+def read_descriptors(header: las.LasHeader) -> tuple[dict[int, Digitizer], dict[int, int], list[str]]:
     """Return digitizers and compression types by index, and warnings.
 
     All descriptors among the VLRs count, also unused and empty ones; `packet_check` checks those that are used.
@@ -158,9 +151,9 @@ def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerle
     header, path = checked.header, checked.path
     if compression and min(compression.values()) > COMPRESSED:
         raise refuse_compressed(path, next(iter(compression.values())))
-    if header.global_encoding & WAVES_INTERNAL:
+    if header.global_encoding & las.WAVES_INTERNAL:
         return _locate_internal(checked)
-    packet_file, external = _find_packet_file(path), header.global_encoding & WAVES_EXTERNAL
+    packet_file, external = _find_packet_file(path), header.global_encoding & las.WAVES_EXTERNAL
     packed = _find_packet_file(path, "wdz")
     if COMPRESSED in compression.values() and packed is not None:
         packet_file = packed
@@ -197,51 +190,51 @@ def _find_packet_file(path: Path, suffix: str = "wdp") -> Path | None:
 
 def _locate_internal(checked: CheckedHeader) -> PacketPlace:
     header, path, size = checked.header, checked.path, checked.size
-    evlrs, _ = find_evlrs(path, header)
+    evlrs, _ = las.find_evlrs(path, header)
     at, warnings = header.waveform_start, []
     if not at:
-        at = next((evlr.start for evlr in evlrs if evlr.record_id == WAVEFORM_RECORD_ID), 0)
+        at = next((evlr.start for evlr in evlrs if evlr.record_id == las.WAVEFORM_RECORD_ID), 0)
         warnings.append(f"the header does not point at the waveform record; it was found as an EVLR at byte {at}")
     least = header.offset_to_points if header.compressed else checked.points_end
-    if not least <= at <= size - EVLR_HEADER_SIZE:
+    if not least <= at <= size - las.EVLR_HEADER_SIZE:
         raise damaged(path, f"waveform record at byte {at}, but the points end at {least} and the file at {size}")
     with open(path, "rb") as file:
         file.seek(at)
-        head = file.read(EVLR_HEADER_SIZE)
+        head = file.read(las.EVLR_HEADER_SIZE)
     record_id, length = struct.unpack_from("<HQ", head, 18)
-    if record_id != WAVEFORM_RECORD_ID:
+    if record_id != las.WAVEFORM_RECORD_ID:
         raise InputError(
             f"{path}: no waveform record at byte {at} (record id {record_id} instead of 65535); the pointer in the "
             "header (byte 227) is wrong: get the file again"
         )
     end = min([size, *(evlr.start for evlr in evlrs if evlr.start > at)])
-    if at + EVLR_HEADER_SIZE + length != end:
-        warnings.append(f"the waveform record claims {length} bytes, {end - at - EVLR_HEADER_SIZE} are there")
-    return PacketPlace(path, True, at, at + EVLR_HEADER_SIZE, end, tuple(warnings))
+    if at + las.EVLR_HEADER_SIZE + length != end:
+        warnings.append(f"the waveform record claims {length} bytes, {end - at - las.EVLR_HEADER_SIZE} are there")
+    return PacketPlace(path, True, at, at + las.EVLR_HEADER_SIZE, end, tuple(warnings))
 
 
 def _locate_external(checked: CheckedHeader, packet_file: Path, headerless: bool) -> PacketPlace:
     size = packet_file.stat().st_size
     with open_regular(packet_file) as file:
-        head = file.read(EVLR_HEADER_SIZE)
+        head = file.read(las.EVLR_HEADER_SIZE)
     warnings = []
-    if len(head) < EVLR_HEADER_SIZE or not head[2:].startswith(b"LAS") or head[18:20] != b"\xff\xff":
+    if len(head) < las.EVLR_HEADER_SIZE or not head[2:].startswith(b"LAS") or head[18:20] != b"\xff\xff":
         if not headerless:
             raise InputError(
                 f"{checked.path}: {packet_file.name} does not begin with the 60-byte header of a waveform record; "
                 "if it has no header, run again with --headerless, else get it again"
             )
-        return PacketPlace(packet_file, False, -EVLR_HEADER_SIZE, 0, size, (f"{packet_file.name} has no header",))
+        return PacketPlace(packet_file, False, -las.EVLR_HEADER_SIZE, 0, size, (f"{packet_file.name} has no header",))
     (length,) = struct.unpack_from("<Q", head, 20)
-    if length not in (0, size - EVLR_HEADER_SIZE):
-        warnings.append(f"{packet_file.name} claims {length} bytes of packets, {size - EVLR_HEADER_SIZE} are there")
-    return PacketPlace(packet_file, False, 0, EVLR_HEADER_SIZE, size, tuple(warnings))
+    if length not in (0, size - las.EVLR_HEADER_SIZE):
+        warnings.append(f"{packet_file.name} claims {length} bytes of packets, {size - las.EVLR_HEADER_SIZE} are there")
+    return PacketPlace(packet_file, False, 0, las.EVLR_HEADER_SIZE, size, tuple(warnings))
 
 
 def settle_headerless(place: PacketPlace, points: np.ndarray) -> PacketPlace:
     """Return the place of packets in a .wdp without header; offsets below 60 count from its first byte."""
     offsets = points["wavepacket_offset"][(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
-    if len(offsets) and int(offsets.min()) < EVLR_HEADER_SIZE:
+    if len(offsets) and int(offsets.min()) < las.EVLR_HEADER_SIZE:
         return replace(place, base=0)
     return place
 

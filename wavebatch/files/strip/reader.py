@@ -23,19 +23,7 @@ from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing, reading, take_whole_records, widen_integers
 from wavebatch.files.las.header import field_names, locate
 from wavebatch.files.las.read_points import open_points
-from wavebatch.files.strip.packet_check import (
-    INDEX_BITS,
-    OPTIONS,
-    PLAIN,
-    Judge,
-    SampleForm,
-    VectorDecision,
-    compare_returns,
-    is_strange,
-    read_packet_samples,
-    read_toward,
-    size_of_sample,
-)
+from wavebatch.files.strip import packet_check
 from wavebatch.files.strip.packets import PacketFile, StripFacts, block_rows, find_facts
 from wavebatch.files.strip.scanner import (
     ScanPart,
@@ -106,8 +94,8 @@ class Unit:
     """Row of `packets` for each context point, i4 (k,)."""
     point_flags: np.ndarray
     """EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET or 0, u2 (n,)."""
-    vectors: VectorDecision
-    forms: Mapping[int, SampleForm]
+    vectors: packet_check.VectorDecision
+    forms: Mapping[int, packet_check.SampleForm]
     """How samples are stored, by descriptor index; see `StripScan.forms`."""
 
 
@@ -135,8 +123,8 @@ class StripReader(Closing):
         self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False,
         unit_points: int | None = None, unit_bytes: int | None = None,
     ) -> None:  # fmt: skip
-        if direction not in OPTIONS:
-            raise ConfigError(f"direction {direction!r}: must be one of {', '.join(OPTIONS)}")
+        if direction not in packet_check.OPTIONS:
+            raise ConfigError(f"direction {direction!r}: must be one of {', '.join(packet_check.OPTIONS)}")
         if isinstance(path, StripFacts):
             facts = path
         else:
@@ -147,7 +135,7 @@ class StripReader(Closing):
         self._unit_points = max(1, min(unit_points or UNIT_POINTS, most))
         self._points = open_points(facts)
         try:
-            self._judge = Judge(facts)
+            self._judge = packet_check.Judge(facts)
             self._packets = PacketFile(facts.packets, facts.compressed)
         except BaseException:
             self._points.close()
@@ -190,8 +178,8 @@ class StripReader(Closing):
             return ""
         used = scan.by_descriptor.keys() & self.facts.digitizers
         longest = max(self.facts.digitizers[index].n_samples for index in used)
-        table = compare_returns(self._sample_returns(scan, size_of_sample(longest)))
-        if not is_strange(table):
+        table = packet_check.compare_returns(self._sample_returns(scan, packet_check.size_of_sample(longest)))
+        if not packet_check.is_strange(table):
             return ""
         return (
             f"{file.name} belongs to another strip: in a sample of {len(table)} packets, returns "
@@ -339,12 +327,13 @@ class StripReader(Closing):
             same = rows[groups.order[start : start + groups.counts[group]]]
             stored = self.facts.digitizers[int(table.digitizer[same[0]])]
             packed, n_samples = bool(table.packed[same[0]]), int(table.n_samples[same[0]])
-            form = unit.forms.get(stored.index, PLAIN)
+            form = unit.forms.get(stored.index, packet_check.PLAIN)
             digitizer = form.digitizer(stored, packed)
             step = block_rows(size, n_samples, 8 * digitizer.width)
             for begin in range(0, len(same), step):
                 chosen = same[begin : begin + step]
-                samples = read_packet_samples(self._packets, table.offset[chosen], n_samples, stored, packed, form)
+                places = table.offset[chosen]
+                samples = packet_check.read_packet_samples(self._packets, places, n_samples, stored, packed, form)
                 yield samples, digitizer, chosen
 
 
@@ -382,7 +371,7 @@ class _Geometry:
         location = widen_integers(records["return_point_wave_location"])
         owner = np.cumsum(counts) - counts
         lead = take_whole_records(records, owner)
-        toward = read_toward(lead, self._unit.vectors.direction, self._unit.vectors.form)
+        toward = packet_check.read_toward(lead, self._unit.vectors.direction, self._unit.vectors.form)
         owners = self._unit.packets.owner[rows]
         return WaveformBlock(
             digitizer=digitizer,
@@ -435,7 +424,7 @@ def _collect_packets(
     lead = lead[order]
     table = PacketTable(
         digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
-        offset=keys[lead] >> INDEX_BITS,
+        offset=keys[lead] >> packet_check.INDEX_BITS,
         size=sizes[lead],
         n_samples=n_samples[lead],
         owner=index[lead],
@@ -521,7 +510,7 @@ def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
         points = reader.read_points(start, min(start + SLICE_POINTS, stop))
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         with np.errstate(all="ignore"):
-            vectors = read_toward(points, scan.vectors.direction, scan.vectors.form)
+            vectors = packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
             place = widen_integers(points["return_point_wave_location"])
             same = (time[1:] == time[:-1]) & (points["wavepacket_offset"][1:] == points["wavepacket_offset"][:-1])
             by_time = np.abs(np.diff(place)) * np.sqrt((vectors[1:] ** 2).sum(axis=1))
@@ -544,7 +533,7 @@ def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
 
 def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> RaySample:
     with np.errstate(all="ignore"):
-        away = -read_toward(points, scan.vectors.direction, scan.vectors.form)
+        away = -packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
         ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
         good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
     good &= np.isfinite(time) & np.isfinite(xyz).all(axis=1)

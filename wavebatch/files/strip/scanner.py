@@ -26,20 +26,7 @@ from wavebatch.files.disk.temp_store import Spool, spread_keys
 from wavebatch.files.las.crs import metres_per_unit
 from wavebatch.files.las.header import locate
 from wavebatch.files.las.read_points import PointSource
-from wavebatch.files.strip.packet_check import (
-    INDEX_BITS,
-    REASON_TEXTS,
-    DirectionTally,
-    FormSample,
-    Judge,
-    Judged,
-    Reason,
-    SampleForm,
-    VectorDecision,
-    decide_direction,
-    find_form,
-    find_forms,
-)
+from wavebatch.files.strip import packet_check as check
 from wavebatch.files.strip.packets import PacketFile, StripFacts
 
 WINDOW = 16_384
@@ -164,7 +151,7 @@ class NearSharing:
             np.add.at(self._new, fresh, 1)
 
     def _bin(self, keys: np.ndarray) -> np.ndarray:
-        return (((keys >> INDEX_BITS) - self._low) // self._width).astype(np.int64)
+        return (((keys >> check.INDEX_BITS) - self._low) // self._width).astype(np.int64)
 
     def __getstate__(self) -> dict[str, object]:
         """Only bins that points refer to: a part of a strip has few of them."""
@@ -263,13 +250,13 @@ class StripScan(Closing):
     """Different usable packets."""
     short: int
     """Points with a packet of fewer samples than its descriptor gives."""
-    reasons: dict[Reason, tuple[int, int]]
+    reasons: dict[check.Reason, tuple[int, int]]
     """For each reason not to use a packet: number of points, and index of the first."""
     by_descriptor: dict[int, int]
     """Points with a packet, by descriptor index."""
     reach: int
     """Largest distance in the file, in points, of two points that share a packet."""
-    vectors: VectorDecision
+    vectors: check.VectorDecision
     borders: np.ndarray
     """First point of each unit, then the number of points, i8 (units + 1,)."""
     overfull: np.ndarray
@@ -281,7 +268,7 @@ class StripScan(Closing):
     warnings: tuple[str, ...]
     problems: tuple[str, ...]
     """Reasons why the strip cannot be processed; empty unless the scan was `tolerant`."""
-    forms: Mapping[int, SampleForm]
+    forms: Mapping[int, check.SampleForm]
     """How samples are stored, by descriptor index; only descriptors whose counts are not simply read as they are."""
     stranger: str = ""
     """Why the packets are certainly those of another strip; empty where they are not, or where it was not asked."""
@@ -294,7 +281,7 @@ class StripScan(Closing):
     @property
     def cut(self) -> int:
         """Points whose packet lies past the end of the file: it is shorter than its packets need."""
-        return self.reasons.get(Reason.CUT, (0, 0))[0]
+        return self.reasons.get(check.Reason.CUT, (0, 0))[0]
 
     @property
     def losses(self) -> tuple[str, ...]:
@@ -307,7 +294,7 @@ class StripScan(Closing):
         self.decoded.close()
 
 
-def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]]) -> str:
+def describe_hopeless(facts: StripFacts, reasons: dict[check.Reason, tuple[int, int]]) -> str:
     """Return the message about a strip without any usable packet."""
     if facts.packets.file is None:
         name = facts.path.with_suffix(".wdp").name
@@ -315,19 +302,19 @@ def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]])
     reason = max(reasons, key=lambda r: reasons[r][0])
     count, first = reasons[reason]
     remedy = f"{facts.packets.file.name} is cut, damaged or belongs to another strip: get it again"
-    if reason is Reason.PACKED:
+    if reason is check.Reason.PACKED:
         remedy = "write the packets with 8, 16 or 32 bits per sample"
     return (
         f"no packet can be used: {count} of {facts.header.point_count} points (first: point {first}) "
-        f"{REASON_TEXTS[reason]}; {remedy}"
+        f"{check.REASON_TEXTS[reason]}; {remedy}"
     )
 
 
-def describe_oddities(reasons: dict[Reason, tuple[int, int]], short: int) -> Iterator[str]:
+def describe_oddities(reasons: dict[check.Reason, tuple[int, int]], short: int) -> Iterator[str]:
     """Yield warnings about a strip that can be processed."""
     for reason, (count, first) in reasons.items():
-        remedy = "; get it again, whole, then run with --resume" if reason is Reason.CUT else ""
-        yield f"{count} points (first: point {first}) {REASON_TEXTS[reason]}; they are written unchanged{remedy}"
+        remedy = "; get it again, whole, then run with --resume" if reason is check.Reason.CUT else ""
+        yield f"{count} points (first: point {first}) {check.REASON_TEXTS[reason]}; they are written unchanged{remedy}"
     if short:
         yield f"{short} points have packets with fewer samples than their descriptor gives; these samples are used"
 
@@ -376,16 +363,16 @@ def cut_scan(units: int, unit_points: int, parts: int) -> list[tuple[int, int]]:
 
 @dataclass(slots=True)
 class _Tally:
-    reasons: np.ndarray = field(default_factory=lambda: np.zeros(len(Reason), np.int64))
-    first: np.ndarray = field(default_factory=lambda: np.full(len(Reason), -1, np.int64))
+    reasons: np.ndarray = field(default_factory=lambda: np.zeros(len(check.Reason), np.int64))
+    first: np.ndarray = field(default_factory=lambda: np.full(len(check.Reason), -1, np.int64))
     by_descriptor: np.ndarray = field(default_factory=lambda: np.zeros(256, np.int64))
     short: int = 0
 
-    def add(self, points: np.ndarray, start: int, judged: Judged) -> None:
-        self.reasons += np.bincount(judged.reason, minlength=len(Reason))
+    def add(self, points: np.ndarray, start: int, judged: check.Judged) -> None:
+        self.reasons += np.bincount(judged.reason, minlength=len(check.Reason))
         for reason in np.flatnonzero((self.reasons > 0) & (self.first < 0)).tolist():
             self.first[reason] = start + int(np.argmax(judged.reason == reason))
-        has = judged.reason != Reason.NO_WAVEFORM
+        has = judged.reason != check.Reason.NO_WAVEFORM
         self.by_descriptor += np.bincount(points["wavepacket_index"][has], minlength=256)
         self.short += int(judged.short.sum())
 
@@ -395,8 +382,9 @@ class _Tally:
         self.by_descriptor += other.by_descriptor
         self.short += other.short
 
-    def describe(self) -> dict[Reason, tuple[int, int]]:
-        return {r: (int(self.reasons[r]), int(self.first[r])) for r in Reason if r in REASON_TEXTS and self.reasons[r]}
+    def describe(self) -> dict[check.Reason, tuple[int, int]]:
+        found = [reason for reason in check.Reason if reason in check.REASON_TEXTS and self.reasons[reason]]
+        return {reason: (int(self.reasons[reason]), int(self.first[reason])) for reason in found}
 
 
 class ScanPart(Closing):
@@ -404,7 +392,7 @@ class ScanPart(Closing):
 
     def __init__(self, facts: StripFacts, form: str, units: int) -> None:
         self.borders: list[int] = []
-        self.tally, self.votes, self.sample, self.claimed = _Tally(), DirectionTally(form), FormSample(), 0
+        self.tally, self.votes, self.sample, self.claimed = _Tally(), check.DirectionTally(form), check.FormSample(), 0
         self.context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
         self.decoded = Spool(units, facts.dtype)
         low, high = facts.packets.offsets
@@ -431,8 +419,8 @@ class _Scanner:
     def __init__(self, facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int) -> None:
         self._facts, self._source, self._unit_points = facts, source, unit_points
         self._packets = packets
-        self._judge = Judge(facts)
-        self._form = find_form(self._take_first())
+        self._judge = check.Judge(facts)
+        self._form = check.find_form(self._take_first())
         self._units = -(-facts.header.point_count // unit_points)
         self._found = ScanPart(facts, self._form, self._units)
         self._keeps = facts.header.compressed
@@ -481,12 +469,12 @@ class _Scanner:
             if suspects.any():
                 self._vote_far()
             for start, judged in self._judge_again(overfull) if len(overfull) else ():
-                here, tally = judged.reason == Reason.OVERFULL, found.tally
+                here, tally = judged.reason == check.Reason.OVERFULL, found.tally
                 many = int(here.sum())
-                if many and tally.first[Reason.OVERFULL] < 0:
-                    tally.first[Reason.OVERFULL] = start + int(np.argmax(here))
-                tally.reasons[Reason.OVERFULL] += many
-                tally.reasons[Reason.USABLE] -= many
+                if many and tally.first[check.Reason.OVERFULL] < 0:
+                    tally.first[check.Reason.OVERFULL] = start + int(np.argmax(here))
+                tally.reasons[check.Reason.OVERFULL] += many
+                tally.reasons[check.Reason.USABLE] -= many
         except BaseException:
             found.close()
             raise
@@ -570,7 +558,7 @@ class _Scanner:
     def _go_far(self, suspects: np.ndarray) -> tuple[int, int, np.ndarray]:
         """Finds points anywhere in the strip that share packets of suspect bins, and adds them to the context."""
         borders = np.array(self._found.borders)
-        count = int(self._found.tally.reasons[Reason.USABLE])
+        count = int(self._found.tally.reasons[check.Reason.USABLE])
         far, packets, reach, overfull = find_far(self._suspect_keys(suspects), count, borders)
         try:
             for unit in range(len(borders) - 1):
@@ -586,7 +574,7 @@ class _Scanner:
             far.close()
         return packets, reach, overfull
 
-    def _judge_again(self, overfull: np.ndarray | None = None) -> Iterator[tuple[int, Judged]]:
+    def _judge_again(self, overfull: np.ndarray | None = None) -> Iterator[tuple[int, check.Judged]]:
         """First index and check of each unit, for passes after the first one."""
         for start, stop in itertools.pairwise(self._found.borders):
             yield start, self._judge.judge(self._source.read(start, stop), self._form, overfull)
@@ -614,8 +602,8 @@ class _Scanner:
         """most: how many times packets may claim the bytes that are there."""
         found, facts, points = self._found, self._facts, self._facts.header.point_count
         tally = found.tally
-        usable, missing = int(tally.reasons[Reason.USABLE]), int(tally.reasons[Reason.NO_WAVEFORM])
-        decision = decide_direction(found.votes, facts.direction_option, metres_per_unit(facts.units)[0])
+        usable, missing = int(tally.reasons[check.Reason.USABLE]), int(tally.reasons[check.Reason.NO_WAVEFORM])
+        decision = check.decide_direction(found.votes, facts.direction_option, metres_per_unit(facts.units)[0])
         reasons = tally.describe()
         problems = list(decision.problems)
         if not usable and missing < points:
@@ -643,7 +631,7 @@ class _Scanner:
             decoded=found.decoded,
             warnings=(*describe_oddities(reasons, tally.short), *decision.warnings),
             problems=tuple(problems),
-            forms=find_forms(facts.digitizers, self._packets, found.sample),
+            forms=check.find_forms(facts.digitizers, self._packets, found.sample),
         )
 
 

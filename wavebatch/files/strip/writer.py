@@ -15,16 +15,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
-from wavebatch.files.las.header import (
-    EVLR_HEADER_SIZE,
-    STANDARD_TIME,
-    WAVES_EXTERNAL,
-    WAVES_INTERNAL,
-    ExtraRecord,
-    LasHeader,
-    Vlr,
-    build_dtype,
-)
+from wavebatch.files.las import header as las
 from wavebatch.files.las.write_points import PointFile, waveform_head
 from wavebatch.files.strip.packets import DESCRIPTOR
 
@@ -82,8 +73,8 @@ class FullwaveWriter(PointFile):
         scales: Sequence[float] = (0.001, 0.001, 0.001),
         offsets: Sequence[float] = (0.0, 0.0, 0.0),
         wkt: str | None = None,
-        extra_bytes: Sequence[ExtraRecord] = (),
-        records: Sequence[Vlr] = (),
+        extra_bytes: Sequence[las.ExtraRecord] = (),
+        records: Sequence[las.Vlr] = (),
         toward: bool = True,
         week: bool = False,
         system: str = "OTHER",
@@ -104,18 +95,18 @@ class FullwaveWriter(PointFile):
             if one.bits not in (8, 16, 32):
                 raise ConfigError(f"{target}: digitizer {one.index} has {one.bits} bits, not 8, 16 or 32")
             payload = DESCRIPTOR.pack(one.bits, 0, one.n_samples, round(one.spacing * PS_PER_NS), one.gain, one.offset)
-            descriptors.append(Vlr(b"LASF_Spec", 99 + one.index, payload, b"wave packet descriptor"))
+            descriptors.append(las.Vlr(b"LASF_Spec", 99 + one.index, payload, b"wave packet descriptor"))
         self._digitizers = {digitizer.index: digitizer for digitizer in digitizers}
         self._internal, self._toward = internal, toward
-        header = LasHeader.new(
-            numbers, point_format, scales, offsets, wkt, WAVES_INTERNAL if internal else WAVES_EXTERNAL
+        header = las.LasHeader.new(
+            numbers, point_format, scales, offsets, wkt, las.WAVES_INTERNAL if internal else las.WAVES_EXTERNAL
         )
         header.vlrs = [*descriptors, *header.vlrs, *records]
         header.system_identifier, header.file_source_id = system.encode("latin-1", "replace")[:32], source
         if week:
-            header.global_encoding &= ~STANDARD_TIME
+            header.global_encoding &= ~las.STANDARD_TIME
         self.scales, self.offsets = header.scales, header.offsets
-        super().__init__(target, header, build_dtype(point_format, extra_bytes), extra_bytes, overwrite=overwrite)
+        super().__init__(target, header, las.build_dtype(point_format, extra_bytes), extra_bytes, overwrite=overwrite)
         packet_file = target if internal else target.with_suffix(".wdp")
         try:
             refuse_existing(packet_file, internal or overwrite)
@@ -126,7 +117,7 @@ class FullwaveWriter(PointFile):
         self.drafts.insert(0, self._packets)
         with reporting(self.target):
             self._packets.file.write(waveform_head(0))
-        self._end = EVLR_HEADER_SIZE
+        self._end = las.EVLR_HEADER_SIZE
 
     def write_packets(self, samples: np.ndarray, digitizer: int) -> np.ndarray:
         """Append packets of raw counts (n, s), s at most the digitizer's samples; return their byte offsets, u8 (n,).
@@ -157,11 +148,11 @@ class FullwaveWriter(PointFile):
         self.write(points)
 
     def _append_records(self) -> None:
-        head = waveform_head(self._end - EVLR_HEADER_SIZE)
+        head = waveform_head(self._end - las.EVLR_HEADER_SIZE)
         with reporting(self.target):
             self._packets.file.seek(0)
             self._packets.file.write(head)
         if self._internal:
-            self.append_record(head, self._packets.file, EVLR_HEADER_SIZE, self._end, waveforms=True)
+            self.append_record(head, self._packets.file, las.EVLR_HEADER_SIZE, self._end, waveforms=True)
             self._packets.discard()
             self.drafts.remove(self._packets)

@@ -168,7 +168,7 @@ def fit_sensor(
     if _condition(normal) < 1e14:
         covariance = residual**2 * _redundancy(time, unit, left) * np.linalg.inv(normal)
     condition = _condition(normal[:3, :3])
-    return SensorFit(centre, half, found, covariance, condition, distance, _extent(unit), residual, len(used))
+    return SensorFit(centre, half, found, covariance, condition, distance, measure_extent(unit), residual, len(used))
 
 
 def fit_best(
@@ -210,8 +210,8 @@ def _condition(normal: np.ndarray) -> float:
     return float(values[-1] / values[0]) if values[0] > 0 else np.inf
 
 
-def _extent(unit: np.ndarray) -> float:
-    """Twice the angle from the mean direction within which 98 % of the directions lie [rad]."""
+def measure_extent(unit: np.ndarray) -> float:
+    """Return twice the angle from the mean direction within which 98 % of the directions lie [rad]."""
     mean = unit.mean(axis=0)
     mean /= max(float(np.sqrt(mean @ mean)), 1e-12)
     off = unit - mean

@@ -25,7 +25,7 @@ from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, measure_ties
 from wavebatch.surveying.calibrating.trends import LEAST_SPREAD, Trend, find_trend, fit_swath
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult, check_attenuation
-from wavebatch.surveying.matching.setting import PLACES
+from wavebatch.surveying.matching.setting import PLACES, number_channel
 
 _UNEXPLAINED = (
     "the strips' light from one place differs by more than their constants explain: check targets, trajectory and "
@@ -82,9 +82,10 @@ def calibrate_flight(
     good = [strip.found for strip in strips if strip.found is not None]
     if not good:
         raise InputError(strips[0].refused if len(strips) == 1 else "; ".join(strip.refused for strip in strips))
+    bent = max(one.bent for one in good)
     sources = [Source(strip, row) for strip in strips for row in strip.channels]
     if len(sources) == 1 and not options.scan_angle:
-        return FlightCalibration(good[0])
+        return FlightCalibration(good[0].widened(bent))
     rights = np.array([source.strip.right for source in sources])
     ties = _tie(sources, rights)
     anchors, seen = _list_given(sources, options)
@@ -112,7 +113,7 @@ def calibrate_flight(
             "--scan-angle: these strips do not show whether light falls from one side of the swath to the other: the "
             f"error of the constants grows by {100 * open_error:.1f} %; give three strips, one of another heading"
         )
-    return FlightCalibration(replace(calibration, notes=(*notes, *more)), pairs, ties.size)
+    return FlightCalibration(replace(calibration.widened(bent), notes=(*notes, *more)), pairs, ties.size)
 
 
 def _refuse_zones(paths: Sequence[Path]) -> None:
@@ -229,11 +230,11 @@ def _assemble(
 
 def _join_places(good: Sequence[Calibration], rows: Sequence[StripConstant]) -> tuple[float, ...]:
     """Ground of the strips with targets, as bright as it is by the mean constants of their channels."""
-    drift = {(row.sha256, row.digitizer): math.log1p(row.drift) for row in rows}
+    drift = {(row.sha256, number_channel(row.digitizer, row.scanner)): math.log1p(row.drift) for row in rows}
     parts = []
     for found in good:
         part = np.reshape(found.places, (-1, 4))
-        part[:, 3] += [drift.get((found.fingerprint["sha256_sampled"], digitizer), 0.0) for digitizer in part[:, 0]]
+        part[:, 3] += [drift.get((found.fingerprint["sha256_sampled"], channel), 0.0) for channel in part[:, 0]]
         parts.append(part)
     joined = np.concatenate(parts)
     return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())

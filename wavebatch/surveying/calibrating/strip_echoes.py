@@ -33,10 +33,10 @@ from wavebatch.surveying.sensor import SensorRequest, SensorSource
 
 ECHO = np.dtype([
     ("xyz", "<f8", 3), ("ray", "<f8", 3), ("distance", "<f8"), ("light", "<f8"), ("light_err", "<f8"),
-    ("channel", "<i4"), ("time", "<f8"), ("given", "<f8"),
+    ("channel", "<i4"), ("time", "<f8"), ("given", "<f8"), ("amplitude", "<f4"),
 ])  # fmt: skip
 """An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel, GPS
-time [s], value of the column that was asked for."""
+time [s], value of the column that was asked for, amplitude [DN]."""
 
 _BLOCK = 8192
 """Waveforms that are read at a time."""
@@ -199,6 +199,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None
     rows["light_err"] = np.where(clipped, np.inf, echoes.attributes[f"{_LIGHT}_err"])
     scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(np.int32)
     rows["time"] = block.gps_time[echoes.waveform]
+    rows["amplitude"] = echoes.amplitude
     rows["given"] = np.nan if given is None else given[echoes.waveform]
     rows["channel"] = SCANNERS * block.digitizer.index + scanner
     known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & ~np.isnan(rows["light_err"])

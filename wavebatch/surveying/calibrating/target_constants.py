@@ -181,7 +181,7 @@ def measure_column(
     apart = float(np.std([np.median(some) for some in classes])) / (result.constant or 1.0)
     inner = MEDIAN_ERROR * (result.spread or 0.0) / np.sqrt(len(rows) - 1)
     error = float(np.sqrt(reflectance_error**2 + apart**2 + inner**2 + air_err**2))
-    return replace(result, relative_error=error), rows, constant
+    return replace(result, relative_error=error, apart=apart), rows, constant
 
 
 def _take_off_air(

@@ -19,6 +19,7 @@ from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.geojson import describe_miss
 from wavebatch.files.las.header import decode_text
 from wavebatch.kernels.physics.radiometry import backscatter_error
+from wavebatch.surveying.calibrating.compression import find_compression
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
 from wavebatch.surveying.calibrating.target_constants import (
     LEAST_ECHOES,
@@ -32,6 +33,12 @@ from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
 from wavebatch.surveying.matching.setting import SCANNERS, keep_places, read_day, read_sensor_name
 from wavebatch.surveying.sensor import SensorSource
+
+LEAST_BENT = 0.01
+"""Error by a compressing receiver from which it is said: a third of that of a target's reflectance."""
+
+MOST_APART = 0.1
+"""How far dark and bright echoes of a column of reflectances may differ: vendors' noise and ours make less than 5 %."""
 
 MOST_ECHOES = 200_000
 """Most echoes that a target uses: the error of its reflectance is far larger than that of so many."""
@@ -82,8 +89,9 @@ def build_calibration(
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])
     ranging = math.hypot(measure_ranging(source.sensor, used["distance"], source.air), source.sent.growth)
+    bent, compressed = _compare_compression(source, used)
     channels = tuple(
-        describe_channel(replace(row, relative_error=float(np.hypot(row.relative_error, ranging))), source)
+        describe_channel(replace(row, relative_error=math.hypot(row.relative_error, ranging)), source)
         for row in _measure_channels(measured)
     )
     # The constant of all together serves files of tools that know no channels; its error covers how far they differ.
@@ -92,7 +100,7 @@ def build_calibration(
     decomposer = next(step.stage.name for step in source.chain.steps if step.stage.kind == "decompose")
     return Calibration(
         constant=whole.constant,
-        relative_error=float(np.hypot(np.hypot(whole.relative_error, apart), ranging)),
+        relative_error=math.hypot(whole.relative_error, apart, ranging),
         attenuation=source.air,
         haze=source.haze,
         divergence=divergence,
@@ -112,7 +120,8 @@ def build_calibration(
         targets=tuple(_split_targets(measured) if len(channels) > 1 else results),
         channels=channels,
         **source.sent.describe(),
-        notes=tuple(_list_doubts(source, results, channels, options)),
+        bent=bent,
+        notes=(*_list_doubts(source, results, channels, options), *compressed),
     )
 
 
@@ -125,6 +134,25 @@ def measure_ranging(sensor: SensorSource, distance: np.ndarray, attenuation: flo
     """Return the relative error of the constant from that of the sensor's position, which all echoes share."""
     middle = np.array([np.median(distance)])
     return float(np.nan_to_num(backscatter_error(np.zeros(1), middle, sensor.error, 0.0, attenuation)[0]))
+
+
+def _compare_compression(source: EchoSource, used: np.ndarray) -> tuple[float, list[str]]:
+    """By how much constants are off for echoes that a compressing receiver makes darker or brighter than the targets,
+    relative, and the lines about it; used: array of ECHO."""
+    most, lines = 0.0, []
+    for channel, found in find_compression(source.reader, source.scan, source.system).items():
+        targets = used["amplitude"][used["channel"] == channel]
+        growth = found.compare(targets) if len(targets) else 0.0
+        most = max(most, growth)
+        if growth > LEAST_BENT:
+            low, high = np.quantile(found.amplitude, [0.05, 0.95]).tolist()
+            off = [found.factor * (float(np.mean(targets)) - amplitude) for amplitude in (low, high)]
+            lines.append(
+                f"the receiver of digitizer {channel // SCANNERS} compresses, by the shape of its echoes: those of "
+                f"{low:.0f} to {high:.0f} DN are {off[0]:+.1%} to {off[1]:+.1%} off against the targets': the error of "
+                f"the constant grows by {growth:.1%}; take targets as bright as the surfaces that you measure"
+            )
+    return most, lines
 
 
 def _measure_channels(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndarray]]) -> list[ChannelConstant]:
@@ -161,8 +189,8 @@ def describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstan
     return replace(
         row,
         noise_dn=system.noise.std,
-        brightest=source.setting.brightest.get(row.digitizer),
-        scene=source.setting.scenes.get(row.digitizer, ()),
+        brightest=source.setting.brightest.get((row.digitizer, row.scanner)),
+        scene=source.setting.scenes.get((row.digitizer, row.scanner), ()),
         bits=digitizer.bits,
         samples=digitizer.n_samples,
         spacing_ns=digitizer.spacing,
@@ -180,6 +208,11 @@ def _list_doubts(
     """What a person should look at before the calibration is used."""
     yield from filter(None, (source.sensor.doubt(), *source.sent.notes))
     for result in results:
+        if result.apart > MOST_APART:
+            yield (
+                f"{result.name}: constants by its dark and its bright echoes differ by {result.apart:.0%} (standard "
+                "deviation): is it the reflectance, of this channel? The error holds it"
+            )
         if options.column and result.air is None and source.air:
             yield (
                 f"{result.name}: its ranges are too alike to show whether it still holds the air: the error of the "

@@ -49,9 +49,9 @@ LIKE_GROUND = 0.5
 """Scatter of the differences of neighbours, over that of surfaces that have nothing to do with each other, up to which
 they are the same surfaces: even ground looks like all even ground, and ground may have changed."""
 
-PRIORS = ((0.7, (0.0, 0.0)), (0.15, (1.0, 0.0)), (0.15, (1.0, 1.0)))
-"""How likely nothing, the energy and the gain are another one before light and noise are seen, and whether light and
-noise change with each. The chance of a change is assumed: it is high, since errors must hold for those who have one."""
+CHANGES = ((1.0, 0.0), (1.0, 1.0))
+"""How another energy and another gain move light and noise; one is as likely as the other, and the chance of both is
+`Calibration.change_chance` before light and noise are seen."""
 
 ZONE_PARTS = 8
 """Parts of a strip whose bend is measured: their scatter tells ground from a wrong pulse zone."""
@@ -106,6 +106,10 @@ _ADJUSTED = 1e9
 _WEEK = 604_800.0
 
 
+_Channel = tuple[int, int]
+"""Index of a digitizer and scanner channel."""
+
+
 class Change(NamedTuple):
     """By how much light is brighter, and what another gain or energy may have to do with it."""
 
@@ -136,13 +140,13 @@ class Setting(NamedTuple):
 
     rate: float | None
     """Pulses per second; None where the times do not show it."""
-    brightest: dict[int, float]
-    """R^2 / eta times the sum of the samples of the strongest waveforms of each digitizer [DN m2]: slopes do not change
+    brightest: dict[_Channel, float]
+    """R^2 / eta times the sum of the samples of the strongest waveforms of each channel [DN m2]: slopes do not change
     it."""
-    scenes: dict[int, tuple[float, ...]]
-    """Logarithms of the QUANTILES of that light, for each digitizer."""
-    places: dict[int, np.ndarray]
-    """East, north, logarithm of that light, and time from -1 to 1 of waveforms of each digitizer, f8 (4, k)."""
+    scenes: dict[_Channel, tuple[float, ...]]
+    """Logarithms of the QUANTILES of that light, for each channel."""
+    places: dict[_Channel, np.ndarray]
+    """East, north, logarithm of that light, and time from -1 to 1 of waveforms of each channel, f8 (4, k)."""
     right: tuple[float, float]
     """Unit vector to the right of the flight."""
     fades: Change
@@ -151,7 +155,7 @@ class Setting(NamedTuple):
     """None where there is no rate."""
 
 
-def weigh_change(shift: float, spread: float, noise: float | None = None) -> Change:
+def weigh_change(shift: float, spread: float, noise: float | None = None, *, chance: float) -> Change:
     """Weigh whether light differs by its surfaces, or by another energy or gain.
 
     Parameters
@@ -162,6 +166,8 @@ def weigh_change(shift: float, spread: float, noise: float | None = None) -> Cha
         How much surfaces change that (standard deviation).
     noise : float, optional
         Logarithm of the ratio of the noise: a gain changes it as it changes light, an energy does not.
+    chance : float
+        Of another energy or gain before light and noise are seen.
 
     Returns
     -------
@@ -169,12 +175,12 @@ def weigh_change(shift: float, spread: float, noise: float | None = None) -> Cha
 
     Notes
     -----
-    Bayes' rule with PRIORS and normal distributions. docs/algorithms.md 5.2.
+    Bayes' rule with this chance and normal distributions. docs/algorithms.md 5.2.
     """
     seen = np.array([shift, noise or 0.0])
     known = np.diag([spread**2, 1e6 if noise is None else SUNLIGHT**2])
     chances, squares = [], []
-    for prior, moves in PRIORS:
+    for prior, moves in [(1.0 - chance, (0.0, 0.0)), *((chance / len(CHANGES), moves) for moves in CHANGES)]:
         covariance = known + USUAL_CHANGE**2 * np.outer(moves, moves)
         inner = np.linalg.solve(covariance, np.stack([seen, moves], axis=1)).T @ np.stack([seen, moves], axis=1)
         chances.append(prior * np.exp(-0.5 * inner[0, 0]) / np.sqrt(np.linalg.det(covariance)))
@@ -184,17 +190,20 @@ def weigh_change(shift: float, spread: float, noise: float | None = None) -> Cha
     return Change(shift, float(1.0 - share[0]), float(np.sqrt(share @ squares)))
 
 
-def compare_scenes(one: Sequence[float], other: Sequence[float], noise: float | None = None) -> Change:
-    """Weigh by how much one scene is brighter than another; noise: as `weigh_change`.
+def compare_scenes(
+    one: Sequence[float], other: Sequence[float], noise: float | None = None, *, chance: float
+) -> Change:
+    """Weigh by how much one scene is brighter than another; noise, chance: as `weigh_change`.
 
     Another energy or gain shifts the logarithms of all quantiles alike; other surfaces shift each in its own way.
     """
     off = np.subtract(one, other)
-    return weigh_change(float(np.median(off)), float(np.hypot(UNLIKE * np.std(off), LEAST_UNLIKE)), noise)
+    spread = float(np.hypot(UNLIKE * np.std(off), LEAST_UNLIKE))
+    return weigh_change(float(np.median(off)), spread, noise, chance=chance)
 
 
 def compare_ground(
-    places: np.ndarray, known: np.ndarray, noise: float | None = None
+    places: np.ndarray, known: np.ndarray, noise: float | None = None, *, chance: float
 ) -> tuple[Change, Change | None] | None:
     """Weigh by how much the ground that a calibrated strip saw too is brighter, and how that grows along the strip.
 
@@ -205,6 +214,7 @@ def compare_ground(
     known : float array, shape (m, 3)
         East, north and logarithm of the light of places of the calibration.
     noise : float, optional
+    chance : float
         As for `weigh_change`.
 
     Returns
@@ -229,18 +239,26 @@ def compare_ground(
     same = np.abs(off - np.median(off)) <= BORDER * robust_std(off)
     off, time, number = off[same], time[same], len(np.unique(near[rows[same]]))
     error, spread = float(np.std(off)) / number**0.5, float(np.std(time))
-    level = weigh_change(float(np.median(off)), float(np.hypot(MEDIAN_ERROR * error, LEAST_UNLIKE)), noise)
+    doubt = float(np.hypot(MEDIAN_ERROR * error, LEAST_UNLIKE))
+    level = weigh_change(float(np.median(off)), doubt, noise, chance=chance)
     if spread < SPAN:
         return level, None
     slope = float(np.polyfit(time, off, 1)[0])
-    return level, weigh_change(slope, float(np.hypot(error / spread, LEAST_UNLIKE)))
+    return level, weigh_change(slope, float(np.hypot(error / spread, LEAST_UNLIKE)), chance=chance)
 
 
 def measure_setting(
-    reader: StripReader, scan: StripScan, sensor: SensorSource, attenuation: float, energy: float = 1.0
+    reader: StripReader,
+    scan: StripScan,
+    sensor: SensorSource,
+    attenuation: float,
+    energy: float = 1.0,
+    *,
+    chance: float = 0.0,
 ) -> Setting:
-    """Measure the setting of a strip; attenuation: of the air, one way [dB/km], energy: by which light is divided."""
-    parts: dict[int, list[np.ndarray]] = {}
+    """Measure the setting of a strip; attenuation: of the air, one way [dB/km], energy: by which light is divided;
+    chance: of a laser that fades, before the light is seen."""
+    parts: dict[_Channel, list[np.ndarray]] = {}
     for block in reader.sample_blocks(scan, SAMPLE):
         block = sensor.fill(block)
         if block.sensor is None:
@@ -251,21 +269,26 @@ def measure_setting(
         distance = np.sqrt((away * away).sum(axis=1))
         whole = np.nansum(above, axis=1) * distance**2 / transmit(distance, attenuation) / energy
         rows = np.stack([block.gps_time, whole, *(away + block.sensor).T, -away[:, 2] / distance, *block.sensor.T[:2]])
-        parts.setdefault(block.digitizer.index, []).append(rows[:, whole > 0])
-    joined = {index: np.concatenate(some, axis=1) for index, some in parts.items()}
-    known = {index: rows for index, rows in joined.items() if rows.size}
+        scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
+        for number in np.unique(scanner).tolist():
+            parts.setdefault((block.digitizer.index, number), []).append(rows[:, (whole > 0) & (scanner == number)])
+    joined = {channel: np.concatenate(some, axis=1) for channel, some in parts.items()}
+    known = {channel: rows for channel, rows in joined.items() if rows.size}
     rate = _measure_rate(reader)
     every = np.concatenate([np.empty((8, 0)), *known.values()], axis=1)
     zone = _find_zone(reader, every, 1e9 * HALF_C / rate) if known and rate else None
-    brightest = {index: float(np.quantile(rows[1], BRIGHT)) for index, rows in known.items()}
-    scenes = {index: _describe_scene(rows[1]) for index, rows in known.items()}
-    places = {index: _list_places(*rows[[2, 3, 1, 0]]) for index, rows in known.items()}
-    fades = max((_find_fading(*rows[:2]) for rows in known.values()), key=lambda one: one.error, default=NO_CHANGE)
+    brightest = {channel: float(np.quantile(rows[1], BRIGHT)) for channel, rows in known.items()}
+    scenes = {channel: _describe_scene(rows[1]) for channel, rows in known.items()}
+    places = {channel: _list_places(*rows[[2, 3, 1, 0]]) for channel, rows in known.items()}
+    fading = [NO_CHANGE, *(_find_fading(*rows[:2], chance=chance) for rows in known.values())]
+    fades = max(fading, key=lambda one: one.error)
     return Setting(rate, brightest, scenes, places, _find_right(every), fades, zone)
 
 
 def _find_right(rows: np.ndarray) -> tuple[float, float]:
     """Unit vector to the right of the mean motion of the sensor; 0 where it does not move."""
+    if not rows.size:
+        return 0.0, 0.0
     time, *place = rows[[0, 6, 7]] - rows[[0, 6, 7]].mean(axis=1, keepdims=True)
     ahead = np.nan_to_num(np.stack(place) @ time)
     return tuple((np.array([ahead[1], -ahead[0]]) / max(float(np.hypot(*ahead)), 1e-30)).tolist())
@@ -317,11 +340,16 @@ def _is_whole(zones: np.ndarray) -> np.ndarray:
     return (number != 0) & (np.abs(number) <= MOST_ZONES) & (np.abs(zones - number) < MOST_BEND)
 
 
-def keep_places(places: Mapping[int, np.ndarray]) -> tuple[float, ...]:
+def number_channel(digitizer: int, scanner: int) -> float:
+    """Return the number of a channel in `Calibration.places`: the digitizer and a quarter of the scanner channel."""
+    return digitizer + scanner / SCANNERS
+
+
+def keep_places(places: Mapping[_Channel, np.ndarray]) -> tuple[float, ...]:
     """Return a part of `Setting.places` as `Calibration.places`, spread evenly over the strip."""
     parts = [
-        np.column_stack([np.full(part.shape[1], index), *part[:2].round(1), part[2].round(3)])
-        for index, part in places.items()
+        np.column_stack([np.full(part.shape[1], number_channel(*channel)), *part[:2].round(1), part[2].round(3)])
+        for channel, part in places.items()
     ]
     joined = np.concatenate([np.empty((0, 4)), *parts])
     return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
@@ -336,7 +364,7 @@ def _describe_scene(light: np.ndarray) -> tuple[float, ...]:
     return tuple(np.log(np.quantile(light, QUANTILES)).tolist())
 
 
-def _find_fading(time: np.ndarray, light: np.ndarray) -> Change:
+def _find_fading(time: np.ndarray, light: np.ndarray, *, chance: float) -> Change:
     """How light grows from the first half of a strip to the second, by a line through the scenes of its parts.
 
     What parts scatter about the line is their surfaces' doing. Fields, forests and towns reach over several parts: such
@@ -355,7 +383,7 @@ def _find_fading(time: np.ndarray, light: np.ndarray) -> Change:
     shared = 1.0 + 2.0 * float(alike[1 : int(np.argmax(alike <= 0.0))].sum())
     error = FEW_PARTS * shared * half * float(np.sqrt(rest @ rest / (FADING_PARTS - 2) * (place @ place)))
     spread = np.sqrt(LEAST_UNLIKE**2 + np.var(slopes) + error**2)
-    return weigh_change(float(np.median(slopes)), float(spread))
+    return weigh_change(float(np.median(slopes)), float(spread), chance=chance)
 
 
 def sum_light(block: WaveformBlock) -> np.ndarray:

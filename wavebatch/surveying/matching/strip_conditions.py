@@ -18,16 +18,16 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.radiometry import AIR_DOUBT
-from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.calibration import Calibration, ChannelConstant
 from wavebatch.surveying.matching.setting import (
     MOST_ZONES,
     OTHER_PULSE,
-    PRIORS,
     SUNLIGHT,
     Change,
     Setting,
     compare_ground,
     compare_scenes,
+    number_channel,
     read_day,
     read_sensor_name,
 )
@@ -137,7 +137,7 @@ def refuse_zone(calibration: Calibration, found: Setting, distance: float | None
     if zone is None or not distance or abs(zone.off) + 2.0 * zone.error < 0.5 * zone.size:
         return
     for row, number in itertools.product(calibration.channels, range(-MOST_ZONES, MOST_ZONES + 1)):
-        scene, off = found.scenes.get(row.digitizer, ()), number * zone.size
+        scene, off = found.scenes.get((row.digitizer, row.scanner), ()), number * zone.size
         if not number or distance + off <= 0.0 or not scene or len(row.scene) != len(scene):
             continue
         light = -2.0 * math.log1p(off / distance) - 2.0e-4 * math.log(10.0) * calibration.attenuation * off
@@ -166,28 +166,29 @@ def compare_setting(
     compare(found.rate, calibration.rate, SAME_RATE, 1.0, "another rate of pulses [1/s], so another energy:")
     for row in calibration.channels:
         noise, which = system.digitizers.get(row.digitizer, system).noise.std, f"of digitizer {row.digitizer}"
+        which += f" scanner channel {row.scanner}" if row.scanner else ""
         compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
         # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
-        light = found.brightest.get(row.digitizer)
+        light = found.brightest.get((row.digitizer, row.scanner))
         surfaces = "other surfaces"
         if light and row.brightest and abs(math.log(light / row.brightest * FOOT**2)) < LIKE_FEET:
             surfaces += ", or coordinates in feet (which make it 10.8 times as bright)"
         compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or {surfaces}: light {which} is")
-        scene = found.scenes.get(row.digitizer)
+        scene = found.scenes.get((row.digitizer, row.scanner))
         if not scene or len(row.scene) != len(scene):
             continue
         louder = math.log(noise / row.noise_dn) if noise and row.noise_dn else None
-        ground = _compare_places(calibration, found, row.digitizer, louder)
+        ground = _compare_places(calibration, found, row, louder)
         seen, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
-        change = change or compare_scenes(scene, row.scene, louder)
+        change = change or compare_scenes(scene, row.scene, louder, chance=calibration.change_chance)
         more = math.expm1(abs(change.shift) if change.chance > LIKELY else change.error)
         growth = max(growth, more)
         if change.chance <= LIKELY and more > HIDDEN:
-            known = "the ground in common scatters" if ground else "surfaces differ and no ground is common"
+            known = f"ground in common scatters {which}" if ground else f"surfaces {which} differ, no ground is common"
             notes.append(
-                f"calibration: {known} {which}, so that another energy under the same "
+                f"calibration: {known}, so that another energy under the same "
                 f"header would not show: {100 * more:.0f} % of error hold it, by an assumed chance of "
-                f"{PRIORS[1][0]:.0%}; calibrate a strip that overlaps this one"
+                f"{calibration.change_chance:.0%} (change_chance); calibrate a strip that overlaps this one"
             )
         elif change.chance > LIKELY:
             lines.append(
@@ -199,11 +200,12 @@ def compare_setting(
 
 
 def _compare_places(
-    calibration: Calibration, found: Setting, digitizer: int, noise: float | None = None
+    calibration: Calibration, found: Setting, row: ChannelConstant, noise: float | None = None
 ) -> tuple[Change, Change | None] | None:
     known = np.reshape(calibration.places[: len(calibration.places) // 4 * 4], (-1, 4))
-    seen = found.places.get(digitizer, np.empty((4, 0)))
-    return compare_ground(seen, known[known[:, 0] == digitizer, 1:], noise)
+    seen = found.places.get((row.digitizer, row.scanner), np.empty((4, 0)))
+    mine = known[known[:, 0] == number_channel(row.digitizer, row.scanner), 1:]
+    return compare_ground(seen, mine, noise, chance=calibration.change_chance)
 
 
 def judge_fading(calibration: Calibration, found: Setting, *, other: bool) -> tuple[float, list[str], list[str]]:
@@ -213,7 +215,7 @@ def judge_fading(calibration: Calibration, found: Setting, *, other: bool) -> tu
     their overlaps do.
     """
     fades, hidden = found.fades, "surfaces in large patches hide"
-    compared = [_compare_places(calibration, found, row.digitizer) for row in calibration.channels if other]
+    compared = [_compare_places(calibration, found, row) for row in calibration.channels if other]
     seen = [ground[1] for ground in compared if ground and ground[1]]
     if seen:
         # One laser that fades is enough.

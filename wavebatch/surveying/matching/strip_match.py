@@ -22,7 +22,7 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import sample_reference
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
-from wavebatch.surveying.matching.setting import measure_setting, see_channels
+from wavebatch.surveying.matching.setting import measure_setting, read_day, see_channels
 from wavebatch.surveying.matching.strip_conditions import (
     compare_air,
     compare_divergence,
@@ -98,13 +98,20 @@ def match_strip(
     if calibration.haze and attenuation is None:
         calibration = replace(calibration, attenuation=calibration.attenuation / calibration.haze * sensor.haze)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
-    setting = measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0)
+    chance = calibration.change_chance
+    setting = measure_setting(reader, scan, sensor, calibration.attenuation, energy or 1.0, chance=chance)
     refuse_zone(calibration, setting, sensor.distance, reader.facts.path)
     notes: list[str] = []
     measured = {calibration.fingerprint.get("sha256_sampled"), *(row.sha256 for row in calibration.strips)}
     if own_strip not in measured:
         more, lines, notes = compare_setting(calibration, setting, system)
         growth, reasons = math.hypot(growth, more), [*reasons, *lines]
+        if not (calibration.flight and read_day(reader)):
+            which = "the calibration" if not calibration.flight else "this strip"
+            notes.append(
+                f"calibration: GPS times of {which} are seconds of a week, so they show no day: it counts as the same "
+                "day; lasers, receivers and air of another day would add to the error"
+            )
     if energy is None:
         more, lines, hidden = judge_fading(calibration, setting, other=own_strip not in measured)
         growth, reasons, notes = math.hypot(growth, more), [*reasons, *lines], [*notes, *hidden]

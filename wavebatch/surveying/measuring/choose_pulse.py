@@ -134,6 +134,8 @@ class Choice:
     tried: tuple[Candidate, ...]
     doubt: float
     """Share by which the number of echoes differs between candidates that cost the same."""
+    spread: float
+    """Share by which their widths differ from that of the best one."""
 
     def describe(self) -> tuple[Tried, ...]:
         """Return the candidates for people, the best first."""
@@ -264,16 +266,27 @@ def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
 
 
 def _decide(found: list[Candidate]) -> Choice:
-    """The candidate with the simplest pulse, then the fewest echoes, that no other one beats surely."""
-    ordered = sorted(found, key=lambda one: (one.gaussians, one.echoes, one.name))
+    """The candidate with the simplest pulse that no other one beats surely.
+
+    Of pulses as simple the shortest description, or that of markedly fewer echoes: one echo more or less is chance.
+    """
+    ordered = []
+    for number in sorted({one.gaussians for one in found}):
+        alike = [one for one in found if one.gaussians == number]
+        shortest = min(alike, key=lambda one: (one.typical, one.name))
+        fewer = [one for one in alike if one.echoes <= FEWER * shortest.echoes and one.exceeds(shortest) < SURE]
+        first = min((shortest, *fewer), key=lambda one: (one.echoes, one.typical))
+        ordered += [first, *(one for one in alike if one is not first)]
     best = ordered[0]
     for one in ordered[1:]:
         doubtful = one.echoes <= FEWER * best.echoes or best.missed > max(COVERED * best.change, one.missed)
         if best.exceeds(one) > (HINT if doubtful and not best.known else SURE):
             best = one
-    tied = [one.echoes for one in ordered if one.exceeds(best) < SURE]
-    doubt = (max(tied) - min(tied)) / max(best.echoes, 1)
-    return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt)
+    tied = [one for one in ordered if one.exceeds(best) < SURE]
+    echoes, widths = [one.echoes for one in tied], [one.system.sigma_ref for one in tied]
+    doubt = (max(echoes) - min(echoes)) / max(best.echoes, 1)
+    spread = max(abs(width / best.system.sigma_ref - 1) for width in widths)
+    return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt, spread)
 
 
 def settle(

@@ -42,9 +42,6 @@ MOST_STRONG = 800
 REACHED = 0.3
 """Misfit of a pulse model, in noise at the strip's strongest amplitudes, that is too small to be seen."""
 
-GOAL = 1.25
-"""Misfit of a pulse model, in errors of the stack, that chance alone makes."""
-
 NEAR_BEST = 1.25
 """Misfit, over that of the best model, at which a simpler one is taken."""
 
@@ -135,7 +132,7 @@ def _learn(
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
     stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
     strongest = float(np.quantile(main.amplitude, 0.99))
-    goal = max(REACHED * system.noise.std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
+    goal = REACHED * system.noise.std / strongest
     small = len(block) < SMALL
     most = min(most, TRIAL.get().most_components)
     sums = fit_gaussians(stack, width, most, 0.0 if small else goal)
@@ -164,11 +161,11 @@ def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[Syst
     clear = find_clear(block, system)
     top = system.saturation or float(block.samples.max())
     clear = clear.take(np.flatnonzero(clear.amplitude < FAR_FROM_LIMIT * top))
-    if len(clear) < FEW:
+    if not len(clear):
         return pulses[0]
     clear = clear.take(np.flatnonzero(clear.sigma > WIDENED * find_edge(clear.sigma)))
     clear = clear.take(np.sort(np.argsort(-clear.amplitude, kind="stable")[:MOST_WIDENED]))
-    if len(clear) < FEW:
+    if not len(clear):
         return pulses[0]
     part, rows = block.rows(clear.waveform), np.arange(len(clear))
     misfits: list[float] = []
@@ -194,7 +191,7 @@ CORE = 4.0
 
 
 def _draw(fit: PulseFit, lag: np.ndarray) -> np.ndarray:
-    """The pulse of a fit at the lags of its stack, with the height of the stack."""
+    """The pulse of a fit at the lags of its stack, of height 1."""
     weight, delay, sigma = fit.components.T
     if fit.kappa:
         at = np.array([fit.datum])
@@ -216,7 +213,10 @@ def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float
     # What the model misses of the stack's core beyond chance, in the kernel's terms: its energy over
     # that of a Gaussian. Further out are neighbours.
     core = np.abs(stack.lag - fit.datum) < CORE * width
-    missed = max(float(np.mean((_draw(fit, stack.lag) - stack.value)[core] ** 2 - stack.error[core] ** 2)), 0.0)
+    drawn, value = _draw(fit, stack.lag)[core], stack.value[core]
+    # Heights of the stacked echoes are those of Gaussians, which a skewed pulse does not have.
+    drawn *= np.einsum("l,l->", drawn, value) / np.einsum("l,l->", drawn, drawn)
+    missed = max(float(np.mean((drawn - value) ** 2 - stack.error[core] ** 2)), 0.0)
     misfit = float(np.sqrt(missed * 2 * CORE / SQRT_PI))
     system = replace(system, ringing=ringing, kappa=fit.kappa, components=(), misfit=misfit)
     if len(fit.components) > 1:

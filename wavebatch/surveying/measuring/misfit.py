@@ -54,6 +54,33 @@ LEAST_TAIL = 0.002
 noise is less."""
 
 
+PEAK, ABOVE_NOISE = 4.0, 3.0
+"""Largest difference of a pulse from its model over the misfit, which is a mean over the echo; and noises that an echo
+must be high beside the strip's strongest ones, which taught the pulse."""
+
+
+def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> SystemPulse:
+    """The system with the `faint_share` that its misfit and its noise leave, where that is less than it has.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        With its final misfit.
+    change : float
+        Of the pulse from shot to shot or below the least misfit that is tried, as a share of the amplitude.
+    echoes : EchoTable
+        Of a sample.
+
+    Returns
+    -------
+    SystemPulse
+    """
+    if not len(echoes):
+        return system
+    seen = ABOVE_NOISE * system.noise.std / float(np.quantile(echoes.amplitude, 0.99))
+    return replace(system, faint_share=min(max(PEAK * max(system.misfit, change), seen), system.faint_share))
+
+
 def measure_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
     """The system with what its pulse leaves before and after strong single echoes: `tail_misfit`, as shares of them."""
     if len(strong) < FEW:

@@ -89,12 +89,18 @@ def measure_returns(reader: StripReader, scan: StripScan, system: SystemPulse) -
 
 def _measure(residuals: np.ndarray) -> float | None:
     """Scatter of residuals (3, k): each with its variance per variance of a return, and with the error of its fits;
-    None for too few of them. Of the half with the smaller errors, less these errors."""
+    None for too few of them. Of the half with the smaller errors, less these errors.
+
+    A few residuals may have less than their errors by chance, which must not mean that returns are exact. So it is the
+    root mean square over the normal distribution of the share LOWEST, at three nodes (Gauss-Hermite).
+    """
     off, factor, error = residuals[:, np.argsort(residuals[2], kind="stable")[: max(LEAST, residuals.shape[1] // 2)]]
     if len(off) < LEAST:
         return None
-    scatter = quantile(np.abs(off) / np.sqrt(factor), LOWEST) / LOWEST_OF_NORMAL
-    return float(np.sqrt(max(scatter**2 - float(median(error**2 / factor)), 0.0)))
+    variance = ((off / LOWEST_OF_NORMAL) ** 2 - error**2) / factor
+    chance = np.sqrt(3.0 * LOWEST * (1.0 - LOWEST) / len(off))
+    low, middle, high = (max(quantile(variance, LOWEST + node * chance), 0.0) for node in (-1.0, 0.0, 1.0))
+    return float(np.sqrt((low + 4.0 * middle + high) / 6.0))
 
 
 def _sample(reader: StripReader, scan: StripScan, system: SystemPulse) -> Iterator[tuple[np.ndarray, ...]]:

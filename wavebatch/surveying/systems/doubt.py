@@ -25,6 +25,10 @@ WEAKER, REACH = 0.5, 15
 SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
 """Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
 
+MOST_SPREAD = 0.05
+"""Difference of widths, among pulses that describe the waveforms as well, from which the width is a guess where no
+echoes stand alone: that of close pairs that a pulse takes for one."""
+
 MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
 """Share of the echoes in doubt, because another pulse, misfit or noise serves as well, from which a survey's pulse is
 called a guess; of a known pulse, from which its noise is."""
@@ -42,8 +46,9 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
     most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
     reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
     # So few that the judge sees what the pulse was learned from: many Gaussians explain any waveforms, and a shipped
-    # pulse may be that of another sensor.
-    few = alone < FEW and (waveforms < SMALL or not (known or system.components))
+    # pulse may be that of another sensor. Of more waveforms the judge knows the width, or that it does not.
+    unsure = figures.width_in_doubt is None or figures.width_in_doubt > MOST_SPREAD
+    few = alone < FEW and (waveforms < SMALL or (unsure and not (known or system.components)))
     if few:
         reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
     measured = system.noise.by_kind

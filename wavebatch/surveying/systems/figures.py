@@ -92,6 +92,8 @@ class Figures:
     false_by_misfit_share: Share = None
     echoes_in_doubt: Figure = None
     """Share of the echoes that another pulse, misfit or noise, as likely, does not find, or whose samples it misses."""
+    width_in_doubt: Figure = None
+    """Share by which the widths of pulses that describe the waveforms as well differ from that of the chosen one."""
     spacing_ns: Figure = None
     n_samples: Figure = None
     bits: Figure = None

@@ -32,17 +32,7 @@ from wavebatch.surveying import SAMPLE, Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.survey import pool_blocks
 from wavebatch.tools.api.strip import AUTO
-from wavebatch.tools.bench.accuracy import (
-    AccuracyTally,
-    Group,
-    choose_cheapest,
-    derive_seed,
-    describe_found,
-    find_front,
-    make_groups,
-    median_range,
-    smoothed_power,
-)
+from wavebatch.tools.bench import accuracy
 from wavebatch.tools.bench.speed import Laps, time_chains
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene, simulate_blocks, simulate_strip
 from wavebatch.tools.simulate.scenes import Drawn
@@ -179,10 +169,10 @@ def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
     pairs = [(kinds.get(f"{kind}_smoothed", 0.0), kinds.get(kind, 0.0)) for kind in ("tail", "quiet")]
     ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
     # The binomial filter whose noise changes by smoothing as the noise of the strip does.
-    color = int(np.argmin(np.abs(np.sqrt(smoothed_power(np.arange(5)) / 6) - ratio)))
+    color = int(np.argmin(np.abs(np.sqrt(accuracy.smoothed_power(np.arange(5)) / 6) - ratio)))
     # Noise of one sample; `noise.std` is what coloured noise does to the amplitude of a pulse.
     noise = kinds.get("outside") or kinds.get("quiet") or system.noise.std
-    gain = np.sqrt(smoothed_power(color) / 6)
+    gain = np.sqrt(accuracy.smoothed_power(color) / 6)
     pulse = PulseModel(sigma=system.sigma_ref, kappa=system.kappa)
     if len(system.components) > 1:
         weight, delay, sigma = system.components[0]
@@ -260,7 +250,7 @@ class BenchOptions:
 def run_bench(
     options: BenchOptions,
     progress: BenchProgress = lambda text: None,
-    measure_others: Callable[[Scene, list[Group]], BenchRows] = lambda scene, groups: [],
+    measure_others: Callable[[Scene, list[accuracy.Group]], BenchRows] = lambda scene, groups: [],
 ) -> dict[str, Any]:
     """Runs a benchmark and returns its document of plain values.
 
@@ -292,18 +282,18 @@ def run_bench(
 
 def _measure_scene(
     scene: Scene, chains: Mapping[str, Chain], options: BenchOptions, place: int, progress: BenchProgress,
-    measure_others: Callable[[Scene, list[Group]], BenchRows],
+    measure_others: Callable[[Scene, list[accuracy.Group]], BenchRows],
 ) -> dict[str, Any]:  # fmt: skip
-    seed = derive_seed(options.seed, place)
-    groups = make_groups(scene, options.waveforms, seed, progress)
+    seed = accuracy.derive_seed(options.seed, place)
+    groups = accuracy.make_groups(scene, options.waveforms, seed, progress)
     chosen = [choose_chains(chains, group.survey) for group in groups]
     twin = find_twin(chosen)
     measured = {name: chain for name, chain in chosen[0].items() if name != AUTO or twin is None}
-    tallies = {name: AccuracyTally() for name in measured}
+    tallies = {name: accuracy.AccuracyTally() for name in measured}
     for name, tally in tallies.items():
         progress(f"{scene.name}: error of {name}")
         for group, of_group in zip(groups, chosen, strict=True):
-            tally.add(group, describe_found(of_group[name].run(group.block, group.system)))
+            tally.add(group, accuracy.describe_found(of_group[name].run(group.block, group.system)))
     laps = _time(scene, groups[0], measured, options, seed, progress)
     rows = [make_row(name, "chain", tally, laps[name]) for name, tally in tallies.items()]
     if twin:
@@ -314,18 +304,19 @@ def _measure_scene(
     names = ("rmse_all_cm", "wrong")
     costs = [(row["kernels"]["median"], *(row["figures"][name]["value"] for name in names))
              if row["kind"] == "chain" else (None,) * 3 for row in rows]  # fmt: skip
-    for row, best in zip(rows, find_front(costs).tolist(), strict=True):
+    for row, best in zip(rows, accuracy.find_front(costs).tolist(), strict=True):
         row["pareto"] = best
     section = {"scene": scene.name, "meaning": scene.meaning, "survey": _describe(groups), "rows": rows}
     if options.tolerance_cm is not None:
-        cheapest = choose_cheapest([row for row in rows if row["kind"] == "chain"], options.tolerance_cm)
+        cheapest = accuracy.choose_cheapest([row for row in rows if row["kind"] == "chain"], options.tolerance_cm)
         section["cheapest"] = cheapest["name"] if cheapest else None
     return section
 
 
 def _time(
-    scene: Scene, group: Group, chains: Mapping[str, Chain], options: BenchOptions, seed: int, progress: BenchProgress
-) -> dict[str, Laps]:
+    scene: Scene, group: accuracy.Group, chains: Mapping[str, Chain], options: BenchOptions, seed: int,
+    progress: BenchProgress,
+) -> dict[str, Laps]:  # fmt: skip
     timed = {name: (chain, group.system) for name, chain in chains.items()}
     block, strip = group.block, None
     with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:
@@ -338,14 +329,15 @@ def _time(
         return time_chains(timed, block, strip, Path(name), options.repeats, progress)
 
 
-def make_row(name: str, kind: str, tally: AccuracyTally, laps: Laps) -> dict[str, Any]:
+def make_row(name: str, kind: str, tally: accuracy.AccuracyTally, laps: Laps) -> dict[str, Any]:
     """The row of a chain or of another program (kind: chain or peer)."""
     figures = {key: figure.to_json() for key, figure in tally.figures().items()}
-    times = {key: median_range(value) if isinstance(value, list) else value for key, value in asdict(laps).items()}
+    found = asdict(laps).items()
+    times = {key: accuracy.median_range(value) if isinstance(value, list) else value for key, value in found}
     return {"name": name, "kind": kind, "waveforms": tally.waveforms, "figures": figures, **times}
 
 
-def _describe(groups: list[Group]) -> dict[str, Any]:
+def _describe(groups: list[accuracy.Group]) -> dict[str, Any]:
     """Range of the results of the groups' surveys."""
     fields = {"noise_std": "noise.std", "noise_gain": "noise.gain"}
     names = ("sigma_ref", "noise_std", "kappa", "noise_gain", "ringing", "acceptance")
@@ -353,6 +345,6 @@ def _describe(groups: list[Group]) -> dict[str, Any]:
     return {
         "groups": len(groups),
         "waveforms_of_a_group": len(groups[0].block),
-        **{name: median_range([float(value) for value in found]) for name, found in values.items()},
+        **{name: accuracy.median_range([float(value) for value in found]) for name, found in values.items()},
         "components": sorted({len(group.system.components) for group in groups}),
     }

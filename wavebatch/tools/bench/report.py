@@ -210,8 +210,7 @@ def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: flo
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.set_xlabel("kernels: microseconds per waveform")
-    axes.set_ylabel(label)
+    axes.set(xlabel="kernels: microseconds per waveform", ylabel=label)
     if not known:
         return
     chains = np.array([row["kind"] == "chain" for row in known])

@@ -155,14 +155,12 @@ def draw_angles(tables: Sequence[AngleTable], target: Path, *, strip: str = "", 
     with open_picture(target, (7.0, 6.0), overwrite=overwrite) as figure:
         axes, errors = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
         axes.plot(found.width, found.angle, color=SERIES[0], linewidth=1.5)
-        axes.set_ylim(0, 90)
-        axes.set_ylabel("incidence angle [deg]")
+        axes.set(ylim=(0, 90), ylabel="incidence angle [deg]")
         for one, color in zip(tables, SERIES, strict=False):
             errors.plot(one.width, one.error, color=color, linewidth=1.2, label=f"echoes of {one.amplitude:.0f} DN")
         errors.set_yscale("log")
         errors.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        errors.set_ylabel("rms error [deg]")
-        errors.set_xlabel("echo_width [ns]")
+        errors.set(xlabel="echo_width [ns]", ylabel="rms error [deg]")
         parts = [plain_text(strip), f"{found.distance:.0f} m, {found.divergence:g} mrad"]
         set_head(figure, [part for part in parts if part], size=10.5)
         errors.legend(loc="upper right")

@@ -28,15 +28,7 @@ from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.api.strip import AUTO, load_chain
-from wavebatch.tools.compare.pairing import (
-    PACKET_DTYPE,
-    SPEED,
-    Comparison,
-    Pairing,
-    check_tolerance,
-    open_task,
-    read_echoes,
-)
+from wavebatch.tools.compare import pairing
 from wavebatch.tools.even_sample import EvenSample
 
 
@@ -149,9 +141,9 @@ class Matchup:
     """Waveforms that were compared."""
     returns: int
     """The vendor's returns in these waveforms."""
-    between: Comparison
+    between: pairing.Comparison
     """a with b; two chains by time within each waveform, so that differences are those of the fits."""
-    vendor: dict[str, Comparison] = field(default_factory=dict)
+    vendor: dict[str, pairing.Comparison] = field(default_factory=dict)
     """Chains `a` and `b` with the vendor's returns, by position within each waveform."""
     fit: dict[str, dict[str, Goodness]] = field(default_factory=dict)
     """Goodness of fit of `a` and `b`: of `all` waveforms with an echo, of those with a `single` echo, with several
@@ -188,7 +180,7 @@ def match_sides(
         raise ConfigError(f"{a.name}: both sides are results already; compare them without --strip")
     if clouds and limit is not None:
         raise ConfigError(f"{clouds[0].name}: a cloud has the echoes of all waveforms; leave --limit out")
-    check_tolerance(tolerance_ns)
+    pairing.check_tolerance(tolerance_ns)
     with StripReader(strip) as reader, reader.scan(force=force) as scan:
         saved = None if survey is None else SavedSurvey(survey)
         request = Request(auto=True, system=saved, force=force)
@@ -211,9 +203,9 @@ def match_sides(
 
 def match_chains(
     blocks: Iterator[WaveformBlock], runs: dict[str, ChainRun], names: tuple[str, str], tolerance_ns: float
-) -> Comparison:
+) -> pairing.Comparison:
     """Compares chains a and b, or a and the vendor's returns, waveform by waveform; each of `runs` collects sums."""
-    between = Pairing(tolerance_ns)
+    between = pairing.Pairing(tolerance_ns)
     for block in blocks:
         found = {key: run.find(block) for key, run in runs.items()}
         number = {key: one.echoes.count(len(block)) for key, one in found.items()}
@@ -234,16 +226,16 @@ def _match_cloud(
     b: Contender,
     runs: dict[str, ChainRun],
     tolerance_ns: float,
-) -> Comparison:
+) -> pairing.Comparison:
     """Compares a chain with a cloud, as two clouds."""
     ((key, run),) = runs.items()
     cloud_side = 1 if key == "a" else 0
     with (
         CloudReader(Path((a, b)[cloud_side].name)) as cloud,
         CloudReader(strip) as returns,
-        open_task(cloud, returns, tolerance_ns) as task,
+        pairing.open_task(cloud, returns, tolerance_ns) as task,
     ):
-        for rows in read_echoes(cloud):
+        for rows in pairing.read_echoes(cloud):
             task.add(cloud_side, rows)
         for block in blocks:
             found = run.find(block)
@@ -279,7 +271,7 @@ class _Found(Solved):
         """
         rows = self.rows(block)
         rows["ray"] = rows["xyz"] = 0.0
-        rows["xyz"][:, 2] = -SPEED * self.echoes.time
+        rows["xyz"][:, 2] = -pairing.SPEED * self.echoes.time
         return rows
 
     def vendor_rows(self, block: WaveformBlock) -> np.ndarray:
@@ -311,7 +303,7 @@ class ChainRun:
         placed = [step for step in chain.steps if step.stage.name == "attribute.position"]
         ending = [Step(STAGES["attribute.echo_width"]), *(placed or [Step(STAGES["attribute.position"])])[:1]]
         self.chain, self.system = Chain((*chain.steps[:3], *ending), chain.name), system
-        self.fit, self.vendor = FitQuality(_KEPT), Pairing(tolerance_ns, limit=_KEPT)
+        self.fit, self.vendor = FitQuality(_KEPT), pairing.Pairing(tolerance_ns, limit=_KEPT)
 
     def find(self, block: WaveformBlock) -> _Found:
         """Runs the chain on a block."""
@@ -327,7 +319,7 @@ class ChainRun:
 
 def _keys(block: WaveformBlock) -> np.ndarray:
     """All waveforms of the block, so that those without an echo count too."""
-    keys = np.zeros(len(block), PACKET_DTYPE)
+    keys = np.zeros(len(block), pairing.PACKET_DTYPE)
     keys["gps_time"] = np.arange(len(block))
     return keys
 

@@ -80,9 +80,7 @@ def chart(title: str, labels: tuple[str, str], draw: Callable[[Axes], None], wor
 
     def fill(figure: Figure) -> None:
         axes = figure.add_axes(PLACE)
-        axes.set_title(plain_text(title, 60))
-        axes.set_xlabel(plain_text(labels[0], 60))
-        axes.set_ylabel(plain_text(labels[1], 40))
+        axes.set(title=plain_text(title, 60), xlabel=plain_text(labels[0], 60), ylabel=plain_text(labels[1], 40))
         draw(axes)
 
     return picture(title, SIZE, fill, words)
@@ -189,8 +187,7 @@ def draw_map(found: Raster, note: str = "") -> list[Picture]:
         add_colorbar(axes, shown, found.values, found.shown, label, length=up, flat=False, place=place)
         axes.locator_params(axis="x", nbins=4 if across > 1.5 else 1)
         axes.locator_params(axis="y", nbins=4 if up > 1.5 else 1)
-        axes.set_xlabel(f"east [{found.crs.unit}]")
-        axes.set_ylabel(f"north [{found.crs.unit}]")
+        axes.set(xlabel=f"east [{found.crs.unit}]", ylabel=f"north [{found.crs.unit}]")
 
     words = f"Cells of {grid.size:g} {found.crs.unit}; origin {west:.10g} E, {south:.10g} N{note}."
     return picture(f"{found.statistic} of {found.facts.name}", size, draw, words)

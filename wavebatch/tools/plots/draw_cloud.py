@@ -102,7 +102,7 @@ def count_values(
     """The histogram of a column of clouds, in bounded memory.
 
     bins: number of bins, by default from the rule of Freedman and Diaconis; a column with a fixed step gets at most as
-    many, each a whole number of steps wide. limits: lowest and highest edge, by default those of `values.shown_limits`.
+    many, each a whole number of steps wide. limits: lowest and highest edge, by default those of `shown_limits`.
     each: one series per cloud instead of one for all. by: one series per value of this column.
     Raises InputError without any value, ConfigError for a column of flags, and more than MOST_GROUPS groups.
     """
@@ -447,8 +447,7 @@ def _place_ticks(axes: Axes, width: float, height: float, unit: str) -> None:
     space_ticks(axes.yaxis, height, 0.5)
     if narrow:
         axes.tick_params(axis="x", labelrotation=90)
-    axes.set_xlabel(f"x [{unit}]")
-    axes.set_ylabel(f"y [{unit}]")
+    axes.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]")
 
 
 def _title(names: tuple[str, ...], total: Tally, column: str, rest: Sequence[str]) -> str:

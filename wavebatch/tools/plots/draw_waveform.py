@@ -249,21 +249,35 @@ def draw_detector(axes: Axes, seen: DetectorSignal, times: tuple[float, float], 
     axes.text(0.995, 0.97, wrapped, transform=axes.transAxes, ha="right", va="top", fontsize=7.5, color=GREY)
 
 
-def _draw_residual(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
+def _draw_residual(
+    axes: Axes, view: WaveformView, times: tuple[float, float], height: float | None = None
+) -> None:
+    """Draws the residual of each sample as a line from 0.
+
+    height: half that of a small panel [noise std], with larger residuals in red up to its edge; None: a large panel.
+    """
     axes.axhspan(-1, 1, color="#e6e6e6", zorder=0)
-    axes.axhline(0, color=GREY, linewidth=0.8, zorder=1)
+    small = height is not None
+    if not small:
+        axes.axhline(0, color=GREY, linewidth=0.8, zorder=1)
     if view.residual is None:
-        axes.set_ylim(-_LEAST_SCALE, _LEAST_SCALE)
-        axes.text(0.5, 0.5, "this chain fits no pulse", transform=axes.transAxes, ha="center", va="center", color=GREY)
+        axes.set_ylim(-(height or _LEAST_SCALE), height or _LEAST_SCALE)
+        if not small:
+            axes.text(0.5, 0.5, "this chain fits no pulse", transform=axes.transAxes, ha="center", va="center",
+                      color=GREY)  # fmt: skip
         return
-    # One line with gaps: a line for each sample of long waveforms would take half a gigabyte.
     inside = (view.time >= times[0]) & (view.time <= times[1])
     time, residual = view.time[inside], view.residual[inside]
-    heights = np.stack([np.zeros(len(time)), residual, np.full(len(time), np.nan)], axis=1)
-    axes.plot(np.repeat(time, 3), heights.ravel(), color=FIT, linewidth=0.8)
-    axes.plot(time, residual, "o", color=FIT, markersize=2.0 if len(view.time) <= _MANY else 1.2)
-    axes.yaxis.get_major_locator().set_params(nbins=4, integer=True, symmetric=True)
-    height = max(_LEAST_SCALE, 1.1 * float(np.abs(residual[np.isfinite(residual)]).max(initial=0.0)))
+    height = height or max(_LEAST_SCALE, 1.1 * float(np.abs(residual[np.isfinite(residual)]).max(initial=0.0)))
+    large = np.abs(residual) > height
+    for rows, color in ((~large, FIT), (large, ECHO)):
+        # One line with gaps: a line for each sample of long waveforms would take half a gigabyte.
+        shown = np.clip(residual[rows], -height, height)
+        heights = np.stack([np.zeros(len(shown)), shown, np.full(len(shown), np.nan)], axis=1)
+        axes.plot(np.repeat(time[rows], 3), heights.ravel(), color=color, linewidth=0.7 if small else 0.8)
+    if not small:
+        axes.plot(time, residual, "o", color=FIT, markersize=2.0 if len(view.time) <= _MANY else 1.2)
+        axes.yaxis.get_major_locator().set_params(nbins=4, integer=True, symmetric=True)
     axes.set_ylim(-height, height)
 
 
@@ -374,7 +388,7 @@ def _draw_cell(
     upper.plot(view.echoes.time, find_echo_heights(view), "D", color=ECHO, markersize=3, markerfacecolor="none",
                markeredgewidth=0.7)  # fmt: skip
     fit_signal_panel(upper, view, times)
-    _draw_small_residual(lower, view)
+    _draw_residual(lower, view, times, RESIDUAL)
     upper.set_xlim(times)
     for axes in (upper, lower):
         axes.tick_params(labelsize=5.5, length=2, pad=1)
@@ -384,19 +398,6 @@ def _draw_cell(
     lower.set_yticks([])
     title = fit_text(figure, _small_title(view, note), CELL[0] - 0.45, size=6.5)
     upper.set_title(title, fontsize=6.5, pad=2)
-
-
-def _draw_small_residual(axes: Axes, view: WaveformView) -> None:
-    axes.axhspan(-1, 1, color="#e6e6e6", zorder=0)
-    axes.set_ylim(-RESIDUAL, RESIDUAL)
-    if view.residual is None:
-        return
-    residual = np.clip(view.residual, -RESIDUAL, RESIDUAL)
-    large = np.abs(view.residual) > RESIDUAL
-    for rows, color in ((~large, FIT), (large, ECHO)):
-        # One broken line: hundreds of lines would be most of a page.
-        ends = np.stack([np.zeros(rows.sum()), residual[rows], np.full(rows.sum(), np.nan)], axis=1)
-        axes.plot(np.repeat(view.time[rows], 3), ends.ravel(), color=color, linewidth=0.7)
 
 
 def _small_title(view: WaveformView, note: str) -> str:

@@ -21,19 +21,7 @@ from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.las.crs import CrsWords
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
-from wavebatch.tools.rasters.cells import (
-    MARGIN,
-    Clouds,
-    Tally,
-    check_crs,
-    check_statistic,
-    compute_cells,
-    name_paths,
-    robust_limits,
-    round_up,
-    sample_points,
-    survey_places,
-)
+from wavebatch.tools.rasters import cells
 from wavebatch.tools.voxels.grid import VoxelFile
 
 MOST_POINTS = 200_000
@@ -49,12 +37,12 @@ _CHOSEN_BINS = 60
 """Bins of a profile, about, if their size is not given."""
 
 
-def open_heights(paths: Sequence[Path], column: str | None, chosen: PointFilter) -> Clouds | VoxelFile:
+def open_heights(paths: Sequence[Path], column: str | None, chosen: PointFilter) -> cells.Clouds | VoxelFile:
     """Clouds or one file of voxels, whose rows have the height as second value."""
     voxels = [path for path in paths if path.suffix.lower() == ".npz"]
     if voxels and len(paths) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
-    return VoxelFile(paths[0], column, chosen) if voxels else Clouds(paths, (column, "z"), chosen)
+    return VoxelFile(paths[0], column, chosen) if voxels else cells.Clouds(paths, (column, "z"), chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +59,7 @@ class Section:
     """Distance from the first end, f8 (n,)."""
     height: np.ndarray
     value: np.ndarray
-    total: Tally
+    total: cells.Tally
     """Counts of all points of the clouds."""
     inside: int
     """Points with a value in the section; at most MOST_POINTS are here."""
@@ -121,7 +109,7 @@ def cut_section(
         keep = (far >= 0) & (far <= length) & (np.abs(aside) <= 0.5 * width) & np.isfinite(height)
         return np.stack([far, height, rows["values"][:, 0]], axis=1)[keep]
 
-    total, sample, _ = sample_points(clouds, lambda _, rows: cut(rows), MOST_POINTS)
+    total, sample, _ = cells.sample_points(clouds, lambda _, rows: cut(rows), MOST_POINTS)
     if not sample.seen:
         raise InputError(
             f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} {crs.unit} of the line from "
@@ -141,8 +129,8 @@ def cut_section(
                    outside, shown, voxel, crs)  # fmt: skip
 
 
-def _find_crs(clouds: Clouds | VoxelFile) -> CrsWords:
-    return CrsWords(clouds.crs) if isinstance(clouds, VoxelFile) else check_crs(clouds.paths)
+def _find_crs(clouds: cells.Clouds | VoxelFile) -> CrsWords:
+    return CrsWords(clouds.crs) if isinstance(clouds, VoxelFile) else cells.check_crs(clouds.paths)
 
 
 def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
@@ -155,13 +143,13 @@ def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
     if len(height) < LEAST:
         return -math.inf, math.inf
     rest = np.sort(height)[few:-few]
-    reach = max(MARGIN * float(rest[-1] - rest[0]), 0.1 * length)
+    reach = max(cells.MARGIN * float(rest[-1] - rest[0]), 0.1 * length)
     return float(rest[0]) - reach, float(rest[-1]) + reach
 
 
-def _choose_line(clouds: Clouds | VoxelFile) -> tuple[float, float, float, float]:
+def _choose_line(clouds: cells.Clouds | VoxelFile) -> tuple[float, float, float, float]:
     """A line through the middle of the points, along their longer extent."""
-    _, sample, _ = survey_places(clouds, option="--line")
+    _, sample, _ = cells.survey_places(clouds, option="--line")
     if not sample.seen:
         raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a position")
     places = sample.read()["place"]
@@ -170,7 +158,7 @@ def _choose_line(clouds: Clouds | VoxelFile) -> tuple[float, float, float, float
     axis = vectors[:, 1] if values[1] > 0 else np.array([1.0, 0.0])
     axis = axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
     ends = (places - middle) @ axis
-    low, high = robust_limits(ends, float(ends.min()), float(ends.max()))
+    low, high = cells.robust_limits(ends, float(ends.min()), float(ends.max()))
     margin = max(0.5 * (1.0 - (high - low)), 0.0)
     return (*(middle + (low - margin) * axis).tolist(), *(middle + (high + margin) * axis).tolist())
 
@@ -189,7 +177,7 @@ class Profile:
     """f8 (series, b); NaN for a mean without a point."""
     outside: int
     """Points below or above the edges."""
-    total: Tally
+    total: cells.Tally
     unit: str
     """Of heights."""
     upright: str = "height"
@@ -223,13 +211,13 @@ def measure_profile(
     """
     clouds = open_heights(paths, column, chosen)
     crs = _find_crs(clouds)
-    check_statistic(column, statistic, clouds.facts, paths[0])
+    cells.check_statistic(column, statistic, clouds.facts, paths[0])
 
     def pick(_: int, rows: np.ndarray) -> np.ndarray:
         height = rows["values"][:, 1:]
         return height[np.isfinite(height[:, 0])]
 
-    total, sample, box = sample_points(clouds, pick)
+    total, sample, box = cells.sample_points(clouds, pick)
     if not sample.seen:
         raise clouds.complain(total)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
@@ -245,7 +233,7 @@ def measure_profile(
         sums[row] += np.bincount(at[good], rows["values"][:, 0][good], minlength=len(edges) - 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         values: Any = {"count": numbers, "sum": sums, "mean": np.where(numbers > 0, sums / numbers, np.nan)}[statistic]
-    names = name_paths(paths)
+    names = cells.name_paths(paths)
     names = names if each or len(paths) == 1 else (f"{len(paths)} clouds",)
     return Profile(clouds.facts, statistic, names, edges, values, outside, total, crs.upright_unit,
                    crs.upright)  # fmt: skip
@@ -253,9 +241,9 @@ def measure_profile(
 
 def place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:
     """Edges of bins: multiples of their size; for voxels the faces of these, or no voxel would lie on one side only."""
-    low, high = robust_limits(sample, least, largest)
+    low, high = cells.robust_limits(sample, least, largest)
     if size is None:
-        size = round_up(max(high - low, 1e-3) / _CHOSEN_BINS)
+        size = cells.round_up(max(high - low, 1e-3) / _CHOSEN_BINS)
     if not (math.isfinite(size) and size > 0):
         raise ConfigError(f"--size {size:g}: must be above 0")
     base = 0.0
@@ -298,11 +286,8 @@ def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite
         axes, place = (figure.subplots(), None) if flat else figure.subplots(1, 2, width_ratios=(1, 0.05))
         axes.set_anchor("C" if flat else "E")
         shown, values = _draw_voxels(axes, found) if found.voxel else _draw_points(axes, found)
-        axes.set_xlim(0.0, length)
-        axes.set_ylim(low, high)
-        axes.set_aspect(aspect)
-        axes.set_xlabel(f"along the line [{found.crs.unit}]")
-        axes.set_ylabel(f"{found.crs.upright} [{found.crs.upright_unit}]")
+        axes.set(xlim=(0.0, length), ylim=(low, high), aspect=aspect, xlabel=f"along the line [{found.crs.unit}]",
+                 ylabel=f"{found.crs.upright} [{found.crs.upright_unit}]")  # fmt: skip
         axes.ticklabel_format(useOffset=False)
         space_ticks(axes.yaxis, width * tall, 0.3)
         label = ("mean of " if found.voxel else "") + found.facts.label
@@ -346,7 +331,7 @@ def _draw_voxels(axes, found: Section):
     row = np.floor((found.height - base) / edge + 1e-6).astype(np.int64)
     shape = (int(row.max()) + 1, int(column.max()) + 1)
     cell = row * shape[1] + column
-    image = compute_cells("mean", cell, found.value, shape[0] * shape[1], 1.0).reshape(shape)
+    image = cells.compute_cells("mean", cell, found.value, shape[0] * shape[1], 1.0).reshape(shape)
     if found.facts.name in LIGHT:
         image[image < FAINT * found.shown[1]] = np.nan
     extent = (0.0, shape[1] * edge, base, base + shape[0] * edge)
@@ -381,8 +366,8 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
         axes.set_ylim(found.edges[0], found.edges[-1])
         axes.ticklabel_format(axis="y", useOffset=False, style="plain")
-        axes.set_xlabel(fit_text(figure, plain_text(found.label, 300), 5.0, size=9.5))
-        axes.set_ylabel(f"{found.upright} [{found.unit}]")
+        across = fit_text(figure, plain_text(found.label, 300), 5.0, size=9.5)
+        axes.set(xlabel=across, ylabel=f"{found.upright} [{found.unit}]")
         parts = [name_clouds(found.names), f"{found.total.values:,} {found.noun}"]
         parts[1:1] = [found.facts.name] if found.facts.name != found.noun else []
         set_head(figure, [*parts, *found.total.list_rest(found.outside)])

@@ -33,15 +33,8 @@ from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
+from wavebatch.kernels.signal import filters
 from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
-from wavebatch.kernels.signal.filters import (
-    curvature_taps,
-    filter_antisymmetric,
-    filter_energy,
-    filter_symmetric,
-    gaussian_taps,
-    slope_taps,
-)
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121
 from wavebatch.kernels.signal.square_differences import pad_samples, slide_taps, square_differences
 from wavebatch.stages.chain import STAGES, Chain, Step
@@ -162,7 +155,7 @@ def _see_maximum(scene: _Scene) -> DetectorSignal:
     if smoothing.taps is None:
         even = smooth_121(smooth_121(scene.signal))
     else:
-        even = filter_symmetric(scene.signal, smoothing.taps)
+        even = filters.filter_symmetric(scene.signal, smoothing.taps)
     return DetectorSignal("smoothed [DN]", scene.rule, even, scene.options.threshold * smoothing.gain * scene.std)
 
 
@@ -179,10 +172,10 @@ def _see_samples(scene: _Scene) -> DetectorSignal:
 
 
 def _see_matched(scene: _Scene) -> DetectorSignal:
-    taps = gaussian_taps(scene.ref)
-    energy = filter_energy(taps)
+    taps = filters.gaussian_taps(scene.ref)
+    energy = filters.filter_energy(taps)
     # In units of the amplitude of a lone echo, as the stage reports it.
-    values = filter_symmetric(scene.signal, taps) / np.float32(energy)
+    values = filters.filter_symmetric(scene.signal, taps) / np.float32(energy)
     return DetectorSignal("correlation [DN]", scene.rule, values, scene.options.threshold * scene.std / np.sqrt(energy))
 
 
@@ -229,10 +222,10 @@ def _see_spikes(scene: _Scene) -> DetectorSignal:
 
 def _see_curvature(scene: _Scene) -> DetectorSignal:
     one = scene.options
-    taps = curvature_taps(max(one.scale * scene.ref, LEAST_BLUR))
+    taps = filters.curvature_taps(max(one.scale * scene.ref, LEAST_BLUR))
     rule = f"{scene.rule} where the smoothed signal is above {one.level:g} std"
-    least = one.threshold * np.sqrt(filter_energy(taps)) * scene.std
-    return DetectorSignal("- second derivative [DN/sample2]", rule, filter_symmetric(scene.signal, taps), least)
+    least = one.threshold * np.sqrt(filters.filter_energy(taps)) * scene.std
+    return DetectorSignal("- second derivative [DN/sample2]", rule, filters.filter_symmetric(scene.signal, taps), least)
 
 
 def _see_crossings(scene: _Scene) -> DetectorSignal:
@@ -240,12 +233,12 @@ def _see_crossings(scene: _Scene) -> DetectorSignal:
     blur = max(one.scale * scene.ref, LEAST_BLUR)
     high = f"where the smoothed signal is above {one.level:g} std"
     if one.derivative == "first":
-        values = filter_antisymmetric(scene.signal, slope_taps(blur))
+        values = filters.filter_antisymmetric(scene.signal, filters.slope_taps(blur))
         least = np.full(values.shape[1], np.nan)
         return DetectorSignal("derivative [DN/sample]", f"falls through zero {high}", values, least)
-    taps = curvature_taps(blur)
-    least = INFLECTED * np.sqrt(filter_energy(taps)) * scene.std
-    values = filter_symmetric(scene.signal, taps)
+    taps = filters.curvature_taps(blur)
+    least = INFLECTED * np.sqrt(filters.filter_energy(taps)) * scene.std
+    values = filters.filter_symmetric(scene.signal, taps)
     return DetectorSignal("- second derivative [DN/sample2]", f"middle of two zeros {high}", values, least)
 
 

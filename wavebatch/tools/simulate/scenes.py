@@ -390,7 +390,7 @@ class Scene:
     times: WithinDepth | WithGaps = WithinDepth(24.0)
     """With 24 ns, the decomposer of docs/algorithms.md 4.3 gets the share of exact counts stated there (.96, .61)."""
     terrain: str = "flat"
-    """A key of geometry.TERRAINS."""
+    """A key of TERRAINS."""
     divergence: float = 0.0
     """Full angle of the beam between the 1/e^2 points [mrad]; above 0, slopes widen the echoes."""
     light: float = 0.0

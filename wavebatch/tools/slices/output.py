@@ -236,13 +236,11 @@ def draw_segments(
         shown = plan.add_collection(LineCollection(ends[:, :, :2] - base[:2], cmap="viridis", linewidths=1.0))
         shown.set_array(height)
         margin = 0.04 * extent[:2].max()
-        plan.set_xlim(low[0] - base[0] - margin, high[0] - base[0] + margin)
-        plan.set_ylim(low[1] - base[1] - margin, high[1] - base[1] + margin)
-        plan.set_aspect("equal")
+        first, last = (low - base - margin)[:2], (high - base + margin)[:2]
+        plan.set(xlim=(first[0], last[0]), ylim=(first[1], last[1]), aspect="equal")
         names = [f"{name} {'-' if value >= 0 else '+'} {abs(value):.10g} [m]" if value else f"{name} [m]"
                  for name, value in zip("xyz", base, strict=True)]  # fmt: skip
-        plan.set_xlabel(names[0])
-        plan.set_ylabel(names[1])
+        plan.set(xlabel=names[0], ylabel=names[1])
         figure.colorbar(shown, ax=plan, label="height [m]", orientation="horizontal", aspect=40)
         space = figure.add_subplot(1, 2, 2, projection="3d")
         tubes = space.add_collection3d(Line3DCollection(ends - base, cmap="viridis", linewidths=0.9))
@@ -256,23 +254,12 @@ def draw_segments(
         # A long box is seen along its diagonal, and leaves more room around it than a cube.
         space.set_box_aspect(sides, zoom=0.85 + 0.35 * (1.0 - np.sort(sides)[1] / sides.max()))
         for axis, side in zip("xyz", sides / sides.max(), strict=True):
-            _place_ticks(getattr(space, f"{axis}axis"), 5.0 * side)
+            space_ticks(getattr(space, f"{axis}axis"), 5.0 * side, 1.0)
         for flat, side in zip((plan.xaxis, plan.yaxis), extent[:2] / extent.max(), strict=True):
-            _place_ticks(flat, 7.0 * side)
+            space_ticks(flat, 7.0 * side, 1.0)
         factor = tall / extent[2]
         scales = "equal scales" if factor < 1.01 else f"heights {factor:.2g} times exaggerated"
         space.set_title(f"{scales}; z above {base[2]:.10g} m", fontsize=9)
-
-
-def _place_ticks(axis, number: float) -> None:
-    """Sets about so many ticks, or only one in the middle of a short axis: more would cover each other."""
-    if number < 1.5:
-        low, high = axis.get_view_interval()
-        step = 10.0 ** np.floor(np.log10(0.5 * (high - low)))
-        axis.set_ticks([step * np.round(0.5 * (low + high) / step)])
-        axis.set_major_formatter("{x:.6g}")
-    else:
-        axis.get_major_locator().set_params(nbins=max(int(number), 2))
 
 
 def draw_cube(slices: Sequence[CubeSlice], target: Path, *, name: str, overwrite: bool = False) -> None:
@@ -289,9 +276,7 @@ def draw_cube(slices: Sequence[CubeSlice], target: Path, *, name: str, overwrite
                                 vmax=max(high, 1e-6), interpolation="nearest")  # fmt: skip
             if one.down:
                 axes.invert_yaxis()
-            axes.set_xlabel(one.across)
-            axes.set_ylabel(one.up)
-            axes.set_title(one.title)
+            axes.set(xlabel=one.across, ylabel=one.up, title=one.title)
         figure.colorbar(shown, ax=panels.tolist(), label="above the level without signal [DN]", extend="max")
 
 
@@ -392,8 +377,7 @@ def draw_slice(
         for segment in segments:
             ends = np.array(segment.ends)
             axes.plot(ends[:, 0], ends[:, 1], color="tab:red", linewidth=1.2)
-        axes.set_xlim(extent[:2])
-        axes.set_ylim(extent[2:])
+        axes.set(xlim=extent[:2], ylim=extent[2:])
         space_ticks(axes.yaxis, width * tall, 0.3)
         axes.set_xlabel("along the slice [m]" if plane else "time from the nearest sample of all [ns]")
         axes.set_ylabel("height [m]" if plane else "pulse")

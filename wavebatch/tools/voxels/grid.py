@@ -29,34 +29,11 @@ from wavebatch.files.disk.npz import NpzWriter, read_npz, reading_npz
 from wavebatch.files.disk.publish import Draft, protecting, publish_together
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.disk.temp_store import HELD, KeyedSums
+from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import name_crs, repair_records, repair_wkt
-from wavebatch.files.las.header import (
-    PROJECTION,
-    WKT_BIT,
-    WKT_ID,
-    ExtraRecord,
-    LasHeader,
-    Vlr,
-    build_dtype,
-    build_wkt,
-    has_record,
-    is_projection,
-    read_header,
-)
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.packets import StripFacts
-from wavebatch.kernels.geometry.voxels import (
-    KEY_BITS,
-    Crossings,
-    VoxelSamples,
-    cross_voxels,
-    differences_along,
-    fits_keys,
-    pack_index,
-    split_rays,
-    sum_before,
-    unpack_index,
-)
+from wavebatch.kernels.geometry import voxels as kernel
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.tools.rasters.cells import Tally
 from wavebatch.tools.voxels.rays import Floor, LightRule, Rays, measure_lengths
@@ -73,7 +50,7 @@ SECTION_UNIT = 2.0**-40
 _RAYS, _LIGHT, _CAUGHT, _PATH, _ENERGY, _SQUARES, _CAUGHT_BY_RATIO, _LIGHT_BY_RATIO, _SECTION, _UNKNOWN = range(10)
 _GROUND, _FREE = 10, 11
 
-_NEXT_Y = np.uint64(1 << KEY_BITS[2])
+_NEXT_Y = np.uint64(1 << kernel.KEY_BITS[2])
 """From the key of a voxel to that of its neighbour along y."""
 
 _CLASSES = 40
@@ -183,15 +160,15 @@ class VoxelGrid(Closing):
         """Adds rays, with the light that the rule finds in them."""
         local = rays.table["start"] - self.anchor * self.size
         step, begin, end = (rays.table[name] for name in ("step", "begin", "end"))
-        good = fits_keys(local, step, begin, end, self.size)
+        good = kernel.fits_keys(local, step, begin, end, self.size)
         self.outside += int(np.count_nonzero(~good))
         self.unknown += int(rays.table["unknown"][good].sum())
         good = np.flatnonzero(good)
         rays, local = rays.take(good), local[good]
         step, begin, end = (rays.table[name] for name in ("step", "begin", "end"))
         self.rays += len(good)
-        for part in split_rays(local, step, begin, end, self.size):
-            found = cross_voxels(local[part], step[part], begin[part], end[part], self.size)
+        for part in kernel.split_rays(local, step, begin, end, self.size):
+            found = kernel.cross_voxels(local[part], step[part], begin[part], end[part], self.size)
             values = self._list_values(found, rays.take(part), rule)
             kept = slice(None) if self._everything else values[:, _ENERGY] > 0
             index = found.voxel[kept]
@@ -199,21 +176,21 @@ class VoxelGrid(Closing):
                 self._low = np.minimum(self._low, index.min(axis=0))
                 self._high = np.maximum(self._high, index.max(axis=0))
             self._energy += int(values[:, _ENERGY].sum())
-            self._sums.add(pack_index(found.voxel), values)
+            self._sums.add(kernel.pack_index(found.voxel), values)
 
-    def _list_values(self, found: Crossings, rays: Rays, rule: LightRule) -> np.ndarray:
+    def _list_values(self, found: kernel.Crossings, rays: Rays, rule: LightRule) -> np.ndarray:
         """Values that every crossing adds to its voxel, i8 (m, columns); over a ray they add up to its total."""
         ray, table, samples = found.ray, rays.table, rays.samples
         first = np.append(True, ray[1:] != ray[:-1])[: len(ray)]
         caught, ground = (_count(part, LIGHT_UNIT) for part in rule.weigh(rays))
         summed = [caught, ground, _count(samples["energy"], self._unit), _count(samples["section"], SECTION_UNIT)]
         summed += [] if self._floor is None else [np.rint(caught * samples["time"]).astype(np.int64)]
-        summed = VoxelSamples(samples["time"], samples["spacing"], np.stack(summed, axis=1))
+        summed = kernel.VoxelSamples(samples["time"], samples["spacing"], np.stack(summed, axis=1))
         each = np.arange(len(table))
-        last = sum_before(summed, table["first"], table["count"], each, np.full(len(table), np.inf))
-        before = sum_before(summed, table["first"], table["count"], ray, found.enter)
+        last = kernel.sum_before(summed, table["first"], table["count"], each, np.full(len(table), np.inf))
+        before = kernel.sum_before(summed, table["first"], table["count"], ray, found.enter)
         before[first] = 0
-        part = differences_along(before, ray, last)
+        part = kernel.differences_along(before, ray, last)
         # What is beyond a lost packet has energy, but light is known up to there only.
         known = found.enter < table["known"][ray]
         inside = np.clip(table["known"][ray] - found.enter, 0.0, found.inside)
@@ -276,7 +253,7 @@ class VoxelGrid(Closing):
             if not self._everything:
                 some = np.flatnonzero(sums[:, _ENERGY] > 0)
                 key, sums = key[some], sums[some]
-            index = unpack_index(key)
+            index = kernel.unpack_index(key)
             yield index - self._low, self._finish(index, sums, log_error)
 
     def _finish(self, index: np.ndarray, sums: np.ndarray, log_error: float) -> dict[str, np.ndarray]:
@@ -396,8 +373,8 @@ def _write_las(
     header = _build_header(space)
     texts = [one.meaning if one.unit == "-" else f"{one.meaning} [{one.unit}]" for one in space.columns]
     columns = zip(space.columns, texts, strict=True)
-    records = [ExtraRecord.build(one.name, one.dtype, text, no_data=one.no_data) for one, text in columns]
-    dtype = build_dtype(header.point_format, records)
+    records = [las.ExtraRecord.build(one.name, one.dtype, text, no_data=one.no_data) for one, text in columns]
+    dtype = las.build_dtype(header.point_format, records)
     number = 0
     with PointFile(target, header, dtype, records, overwrite=overwrite) as file:
         for index, columns in pieces:
@@ -417,26 +394,26 @@ def _write_las(
     return number
 
 
-def _build_header(space: VoxelSpace) -> LasHeader:
-    facts, source = space.facts, read_header(space.facts.path)
-    vlrs = repair_records(vlr for vlr in source.vlrs if is_projection(vlr))
-    if not has_record(vlrs, PROJECTION, WKT_ID) and (facts.crs or "").endswith("]"):
-        record = build_wkt(repair_wkt(facts.crs))  # from an extended record
+def _build_header(space: VoxelSpace) -> las.LasHeader:
+    facts, source = space.facts, las.read_header(space.facts.path)
+    vlrs = repair_records(vlr for vlr in source.vlrs if las.is_projection(vlr))
+    if not las.has_record(vlrs, las.PROJECTION, las.WKT_ID) and (facts.crs or "").endswith("]"):
+        record = las.build_wkt(repair_wkt(facts.crs))  # from an extended record
         if len(record.payload) > 65535:
             raise InputError(f"{facts.path}: its CRS is longer than the record of a point cloud; write an .npz")
         vlrs.append(record)
     modern = source.point_format >= 6
     encoding = source.global_encoding & 1
-    if modern and (has_record(vlrs, PROJECTION, WKT_ID) or not vlrs):
-        encoding |= WKT_BIT
+    if modern and (las.has_record(vlrs, las.PROJECTION, las.WKT_ID) or not vlrs):
+        encoding |= las.WKT_BIT
     text = json.dumps(space.meta, sort_keys=True, separators=(",", ":")).encode()
-    return LasHeader(
+    return las.LasHeader(
         version=(1, 4) if modern else source.version,
         point_format=6 if modern else 0,
         point_length=0,
         scales=(0.5 * space.size,) * 3,
         offsets=tuple(float(value) for value in space.origin),
-        vlrs=[*vlrs, Vlr(b"wavebatch", 1, text, b"how voxels were made (JSON)")],
+        vlrs=[*vlrs, las.Vlr(b"wavebatch", 1, text, b"how voxels were made (JSON)")],
         file_source_id=source.file_source_id,
         global_encoding=encoding,
         project_id=source.project_id,
@@ -509,7 +486,7 @@ _LARGEST = 1e12
 class VoxelFile:
     """The voxels of an .npz of `wavebatch voxelize`, read as the points at their centres.
 
-    Has the interface of `values.Clouds`. Raises InputError for a file that holds no voxels, ConfigError without the
+    Has the interface of `cells.Clouds`. Raises InputError for a file that holds no voxels, ConfigError without the
     column.
     """
 

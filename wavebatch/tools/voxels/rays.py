@@ -39,16 +39,7 @@ from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, along_ray, f
 from wavebatch.kernels.geometry.planes import fit_planes
 from wavebatch.kernels.physics import radiometry
 from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
-from wavebatch.kernels.signal.deconvolve import (
-    deconvolve_gold,
-    deconvolve_richardson_lucy,
-    deconvolve_wiener,
-    fit_height,
-    keep_signal,
-    measure_offsets,
-    wiener_taps,
-    window_signal,
-)
+from wavebatch.kernels.signal import deconvolve
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121, widen
 from wavebatch.stages.detect.candidates import signal_above
 from wavebatch.stages.noise import pooled
@@ -140,7 +131,7 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
     n, s = block.samples.shape
     support = widen(smooth_121(signal) > np.float32(SUPPORT * SMOOTH_GAIN) * noise.std, 1)
     width = system.sigma_ref / block.spacing
-    first, length = window_signal(support, int(np.ceil(_PULSE_REACH * width)))
+    first, length = deconvolve.window_signal(support, int(np.ceil(_PULSE_REACH * width)))
     least = options.threshold * _lone_error(taps, width, options)
     floor = FLOOR * max(least, 1e-3) / max(width, 1.0)
     value, seen = np.zeros((n, s)), np.zeros(n, bool)
@@ -150,9 +141,9 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
         part = signal[place, rows]
         profile = _deconvolve(part, taps, noise.std[rows], options)
         near = np.ascontiguousarray(support[place, rows].T)
-        kept, seen[rows] = keep_signal(np.ascontiguousarray(profile.T), near, least * std, floor * std)
+        kept, seen[rows] = deconvolve.keep_signal(np.ascontiguousarray(profile.T), near, least * std, floor * std)
         if options.method != "richardson_lucy":  # that iteration keeps the energy, the others do not
-            kept = fit_height(kept, part, taps, near)
+            kept = deconvolve.fit_height(kept, part, taps, near)
         if block.missing is not None:
             kept = np.where(block.missing[rows[:, None], place.T], 0.0, kept)
         value[rows[:, None], place.T] = kept
@@ -177,17 +168,17 @@ def _lone_error(taps: np.ndarray, width: float, options: Deconvolution) -> float
     """
     if options.method != "wiener":
         return float(1.0 / np.sqrt(np.sum(taps**2)))
-    inverse = wiener_taps(taps, (options.snr or SNR) ** -2.0, 4 * len(taps))
+    inverse = deconvolve.wiener_taps(taps, (options.snr or SNR) ** -2.0, 4 * len(taps))
     box = np.ones(2 * max(int(round(width)), 1) + 1)
     return float(np.sqrt(np.sum(np.convolve(inverse, box) ** 2)))
 
 
 def _deconvolve(signal: np.ndarray, taps: np.ndarray, std: np.ndarray, options: Deconvolution) -> np.ndarray:
     if options.method == "wiener":
-        return deconvolve_wiener(signal, taps, (options.snr or SNR) ** -2.0)
+        return deconvolve.deconvolve_wiener(signal, taps, (options.snr or SNR) ** -2.0)
     if options.method == "gold":
-        return deconvolve_gold(signal, taps, options.steps)
-    return deconvolve_richardson_lucy(signal, taps, np.float32(BACKGROUND) * std, options.steps)
+        return deconvolve.deconvolve_gold(signal, taps, options.steps)
+    return deconvolve.deconvolve_richardson_lucy(signal, taps, np.float32(BACKGROUND) * std, options.steps)
 
 
 def _pulse_taps(system: SystemPulse, spacing: float) -> tuple[np.ndarray, float]:
@@ -213,7 +204,7 @@ def _find_offsets(block: WaveformBlock, value: np.ndarray) -> tuple[np.ndarray, 
         return np.zeros(len(block)), np.zeros(len(block), bool)
     reach = int(np.ceil(TOLERANCE / block.spacing + 0.5))
     row = returns.waveform.astype(np.int64)
-    offset, known = measure_offsets(value, row, returns.time / block.spacing, reach)
+    offset, known = deconvolve.measure_offsets(value, row, returns.time / block.spacing, reach)
     return offset * block.spacing, known
 
 

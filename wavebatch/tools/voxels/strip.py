@@ -34,6 +34,7 @@ from wavebatch.surveying.choose_chain import Request
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
+from wavebatch.tools.voxels import rays
 from wavebatch.tools.voxels.grid import (
     ProfileWriter,
     VoxelGrid,
@@ -41,22 +42,6 @@ from wavebatch.tools.voxels.grid import (
     check_voxel_target,
     energy_unit,
     write_voxels,
-)
-from wavebatch.tools.voxels.rays import (
-    PACKET,
-    SAMPLE,
-    Batch,
-    Ceiling,
-    Deconvolution,
-    Floor,
-    Rays,
-    deconvolve_block,
-    find_ceiling,
-    find_rule,
-    join_packets,
-    list_signal,
-    measure_lengths,
-    read_batches,
 )
 
 LARGEST = 1e6
@@ -81,7 +66,7 @@ class VoxelOptions:
     size: Annotated[float, Above(0.0, LARGEST)] = option(
         MISSING, "Edge of a voxel [m]; the faces of voxels lie at multiples of it.", form="M"
     )
-    deconvolution: Deconvolution = field(default_factory=Deconvolution)
+    deconvolution: rays.Deconvolution = field(default_factory=rays.Deconvolution)
     headroom: Annotated[float | None, Range(0.0, 1e5)] = option(
         None, "Count each ray from this distance before its first sample [m], whether recorded or not.", form="M",
         unset="from the highest return near it",
@@ -216,15 +201,15 @@ def voxelize_strip(
                     "or give a --system file that has it"
                 )
         middle = _find_middle(reader, scan, options)
-        floor = Floor(middle)
-        ceiling = find_ceiling(reader, scan, middle, options.size, floor)
+        floor = rays.Floor(middle)
+        ceiling = rays.find_ceiling(reader, scan, middle, options.size, floor)
         tracer = _Tracer(reader, source, pulse, options, floor.finish(), ceiling, energy, calibration is not None)
         numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
         each = -(-SAMPLED // max(len(numbers), 1))  # about SAMPLED pulses, spread evenly over the strip
-        batches = read_batches(
+        batches = rays.read_batches(
             reader, scan, numbers=numbers.tolist(), choose=lambda rows: rows[even_places(len(rows), each)]
         )
-        rule = find_rule(map(tracer.trace, batches), options.reflectance_ratio)
+        rule = rays.find_rule(map(tracer.trace, batches), options.reflectance_ratio)
         with (
             _open_grid(reader, middle, options, calibration is not None, tracer.floor, held) as grid,
             (
@@ -240,12 +225,12 @@ def voxelize_strip(
                 reflectance_ratio_err=rule.error, reflectance_ratio_source=rule.source, hidden_light=rule.hidden_light,
                 profiles=None if profiles is None else str(profiles),
             )  # fmt: skip
-            for batch in read_batches(reader, scan, keep=keep, block_size=block_size):
-                rays = tracer.trace(batch)
-                grid.add(rays, rule)
+            for batch in rays.read_batches(reader, scan, keep=keep, block_size=block_size):
+                traced = tracer.trace(batch)
+                grid.add(traced, rule)
                 if writer is not None:
-                    writer.add_rays(rays)
-                summary.add(rays.table)
+                    writer.add_rays(traced)
+                summary.add(traced.table)
                 if progress is not None:
                     progress(sum(len(rows) for _, rows, *_ in batch.parts), scan.packets)
             grid.measure_spread()
@@ -302,7 +287,7 @@ def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) ->
 
 
 def _open_grid(
-    reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, floor: Floor, held: int
+    reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, floor: rays.Floor, held: int
 ) -> VoxelGrid:
     digitizers = reader.facts.digitizers.values()
     return VoxelGrid(
@@ -324,41 +309,41 @@ class _Tracer:
     sensor: SensorSource
     pulse: SystemPulse
     options: VoxelOptions
-    floor: Floor
-    ceiling: Ceiling
+    floor: rays.Floor
+    ceiling: rays.Ceiling
     energy: PulseEnergy | None
     sections: bool
 
-    def trace(self, batch: Batch) -> Rays:
+    def trace(self, batch: rays.Batch) -> rays.Rays:
         """The rays of the pulses of a batch that `--where` keeps."""
-        packets, samples = [np.empty(0, PACKET)], [np.empty(0, SAMPLE)]
+        packets, samples = [np.empty(0, rays.PACKET)], [np.empty(0, rays.SAMPLE)]
         number = 0
         for unit, rows, groups, kept in batch.parts:
             place = np.zeros(len(unit.packets), np.int64)
             place[rows] = np.arange(len(rows))
             for block, index in self.reader.read_rows(unit, rows, max(len(rows), 1)):
                 block = self.sensor.fill(block if self.energy is None else self.energy.fill(block, unit))
-                profiles = deconvolve_block(block, self.pulse, self.options.deconvolution)
+                profiles = rays.deconvolve_block(block, self.pulse, self.options.deconvolution)
                 if block.pulse_energy is not None:
                     known = np.isfinite(block.pulse_energy)
                     scale = np.where(known, block.pulse_energy, 1.0)[:, None]
                     profiles = replace(profiles, value=profiles.value / scale)
                 system = self.pulse if self.sections else None
                 at = place[index]
-                found = list_signal(block, profiles, groups[at], self.floor, self.options.ground_height, system)
+                found = rays.list_signal(block, profiles, groups[at], self.floor, self.options.ground_height, system)
                 found[0]["kept"] = kept[at]
                 found[1]["packet"] += number
                 number += len(block)
                 packets.append(found[0])
                 samples.append(found[1])
-        rays = join_packets(np.concatenate(packets), np.concatenate(samples), batch.lost)
-        rays = rays.take(rays.table["kept"])
+        traced = rays.join_packets(np.concatenate(packets), np.concatenate(samples), batch.lost)
+        traced = traced.take(traced.table["kept"])
         headroom = self.options.headroom
         if headroom is None:
-            headroom = self.ceiling.measure_headroom(rays.table["start"], rays.table["step"])
+            headroom = self.ceiling.measure_headroom(traced.table["start"], traced.table["step"])
         with np.errstate(divide="ignore", invalid="ignore"):
-            rays.table["begin"] -= headroom / measure_lengths(rays.table["step"])
-        return rays
+            traced.table["begin"] -= headroom / rays.measure_lengths(traced.table["step"])
+        return traced
 
 
 def _describe(
