@@ -276,10 +276,12 @@ def test_a_real_browser_shows_the_page_sorts_its_table_and_complains_about_nothi
     source = (flight / "run.html").read_text()
     # The page's rules allow its own script only; the test's script needs a door.
     probe = (
-        "<script>const t = document.querySelector('table.sortable'); t.tHead.rows[0].cells[2].click();"
-        "const v = () => [...t.tBodies[0].rows].map((r) => r.cells[2].textContent).join('|');"
-        "const up = v(); t.tHead.rows[0].cells[2].click();"
-        "document.title = 'SORTED ' + up + ' THEN ' + v() + ' WIDTH ' +"
+        "<script>const t = document.querySelector('table.sortable'); const heads = [...t.tHead.rows[0].cells];"
+        "const at = heads.findIndex((head) => head.textContent == 'points in'); heads[at].firstChild.click();"
+        "const v = () => [...t.tBodies[0].rows].map((r) => r.cells[at].textContent).join('|');"
+        "const up = v(); heads[at].firstChild.click();"
+        "const side = getComputedStyle(heads[at]).textAlign;"
+        "document.title = 'SORTED ' + up + ' THEN ' + v() + ' HEAD ' + side + ' WIDTH ' +"
         " [...document.querySelectorAll('figure img')].every((s) => s.getBoundingClientRect().height > 50);</script>"
     )
     opened = re.sub(r"script-src '[^']+'", "script-src 'unsafe-inline'", source).replace("</body>", f"{probe}</body>")
@@ -292,4 +294,4 @@ def test_a_real_browser_shows_the_page_sorts_its_table_and_complains_about_nothi
     sums = json.loads((flight / "run.json").read_text())["strips"]
     points = f"{sums[0]['counts']['points_in'] or sums[1]['counts']['points_in']:,}"
     title = re.search(r"<title>(.*?)</title>", shown.stdout)[1]
-    assert title == f"SORTED {points}|{points}|\u2013 THEN {points}|{points}|\u2013 WIDTH true"
+    assert title == f"SORTED {points}|{points}|\u2013 THEN {points}|{points}|\u2013 HEAD right WIDTH true"

@@ -156,14 +156,15 @@ def _picture(one: Picture) -> str:
 
 
 def _table(one: Table) -> str:
-    """A table; numbers stand to the right, and a page sorts by them."""
+    """A table; numbers and their heads stand to the right, and a page sorts by them."""
     forms = [one.forms] * len(one.heads) if isinstance(one.forms, str) else one.forms
     before, after = ('<button type="button">', "</button>") if one.sortable else ("", "")
-    heads = "".join(f'<th scope="col">{before}{text(name)}{after}</th>' for name in one.heads)
-    body = "\n".join(
-        "<tr>" + "".join(_cell(value, form) for value, form in zip(row, forms, strict=True)) + "</tr>"
-        for row in one.rows
+    rows = [[_cell(value, form) for value, form in zip(row, forms, strict=True)] for row in one.rows]
+    kinds = [' class="n"' if any('class="n"' in cell for cell in column) else "" for column in zip(*rows, strict=True)]
+    heads = "".join(
+        f'<th scope="col"{kind}>{before}{text(name)}{after}</th>' for name, kind in zip(one.heads, kinds, strict=True)
     )
+    body = "\n".join(f"<tr>{''.join(cells)}</tr>" for cells in rows)
     title = f"<caption>{text(one.title)}</caption>" if one.title else ""
     kind, tall = ' class="sortable"' if one.sortable else "", " tall" if len(one.rows) > LONG else ""
     whole = f"{title}<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody>"
