@@ -96,6 +96,8 @@ class Candidate:
     """Of the pulse, as far as they had to be learned: 2 for one that is known, so that a plain Gaussian goes first."""
     seen: float
     """Change of the shape that the median of the strongest echoes shows."""
+    as_likely: tuple[int, ...] = ()
+    """Echoes with other changes of the shape that cost the same."""
 
     @property
     def missed(self) -> float:
@@ -266,7 +268,8 @@ def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
         tried.append(judged if same else _judge(block, judged.name, judged.system, change, known=judged.known))
     tried = [one for one in tried if one.change <= STEP_OF_CHANGES * one.seen]
     best = min(tried, key=lambda one: one.typical)
-    return next(one for one in tried if one.exceeds(best) < HINT)
+    found = next(one for one in tried if one.exceeds(best) < HINT)
+    return replace(found, as_likely=tuple(one.echoes for one in tried if one.exceeds(best) < SURE))
 
 
 def _decide(found: list[Candidate]) -> Choice:
@@ -288,7 +291,7 @@ def _decide(found: list[Candidate]) -> Choice:
         if best.exceeds(one) > (HINT if doubtful and not best.known else SURE):
             best = one
     tied = [one for one in ordered if one.exceeds(best) < SURE]
-    echoes, widths = [one.echoes for one in tied], [one.system.sigma_ref for one in tied]
+    echoes, widths = [*best.as_likely, *(one.echoes for one in tied)], [one.system.sigma_ref for one in tied]
     doubt = (max(echoes) - min(echoes)) / max(best.echoes, 1)
     spread = max(abs(width / best.system.sigma_ref - 1) for width in widths)
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt, spread)
