@@ -38,6 +38,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     list_widths,
     measure_again,
     measure_gaussian,
+    measure_once_more,
     measure_quiet,
     thin_samples,
 )
@@ -390,7 +391,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         part = thin_samples(block, RESIDUAL_LOOK)
         narrower = not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref
         if narrower or len(main) < ENOUGH_TO_LEARN:
-            noise = measure_quiet(block, system.sigma_ref / block.spacing).noise
+            noise = measure_once_more(block, system)
             if narrower or noise.by_kind["quiet"]:
                 system = replace(system, noise=replace(noise, gain=first.noise.gain))
         echoes = decompose_sample(part, system)

@@ -103,6 +103,21 @@ def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
     return _gaussian_system(_find_noise(thin_samples(block, NOISE_LOOK), width), block.spacing, width, saturation)
 
 
+def measure_once_more(block: WaveformBlock, system: SystemPulse) -> ReceiverNoise:
+    """The noise outside of the echoes, by the width of the pulse that was chosen: from a guess of it, or from that.
+
+    The one that is less to this pulse: weak echoes among the quiet samples only add.
+    """
+    width, guessed = system.sigma_ref / block.spacing, system.noise
+    found = measure_quiet(block, width).noise
+    if not guessed.by_kind["quiet"]:
+        return found
+    seen = float(guessed.quiet * noise_factors(GAUSSIAN, width, guessed.correlation)[0])
+    least = DITHERED if guessed.quiet < UNDITHERED else guessed.quiet
+    guessed = replace(guessed, std=max(seen, least), by_kind={**guessed.by_kind, "quiet_pulse": seen})
+    return found if found.by_kind["quiet"] and found.std < guessed.std else guessed
+
+
 def measure_again(block: WaveformBlock, system: SystemPulse, gain: float) -> SystemPulse:
     """The system with a growth of its noise [count], and the width that echoes repeat by errors that hold it.
 
