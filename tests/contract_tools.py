@@ -3,6 +3,8 @@
 from dataclasses import fields, replace
 
 import numpy as np
+from given_echoes import FINE, fine_recording, known_noise, simulate_echoes
+from published import PULSE_SIGMA as SIGMA
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.system import ReceiverNoise
@@ -144,3 +146,12 @@ def scene_blocks():
 
 def pieces(n, size):
     return [slice(start, min(start + size, n)) for start in range(0, n, size)]
+
+
+def record(n, *echoes, std=1.0, seed=0, s=80):
+    """Waveforms with echoes (amplitude in counts of noise 1, time), in steps of 0.01; the noise known."""
+    recording = fine_recording(std, SIGMA, n_samples=s)
+    time = np.stack([np.broadcast_to(time, n) for _, time in echoes] or [np.full(n, np.nan)], axis=1)
+    amplitude = FINE * np.stack([np.broadcast_to(height, n) for height, _ in echoes] or [np.zeros(n)], axis=1)
+    block, _ = simulate_echoes(recording, time, amplitude, SIGMA, np.random.default_rng(seed))
+    return block, known_noise(recording, n, FINE)

@@ -1,6 +1,5 @@
 """Slow, plain references for kernels/signal: noise, defects, runs and profiles of one waveform after the other."""
 
-from itertools import groupby
 
 import naive
 import numpy as np
@@ -35,32 +34,6 @@ def add_up(values):
     return total
 
 
-def find_stretches(mask):
-    """(row, first, one behind the last) of every stretch of true samples."""
-    found = []
-    for row, samples in enumerate(mask):
-        at = 0
-        for value, run in groupby(samples):
-            length = len(list(run))
-            if value:
-                found.append((row, at, at + length))
-            at += length
-    return found
-
-
-def lobe_edges(x, curve, level):
-    """Crossings of a level nearest to the highest sample."""
-    top = int(np.argmax(curve))
-    edges = []
-    for step in (-1, 1):
-        i = top
-        while curve[i] >= level:
-            i += step
-        share = (level - curve[i]) / (curve[i - step] - curve[i])
-        edges.append(x[i] + share * (x[i - step] - x[i]))
-    return tuple(edges)
-
-
 def find_spikes(above, std, width):
     """(s, n) True where no pulse of this width explains a sample: far above both neighbours, or below both sides."""
     drop = 1.5 * (1 - np.exp(-0.5 / width**2))
@@ -77,66 +50,6 @@ def find_spikes(above, std, width):
                 sides.append(near * falls)
             spikes[i, w] |= min(sides) - y[i] > 6.5 * std + drop * max(high, 0)
     return spikes
-
-
-def find_pattern(signal, quiet):
-    """Mean deviation of samples 0, 1, 2, 3, 0 ... from those within half a period, and its error."""
-    deviations = [[], [], [], []]
-    s, n = signal.shape
-    for w in range(n):
-        for i in range(2, s - 2):
-            if quiet[i - 2 : i + 3, w].all():
-                y = signal[i - 2 : i + 3, w].astype(float)
-                deviations[i % 4].append(y[2] - (0.5 * y[0] + y[1] + y[2] + y[3] + 0.5 * y[4]) / 4)
-    mean = np.array([np.mean(values) if len(values) > 1 else 0.0 for values in deviations])
-    error = np.array([np.std(values) / np.sqrt(len(values)) if len(values) > 1 else np.inf for values in deviations])
-    return mean - mean.mean(), error
-
-
-def find_transient(above, std):
-    """Samples at the start whose spread or mean over the waveforms is not that of samples 8 to 15."""
-    if len(above) < 24:
-        return 0
-    usual = [np.quantile(row, [0.05, 0.5, 0.95]) for row in above[8:16]]
-    quiet = [
-        abs(y - middle) < 4 * std + 0.5 for row, (_, middle, _) in zip(above[8:16], usual, strict=True) for y in row
-    ]
-    if np.mean(quiet) < 0.8:
-        return 0
-    spread = max(np.median([high - low for low, _, high in usual]), 2 * std)
-    centre = np.median([middle for _, middle, _ in usual])
-    if max(abs(middle - centre) for _, middle, _ in usual) > 0.5 * std + 0.5:
-        return 0
-    for i in range(8):
-        low, high = np.quantile(above[i], [0.05, 0.95])
-        mean = np.mean([min(max(y, low), high) for y in above[i]])
-        if high - low <= 1.6 * spread and abs(mean - centre) <= max(0.5 * std, 0.3):
-            return i
-    return 0
-
-
-def fit_slope(y, std, reach, limit=4.0, missing=None, recovery=0):
-    """Slope of the baseline of one waveform and its error, by lines through the samples that are quiet about a line."""
-    s = len(y)
-    x = np.arange(s) - 0.5 * (s - 1)
-    missing = np.zeros(s, bool) if missing is None else missing
-    edges = [int(s * k / 6) for k in range(7)]
-    place = [np.mean(x[a:b]) for a, b in zip(edges, edges[1:], strict=False)]
-    low = [sorted(y[a:b])[(b - a) // 4] for a, b in zip(edges, edges[1:], strict=False)]
-    pairs = [(low[j] - low[i]) / (place[j] - place[i]) for i in range(6) for j in range(i + 1, 6)]
-    slope = np.median(pairs)
-    level = np.median([value - slope * at for value, at in zip(low, place, strict=True)])
-    error = np.inf
-    for extra in (2.0, 1.0, 0.0):
-        rest = y - level - slope * x
-        width = limit * (np.sqrt(6) / 4 + extra) * std + 0.25
-        quiet = find_quiet(rest[:, None], width, reach, recovery)[:, 0] & ~missing
-        line = np.polyfit(x[quiet], y[quiet], 1)
-        slope, level = line
-        size = np.sum((x[quiet] - x[quiet].mean()) ** 2)
-        enough = quiet.sum() >= s // 5 and size > quiet.sum() * (0.15 * s) ** 2
-        error = std / np.sqrt(size) if enough else np.inf
-    return slope, error
 
 
 def find_level(y, std, reach, limit=4.0, recovery=0):
@@ -180,17 +93,6 @@ def measure_covariance(signal, quiet, lags, mirrored=None):
     sill = np.average(half[far:], weights=pairs[far:])
     rest = sill - np.array(half)
     return np.r_[sill, np.where(np.abs(rest) > noise.CHANCE * sill / np.sqrt(pairs), rest, 0.0)]
-
-
-def keep_longest(missing):
-    """All but the first of the longest stretches of recorded samples of each waveform."""
-    lost = np.ones_like(missing)
-    for w, column in enumerate(missing.T):
-        stretches = [(first - end, first, end) for _, first, end in find_stretches(~column[None])]
-        if stretches:
-            _, first, end = min(stretches)
-            lost[first:end, w] = False
-    return lost
 
 
 def measure_recovery(signal, noise, reach, limit):
@@ -270,63 +172,3 @@ def wiener(waveform, taps, noise_to_signal):
     pulse = naive.pulse_matrix(len(waveform), taps)
     inverse = pulse.T @ np.linalg.inv(pulse @ pulse.T + noise_to_signal * np.eye(len(waveform)))
     return inverse @ waveform
-
-
-def fit_height(profile, waveform, taps, support):
-    """One profile scaled so that its sum of pulses has the energy of the waveform over the support."""
-    made = (naive.pulse_matrix(len(waveform), taps) @ profile)[support].sum()
-    return profile * (max(waveform[support].sum(), 0.0) / made if made > 0 else 0.0)
-
-
-def refine_peak(waveform, at):
-    """Time and height of one peak by a parabola through the logarithms of three samples."""
-    if not 0 < at < len(waveform) - 1 or min(waveform[at - 1 : at + 2]) <= 0:
-        return at, waveform[at]
-    c2, c1, c0 = np.polyfit([-1, 0, 1], np.log(waveform[at - 1 : at + 2]), 2)
-    if 2 * c2 >= -1e-12:
-        return at, waveform[at]
-    shift = min(max(-c1 / (2 * c2), -0.5), 0.5)
-    return at + shift, np.exp(c0 + 0.5 * c1 * shift)
-
-
-def find_reference(samples, quiet_widths=3.5, lags=4):
-    """(width, noise, gain, level, spread) of outgoing pulses that rise from a quiet level."""
-    samples = samples.astype(float)
-    width = max(np.median([sum(y - min(y) > 0.5 * (max(y) - min(y))) for y in samples]) / 2.3548, 0.5)
-    quiet = [[v for i, v in enumerate(y) if i < np.argmax(y) - quiet_widths * width] for y in samples]
-    quiet = [values for values in quiet if len(values) >= 3]
-    noise = np.sqrt(sum(len(v) * np.var(v) for v in quiet) / sum(len(v) - 1 for v in quiet))
-    noise = max(noise, QUANTISATION_STD)
-    means = [np.mean(v) for v in quiet]
-    level = np.median(means)
-    variance = np.mean([(v - level) ** 2 for values in quiet for v in values])
-    gain = 1.0
-    for lag in range(1, lags + 1):
-        pairs = [(v[i] - level) * (v[i + lag] - level) for v in quiet for i in range(len(v) - lag)]
-        gain += 2 * max(np.mean(pairs) / variance, 0.0) if len(pairs) >= 100 else 0.0
-    total = 1.482602 * np.median(np.abs(means - level))
-    within = noise**2 * gain / np.median([len(v) for v in quiet])
-    return width, noise, gain, level, np.sqrt(max(total**2 - within, 0.0))
-
-
-def measure_outgoing(y, width, noise, gain, level, spread):
-    """Energy, height, place and level of one outgoing pulse, and the errors of the first two; None without a pulse."""
-    y = y.astype(float)
-    at = min(max(int(np.argmax(y)), 1), len(y) - 2)
-    quiet = [v for i, v in enumerate(y) if i < at - 3.5 * width]
-    variance = spread**2
-    if quiet:
-        within = noise**2 * gain / len(quiet)
-        share = spread**2 / (spread**2 + within)
-        level, variance = level + share * (np.mean(quiet) - level), share * within
-    a, b, c = np.log(np.maximum(y[at - 1 : at + 2] - level, 0.5 * noise))
-    shift = min(max((a - c) / 2 / (a + c - 2 * b), -1.0), 1.0) if a + c < 2 * b else 0.0
-    height, time = np.exp(b - (a - c) * shift / 4), at + shift
-    energy = total = squares = 0.0
-    for i, value in enumerate(y):
-        inside = min(max(i - time + 4 * width + 0.5, 0), 1) * min(max(6 * width + 0.5 - i + time, 0), 1)
-        energy, total, squares = energy + inside * (value - level), total + inside, squares + inside**2
-    if not (height > 8 * noise and energy > 0):
-        return None
-    errors = np.sqrt(noise**2 * gain * squares + variance * total**2), np.sqrt((1.1 * noise) ** 2 + variance)
-    return energy, height, time, level, *errors
