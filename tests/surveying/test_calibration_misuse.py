@@ -583,7 +583,7 @@ def test_an_outline_around_many_fields_is_named_and_in_the_error(tmp_path, calib
     """A radius of 150 m in place of 5: the constant of all fields together, with the error of one."""
     (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n0.3,{EAST + 50},{NORTH + 10},150\n")
     done = call("calibrate", calibrated / "a.las", "--targets", tmp_path / "t.csv", "-o", tmp_path / "cal.toml")
-    assert done.exit_code == 0 and "several surfaces? check its outline" in done.stderr
+    assert done.exit_code == 0 and "several surfaces? Check its outline" in done.stderr
     assert load_calibration(tmp_path / "cal.toml").relative_error > 0.12
 
 

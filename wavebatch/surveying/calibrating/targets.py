@@ -207,12 +207,10 @@ def _list_doubts(
     yield from filter(None, (source.sensor.doubt(), *source.sent.notes))
     for result in results:
         if result.apart > MOST_APART:
-            which = "dark and bright echoes" if options.column else "parts"
-            yield (
-                f"{result.name}: constants of its {which} scatter by {result.apart:.0%}: "
-                + ("is it the reflectance, of this channel" if options.column else "several surfaces? check its outline")
-                + "; the error holds it"
-            )
+            which, why = "parts", "several surfaces? Check its outline"
+            if options.column:
+                which, why = "dark and bright echoes", "is it the reflectance, of this channel?"
+            yield f"{result.name}: constants of its {which} scatter by {result.apart:.0%}, which the error holds: {why}"
         if options.column and result.air is None and source.air:
             yield (
                 f"{result.name}: its ranges are too alike to show whether it still holds the air: the error of the "
