@@ -126,6 +126,16 @@ def test_symmetric_filters_equal_a_double_loop(rng, taps, s):
     np.testing.assert_allclose(filter_symmetric(signal, taps), expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("taps", [gaussian_taps(2.0), gaussian_taps(300.0)])
+def test_symmetric_filters_give_the_same_bits_however_waveforms_lie_in_memory(rng, taps):
+    signal = rng.standard_normal((700, 5)).astype(np.float32)
+    filtered = filter_symmetric(signal, taps)
+    np.testing.assert_array_equal(filter_symmetric(np.asfortranarray(signal), taps), filtered)
+    np.testing.assert_array_equal(filter_symmetric(signal[:, 2:3], taps), filtered[:, 2:3])
+    expected = np.stack([naive.correlate_symmetric(column, taps) for column in signal.T], axis=1)
+    np.testing.assert_allclose(filtered, expected, rtol=1e-4, atol=1e-4)
+
+
 @pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4)])
 def test_filters_let_the_stated_noise_through(rng, taps):
     noise = rng.standard_normal((200, 1000)).astype(np.float32)

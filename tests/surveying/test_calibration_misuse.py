@@ -578,6 +578,21 @@ def test_points_of_another_crs_than_their_vectors_are_named(tmp_path, slope):
     assert done.exit_code == 0 and "vectors" not in done.stderr
 
 
+def test_an_outline_around_many_fields_is_named_and_in_the_error(tmp_path, calibrated):
+    """A radius of 150 m in place of 5: the constant of all fields together, with the error of one."""
+    (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n0.3,{EAST + 50},{NORTH + 10},150\n")
+    done = call("calibrate", calibrated / "a.las", "--targets", tmp_path / "t.csv", "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 0 and "several surfaces? Check its outline" in done.stderr
+    assert load_calibration(tmp_path / "cal.toml").relative_error > 0.12
+
+
+def test_a_target_that_is_listed_twice_does_not_halve_the_error(tmp_path, calibrated):
+    row = f"0.3,{EAST + 50},{NORTH + 10},"
+    (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n{row}8\n{row}7\n")
+    done = call("calibrate", calibrated / "a.las", "--targets", tmp_path / "t.csv", "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 2 and "targets 1 and 2 are one target: its reflectance would count twice" in done.stderr
+
+
 def test_a_strip_whose_times_show_no_day_is_said_to_count_as_of_the_same_day(tmp_path, calibrated):
     write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 90 * 86400), 10_000, seed=87)
     content = bytearray((tmp_path / "s.las").read_bytes())
@@ -593,7 +608,7 @@ def test_a_column_that_is_no_reflectance_of_the_channel_is_named(tmp_path, monke
     monkeypatch.setattr(facet_strips, "_write", lambda *a: write(*a[:10], np.full_like(a[10], 0.6)))
     write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, vendor="share"), 6000, seed=89)
     done = call("calibrate", tmp_path / "s.las", "--from-column", "Reflectance", "-o", tmp_path / "cal.toml")
-    assert done.exit_code == 0 and "constants by its dark and its bright echoes differ by 5" in done.stderr
+    assert done.exit_code == 0 and "constants of its dark and bright echoes scatter by 5" in done.stderr
     assert load_calibration(tmp_path / "cal.toml").relative_error > 0.5
 
 

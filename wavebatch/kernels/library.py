@@ -18,9 +18,9 @@ from wavebatch.kernels.build_kernels import LIBRARY, SOURCES, compile_library, i
 _POINTER = ctypes.c_void_p
 
 FUNCTIONS = (
-    "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
-    "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse", "render_pulses",
-    "measure_changes", "pair_differences", "judge_packets",
+    "decompose_clusters", "promise_echoes", "quiet_levels", "filter_rows", "find_maxima", "group_candidates",
+    "exponentials", "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse",
+    "render_pulses", "measure_changes", "pair_differences", "judge_packets",
     "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes",
     "match_returns",
 )  # fmt: skip

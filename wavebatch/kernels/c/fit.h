@@ -58,20 +58,26 @@ INLINE void evaluate_rows(int64_t k, int64_t per, const Settings *s, Work *work,
     for (int64_t i = 0; i <= per * k && w->is_whitened; i++) whiten(w, work->rows + i * n);
 }
 
-/* The same to the same bits where rows are long: a sum waits for each of its additions, so there are four at a time. */
+/* The same to the same bits where rows are long: a sum waits for each of its additions, so there are eight at a time. */
 static void multiply_long_rows(int64_t rows, int64_t vectors, const lanes *row, double *gram) {
-    for (int64_t i = 0; i < rows; i++)
-        for (int64_t j = 0; j <= i; j += 4) {
-            const lanes *a = row + i * vectors, *b[4];
-            lanes sum[4];
+    for (int64_t i = 0; i < rows; i += 2) {
+        const int64_t next = i + 1 < rows ? i + 1 : i;
+        for (int64_t j = 0; j <= next; j += 4) {
+            const lanes *a = row + i * vectors, *other = row + next * vectors, *b[4];
+            lanes sum[4], also[4];
             for (int64_t q = 0; q < 4; q++) {
-                b[q] = row + (j + q < i ? j + q : i) * vectors;
+                b[q] = row + (j + q < next ? j + q : next) * vectors;
                 sum[q] = a[0] * b[q][0];
+                also[q] = other[0] * b[q][0];
             }
             for (int64_t v = 1; v < vectors; v++)
-                for (int64_t q = 0; q < 4; q++) sum[q] += a[v] * b[q][v];
-            for (int64_t q = 0; q < 4 && j + q <= i; q++) gram[i * rows + j + q] = sum_lanes(sum[q]);
+                for (int64_t q = 0; q < 4; q++) { sum[q] += a[v] * b[q][v]; also[q] += other[v] * b[q][v]; }
+            for (int64_t q = 0; q < 4; q++) {
+                if (j + q <= i) gram[i * rows + j + q] = sum_lanes(sum[q]);
+                if (j + q <= next) gram[next * rows + j + q] = sum_lanes(also[q]);
+            }
         }
+    }
 }
 
 /* Inner products of all rows: the lower triangle of gram, (rows, rows). */

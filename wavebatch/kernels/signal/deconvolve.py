@@ -33,7 +33,7 @@ def convolve_pulse(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
         Of the dtype of the signal.
     """
     half = len(taps) // 2
-    if np.array_equal(taps, taps[::-1]):
+    if signal.dtype == np.float32 and np.array_equal(taps, taps[::-1]):
         return filter_symmetric(signal, taps[half:])
     s = len(signal)
     total = signal.dtype.type(taps[half]) * signal
@@ -93,7 +93,7 @@ def deconvolve_wiener(signal: np.ndarray, taps: np.ndarray, noise_to_signal: flo
     """
     reach = 4 * len(taps)
     inverse = wiener_taps(taps, noise_to_signal, reach)
-    if np.array_equal(taps, taps[::-1]):
+    if signal.dtype == np.float32 and np.array_equal(taps, taps[::-1]):
         inverse = 0.5 * (inverse + inverse[::-1])
     return convolve_pulse(signal, inverse)
 

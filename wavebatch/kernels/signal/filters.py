@@ -67,13 +67,13 @@ def filter_symmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
     -------
     float32 (s, n)
     """
-    s = len(signal)
-    total = np.float32(taps[0]) * signal
-    for i, tap in enumerate(taps[1:s], start=1):
-        part = np.float32(tap) * signal
-        total[i:] += part[:-i]
-        total[:-i] += part[i:]
-    return total
+    s, n = signal.shape
+    by_waveform = signal.flags.f_contiguous
+    rows = np.ascontiguousarray(signal.T if by_waveform else signal, np.float32)
+    half, total = np.ascontiguousarray(taps, np.float32), np.empty_like(rows)
+    sizes = (n, s, 1) if by_waveform else (1, s * n, n)
+    call("filter_rows", rows, *map(ctypes.c_int64, sizes), half, ctypes.c_int64(len(half) - 1), total)
+    return total.T if by_waveform else total
 
 
 def filter_antisymmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:

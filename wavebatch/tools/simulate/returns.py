@@ -462,7 +462,6 @@ _LEVELS = np.geomspace(1e-12, 1e12, 4801)
 """Edges of the histogram of strengths, 1.2 % apart, from which the gain is chosen."""
 
 
-
 @dataclass(slots=True)
 class SynthesisSummary:
     """Counts of a synthesized strip."""
