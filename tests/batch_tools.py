@@ -1,5 +1,6 @@
 """Runs for tests: a strip through a profile in this process, and what came out."""
 
+import json
 from pathlib import Path
 
 import laspy
@@ -29,3 +30,20 @@ def read_cloud(path) -> tuple[np.ndarray, np.ndarray]:
     with laspy.open(path) as reader:
         points = reader.read_points(reader.header.point_count)
         return points.array, np.stack([np.asarray(points[axis]) for axis in "xyz"], axis=1)
+
+
+def read_outputs(folder) -> dict:
+    """Bytes of all files in a folder by name; of reports what they say, without timing."""
+    found = {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+    for name in found:
+        if name.endswith(".report.json"):
+            found[name] = {key: value for key, value in json.loads(found[name]).items() if key != "timing"}
+    return found
+
+
+def is_alive(pid) -> bool:
+    """Whether the process runs; one that ended and was not collected does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from facet_strips import _render
 
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.las.header import ExtraRecord
@@ -168,16 +169,6 @@ def _trace(origin: np.ndarray, unit: np.ndarray, planes: Sequence[Plane]) -> tup
         facing = np.where(hit, fall / np.sqrt(1 + sx * sx + sy * sy), facing)
     assert np.isfinite(best).all(), "every sub-ray must meet a plane"
     return best, facing, plane
-
-
-def _render(time: np.ndarray, strength: np.ndarray, flight: Flight) -> np.ndarray:
-    grid = np.arange(flight.n_samples) * flight.spacing
-    wave = np.zeros((len(time), len(grid)))
-    for k in range(time.shape[1]):
-        lag = grid - time[:, k : k + 1]
-        for weight, delay, sigma in flight.pulse:
-            wave += strength[:, k : k + 1] * weight * np.exp(-0.5 * ((lag - delay) / sigma) ** 2)
-    return wave
 
 
 def _write(path, flight, origin, ray, seconds, counts, first, hit, energy) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from batch_tools import read_outputs
 from commands import run_command
 
 from wavebatch.batch.workers import dask_cluster
@@ -94,16 +95,6 @@ def run(*arguments):
     return done.exit_code, done.stderr
 
 
-def contents(folder):
-    """Bytes of the clouds, reports without timing."""
-    found = {}
-    for path in sorted(folder.iterdir()):
-        found[path.name] = path.read_bytes()
-        if path.suffix == ".json":
-            found[path.name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "timing"}
-    return found
-
-
 def test_a_cluster_writes_the_same_bytes(dask, strips, tmp_path, monkeypatch):
     monkeypatch.chdir(strips.parent)
     relative = os.path.relpath(strips)
@@ -114,7 +105,7 @@ def test_a_cluster_writes_the_same_bytes(dask, strips, tmp_path, monkeypatch):
     code, said = run(relative, broken, "-o", tmp_path / "there", "-q", "--scheduler", dask.address)
     assert code == 3, said
     assert said.startswith(f"error: {broken}: ") and said.count("\n") == 1
-    assert contents(tmp_path / "there") == contents(tmp_path / "local")
+    assert read_outputs(tmp_path / "there") == read_outputs(tmp_path / "local")
     skipped = run(relative, "-o", tmp_path / "there", "--scheduler", dask.address, "--resume")
     assert skipped == (0, f"{relative}/a.las: is up to date, skipped\n{relative}/b.las: is up to date, skipped\n")
 
@@ -258,7 +249,7 @@ def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, s
     assert "the cluster is lost" in said and "--resume" in said and said.count("\n") == 1
     assert run(strips, "-o", out, "-q", "--resume") == (0, "")
     assert run(strips, "-o", tmp_path / "local", "-q") == (0, "")
-    assert contents(out) == contents(tmp_path / "local")
+    assert read_outputs(out) == read_outputs(tmp_path / "local")
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from batch_tools import read_cloud
+from batch_tools import read_cloud, read_outputs
 from commands import run_command
 from helpers_scenes import make_scene
 
@@ -19,17 +19,6 @@ def _run(*arguments):
 
 def _report(folder, name):
     return json.loads((folder / f"{name}.report.json").read_text())
-
-
-def _files(folder):
-    """Bytes of the clouds and of the flight's survey, reports without timing."""
-    found = {}
-    for path in sorted(folder.iterdir()):
-        if path.name.endswith(".report.json"):
-            found[path.name] = {key: value for key, value in json.loads(path.read_text()).items() if key != "timing"}
-        else:
-            found[path.name] = path.read_bytes()
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -80,10 +69,10 @@ def test_a_strip_that_does_not_fit_is_named_once_and_gets_its_own_survey(strips,
 
 def test_resume_takes_the_kept_survey_also_for_later_strips(strips, flown, tmp_path):
     folder, _ = flown
-    before = _files(folder)
+    before = read_outputs(folder)
     result = _run(*(strips[name] for name in ("a", "b", "odd", "c")), "-o", folder, "--survey", "flight", "--resume")
     assert result.exit_code == 0 and result.stderr.count("skipped") == 3
-    after = _files(folder)
+    after = read_outputs(folder)
     assert {name: after[name] for name in before} == before
     assert _report(folder, "c")["request"] == _report(folder, "a")["request"]
     later = _run(strips["c"], "-o", folder, "--survey", "flight")
@@ -95,7 +84,8 @@ def test_the_order_and_the_jobs_do_not_matter(strips, flown, tmp_path):
     folder, _ = flown
     result = _run(*(strips[name] for name in ("odd", "b", "a")), "-o", tmp_path, "--survey", "flight", "--jobs", 2)
     assert result.exit_code == 0
-    assert _files(tmp_path) == {name: content for name, content in _files(folder).items() if not name.startswith("c.")}
+    expected = read_outputs(folder).items()
+    assert read_outputs(tmp_path) == {name: content for name, content in expected if not name.startswith("c.")}
 
 
 def test_a_changed_survey_is_not_trusted_in_silence(strips, tmp_path):
@@ -145,8 +135,8 @@ def test_a_survey_of_which_no_cloud_comes_is_not_kept(strips, flown, tmp_path):
     wrong = ("--survey", "flight", "--where", "nonsense > 3", "--profile", "fast")
     result = _run(strips["a"], strips["b"], "-o", tmp_path / "out", *wrong)
     assert result.exit_code == 2 and list((tmp_path / "out").iterdir()) == []
-    folder, before = flown[0], _files(flown[0])
-    assert _run(strips["c"], "-o", folder, *wrong).exit_code in (2, 4) and _files(folder) == before
+    folder, before = flown[0], read_outputs(flown[0])
+    assert _run(strips["c"], "-o", folder, *wrong).exit_code in (2, 4) and read_outputs(folder) == before
 
 
 def test_a_survey_of_an_interrupted_run_is_kept_for_the_next(strips, tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """Runs that end in the middle: killed, interrupted, a worker shot. Nothing half-written is taken for a cloud."""
 
-import json
 import os
 import signal
 import subprocess
@@ -8,6 +7,7 @@ import sys
 import time
 
 import pytest
+from batch_tools import is_alive, read_outputs
 
 from wavebatch.batch.workers import serve
 from wavebatch.tools.simulate import simulate_strip
@@ -30,22 +30,11 @@ def strips(tmp_path_factory):
 def undisturbed(strips, tmp_path_factory):
     folder = tmp_path_factory.mktemp("undisturbed")
     subprocess.run(_command(strips, folder), check=True)
-    return _contents(folder)
+    return read_outputs(folder)
 
 
 def _command(strips, folder, *more):
     return [sys.executable, "-m", "wavebatch", "run", str(strips), "-o", str(folder), *PROFILE, "-q", *more]
-
-
-def _contents(folder):
-    """Bytes of the clouds, reports without timing, by name; temporary files too."""
-    found = {}
-    for path in sorted(folder.iterdir()):
-        if path.name.endswith(".report.json"):
-            found[path.name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "timing"}
-        else:
-            found[path.name] = path.read_bytes()
-    return found
 
 
 _AT = """
@@ -97,15 +86,6 @@ def _children(pid):
         return [int(word) for word in file.read().split()]
 
 
-def _is_alive(pid):
-    """Whether the process runs; one that ended and was not collected does not."""
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 def _is_tracker(pid):
     try:
         with open(f"/proc/{pid}/cmdline", "rb") as file:
@@ -119,9 +99,9 @@ def _is_tracker(pid):
 def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips, undisturbed, tmp_path, event):
     out = tmp_path / "out"
     code, _ = _disturb(strips, out, event, signal.SIGKILL)
-    assert code == -signal.SIGKILL and _contents(out).keys() != undisturbed.keys()
+    assert code == -signal.SIGKILL and read_outputs(out).keys() != undisturbed.keys()
     subprocess.run(_command(strips, out, "--resume"), check=True)
-    assert _contents(out) == undisturbed
+    assert read_outputs(out) == undisturbed
 
 
 @pytest.mark.quick_cases("15")
@@ -131,7 +111,7 @@ def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path
     code, said = _disturb(strips, out, DRAWN_UP, number)
     assert code == 130
     assert said.startswith("interrupted") and said.count("\n") == 1
-    assert set(_contents(out)) <= set(undisturbed)
+    assert set(read_outputs(out)) <= set(undisturbed)
     for path in out.glob("*.report.json"):
         assert path.with_name(path.name.replace(".report.json", ".laz")).exists()
 
@@ -156,7 +136,7 @@ def test_workers_die_with_their_parent(strips, tmp_path, stopped):
 
 def _wait_until_gone(children):
     deadline = time.monotonic() + 300
-    while any(_is_alive(child) for child in children):
+    while any(is_alive(child) for child in children):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.01)
 
@@ -244,5 +224,5 @@ def test_a_strip_at_which_a_worker_dies_is_tried_once_more_and_only_then_fails(s
     statuses, error = done.stdout.splitlines()
     assert statuses == "['written', 'failed', 'written']"
     assert "a worker process died" in error and "b.las" in error and "tried again alone" in error
-    found = _contents(out)
+    found = read_outputs(out)
     assert found == {name: content for name, content in undisturbed.items() if not name.startswith("b.")}

@@ -4,9 +4,9 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+from batch_tools import is_alive
 
 EARLY = """
 import os, sys, time
@@ -23,13 +23,6 @@ if __name__ == "__main__":
 """
 
 
-def _is_alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
 @pytest.mark.parametrize("state", ["running", "stopped"])
 def test_processes_that_were_started_for_nothing_end_with_their_parent(tmp_path, state):
@@ -41,7 +34,7 @@ def test_processes_that_were_started_for_nothing_end_with_their_parent(tmp_path,
     children = [int(word) for word in done.stdout.split()]
     assert len(children) >= 2
     deadline = time.monotonic() + 300
-    while any(_is_alive(child) for child in children):  # one of them is multiprocessing's own, which ends by itself
+    while any(is_alive(child) for child in children):  # one of them is multiprocessing's own, which ends by itself
         assert time.monotonic() < deadline, "a process stays"
         time.sleep(0.01)
 

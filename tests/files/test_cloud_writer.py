@@ -28,7 +28,6 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.cloud_reader import CloudReader, ColumnReader, read_cloud
 from wavebatch.files.cloud.column_names import STYLES
 from wavebatch.files.cloud.writer import CloudWriter
-from wavebatch.files.disk.publish import remove_stale
 from wavebatch.files.las.header import WKT_ID, ExtraRecord, Vlr, build_wkt, find_evlrs, read_header
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
@@ -39,8 +38,7 @@ COLUMNS = ["amplitude", "echo_width", "range", "echo_flags"]
 NOT_KEPT = (("LASF_Spec", 4), "laszip encoded", "wavebatch")
 VERSIONS = {4: (1, 3), 5: (1, 3), 9: (1, 4), 10: (1, 4)}
 UTM_KEYS, OTHER_KEYS = (
-    Vlr(b"LASF_Projection", 34735, pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, code))
-    for code in (32633, 31468)
+    Vlr(b"LASF_Projection", 34735, pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, code)) for code in (32633, 31468)
 )
 
 
@@ -557,37 +555,6 @@ def test_an_aborted_file_leaves_nothing(tmp_path, suffix):
     assert os.listdir(tmp_path) == ["a.las"]
 
 
-def test_outputs_are_not_replaced_unless_asked_and_never_the_input(tmp_path):
-    path = tmp_path / "a.las"
-    points = write_source(path, 9, (1, 4))
-    layout = plan_output(path, [])
-    rows = layout.rows(points)
-    (tmp_path / "out.laz").write_bytes(b"old")
-    with pytest.raises(InputError, match="out.laz: exists already; .*--overwrite"):
-        CloudWriter(layout, tmp_path / "out.laz", provenance={})
-    write(layout, tmp_path / "out.laz", rows, overwrite=True)
-    assert read_raw(tmp_path / "out.laz").tobytes() == rows.tobytes()
-    (tmp_path / "link.las").symlink_to(path)
-    for target in (path, tmp_path / "link.las"):
-        with pytest.raises(ConfigError, match="would replace this input"):
-            CloudWriter(layout, target, provenance={}, overwrite=True)
-    with pytest.raises(ConfigError, match="out.txt: an output's name must end in .las or .laz"):
-        CloudWriter(layout, tmp_path / "out.txt", provenance={})
-    with pytest.raises(InputError, match="make the folder first"):
-        CloudWriter(layout, tmp_path / "none" / "out.las", provenance={})
-    assert remove_stale(tmp_path) == []
-
-
-def test_kept_packets_never_replace_those_of_the_input(tmp_path):
-    points = write_strip(tmp_path / "a.laz", internal=False)
-    layout = plan_output(tmp_path / "a.laz", [], packets=facts_of(tmp_path / "a.laz"))
-    before = (tmp_path / "a.wdp").read_bytes()
-    with pytest.raises(ConfigError, match="a.wdp: the output would replace this input"):
-        write(layout, tmp_path / "a.las", layout.rows(points), overwrite=True)
-    assert (tmp_path / "a.wdp").read_bytes() == before
-    assert sorted(os.listdir(tmp_path)) == ["a.laz", "a.wdp"]
-
-
 REMEDY = "free space or choose another output folder"
 FULL_DISK = """
 import resource, sys
@@ -613,6 +580,17 @@ try:
 except InputError as error:
     print(error)
 """
+
+
+def test_no_input_is_replaced_not_even_its_packets(tmp_path):
+    points = write_strip(tmp_path / "a.laz", internal=False)
+    layout = plan_output(tmp_path / "a.laz", [], packets=facts_of(tmp_path / "a.laz"))
+    (tmp_path / "link.laz").symlink_to(tmp_path / "a.laz")
+    before = {name: (tmp_path / name).read_bytes() for name in ("a.laz", "a.wdp", "link.laz")}
+    for target, kept in (("a.las", "a.wdp"), ("a.laz", "a.laz"), ("link.laz", "link.laz")):
+        with pytest.raises(ConfigError, match=f"{kept}: the output would replace this input"):
+            write(layout, tmp_path / target, layout.rows(points), overwrite=True)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize("name", ["out.las", "out.laz", "keep.laz"])

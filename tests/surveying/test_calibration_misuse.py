@@ -380,29 +380,28 @@ def write_off(monkeypatch, path, off, sensor=FAST, ground=HILLY, pulses=8000):
     monkeypatch.undo()
 
 
-@pytest.mark.parametrize(("off", "said"), [(1, "m too short, 1 x the 600 m"), (-1, "too long"), (0, "")])
-def test_a_wrong_pulse_zone_is_refused(tmp_path, monkeypatch, off, said):
-    write_off(monkeypatch, tmp_path / "s.las", lambda share, angle: off)
-    done = call("calibrate", tmp_path / "s.las", "--targets", write_targets(tmp_path / "t.csv"),
-                "-o", tmp_path / "cal.toml")  # fmt: skip
-    assert done.exit_code == (1 if off else 0) and said in done.stderr
-    assert ("its ground is bent across the flight" in done.stderr) == bool(off)
+JUMP = "pulses jump by a whole number of the 600 m between two pulses"
 
 
-@pytest.mark.quick_cases("late")
+@pytest.mark.quick_cases("short", "long", "right", "late")
 @pytest.mark.parametrize(
-    "off",
+    ("off", "said"),
     [
-        pytest.param(lambda share, angle: share > 0.4, id="late"),
-        pytest.param(lambda share, angle: -1.0 * (share < 0.15), id="early"),
-        pytest.param(lambda share, angle: angle > 18.5, id="edges"),
+        pytest.param(lambda share, angle: 1, "m too short, 1 x the 600 m", id="short"),
+        pytest.param(lambda share, angle: -1, "too long", id="long"),
+        pytest.param(lambda share, angle: 0, "", id="right"),
+        pytest.param(lambda share, angle: share > 0.4, JUMP, id="late"),
+        pytest.param(lambda share, angle: -1.0 * (share < 0.15), JUMP, id="early"),
+        pytest.param(lambda share, angle: angle > 18.5, JUMP, id="edges"),
     ],
 )
-def test_a_pulse_zone_that_is_wrong_in_a_part_of_the_strip_is_refused(tmp_path, monkeypatch, off):
+def test_a_wrong_pulse_zone_is_refused(tmp_path, monkeypatch, off, said):
+    """Of the whole strip, or of a part of it."""
     write_off(monkeypatch, tmp_path / "s.las", off)
     done = call("calibrate", tmp_path / "s.las", "--targets", write_targets(tmp_path / "t.csv"),
                 "-o", tmp_path / "cal.toml")  # fmt: skip
-    assert done.exit_code == 1 and "pulses jump by a whole number of the 600 m between two pulses" in done.stderr
+    assert done.exit_code == (1 if said else 0) and said in done.stderr
+    assert said == JUMP or ("its ground is bent across the flight" in done.stderr) == bool(said)
 
 
 @pytest.mark.slow
@@ -579,14 +578,29 @@ def test_points_of_another_crs_than_their_vectors_are_named(tmp_path, slope):
     assert done.exit_code == 0 and "vectors" not in done.stderr
 
 
+def test_an_outline_around_many_fields_is_named_and_in_the_error(tmp_path, calibrated):
+    """A radius of 150 m in place of 5: the constant of all fields together, with the error of one."""
+    (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n0.3,{EAST + 50},{NORTH + 10},150\n")
+    done = call("calibrate", calibrated / "a.las", "--targets", tmp_path / "t.csv", "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 0 and "several surfaces? Check its outline" in done.stderr
+    assert load_calibration(tmp_path / "cal.toml").relative_error > 0.12
+
+
+def test_a_target_that_is_listed_twice_does_not_halve_the_error(tmp_path, calibrated):
+    row = f"0.3,{EAST + 50},{NORTH + 10},"
+    (tmp_path / "t.csv").write_text(f"reflectance,x,y,radius\n{row}8\n{row}7\n")
+    done = call("calibrate", calibrated / "a.las", "--targets", tmp_path / "t.csv", "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 2 and "targets 1 and 2 are one target: its reflectance would count twice" in done.stderr
+
+
 def test_a_strip_whose_times_show_no_day_is_said_to_count_as_of_the_same_day(tmp_path, calibrated):
     write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 90 * 86400), 10_000, seed=87)
     content = bytearray((tmp_path / "s.las").read_bytes())
     content[6] &= 0xFE  # seconds of the week
     (tmp_path / "s.las").write_bytes(content)
     said = run(calibrated, tmp_path / "out", tmp_path / "s.las")
-    assert "GPS times of this strip are seconds of a week, so they show no day: it counts as the same day" in said
-    assert "show no day" not in run(calibrated, tmp_path / "out", "a.las")
+    assert "the day of this strip is not known (GPS times that are seconds of a week show none)" in said
+    assert "the day of" not in run(calibrated, tmp_path / "out", "a.las")
 
 
 def test_a_column_that_is_no_reflectance_of_the_channel_is_named(tmp_path, monkeypatch):
@@ -594,7 +608,7 @@ def test_a_column_that_is_no_reflectance_of_the_channel_is_named(tmp_path, monke
     monkeypatch.setattr(facet_strips, "_write", lambda *a: write(*a[:10], np.full_like(a[10], 0.6)))
     write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, vendor="share"), 6000, seed=89)
     done = call("calibrate", tmp_path / "s.las", "--from-column", "Reflectance", "-o", tmp_path / "cal.toml")
-    assert done.exit_code == 0 and "constants by its dark and its bright echoes differ by 5" in done.stderr
+    assert done.exit_code == 0 and "constants of its dark and bright echoes scatter by 5" in done.stderr
     assert load_calibration(tmp_path / "cal.toml").relative_error > 0.5
 
 

@@ -1,10 +1,12 @@
 """How exactly returns were placed, and that errors of places and ranges hold it: traced strips with noise on points."""
 
+import json
 from dataclasses import replace
 
 import footprints
 import numpy as np
 import pytest
+from commands import run_command
 from facet_strips import Facet, Sensor
 from facet_strips import write_strip as write_facets
 from footprints import EAST, NORTH, Flight, Plane, match, roofs, write_strip
@@ -76,6 +78,14 @@ def test_a_phase_of_the_pulse_is_no_scatter(tiny_strip):
     """Locations of simulated returns are up to half a sample off, their points are true."""
     found = measure(tiny_strip)
     assert found.scatter < 0.005 and 0.03 < found.phase < 0.07
+
+
+def test_scatter_and_phase_are_printed_and_in_the_report(tiny_strip, tmp_path):
+    done = run_command("run", tiny_strip, "-o", tmp_path, "-v", "--profile", "fast")
+    found = json.loads((tmp_path / f"{tiny_strip.stem}.report.json").read_text())["strip"]["sensor"]["returns"]
+    assert found["from"] in ("neighbours", "pairs of returns", "locations") and 0.03 < found["phase_m"] < 0.07
+    said = f"returns were placed to {found['scatter_m']:.3f} m, by {found['from']}; an echo without a return is off by"
+    assert f"{said} {found['phase_m']:.3f} m" in done.stderr
 
 
 @pytest.mark.parametrize("ratio", [0.3, 0.6, 2.0])

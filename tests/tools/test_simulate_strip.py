@@ -182,21 +182,6 @@ def test_close_echoes_share_a_return_of_the_strongest():
     assert len(list_returns(EchoTable.empty(), 2, recording, 7, keep_empty=False).pulse) == 0
 
 
-def test_existing_files_are_refused_and_nothing_half_done_remains(tmp_path):
-    path, truth = tmp_path / "strip.las", tmp_path / "truth.npz"
-    simulate_strip("flat", path, pulses=50, truth=truth)
-    before = sorted(tmp_path.iterdir())
-    content = path.read_bytes()
-    with pytest.raises(InputError, match="exists"):
-        simulate_strip("flat", path, pulses=60, truth=tmp_path / "other.npz")
-    with pytest.raises(InputError, match="exists"):
-        simulate_strip("flat", tmp_path / "new.las", pulses=60, truth=truth)
-    assert sorted(tmp_path.iterdir()) == before
-    assert path.read_bytes() == content
-    simulate_strip("flat", path, pulses=60, truth=truth, overwrite=True)
-    assert path.read_bytes() != content
-
-
 def test_failures_half_way_leave_nothing(tmp_path):
     def stop(done):
         raise KeyboardInterrupt

@@ -67,7 +67,7 @@ class TargetResult:
     air: float | None = None
     """Share of the air that a column of reflectances held, which was taken off; None where it is not known."""
     apart: float = 0.0
-    """Scatter of the constants by dark and by bright echoes of a column of reflectances, relative."""
+    """Scatter of the constants of its parts, relative; of dark and bright echoes of a column of reflectances."""
     refused: str = ""
     """Why the target gave no constant."""
     channel: str = ""

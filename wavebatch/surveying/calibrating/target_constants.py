@@ -34,6 +34,10 @@ STRANGE_SIGMA, MOST_STRANGE = 6.0, 0.02
 """Echoes this many robust standard deviations off the median are of another surface; more than this share may be the
 target itself, inside of an outline that is too large: it is named, and by how much they are off is in the error."""
 
+MOST_PARTS, MOST_APART = 8, 0.1
+"""Parts of a target in each direction, of LEAST_ECHOES echoes or more; and scatter of their constants, beyond what that
+of the echoes explains, from which it is of several surfaces, which is in the error: tarps and asphalt have 1 to 3 %."""
+
 MOST_CLIPPED = 0.2
 """Share of clipped echoes from which a target is refused: the others are the dim ones, by a third of their scatter."""
 
@@ -130,10 +134,11 @@ def measure_target(
         inset_m=round(inset, 3),
         edge=edge,
         strange=strange,
+        apart=_compare_parts(relative, rows["xyz"][used]),
     )
     inner = MEDIAN_ERROR * (result.spread or 0.0) / np.sqrt(result.echoes - 1)
     hot_err = 0.5 * target.hot_spot / (1.0 + target.hot_spot)
-    other = max(edge_err, strange_err)
+    other = max(edge_err, strange_err, result.apart if result.apart > MOST_APART else 0.0)
     error = float(np.sqrt(reflectance_error**2 + hot_err**2 + facing_err**2 + inner**2 + other**2))
     return replace(result, relative_error=error), rows[used], constant
 
@@ -226,6 +231,17 @@ def _share_strange(constant: np.ndarray) -> tuple[float, float]:
     strange = off > max(STRANGE_SIGMA * MAD_TO_STD * float(np.median(off)), LEAST_EDGE)
     share = float(np.mean(strange))
     return share, float(np.median(off[strange])) if share > MOST_STRANGE else 0.0
+
+
+def _compare_parts(constant: np.ndarray, xyz: np.ndarray) -> float:
+    """Scatter of the constants of parts of a target, beyond what the scatter within them explains."""
+    side = min(int((len(constant) / LEAST_ECHOES) ** 0.5), MOST_PARTS)
+    if side < 2:
+        return 0.0
+    columns = np.array_split(np.argsort(xyz[:, 0], kind="stable"), side)
+    parts = [part for some in columns for part in np.array_split(some[np.argsort(xyz[some, 1], kind="stable")], side)]
+    chance = np.mean([MEDIAN_ERROR**2 * robust_std(constant[part]) ** 2 / len(part) for part in parts])
+    return float(max(np.var([np.median(constant[part]) for part in parts]) - chance, 0.0) ** 0.5)
 
 
 def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None, float]:

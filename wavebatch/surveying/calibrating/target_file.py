@@ -106,6 +106,13 @@ def load_targets(path: Path | str) -> list[Target]:
     targets = [replace(_read_target(row, f"{path}: target {i}"), file=file) for i, row in enumerate(rows, 1)]
     if not targets:
         raise ConfigError(f"{path}: no target in it; give polygons (GeoJSON) or rows (CSV)")
+    seen: dict[tuple[float, ...], int] = {}
+    for number, one in enumerate(targets, 1):
+        first = seen.setdefault((one.reflectance, *one.corners.mean(axis=0).round(6).tolist()), number)
+        if first != number:
+            raise ConfigError(
+                f"{path}: targets {first} and {number} are one target: its reflectance would count twice; leave one out"
+            )
     return targets
 
 

@@ -23,6 +23,7 @@ from wavebatch.surveying.calibrating.compression import find_compression
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
 from wavebatch.surveying.calibrating.target_constants import (
     LEAST_ECHOES,
+    MOST_APART,
     MOST_STRANGE,
     combine_targets,
     measure_column,
@@ -36,9 +37,6 @@ from wavebatch.surveying.sensor import SensorSource
 
 LEAST_BENT = 0.01
 """Error by a compressing receiver from which it is said: a third of that of a target's reflectance."""
-
-MOST_APART = 0.1
-"""How far dark and bright echoes of a column of reflectances may differ: vendors' noise and ours make less than 5 %."""
 
 MOST_ECHOES = 200_000
 """Most echoes that a target uses: the error of its reflectance is far larger than that of so many."""
@@ -209,10 +207,10 @@ def _list_doubts(
     yield from filter(None, (source.sensor.doubt(), *source.sent.notes))
     for result in results:
         if result.apart > MOST_APART:
-            yield (
-                f"{result.name}: constants by its dark and its bright echoes differ by {result.apart:.0%} (standard "
-                "deviation): is it the reflectance, of this channel? The error holds it"
-            )
+            which, why = "parts", "several surfaces? Check its outline"
+            if options.column:
+                which, why = "dark and bright echoes", "is it the reflectance, of this channel?"
+            yield f"{result.name}: constants of its {which} scatter by {result.apart:.0%}, which the error holds: {why}"
         if options.column and result.air is None and source.air:
             yield (
                 f"{result.name}: its ranges are too alike to show whether it still holds the air: the error of the "

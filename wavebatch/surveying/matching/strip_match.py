@@ -109,8 +109,8 @@ def match_strip(
         if not (calibration.flight and read_day(reader)):
             which = "the calibration" if not calibration.flight else "this strip"
             notes.append(
-                f"calibration: GPS times of {which} are seconds of a week, so they show no day: it counts as the same "
-                "day; lasers, receivers and air of another day would add to the error"
+                f"calibration: the day of {which} is not known (GPS times that are seconds of a week show none): it "
+                "counts as the same day; lasers, receivers and air of another day would add to the error"
             )
     if energy is None:
         more, lines, hidden = judge_fading(calibration, setting, other=own_strip not in measured)
