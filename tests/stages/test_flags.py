@@ -106,7 +106,7 @@ def test_echoes_that_an_error_of_the_pulse_explains_are_dropped_as_by_a_loop(tab
             if system.components and table.amplitude[j] >= top:
                 share = max(share, 0.005)
             if np.abs(lag - lags).min() <= 0.6 * 2.0:
-                share = max(share, 2.0 * np.interp(lag, lags, shares))
+                share = max(share, 1.5 * np.interp(lag, lags, shares))
             if table.amplitude[i] < share * table.amplitude[j]:
                 dropped.add(i)
         kept = drop_unproven(table, system, top)

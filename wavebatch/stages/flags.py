@@ -22,9 +22,10 @@ RINGING_REACH = 12.0
 RINGING_FACTOR = 1.2
 """Echoes up to this many times the strip's ringing may be ringing (docs/algorithms.md H7)."""
 
-TAIL_FACTOR = 2.0
-"""An echo must be so many times as high as the measured misfit of a stronger echo's tail at its place: it is measured
-in steps of a width, and ringing is higher between them."""
+TAIL_FACTOR, FAR_TAIL_FACTOR = 1.5, 2.0
+"""An echo must be so many times as high as the measured misfit of a stronger echo's tail at its place; further away than
+BESIDE, where no component of the pulse reaches: it is measured in steps of a width, and ringing is higher between them.
+"""
 
 CORE, CORE_STD = 4.0, 0.34
 """Distance up to which the misfit of an echo adds to the errors of others [system widths], and standard deviation of
@@ -109,7 +110,8 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
             faint[row] |= table.amplitude[row] < clipped[other]
     if system.tail_misfit:
         for row, other, lag in list_neighbours(table):
-            faint[row] |= table.amplitude[row] < TAIL_FACTOR * _tail_share(system, lag) * table.amplitude[other]
+            factor = np.where(np.abs(lag) < BESIDE * system.sigma_ref, TAIL_FACTOR, FAR_TAIL_FACTOR)
+            faint[row] |= table.amplitude[row] < factor * _tail_share(system, lag) * table.amplitude[other]
     return table.take(np.flatnonzero(~faint)) if faint.any() else table
 
 
