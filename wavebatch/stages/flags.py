@@ -23,9 +23,9 @@ RINGING_FACTOR = 1.2
 """Echoes up to this many times the strip's ringing may be ringing (docs/algorithms.md H7)."""
 
 TAIL_FACTOR, FAR_TAIL_FACTOR = 1.5, 2.0
-"""An echo must be so many times as high as the measured misfit of a stronger echo's tail at its place; further away than
-BESIDE, where no component of the pulse reaches: it is measured in steps of a width, and ringing is higher between them.
-"""
+"""An echo must be so many times as high as the measured misfit of a stronger echo's tail at its place. The second one
+counts beyond BESIDE, where no component of the pulse reaches: it is measured in steps of a width, and ringing is higher
+between them."""
 
 CORE, CORE_STD = 4.0, 0.34
 """Distance up to which the misfit of an echo adds to the errors of others [system widths], and standard deviation of
