@@ -11,6 +11,7 @@ TESTS = Path(__file__).resolve().parents[1]
 COMPILED = {
     "decompose_clusters": ("decompose_clusters", "naive_fit.decompose"),
     "promise_echoes": ("promise_echoes", "naive_fit.propose"), "quiet_levels": ("quiet_levels", "naive.smooth_121"),
+    "filter_rows": ("filter_symmetric", "naive.correlate_symmetric"),
     "find_maxima": ("find_maxima", "naive.find_peaks"),
     "group_candidates": ("cluster_candidates", "test_maxima.naive_clusters"), "exponentials": ("exp", "math.exp"),
     "logarithms": ("log", "math.log"), "solve_equations": ("solve", "np.linalg.solve"),
