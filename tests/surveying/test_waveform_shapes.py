@@ -203,6 +203,17 @@ def test_converters_that_take_turns_are_made_alike():
     assert found > 0.9 and true > 0.985
 
 
+def test_converters_are_made_alike_where_no_echo_stands_alone():
+    """Fourteen echoes in each waveform: starts of guessed widths knew of no defects, and what was learned from them."""
+    rng = np.random.default_rng(5)
+    signal = np.zeros((300, 160))
+    for _ in range(14):
+        signal += rng.uniform(15, 60, (300, 1)) * bell((np.arange(160) - rng.uniform(25, 135, (300, 1))) / 1.2)
+    survey = survey_block(digitize(signal + np.tile([1.2, -1.2], 80), 5, noise=1.0))
+    assert survey.figures.isolated_echoes < 20
+    assert np.ptp(survey.system.defects.pattern) == pytest.approx(2.4, rel=0.1)
+
+
 @pytest.mark.parametrize("everywhere", [True, False])
 def test_jumps_at_the_start_are_no_echoes(everywhere):
     signal, rows, time, _ = render(bell, 7)

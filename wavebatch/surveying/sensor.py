@@ -155,14 +155,14 @@ class SensorSource:
         return replace(block, sensor=np.where(down > 0, block.origin - back, np.nan))
 
     def doubt(self) -> str:
-        """Return the line about a trajectory that contradicts the packet vectors; empty where it does not."""
+        """Return the line about what contradicts the range: vectors, relief or a trajectory; empty without any."""
         facts = dict(self.facts)
         if spread := facts.get("do_not_meet_deg"):
             return (
                 f"range: the packets' vectors spread by {spread:.0f} degrees, but do not meet in a path of the sensor: "
                 "points and vectors are of two CRSs, axes are swapped, or times are wrong; new echoes lie along them"
             )
-        if self.height and facts["relief_m"] > HEIGHT_ERROR * self.height:
+        if self.height and facts.get("relief_m", 0.0) > HEIGHT_ERROR * self.height:
             return (
                 f"range: --flight-height is one number, but heights scatter by {facts['relief_m']:.0f} m: the "
                 f"error of the ranges, {self.error:.2g} m, holds it; give --trajectory"

@@ -384,7 +384,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             starts |= {} if guess is None else {"single echoes": guess}
             starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in list_widths(block)}
         choice = choose_pulse(block, starts, list_known(block, system))
-        system, candidates = choice.best.system, choice.describe()
+        # Starts of guessed widths are measured from nothing, and know no defects.
+        system, candidates = replace(choice.best.system, defects=first.defects), choice.describe()
         figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change
         gaussians = (one.typical for one in choice.tried if one.name.startswith("gaussian"))
         figures.gaussian_nats = min(gaussians, default=None)

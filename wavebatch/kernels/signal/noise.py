@@ -197,21 +197,21 @@ def _estimate_from(
         level = np.where(number > 0, np.nan_to_num(level) + mean, np.float32(np.nan))
         if turn and abs(_smoothed_std(covariance) - last) < SETTLED * last:
             break
+    again = None  # with a tighter limit: weak echoes only add to noise
+    if limit > LEAST_LIMIT and _lopsided(signal, level, quiet) > LOPSIDED:
+        again = _estimate_from(signal, reach, TIGHTER * limit, missing, recovery, room=0.0)
     known = number > 0
     middle, spread = _spread_of_levels(level[known].astype(np.float64), number[known], covariance)
     std = max(float(np.sqrt(covariance[0])), QUANTISATION_STD)
     correlation = covariance[1:] / std**2
-    if limit > LEAST_LIMIT and _lopsided(signal, level, quiet) > LOPSIDED:
-        again = _estimate_from(signal, reach, TIGHTER * limit, missing, recovery, room=0.0)
-        if again.std < std:  # weak echoes only add to noise
-            return again
     if spread <= DRIFT * std:
         seen = std
         middle, std, spread, correlation = undo_floor(signal[quiet], middle, std, spread, correlation)
         if room and std > MUCH_CUT * seen:  # a limit of what is left of the noise cuts off its top too
             wider = limit * float(np.sqrt(std / seen))  # half way: weak echoes must not come in
             return _estimate_from(signal, reach, wider, missing, recovery, room=0.0)
-    return PooledNoise(middle, std, spread, float(quiet.mean()), correlation, recovery)
+    found = PooledNoise(middle, std, spread, float(quiet.mean()), correlation, recovery)
+    return again if again is not None and again.share and again.std < std else found
 
 
 def _lopsided(signal: np.ndarray, level: np.ndarray, quiet: np.ndarray) -> float:

@@ -146,7 +146,9 @@ def _compare_compression(source: EchoSource, used: np.ndarray) -> tuple[float, l
             low, high = np.quantile(found.amplitude, [0.05, 0.95]).tolist()
             off = [found.factor * (float(np.mean(targets)) - amplitude) for amplitude in (low, high)]
             lines.append(
-                f"the receiver of digitizer {channel // SCANNERS} compresses, by the shape of its echoes: those of "
+                f"the receiver of digitizer {channel // SCANNERS}"
+                + (f", scanner channel {channel % SCANNERS}," if channel % SCANNERS else "")
+                + " compresses, by the shape of its echoes: those of "
                 f"{low:.0f} to {high:.0f} DN are {off[0]:+.1%} to {off[1]:+.1%} off against the targets': the error of "
                 f"the constant grows by {growth:.1%}; take targets as bright as the surfaces that you measure"
             )

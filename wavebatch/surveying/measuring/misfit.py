@@ -77,7 +77,7 @@ def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> System
     """
     if not len(echoes):
         return system
-    seen = ABOVE_NOISE * system.noise.std / float(np.quantile(echoes.amplitude, 0.99))
+    seen = ABOVE_NOISE * system.noise.std / max(float(np.quantile(echoes.amplitude, 0.99)), 1e-9)
     return replace(system, faint_share=min(max(PEAK * max(system.misfit, change), seen), system.faint_share))
 
 

@@ -74,7 +74,7 @@ class Figures:
     isolated_echoes: Figure = None
     """Echoes that the pulse was learned from."""
     misfit_goal: Figure = None
-    """Misfit of a pulse model that chance alone makes, as a share of the amplitude."""
+    """Misfit of a pulse model that is too small to be seen, as a share of the amplitude."""
     misfit_skewed: Figure = None
     """Of the skewed pulse."""
     kappa: Figure = None
