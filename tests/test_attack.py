@@ -27,6 +27,7 @@ def _plant(attacker, monkeypatch, code):
         import os, pathlib, signal, subprocess, sys, time
         out = pathlib.Path(sys.argv[-1]); out.mkdir(exist_ok=True)
         signal.signal(signal.SIGTERM, lambda *_: None)
+        sys.exit = lambda code: (sys.stderr.flush(), os._exit(code))  # Python dies of a signal that comes while it ends
         {code}
     """
     words = [sys.executable, "-c", textwrap.dedent(program), "spawn_main", str(attacker._folder / "out")]
