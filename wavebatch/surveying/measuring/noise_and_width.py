@@ -112,9 +112,8 @@ def measure_once_more(block: WaveformBlock, system: SystemPulse) -> ReceiverNois
     found = measure_quiet(block, width).noise
     if not guessed.by_kind["quiet"]:
         return found
-    seen = float(guessed.quiet * noise_factors(GAUSSIAN, width, guessed.correlation)[0])
-    least = DITHERED if guessed.quiet < UNDITHERED else guessed.quiet
-    guessed = replace(guessed, std=max(seen, least), by_kind={**guessed.by_kind, "quiet_pulse": seen})
+    seen, std = _noise_of_pulse(guessed.quiet, guessed.correlation, width)
+    guessed = replace(guessed, std=std, by_kind={**guessed.by_kind, "quiet_pulse": seen})
     return found if found.by_kind["quiet"] and found.std < guessed.std else guessed
 
 
@@ -149,19 +148,24 @@ def _find_noise(block: WaveformBlock, width: float) -> PooledNoise:
     return estimate_noise(transpose_samples(block.samples), _reach(width), missing=missing)
 
 
+def _noise_of_pulse(std: float, correlation: tuple[float, ...], width: float) -> tuple[float, float]:
+    """Noise of a Gaussian of this width [samples] from that of a sample; and what a survey takes it for, at least."""
+    seen = float(std * noise_factors(GAUSSIAN, width, correlation)[0])
+    return seen, max(seen, std, DITHERED if std < UNDITHERED else QUANTISATION_STD)
+
+
 def _gaussian_system(noise: PooledNoise, spacing: float, width: float, saturation: float | None) -> SystemPulse:
     """A Gaussian of this width [samples] with this noise; spacing of the samples [ns]."""
     correlation = tuple(noise.correlation.tolist())
-    seen = float(noise.std * noise_factors(GAUSSIAN, width, correlation)[0])
+    seen, std = _noise_of_pulse(noise.std, correlation, width)
     known = noise.std if noise.share > 0 else 0.0
-    hidden = DITHERED if noise.std < UNDITHERED else QUANTISATION_STD
     return SystemPulse(
         sigma_ref=width * spacing,
         noise=ReceiverNoise(
             baseline=noise.level,
             baseline_spread=noise.spread,
             recovery=float(noise.recovery * spacing),
-            std=max(seen, noise.std, hidden),
+            std=std,
             by_kind={"quiet": known, "quiet_pulse": seen},
             correlation=correlation,
         ),
