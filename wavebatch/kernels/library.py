@@ -295,7 +295,7 @@ def place(array: np.ndarray, dtype: type) -> int:
 
 
 def address(array: np.ndarray) -> int:
-    """Address of an array's first value. `ctypes.data` takes three times as long: 3 % of a survey's small calls."""
+    """Address of an array's first value; `array.ctypes.data` takes twice as long, and a survey asks 10,000 times."""
     if array.size and array.flags.carray:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
     return array.ctypes.data  # of what cannot be written, or is empty
