@@ -307,7 +307,7 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
     answer({"output": str(output), "cube": str(cube_file), "slices": drawn})
 
 
-_SHOWN = ("detector", "asdf", "wavelet", "correlation", "deconvolved", "derivative")
+_SHOWN = ("detector", "asdf", "correlation", "deconvolved", "derivative", "wavelet")
 
 
 @click.group(cls=NearestGroup)
