@@ -50,7 +50,7 @@ class DetectorSignal(Searched):
     """The echoes that the detector found in the one waveform."""
 
 
-def list_kinds() -> dict[str, str]:
+def list_signals() -> dict[str, str]:
     """Kinds of signal that --show names, and the detector of each: the first by its name."""
     found: dict[str, str] = {}
     for name, one in sorted(STAGES.items()):
@@ -61,7 +61,7 @@ def list_kinds() -> dict[str, str]:
 
 def choose_step(chain: Chain, show: str) -> Step:
     """The detector whose signal is shown: that of the chain if it searches in this kind, else the kind's first one."""
-    step, kinds = chain.steps[1], list_kinds()
+    step, kinds = chain.steps[1], list_signals()
     if show == "detector":
         if step.stage.searches is None:
             raise ConfigError(f"--show detector: {step.stage.name} has no known signal; choose {', '.join(kinds)}")
