@@ -23,8 +23,9 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
+from wavebatch.files.toml_file import describe_record
 from wavebatch.tools import return_stats as returns
-from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv
+from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv, list_facts
 
 EXIT_UNREADABLE = 1
 """A cloud could not be read; the others were counted."""
@@ -111,6 +112,7 @@ def _sheet(found: returns.ReturnStats) -> Sheet:
         pulses = count(found.several, "pulse")
         words = f"{found.depth:.3f} m, mean height of the first above the last return of {pulses}"
         parts.append(Fact("first to last", words))
+    parts += list_facts(found)
     parts += [Fact(f"  {name}", number) for name, number in (found.flags or {}).items() if number]
     parts += [Note(words, "warning") for words in found.warnings]
     number = range(1, max((max(area.by_count) for area in found.areas), default=0) + 1)
@@ -141,7 +143,7 @@ def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_coun
     ends = ["", *(f"_{pair.replace('-', '_').rstrip('_')}" for pair in returns.RANKS)]
     for end, one in zip(ends, [part if is_area else part.separations["all"], *_rank_pairs(part)], strict=True):
         found |= {f"pairs{end}": one.pairs, f"mean_m{end}": one.mean, f"least_m{end}": one.least}
-    found |= {"pulses_with_several": part.several, "first_above_last_m": part.depth}
+    found |= describe_record(part)
     # Distances are collected per cloud only: a histogram per area would need too much memory.
     zones = {} if is_area else part.dead_zones
     for end, name in zip(ends, ("all", *returns.RANKS), strict=True):

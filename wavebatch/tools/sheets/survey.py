@@ -10,7 +10,7 @@ from typing import Any
 from wavebatch.core.units import FWHM_PER_SIGMA, count, format_measure
 from wavebatch.surveying import Survey
 from wavebatch.surveying.systems.shown import name_model
-from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Picture, Sheet, Table
+from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Picture, Sheet, Table, list_facts
 
 NOISE_KINDS = {
     "quiet": "quiet samples",
@@ -121,8 +121,7 @@ def _list_scene(survey: Survey) -> Iterator[Part]:
     shares = [f"{100 * share:.2f} % {kind}" for kind, share in kinds.items() if share is not None]
     if shares and figures.echoes_per_waveform is not None:
         yield Fact("waveforms", f"{', '.join(shares)}; {figures.echoes_per_waveform:.3f} echoes each")
-    if figures.amplitude_99 is not None:
-        yield Fact("amplitudes", f"99 % below {figures.amplitude_99:.1f} DN")
+    yield from list_facts(figures)
     if figures.system_width_share is not None:
         share = 100 * figures.system_width_share
         yield Fact("widths", f"{share:.1f} % of the clear echoes have the width of the system pulse")
