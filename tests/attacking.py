@@ -31,10 +31,10 @@ import wavebatch
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.strip import StripOptions
 
-LONGEST = 60.0
+LONGEST = 300.0
 """Seconds after which a command hangs; undisturbed ones take one or two."""
 
-STAY = 15.0
+STAY = 60.0
 """Seconds that other processes of the session have to end after the command."""
 
 RUN = "run {base}/strips -o {out} -q"

@@ -165,7 +165,7 @@ def _drop(words):
     ],
 )
 def test_the_fuzzer_sees_every_kind_of_failure(fuzzer, what, why):
-    limits = Limits(0.3 if "ran" in why else 10, 1 if "waits" in why else 15, 600 << 20)
+    limits = Limits(0.3 if "ran" in why else 10, 1 if "waits" in why else 60, 600 << 20)
     planted = Fuzzer(fuzzer.base.parent, _plant(what), limits)
     assert re.search(why, planted.run(Case("strip.las", "survey {input} -o {out}/a.toml", [])))
     planted.close()

@@ -50,7 +50,7 @@ class Limits(NamedTuple):
 
     seconds: float = 10
     """Of a processor."""
-    waiting: float = 15
+    waiting: float = 60
     """Of a clock, while it does nothing."""
     memory: int = 1 << 30
     """Bytes that the process takes at most, with Python and NumPy."""

@@ -63,8 +63,8 @@ _POPEN = attacking.subprocess.Popen
     ],
 )
 def test_the_attacker_sees_every_kind_of_failure(attacker, monkeypatch, code, why):
-    monkeypatch.setattr(attacking, "LONGEST", 3.0 if why == "hangs" else 60.0)
-    monkeypatch.setattr(attacking, "STAY", 1.0 if why == "stay" else 15.0)
+    monkeypatch.setattr(attacking, "LONGEST", 3.0 if why == "hangs" else attacking.LONGEST)
+    monkeypatch.setattr(attacking, "STAY", 1.0 if why == "stay" else attacking.STAY)
     _plant(attacker, monkeypatch, code)
     assert re.search(why, attacker.attack(Attack("survey", "TERM", 0.3)))
 

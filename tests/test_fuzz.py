@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks a process
 def _run(*options):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *options]
     cases = Path(__file__).with_name("fuzz_cases.py")
-    done = subprocess.run([*command, str(cases)], cwd=cases.parents[1], capture_output=True, text=True, timeout=1200)
+    done = subprocess.run([*command, str(cases)], cwd=cases.parents[1], capture_output=True, text=True, timeout=2000)
     assert done.returncode == 0 and " passed" in done.stdout, done.stdout[-5000:] + done.stderr[-2000:]
 
 

@@ -40,11 +40,18 @@ class Dask:
         self.address = json.loads(file.read_text())["address"]
 
     def start_worker(self, **env):
+        return self.start_workers(1, **env)[0]
+
+    def start_workers(self, number, **env):
+        """Start them at once, and wait until the scheduler knows all: a command waits ten seconds for its first."""
         # A function of this file travels as "tests.batch.test_dask_cluster": the worker must be able to import that.
         tests = Path(__file__).parents[1]
         path = os.pathsep.join(filter(None, (str(tests.parent), str(tests), os.environ.get("PYTHONPATH"))))
         common = ("--nthreads", "1", "--no-dashboard", "--no-nanny", "--memory-limit", "0")
-        return self._start(*_WORKER, self.address, *common, PYTHONPATH=path, **env)
+        workers = [self._start(*_WORKER, self.address, *common, PYTHONPATH=path, **env) for _ in range(number)]
+        logs = [self.folder / f"log{self.processes.index(worker)}" for worker in workers]
+        self.wait_until(lambda: all(b"Registered to" in log.read_bytes() for log in logs))
+        return workers
 
     def _start(self, *command, **env):
         with open(self.folder / f"log{len(self.processes)}", "wb") as log:
@@ -52,7 +59,6 @@ class Dask:
             process = subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, env=env)
         self.processes.append(process)
         return process
-
     def wait_until(self, true):
         deadline = time.monotonic() + 300
         while not true():
@@ -65,15 +71,20 @@ class Dask:
             process.wait()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def patience():
+    """On a busy machine the scheduler answers late."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dask_cluster, "_CONNECT", 100.0)
+        yield
+
+
 @pytest.fixture(scope="module")
 def dask(tmp_path_factory):
     """A cluster of two workers that are started in another folder than the tests."""
     cluster = Dask(tmp_path_factory.mktemp("dask"))
-    cluster.start_worker()
-    cluster.start_worker()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dask_cluster, "_CONNECT", 100.0)  # on a busy machine the scheduler answers late
-        yield cluster
+    cluster.start_workers(2)
+    yield cluster
     cluster.stop()
 
 
@@ -342,9 +353,12 @@ def test_a_worker_that_joins_later_and_does_not_fit_gets_no_work(tmp_path):
         dask.stop()
 
 
-def _busy_pid():
-    """The process, after some time in which others may take calls."""
-    time.sleep(0.3)
+def _meet(folder, number):
+    """The process, once so many processes make this call; each notes itself in the folder."""
+    (folder / str(os.getpid())).touch()
+    deadline = time.monotonic() + 100
+    while len(list(folder.iterdir())) < number and time.monotonic() < deadline:
+        time.sleep(0.01)
     return os.getpid()
 
 
@@ -362,7 +376,8 @@ def test_workers_that_join_later_take_part_and_replace_those_that_die(tmp_path, 
             second = dask.start_worker()
             dask.wait_until(lambda: len(cluster._look()) == 2)
             assert (cluster.jobs, cluster.limit) == (2, 4)
-            futures = [cluster.submit(_busy_pid) for _ in range(8)]
+            (tmp_path / "met").mkdir()
+            futures = [cluster.submit(_meet, tmp_path / "met", 2) for _ in range(8)]
             assert {future.result(timeout=300) for future in futures} == {first.pid, second.pid}
             for process in first, second:
                 process.kill()
