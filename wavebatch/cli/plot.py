@@ -257,22 +257,16 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
       # length of surface lines by height
       wavebatch plot profile lines.csv --column length -o lines.png
     """  # fmt: skip
-    from wavebatch.tools.plots.sections import measure_profile
-    from wavebatch.tools.slices.output import is_segments, profile_segments
+    from wavebatch.tools.plots.sections import draw_profile, measure_profile
 
     column = options["column"]
     statistic = options["statistic"] or ("count" if column is None else "sum")
     how = {"size": options["size"], "each": options["each"]}
-    if segments := is_segments(paths[0]):
-        found = profile_segments(paths, column, statistic, **how)
-    else:
-        found = measure_profile(paths, column, statistic, choose_points(options), **how)
-    from wavebatch.tools.plots.sections import draw_profile
-
+    found = measure_profile(paths, column, statistic, choose_points(options), **how)
     draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
     series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]
     more = {"statistic": statistic, "outside": found.outside, "edges": found.edges.tolist(), "series": series}
-    text = describe_tally(found.total, found.outside, "segment" if segments else "value")
+    text = describe_tally(found.total, found.outside, found.noun.removesuffix("s"))
     return text, {"column": column, **list_tally(found.total), **more, "unit": found.unit}
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.order import EvenSample
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.packets import MAX_SAMPLES
@@ -29,7 +30,6 @@ from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.api.strip import AUTO, load_chain
 from wavebatch.tools.compare import pairing
-from wavebatch.tools.even_sample import EvenSample
 
 
 @dataclass(frozen=True, slots=True)
