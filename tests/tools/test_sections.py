@@ -15,8 +15,8 @@ from wavebatch.core.units import HALF_C
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.plots import sections
 from wavebatch.tools.plots.sections import cut_section, measure_profile
-from wavebatch.tools.slices.output import SegmentWriter, align_pulses, build_cube, cut_cube
-from wavebatch.tools.slices.segments import ScanLine, Segment, read_scan_lines
+from wavebatch.tools.scan_slices import ScanLine, Segment, read_scan_lines
+from wavebatch.tools.slice_output import SegmentWriter, align_pulses, build_cube, cut_cube
 from wavebatch.tools.voxels.grid import COLUMNS
 
 LINE = (500_005.0, 5_400_003.0, 500_030.0, 5_400_020.0)

@@ -1,6 +1,6 @@
 """`wavebatch import`: PulseWaves files as strips; `wavebatch export`: strips for other programs.
 
-Only reads options and prints; the work is in `wavebatch.tools.archives`.
+Only reads options and prints; the work is in `wavebatch.tools.import_file` and `export_strip`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, counting, tell
 from wavebatch.cli.program.command import complete_files
 from wavebatch.core.units import count
-from wavebatch.tools.archives.export_strip import SUFFIXES as WRITTEN
-from wavebatch.tools.archives.export_strip import ExportSummary, export_strip
-from wavebatch.tools.archives.import_file import SUFFIXES, ImportOptions, ImportSummary, import_file
+from wavebatch.tools.export_strip import SUFFIXES as WRITTEN
+from wavebatch.tools.export_strip import ExportSummary, export_strip
+from wavebatch.tools.import_file import SUFFIXES, ImportOptions, ImportSummary, import_file
 
 EXIT_SOME, EXIT_NONE = 3, 4
 """Exit codes of `wavebatch run`: some files failed; no file was written."""

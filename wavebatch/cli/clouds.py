@@ -1,7 +1,7 @@
 """`wavebatch stats`: return numbers, separations and flags of clouds; `wavebatch grid`: their columns as a GeoTIFF.
 
 Reads options and writes text, CSV and JSON; counting is in `wavebatch.tools.return_stats`, rasters are made in
-`wavebatch.tools.rasters`, which needs rasterio (extra `gis`).
+`wavebatch.tools.raster`, which needs rasterio (extra `gis`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
 from wavebatch.files.toml_file import describe_record
 from wavebatch.tools import return_stats as returns
-from wavebatch.tools.rasters.grid import ForestOptions, GridOptions, GridResult, write_grid
+from wavebatch.tools.raster import ForestOptions, GridOptions, GridResult, write_grid
 from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv, list_facts
 
 EXIT_UNREADABLE = 1

@@ -115,8 +115,8 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
       # widths of all clouds
       wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png
     """  # fmt: skip
+    from wavebatch.tools.cells import Clouds
     from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values
-    from wavebatch.tools.rasters.cells import Clouds
 
     column, chosen = options["column"], choose_points(options)
     if Clouds(clouds, (column,), chosen).facts.is_flags:
@@ -162,7 +162,7 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
       # mean amplitude in cells of 1 m
       wavebatch plot map clouds/ --column amplitude --size 1 -o map.png
     """  # fmt: skip
-    from wavebatch.tools.rasters.cells import grid_values
+    from wavebatch.tools.cells import grid_values
 
     column, statistic = options["column"], options["statistic"]
     found = grid_values(clouds, column, statistic, choose_points(options), size=options["size"], bounds=options["bbox"])
@@ -179,7 +179,7 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
 
 def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> list[Path]:
     """Clouds, one file of voxels, or files of segments: these from a folder or pattern where it has no clouds."""
-    from wavebatch.tools.slices.output import SEGMENT_SUFFIXES, check_alone, is_segments
+    from wavebatch.tools.slice_output import SEGMENT_SUFFIXES, check_alone, is_segments
 
     kinds = (SUFFIXES, SEGMENT_SUFFIXES) if or_segments else (SUFFIXES,)
     paths = shared.find_inputs(clouds, recursive=options["recursive"], kinds=kinds)
@@ -288,11 +288,11 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
       # scan line 3, and all pulses at 250 ns
       wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png
     """  # fmt: skip
-    from wavebatch.tools.slices.output import cut_cube
+    from wavebatch.tools.slice_output import cut_cube
 
     check_picture(output, overwrite=options["overwrite"])
     slices = cut_cube(cube_file, {name: options[name] for name in "xyt"})
-    from wavebatch.tools.slices.output import draw_cube
+    from wavebatch.tools.slice_output import draw_cube
 
     draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
     tell(f"{output}: {', '.join(one.title for one in slices)}")

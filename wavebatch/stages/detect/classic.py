@@ -15,13 +15,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.closed_form import estimate_starts
-from wavebatch.kernels.signal.filters import (
-    curvature_taps,
-    filter_antisymmetric,
-    filter_energy,
-    filter_symmetric,
-    slope_taps,
-)
+from wavebatch.kernels.signal import filters
 from wavebatch.kernels.signal.runs import find_runs, highest_samples, run_moments, walk_down
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range, stage
@@ -209,10 +203,11 @@ def _differentiate(
     signal, high = signal_above(block, noise), f"where the smoothed signal is above {level:g} std"
     blur = max(scale * system.sigma_ref / block.spacing, LEAST_BLUR)
     if derivative == "first":
-        values, least = filter_antisymmetric(signal, slope_taps(blur)), np.full(len(block), np.nan)
+        values, least = filters.filter_antisymmetric(signal, filters.slope_taps(blur)), np.full(len(block), np.nan)
         return Searched("derivative [DN/sample]", f"falls through zero {high}", values, least, signal)
-    taps = curvature_taps(blur)
-    values, least = filter_symmetric(signal, taps), np.float32(INFLECTED * np.sqrt(filter_energy(taps))) * noise.std
+    taps = filters.curvature_taps(blur)
+    values = filters.filter_symmetric(signal, taps)
+    least = np.float32(INFLECTED * np.sqrt(filters.filter_energy(taps))) * noise.std
     return Searched("- second derivative [DN/sample2]", f"middle of two zeros {high}", values, least, signal)
 
 

@@ -17,16 +17,8 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.elementary import log as logarithm
+from wavebatch.kernels.signal import filters
 from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
-from wavebatch.kernels.signal.filters import (
-    b3_detail,
-    b3_gain,
-    b3_level,
-    curvature_taps,
-    filter_energy,
-    filter_symmetric,
-    refine_peaks,
-)
 from wavebatch.kernels.signal.runs import list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.kernels.signal.square_differences import (
@@ -92,7 +84,7 @@ def wavelet(
     """
     found = _transform(block, noise, system, wavelet=wavelet, threshold=threshold, scale=scale)
     waveform, sample = find_peaks(found.values, found.least)
-    time, _ = refine_peaks(found.values, waveform, sample)
+    time, _ = filters.refine_peaks(found.values, waveform, sample)
     amplitude = smooth_121(found.signal)[sample, waveform]
     return candidate_table(block, system, waveform, time, amplitude)
 
@@ -125,12 +117,12 @@ def transform(signal: np.ndarray, ref: float, wavelet: str, scale: float, spacin
         For a level of the B3 transform that is too coarse.
     """
     if wavelet != "b3":
-        taps = curvature_taps(max(scale / spacing if scale > 0 else HAT_WIDTH * ref, 0.5))
-        return filter_symmetric(signal, taps), float(np.sqrt(filter_energy(taps)))
-    level = max(round(scale), 1) if scale > 0 else b3_level(ref)
+        taps = filters.curvature_taps(max(scale / spacing if scale > 0 else HAT_WIDTH * ref, 0.5))
+        return filters.filter_symmetric(signal, taps), float(np.sqrt(filters.filter_energy(taps)))
+    level = max(round(scale), 1) if scale > 0 else filters.b3_level(ref)
     if level > COARSEST:
         raise ConfigError(f"scale is the level of the b3 wavelet, at most {COARSEST}, it is {scale:g}")
-    return b3_detail(signal, level), b3_gain(level)
+    return filters.b3_detail(signal, level), filters.b3_gain(level)
 
 
 def _deconvolve(
@@ -290,7 +282,7 @@ def correlation(
         value = correlations[sample, waveform]
         alike = value >= similarity * np.sqrt(np.maximum(squares, 0) * np.float32(energy))
         waveform, sample = waveform[alike], sample[alike]
-        time, height = refine_peaks(correlations, waveform, sample)
+        time, height = filters.refine_peaks(correlations, waveform, sample)
         return waveform, time + (given.peak - given.middle), height / energy
 
     return candidate_table(block, system, *_in_parts(signal_above(block, noise), noise.std, detect))

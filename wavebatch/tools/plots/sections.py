@@ -20,9 +20,9 @@ from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.las.crs import CrsWords
+from wavebatch.tools import cells
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
-from wavebatch.tools.rasters import cells
-from wavebatch.tools.slices.output import UNIT, SegmentFiles, is_segments
+from wavebatch.tools.slice_output import UNIT, SegmentFiles, is_segments
 from wavebatch.tools.voxels.grid import VoxelFile
 
 MOST_POINTS = 200_000

@@ -27,8 +27,8 @@ from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.figure_file import open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.geojson import GeoJsonCrs
-from wavebatch.tools.rasters.cells import Tally
-from wavebatch.tools.slices.segments import ScanLine, Segment, Slice, align_times, find_main_axis
+from wavebatch.tools.cells import Tally
+from wavebatch.tools.scan_slices import ScanLine, Segment, Slice, align_times, find_main_axis
 
 MOST_VALUES = 200_000_000
 """Most values of a cube (800 MB): it is built in memory."""
