@@ -19,9 +19,8 @@ import click
 from wavebatch.batch.options import OPTIONS, RunOptions
 from wavebatch.cli import messages
 from wavebatch.cli import options as shared
-from wavebatch.core.errors import WARNINGS, ConfigError, InputError, StripWarning
+from wavebatch.core.errors import WARNINGS, ConfigError, InputError, StripWarning, nearest
 from wavebatch.core.process import importing
-from wavebatch.core.suggest import nearest
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_input
 

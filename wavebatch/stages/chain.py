@@ -19,6 +19,7 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import SUFFIX
 from wavebatch.core.process import Seconds
 from wavebatch.core.schema import Range, read_hint
@@ -41,7 +42,7 @@ _ENTRY = re.compile(r"^(\w+)(?: :.*)?$", re.MULTILINE)
 """Heading of a section of a numpydoc docstring, and of a parameter in it."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Parameter:
     """One keyword argument of a stage: a key of its table in the chain file."""
 
@@ -53,7 +54,7 @@ class Parameter:
     range: Range | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Stage:
     """A registered algorithm."""
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.kernels.signal.signal import transpose_samples
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Searched:
     """The signal in which a detector searches n waveforms for echoes; `wavebatch plot waveform --show` draws it."""
 

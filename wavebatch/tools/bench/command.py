@@ -35,6 +35,7 @@ from wavebatch.batch.run import run_batch
 from wavebatch.batch.unit import BLOCK_SAMPLES
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.process import CHILD, Seconds
 from wavebatch.core.schema import Range, option
 from wavebatch.core.units import QUANTISATION_STD
@@ -270,7 +271,7 @@ STRONG = 20.0
 """Signal to noise from which measured widths show the true spread of widths."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Sample:
     """Echoes of decomposed waveforms, to draw from."""
 
@@ -284,7 +285,7 @@ class Sample:
     """Of the main lobe [ns], without the scatter of its error, f8 (m,)."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StripScene(Scene):
     """Waveforms like those of a strip, drawn from a sample of its echoes."""
 
@@ -399,7 +400,7 @@ BenchProgress = Callable[[str], None]
 BenchRows = list[dict[str, Any]]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class BenchOptions:
     """What a benchmark measures."""
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +19,7 @@ import scipy  # parts of it load when they are first asked for
 from wavebatch import __version__
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.system import swath_columns
 from wavebatch.core.units import FWHM_PER_SIGMA, count, format_measure, format_relative
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -329,7 +329,7 @@ _WIDEST, _FINE = 40.0, 20_000
 """Largest width that is tried [system widths], and number of widths."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class AngleTable:
     """Widths by angle at one distance and amplitude; NaN where no width means the angle."""
 
