@@ -11,8 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.tools.simulate import PulseModel, Recording, Scene
 from wavebatch.tools.simulate.scenes import (
     Draw,

@@ -7,13 +7,14 @@ Before you change it: `a + b` must be exact and independent of order, so histogr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, field, fields
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StageError, StripWarning
+from wavebatch.core.frozen import frozen
 from wavebatch.core.process import Seconds
 from wavebatch.core.units import FWHM_PER_SIGMA
 
@@ -48,7 +49,7 @@ OVERFLOW = 16
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LogBins:
     """Logarithmic bins; the first and the last also count the values beyond them."""
 
@@ -84,7 +85,7 @@ def _zeros(number: int) -> Any:
     return field(default_factory=lambda: np.zeros(number, np.int64))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class RunReport:
     """Counts and quality of a unit, a strip or a batch; `a + b` merges two."""
 

@@ -8,7 +8,7 @@ Before you change it: a job travels to other processes, and all of it that decid
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,8 +17,8 @@ import numpy as np
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.output_rows import NEEDED
 from wavebatch.core.echoes import COLUMNS
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.column_names import name_standard, read_field, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter
@@ -34,7 +34,7 @@ WITHOUT_STAGE = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StripJob:
     """A strip to process and how; picklable."""
 
@@ -188,7 +188,7 @@ class UnitRows(NamedTuple):
     """Computed columns (m,) as the chain gave them, whatever the cloud's names and units; echo_flags among them."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RowColumn:
     """A column of UnitRows; picklable."""
 

@@ -16,7 +16,7 @@ import itertools
 import pickle
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from wavebatch.batch.output_rows import Assembled, UnitEchoes, spread
 from wavebatch.batch.unit import Prepared, SolvedBlocks, UnitResult, finish_rows, solve_unit, unpack
 from wavebatch.core.echoes import COLUMNS, EchoTable
 from wavebatch.core.errors import StageError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.core.process import Seconds
 from wavebatch.files.disk.temp_store import RowStore, Spool
@@ -56,7 +57,7 @@ Found = tuple[np.ndarray, np.ndarray, RunReport]
 """Rows i8 (m,), ascending; the values found for them, as `_found_dtype` has them; and the timing."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class TileTask:
     """Everything that the tiles of a strip share; picklable."""
 

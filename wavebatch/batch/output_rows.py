@@ -8,7 +8,7 @@ before you change anything here, make sure that each packet and each point still
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from wavebatch.batch.counts import RunReport, count_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable
 from wavebatch.core.errors import StageError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import count_reasons
 from wavebatch.core.order import find_order
 from wavebatch.core.units import PS_PER_NS
@@ -35,7 +36,7 @@ NEEDED = ("x", "y", "z", "point")
 """Attribute columns that every point needs."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class UnitEchoes:
     """The echoes of all packets that a unit read."""
 
@@ -49,7 +50,7 @@ class UnitEchoes:
     """Away from the sensor, per packet [m/ns], f8 (packets, 3)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class _Members:
     """Points of the unit, then the points of other units that share its packets."""
 
@@ -77,7 +78,7 @@ class _Members:
         return rows
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class _Rows:
     """The sources of each output row, in output order."""
 

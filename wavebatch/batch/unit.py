@@ -12,7 +12,7 @@ import functools
 import pickle
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from wavebatch.batch.counts import LEFT_OUT, RunReport, count_flags
 from wavebatch.batch.job import RowColumn, StripJob, UnitRows, plan_filter, plan_layout
 from wavebatch.batch.output_rows import Assembled, UnitEchoes, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.core.errors import InputError, StripWarning
+from wavebatch.core.frozen import frozen
 from wavebatch.core.process import Seconds
 from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -59,7 +60,7 @@ LARGEST_HEIGHT_ERROR = 0.3
 """Largest logarithm of the ratio of two flight heights: a user knows the one planned, not that above each hill."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Prepared:
     """Everything that the units of a strip share; picklable."""
 

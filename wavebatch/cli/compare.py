@@ -132,7 +132,7 @@ def _is_chain(side: Path) -> bool:
 
 
 def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: dict) -> Matchup:
-    from wavebatch.core.suggest import nearest
+    from wavebatch.core.errors import nearest
     from wavebatch.surveying.choose_chain import COSTS
     from wavebatch.surveying.system_file import load_survey
     from wavebatch.tools.api.strip import AUTO

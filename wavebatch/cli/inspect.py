@@ -17,8 +17,7 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, print_result, print_sheet, print_text, printable, talk
 from wavebatch.cli.options import common_options
 from wavebatch.cli.program.command import complete_files, complete_stages
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.units import count
 from wavebatch.tools.file_facts import describe_file
 from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet

@@ -26,7 +26,7 @@ from typing import IO, Any
 import click
 
 from wavebatch.core import interrupts
-from wavebatch.core.errors import ConfigError, InputError, StageError
+from wavebatch.core.errors import ConfigError, InputError, StageError, nearest
 from wavebatch.tools.sheets.sheet import Sheet, list_lines
 
 _LEVEL, LOG = "wavebatch.log_level", "wavebatch.log_path"
@@ -209,8 +209,6 @@ class NearestGroup(click.Group):
         """Finds the command; fails with the nearest name for an unknown one."""
         name = args[0] if args else ""
         if name and not name.startswith("-") and name not in self.list_commands(ctx):
-            from wavebatch.core.suggest import nearest
-
             ctx.fail(f"no command {name!r}; {nearest(name, self.list_commands(ctx))}")
         return super().resolve_command(ctx, args)
 

@@ -33,9 +33,8 @@ from wavebatch.cli.messages import (
     typed_command,
     write_message,
 )
-from wavebatch.core.errors import WARNINGS, ConfigError, InputError, StripWarning
+from wavebatch.core.errors import WARNINGS, ConfigError, InputError, StripWarning, nearest
 from wavebatch.core.process import importing
-from wavebatch.core.suggest import nearest
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_input
 

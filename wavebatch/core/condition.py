@@ -10,14 +10,13 @@ from __future__ import annotations
 import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, nearest
+from wavebatch.core.frozen import frozen
 
 MOST_CHARACTERS = 2000
 """Longest text; longer ones are made by programs, and would be slow on every point."""
@@ -47,7 +46,7 @@ Truth = tuple[np.ndarray, np.ndarray]
 """Points for which a part is true, and those for which it is false, bool (n,) each; neither: no data."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Condition:
     """A condition on the columns of points; picklable.
 

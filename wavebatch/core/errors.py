@@ -1,4 +1,4 @@
-"""The three errors of wavebatch, and the warnings about a strip.
+"""The three errors of wavebatch, what they suggest, and the warnings about a strip.
 
 All rooms raise the errors; each is also the builtin error that a caller would expect, and the command line prints it as
 one line. Any other exception is a bug.
@@ -7,7 +7,8 @@ one line. Any other exception is a bug.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+
+from wavebatch.core.frozen import frozen
 
 
 class ConfigError(ValueError):
@@ -20,6 +21,17 @@ class InputError(OSError):
 
 class StageError(RuntimeError):
     """A stage broke its contract while a block ran through it: a bug, which is never hidden."""
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """`did you mean 'x'?` where a known word is similar, otherwise the list of known words."""
+    import difflib
+
+    known = list(known)
+    near = difflib.get_close_matches(word, known, 1)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    return f"known are {', '.join(known)}" if known else "none is known"
 
 
 WARNINGS = {
@@ -47,7 +59,7 @@ _OF_FILES = ("header", "packets", "dropped-records")
 """Codes of what is odd about a file, while the results are as good as usual."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
+@frozen(order=True)
 class StripWarning:
     """What makes results of a strip doubtful: a code of WARNINGS, and a line with the figures and the remedy."""
 

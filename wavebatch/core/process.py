@@ -12,7 +12,8 @@ import gc
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+
+from wavebatch.core.frozen import frozen
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Parameters of glibc's mallopt(3)."""
@@ -66,7 +67,7 @@ def importing() -> Iterator[None]:
             gc.enable()
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Seconds:
     """Time that tasks took; sums and differences are taken part by part."""
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import functools
 import types
 import typing
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from typing import Any, NamedTuple
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 
 
 class Range(NamedTuple):
@@ -91,7 +92,7 @@ _LATE = ("Chain", "Condition", "Survey")
 """Types that only Python gives; they take time to import."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Option:
     """What the documentation says about an option."""
 

@@ -7,16 +7,17 @@ stand in system files (`surveying/system_file.py`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated
 
 import numpy as np
 
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Key, Range
 from wavebatch.core.units import AIR_ATTENUATION, QUANTISATION_STD
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ReceiverNoise:
     """What a receiver records without signal."""
 
@@ -61,7 +62,7 @@ class ReceiverNoise:
         return min(self.std, self.by_kind.get("quiet") or self.std)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Defects:
     """What waveforms have before any signal, and what is taken off them before they are read."""
 
@@ -84,7 +85,7 @@ class Defects:
         return bool(self.pattern or self.slope_spread or self.spikes or self.transient)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LevelWidths:
     """How wide the echoes of level ground are, seen from above."""
 
@@ -106,7 +107,7 @@ class LevelWidths:
     """Scatter of the echo widths of one surface beyond their fit errors [ns]: no pulse model is exact."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Radiometry:
     """What turns amplitudes and times into light: beam, calibration, air, and the errors of each."""
 

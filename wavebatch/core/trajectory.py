@@ -6,11 +6,12 @@ trajectories use different GPS clocks: `solve_offset` finds the difference.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 
 WEEK = 604_800.0
 """Length of a GPS week [s]."""
@@ -31,7 +32,7 @@ GAP_STEPS = 5.0
 """Gaps up to this many usual steps are bridged too."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Trajectory:
     """Positions of the sensor over time. It can be pickled, so that worker processes can use it."""
 

@@ -14,13 +14,13 @@ import json
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.optional import need
 from wavebatch.files.las.crs import CrsUnits, drop_empty_codes, find_epsg, parse_wkt, read_crs_definition
 from wavebatch.files.las.header import LasHeader
@@ -53,7 +53,7 @@ _CODE = re.compile(
 """A CRS by its code as GDAL, QGIS and OGC write it: as a URN, as an address, or EPSG:n."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class AreaFile:
     """How the coordinates of a file of areas are meant."""
 
@@ -241,7 +241,7 @@ _DEGREES, _METRES = 9, 4
 """Decimals of coordinates: a tenth of a millimetre."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class GeoJsonCrs:
     """How points of a strip are written."""
 
@@ -301,7 +301,7 @@ FARTHEST = 1e12
 """Largest coordinate of a corner; squares and products of larger ones overflow."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Polygon:
     """An area with a name; several parts or holes give several rings."""
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.publish import Draft, check_target
 from wavebatch.files.disk.raw_bytes import Closing
@@ -24,7 +24,7 @@ TILE = 256
 """Cells along a side of a tile: usual for web viewers and cloud storage."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Band:
     """One band of a raster."""
 
@@ -33,7 +33,7 @@ class Band:
     """Empty where it has none."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RasterLayout:
     """Size and place of a raster: square cells, the first row is the northernmost."""
 

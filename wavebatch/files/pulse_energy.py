@@ -7,15 +7,15 @@ the calibration, or of the strip where there is none: see `matching.strip_energi
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import InputError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
-from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.header import ExtraRecord
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
@@ -40,7 +40,7 @@ LARGEST = 1e30
 """Energies from here on count as unknown: their squares overflow, and no unit is so small."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class PulseEnergy:
     """Where the energies of a strip's pulses come from; picklable."""
 

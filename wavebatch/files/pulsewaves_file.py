@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.disk.raw_bytes import Closing, damaged, open_regular, read_exactly, reporting_reads
 from wavebatch.files.las.header import MAX_FILE, MAX_FRONT, MAX_VLRS, PROJECTION, Vlr, decode_text
 from wavebatch.files.las.read_points import LARGEST_OFFSET, LARGEST_SCALE, LEAST_SCALE
@@ -52,7 +53,7 @@ PULSE = [
 """Fields of a pulse record; `bits` has the descriptor, edge, direction and facet."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Sampling:
     """One sampling of a pulse: how its segments are stored."""
 
@@ -75,7 +76,7 @@ class Sampling:
     """Time between samples [ns]."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Descriptor:
     """How the waves of a pulse are stored."""
 
@@ -87,7 +88,7 @@ class Descriptor:
     samplings: tuple[Sampling, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class PulseHeader:
     """What the header of a .pls says, checked."""
 
@@ -266,7 +267,7 @@ PIECE_BYTES = 1 << 25
 _AHEAD = 1 << 16
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Segments:
     """k segments of waves, in the order of pulse, sampling and time."""
 
@@ -295,10 +296,10 @@ class Segments:
 
     def take(self, rows: np.ndarray) -> Segments:
         """Return the segments at `rows` (indices or mask)."""
-        return Segments(*(getattr(self, name)[rows] for name in self.__slots__))
+        return Segments(*(getattr(self, one.name)[rows] for one in fields(self)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class PulsePiece:
     """Consecutive pulses with their segments."""
 
@@ -420,8 +421,8 @@ class PulseReader(Closing):
                 raise damaged(self.header.path, f"pulse {pulse} refers to descriptor {number}, which is not there")
             parts += _Walk(self.header, waves, first).follow(rows, pulses["offset"][rows], descriptor)
         if not parts:
-            return Segments(*(np.empty(0) for _ in Segments.__slots__))
-        columns = [np.concatenate([part[column] for part in parts]) for column in range(len(Segments.__slots__))]
+            return Segments(*(np.empty(0) for _ in fields(Segments)))
+        columns = [np.concatenate([part[column] for part in parts]) for column in range(len(fields(Segments)))]
         order = np.argsort(columns[0] * (1 << 32) + np.concatenate([part[-1] for part in parts]), kind="stable")
         return Segments(*(column[order] for column in columns))
 

@@ -21,13 +21,12 @@ import tomllib
 import types
 import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import date
 from typing import Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.errors import ConfigError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Key, Range
-from wavebatch.core.suggest import nearest
 
 LARGEST_INTEGER = 1 << 53
 """Largest integer that is taken for a number: a float64 holds all integers up to here exactly."""
@@ -163,7 +162,7 @@ KINDS = {"chain": "a chain file", "system": "a survey", "calibration": "a calibr
 """TOML files of wavebatch, by the option that takes them."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TomlTable:
     """A table of a TOML file with checks; each check raises ConfigError with file, table, key and remedy."""
 

@@ -11,7 +11,7 @@ import inspect
 import re
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import SUFFIX
 from wavebatch.core.process import Seconds
 from wavebatch.core.schema import Range, read_hint
@@ -41,7 +42,7 @@ _ENTRY = re.compile(r"^(\w+)(?: :.*)?$", re.MULTILINE)
 """Heading of a section of a numpydoc docstring, and of a parameter in it."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Parameter:
     """One keyword argument of a stage: a key of its table in the chain file."""
 
@@ -53,7 +54,7 @@ class Parameter:
     range: Range | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Stage:
     """A registered algorithm."""
 
@@ -220,7 +221,7 @@ def _split_docstring(function: Callable | type) -> tuple[str, dict[str, str]]:
     return prose.strip(), {title: body.strip("\n") for title, body in zip(rest[::2], rest[1::2], strict=True)}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Step:
     """One stage of a chain with the parameters that the chain sets; all others keep their defaults."""
 
@@ -257,7 +258,7 @@ class Solved(NamedTuple):
         return self._replace(block=self.block.without_samples(), noise=replace(self.noise, of_sample=None))
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@frozen
 class Chain:
     """Checked, ordered steps: one noise stage, one detector, one decomposer, then any attributes."""
 

@@ -14,8 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, check_range, check_type, format_toml, format_toml_value, parse_toml
 from wavebatch.stages.chain import KINDS, STAGES, Chain, Stage, Step

@@ -5,12 +5,12 @@ Called by `bench`, `compare --truth` and predictions of errors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import robust_std
 
 TOLERANCE_NS = 1.5
@@ -133,7 +133,7 @@ def pair_nearest(left: np.ndarray, right: np.ndarray, distance: np.ndarray, n_le
     return np.concatenate(kept) if kept else np.empty(0, np.int64)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ErrorStats:
     """Errors of one quantity over matched echoes, in its unit; NaN without echoes."""
 

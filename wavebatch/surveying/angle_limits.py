@@ -6,11 +6,12 @@ Before you change it: stage attribute.incidence_angle must use the same limits, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import SystemPulse
@@ -30,7 +31,7 @@ REFERENCE_ERROR = 0.003
 """Error of the system pulse's width, relative: the default of stage attribute.incidence_angle."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class AngleOutlook:
     """How good angles from widths will be on a strip."""
 

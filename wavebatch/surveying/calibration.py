@@ -10,10 +10,11 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from typing import Annotated, Any
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Key, Range
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import STAGES, Chain, Step
@@ -40,7 +41,7 @@ def check_attenuation(value: float) -> None:
         raise ConfigError(f"{problem}; is it per metre? Clear air has 0.1 to 0.5 dB/km")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TargetResult:
     """What one reference target gave; where it gave no constant, `refused` says why."""
 
@@ -79,7 +80,7 @@ class TargetResult:
         return ", ".join(filter(None, (self.name, self.channel)))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ChannelConstant:
     """The calibration of one channel, a digitizer together with a scanner channel, and how that channel records.
 
@@ -120,7 +121,7 @@ class ChannelConstant:
         return any(value is not None for value in (self.bits, self.spacing_ns, self.gain, self.pulse_ns))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StripConstant:
     """The constant of one channel on one strip of the flight that was calibrated."""
 
@@ -140,7 +141,7 @@ class StripConstant:
     """Places that tie it to other strips or channels."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Calibration:
     """Constants that turn amplitudes into backscatter; picklable."""
 

@@ -7,12 +7,13 @@ Before you change it: the choice must depend on the strip and the request alone,
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import Chain
@@ -34,7 +35,7 @@ COSTS = ("fast", "balanced", "accurate")
 """The shipped chains by computing time, the fastest first; measured by `wavebatch bench`."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Request:
     """How a strip gets its pulse and its chain; picklable."""
 
@@ -56,7 +57,7 @@ class Request:
         return "auto" if self.auto else None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ChainChoice:
     """The chain and the survey that a strip is run with, and the reasons; picklable."""
 

@@ -10,12 +10,13 @@ slope adds to the width is taken off. The same echoes show the beam's divergence
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.system import LevelWidths
 from wavebatch.core.units import SQUARED_NORMAL_MEDIAN, C, format_measure
@@ -75,7 +76,7 @@ class Slopes(NamedTuple):
     """float64 (n,), rad."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class GroundReference:
     """What echoes of surfaces of known slope show."""
 

@@ -10,7 +10,7 @@ import functools
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, field, replace
+from dataclasses import asdict, astuple, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from wavebatch.core import interrupts
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import quantile
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
@@ -87,7 +88,7 @@ Spread = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]
 _FORMS = ("{:g} bits", "samples {:g} ns apart", "gain {:g}", "offset {:g}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class StripSample:
     """A strip and waveforms that are spread over it."""
 
@@ -103,7 +104,7 @@ class StripSample:
         return sum(map(len, self.blocks))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Held:
     """A strip compared with a flight."""
 
@@ -134,7 +135,7 @@ class Held:
         }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Flight:
     """The survey of a flight and its strips, by content."""
 

@@ -6,13 +6,14 @@ Before you change it: an error in a file is a finding here, never an exception.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError, StripWarning
+from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.strip.describe import audit_header, describe_samples
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
@@ -26,7 +27,7 @@ packets match .85 to 1.00 of them (real and simulated strips), those of another 
 """
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Findings:
     """The result of `check` for one file; `problems` and `notes` are lines without the file's name."""
 

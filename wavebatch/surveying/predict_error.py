@@ -7,11 +7,12 @@ Before you change it: a strip must get the same prediction every time, so the se
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import without_nan
 from wavebatch.core.system import Defects
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
@@ -42,7 +43,7 @@ after-pulses, it is 0.62 and 0.47 for chains that fit plain Gaussians, 0.007 for
 _DOUBTFUL = EchoFlag.AT_BOUND | EchoFlag.NOT_CONVERGED | EchoFlag.NEAR_EDGE
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Prediction:
     """The result to expect from a chain on a strip."""
 

@@ -7,10 +7,11 @@ run sees. Before you change it: the result must depend on the strip and the requ
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.pulse_energy import NONE
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -34,7 +35,7 @@ class Positions(Enum):
     NONE = "never"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Setup:
     """What a strip is decomposed with; picklable."""
 

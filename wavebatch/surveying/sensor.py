@@ -6,13 +6,14 @@ Before you change it: positions must depend on the strip and the request alone, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import robust_std
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.units import AIR_ATTENUATION, MAD_TO_STD, MEDIAN_ERROR
@@ -74,7 +75,7 @@ LEAST_RAYS, LEAST_SPREAD = 100, np.radians(4.0)
 """So many packet vectors, which cover so wide an angle, meet in a path, or contradict their points."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SensorRequest:
     """Where the sensor's positions shall come from; picklable."""
 
@@ -88,7 +89,7 @@ class SensorRequest:
     """Of the flight above the ground, used where rays give no position [m]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class SensorSource:
     """Positions of the sensor and where they come from; picklable."""
 

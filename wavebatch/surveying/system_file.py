@@ -7,11 +7,12 @@ Before you change it: every number must come back to the last bit, and old files
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
+from wavebatch.core.frozen import frozen
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml
 from wavebatch.surveying import Decision, Survey
@@ -23,7 +24,7 @@ SYSTEM_SCHEMA = "wavebatch.system/1"
 _HEADING = "What a survey found: `wavebatch run --system` takes it for a strip of the same sensor and settings."
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SavedSurvey:
     """A survey and the strip that it was made on."""
 

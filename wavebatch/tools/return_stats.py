@@ -18,6 +18,7 @@ import numpy as np
 
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import HALF_C
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
@@ -148,7 +149,7 @@ RANKS = name_ranks(4)
 """Classes of pairs per area and of dead zones."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Separation:
     """Distances between two consecutive returns of a pulse [m]."""
 
@@ -328,7 +329,7 @@ _NEXT = 10
 """Pairs above the edge from which the distance of neighbouring pairs is measured."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class DeadZone:
     """The shortest distance between a return and the next one."""
 

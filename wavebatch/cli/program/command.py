@@ -13,7 +13,6 @@ are printed in one line.
 
 from __future__ import annotations
 
-import difflib
 import glob
 import inspect
 import math
@@ -31,8 +30,7 @@ from click.shell_completion import CompletionItem
 from wavebatch import __version__
 from wavebatch.batch.options import AIR, CHAIN, EXCLUSIVE, HEADINGS, OPTIONS, OUTPUT, READING, RUNNING, WHICH
 from wavebatch.cli.messages import talk
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, nearest
 
 FILE = "wavebatch.toml"
 PREFIX = "WAVEBATCH_"
@@ -151,6 +149,8 @@ def _find_strangers(context: click.Context) -> Iterator[str]:
     given = [name for name in os.environ if name.startswith(PREFIX)]
     if set(given) <= _list_variables(context.command):  # nearly always: the other commands need not be imported
         return
+    import difflib
+
     commands = dict(_load_all(context.find_root()))
     known = {name.removeprefix(PREFIX) for one in commands.values() for name in _list_variables(one)}
     prefixes = tuple(f"{name.upper().replace(' ', '_')}_" for name in commands)

@@ -10,15 +10,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import COLUMNS
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.files.cloud.column_names import STYLES, find_written, name_standard, read_field, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
 from wavebatch.files.disk.raw_bytes import Closing, widen_integers
@@ -72,7 +72,7 @@ _UNITS = {
 """Units of the standard fields that have one."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ColumnFacts:
     """Name, unit and meaning of a column, as the file or the LAS standard declares them."""
 

@@ -13,14 +13,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, Column
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las import header as las
 
@@ -55,7 +54,7 @@ def find_written(header: las.LasHeader, extra: Collection[str]) -> dict[str, str
     return {column: name for column, name in columns.items() if isinstance(name, str) and name in extra}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Naming:
     """How a style writes one column, where it differs from the declaration of the column."""
 
@@ -140,7 +139,7 @@ _STANDARD = frozenset(
 """Normalised names of the standard LAS dimensions."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class WrittenColumn:
     """A wavebatch column as it is written to the file."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from wavebatch.core.condition import Condition, parse_condition, read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.geojson import Polygon, describe_miss, find_inside, load_polygons
 from wavebatch.files.las.header import LasHeader
 
@@ -29,7 +30,7 @@ ReadColumn = Callable[[Any], np.ndarray]
 """Gives the values (n,) of a column from rows, NaN for no data."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PointFilter:
     """Which points are used; picklable. By default all."""
 
@@ -160,7 +161,7 @@ EVERY = PointFilter()
 """All points."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class PlannedFilter:
     """A filter whose columns are found, from `PointFilter.plan`; picklable if they are."""
 

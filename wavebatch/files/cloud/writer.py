@@ -21,7 +21,7 @@ import io
 import json
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.cloud.column_names import USER_ID, WrittenColumn, style_columns
 from wavebatch.files.disk.publish import Draft, protecting, reporting
 from wavebatch.files.las import header as las
@@ -41,7 +42,7 @@ LAS_VERSIONS = ("1.4", "1.3", "keep")
 """Values of --las-version."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Version:
     """What `choose_version` chose."""
 
@@ -130,7 +131,7 @@ def _as_1_3(path: Path, header: las.LasHeader, target: int) -> Version:
     return Version((1, 3), target, repaired, notes)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Carried:
     """An extra dimension of the input that is copied to the output."""
 
@@ -157,7 +158,7 @@ def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[Carried, ...]:
     return tuple(carried)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class OutputLayout:
     """Layout of the output points of one strip; picklable, so that workers can make rows with it."""
 

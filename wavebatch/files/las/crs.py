@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.optional import advise_install
 from wavebatch.files.las import header as las
 
@@ -51,7 +52,7 @@ METRES = {
 """Metres per unit by EPSG code of the unit (GeoTIFF specification 6.3.1.3)."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class GeoKeys:
     """The keys of a GeoKeyDirectory (record 34735)."""
 
@@ -414,7 +415,7 @@ _HIGHEST = 3e4
 _NAMES = {1.0: "metres", 0.3048: "international feet", 1200 / 3937: "US survey feet"}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class CrsUnits:
     """Kind and units of the coordinates of a CRS; None for what it does not give."""
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.disk.raw_bytes import damaged, open_regular, reporting_reads, widen_integers
 
 _XYZ = [("X", "<i4"), ("Y", "<i4"), ("Z", "<i4"), ("intensity", "<u2"), ("bit_fields", "u1")]
@@ -105,7 +106,7 @@ _FRONT = struct.Struct("<4sHH16sBB32s32sHHHIIBHI5I12d")
 """The first 227 bytes, which are the same in all versions."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Vlr:
     """A variable length record; user id and description are the raw bytes, padded with NUL."""
 
@@ -126,7 +127,7 @@ class Vlr:
         return _VLR.pack(*front) + self.payload
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Evlr:
     """Place of an extended record: `start` is the offset of its 60-byte header, `length` the size of its payload."""
 
@@ -479,7 +480,7 @@ _LARGEST = 1e30
 _AT_NAME, _AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_DESCRIPTION = 4, 40, 64, 88, 112, 160
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ExtraRecord:
     """One described extra dimension; `data` are the 192 bytes of its record in the file."""
 

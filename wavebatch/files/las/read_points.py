@@ -11,7 +11,6 @@ checked before it gets any bytes, and each chunk is passed on as a small file in
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ import lazrs
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_panics, read_exactly, reading
 from wavebatch.files.las import header as las
 
@@ -28,7 +28,7 @@ LEAST_SCALE, LARGEST_SCALE, LARGEST_OFFSET = 1e-12, 1e6, 1e12
 """Scales and offsets of coordinates outside these limits [m] are damage: no survey needs them."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class CheckedHeader:
     """A header whose claims fit the size of the file."""
 

@@ -27,6 +27,7 @@ from enum import IntEnum
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, even_places, median, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
@@ -58,7 +59,7 @@ _ENOUGH = 3
 """Fewer pairs than this decide nothing if heights do."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class VectorDecision:
     """Meaning of the packet vectors of a strip."""
 
@@ -349,7 +350,7 @@ REASON_TEXTS = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Judged:
     """Result of the check for n points."""
 
@@ -469,7 +470,7 @@ LEAST_SKEWNESS = 1.0
 """Skewness of the deviations from the median that decides; one side of a Gaussian noise has 0, echoes have 3 to 10."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SampleForm:
     """How the samples of one descriptor are stored."""
 

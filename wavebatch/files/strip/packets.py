@@ -12,13 +12,14 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from io import FileIO
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.publish import list_packet_files
@@ -32,7 +33,7 @@ _FIRST_POINTS = 10_000
 """Points that show from where a .wdp without header counts its byte offsets."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class StripFacts(CheckedHeader):
     """Facts of a strip after all checks: its header, and what follows from it; picklable."""
 
@@ -90,7 +91,7 @@ _GAP = 1 << 14
 """Gap between packets [bytes] that is read over: a seek costs more than 16 KiB."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PacketPlace:
     """Bytes [start, end) of `file` that packets may use; a packet begins at `base` + its offset. None: no packets."""
 

@@ -10,13 +10,14 @@ with times and directions. The sample is the same every time and bounded, for st
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, even_places, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
@@ -51,7 +52,7 @@ LONG, LONG_SAMPLES = 2048, 1 << 17
 much of one pulse; where all of it is echoes, a survey takes 50 us per sample, twenty times as long as the chain."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class PacketTable:
     """m different packets in the order of their owners."""
 
@@ -74,7 +75,7 @@ class PacketTable:
         return len(self.offset)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Unit:
     """Consecutive points of a strip, with all that is needed to process their packets."""
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct
 from wavebatch.files.disk.raw_bytes import Closing, take_whole_records
 from wavebatch.files.disk.temp_store import Spool, spread_keys
@@ -42,7 +43,7 @@ _KEY = np.dtype([("key", "<u8"), ("index", "<i8")])
 _WANT = np.dtype([("index", "<i8"), ("unit", "<i8")])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class PacketGroups:
     """Entries sorted by key, then by place: group g is order[starts[g] : starts[g] + counts[g]]."""
 
@@ -235,7 +236,7 @@ def _read_bucket(spool: Spool, bucket: int) -> np.ndarray:
     return held
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class StripScan(Closing):
     """Result of one pass over the points; picklable. `close` it (or use `with`) to remove its temporary files."""
 

@@ -7,12 +7,13 @@ resampling blocks of the overlap, since neighbouring cells share roads, fields a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 from scipy.sparse import csr_array, hstack
 from scipy.sparse.csgraph import connected_components
 
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.surveying.calibrating.tie_cells import Ties
 
@@ -32,7 +33,7 @@ _ROUNDS = 8
 _LEAST_SCATTER = 0.003
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Adjustment:
     """The constants of n sources; NaN for sources that neither a target nor a chain of ties reaches."""
 
@@ -54,7 +55,7 @@ class Adjustment:
     """Those of the resamples, f8 (TRIALS, m)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Anchors:
     """What targets say of the n sources."""
 
@@ -147,7 +148,7 @@ def _reach(ties: Ties, known: np.ndarray, n: int) -> np.ndarray:
     return np.isin(group, group[known])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class _Equations:
     """Those of k rows of ties for the constants of n sources and the coefficients of m columns."""
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.system import swath_columns
 from wavebatch.files.las.crs import describe_crs
@@ -33,7 +34,7 @@ _UNEXPLAINED = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FlightCalibration:
     """A calibration of several strips, and how they agree."""
 

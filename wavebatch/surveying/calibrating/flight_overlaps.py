@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import robust_std
 from wavebatch.surveying.calibrating.adjust_flight import LEAST_TIES, Adjustment
 from wavebatch.surveying.calibrating.tie_cells import Ties
@@ -23,7 +23,7 @@ LEAST_DRIFT = 4.0
 """Drifts of this many standard deviations are named."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PairOverlap:
     """What two sources have in common."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.pulse_energy import PulseEnergy, find_column, name_columns, take_records
@@ -44,7 +45,7 @@ _BLOCK = 8192
 _LIGHT = "relative_backscatter"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class CalibrationOptions:
     """How a calibration is measured."""
 
@@ -90,7 +91,7 @@ class CalibrationOptions:
         return usual_attenuation(self.wavelength) if self.attenuation is None else self.attenuation
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class EchoSource:
     """An open strip with pulse, chain and sensor."""
 

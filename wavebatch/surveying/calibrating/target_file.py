@@ -8,13 +8,14 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.geojson import FARTHEST, AreaFile, find_inside, place_rings, read_features
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.text_file import MOST_LIST, read_text
@@ -38,7 +39,7 @@ LEAST_REFLECTANCE = 1e-6
 """Of a target: the blackest coatings reflect 100 times as much."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Target:
     """An area of known reflectance."""
 

@@ -6,10 +6,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import group_medians
 from wavebatch.core.system import angle_across
 from wavebatch.core.units import MEDIAN_ERROR
@@ -40,7 +41,7 @@ SMALLEST, LARGEST = 1.0, 10.0
 """Limits of the size of cells [m]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Ties:
     """What sources saw in cells that at least two of them saw; arrays (k,), one row per source and cell."""
 

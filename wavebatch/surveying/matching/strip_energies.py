@@ -7,12 +7,13 @@ into the errors: the scatter of energies that are not logged, a log that drifts 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
@@ -43,7 +44,7 @@ LEAST_SAID = 0.01
 """Smaller errors are not named."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StripEnergies:
     """What is known of the energies of a strip's pulses."""
 

@@ -8,12 +8,13 @@ that it was not learned from are shorter to describe with it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
@@ -79,7 +80,7 @@ SIGNIFICANCE, FINER, MOST_SIGNIFICANT = 4.5, 0.5, 6.5
 """Least energy of an echo to begin with, step by which it grows, and where it ends [standard deviations]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Candidate:
     """A pulse with its noise and its change from shot to shot, and what waveforms cost with it."""
 
@@ -131,7 +132,7 @@ class Tried(NamedTuple):
     chosen: bool
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Choice:
     """The candidate that was taken, and those that lost."""
 

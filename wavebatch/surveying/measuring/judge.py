@@ -7,11 +7,12 @@ only for what shortens the description of waveforms that nothing was learned fro
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import SQRT_2PI, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
@@ -51,7 +52,7 @@ KNOWN, LEAST_KNOWN = 0.15, 10
 _DOUBTFUL = np.uint16(EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED | EchoFlag.MERGED)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Explained:
     """Waveforms, and what echoes of one pulse explain of them."""
 

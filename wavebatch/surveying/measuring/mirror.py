@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.detect.maximum import matched_filter, maximum
@@ -29,7 +30,7 @@ WORTH = 0.2
 """Echoes in the mirror per echo that is false: misfit that leaves an echo of one sign has no twin there."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Mirror:
     """Counts of echoes, and of those in the mirror that match none."""
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 
+from wavebatch.core.frozen import frozen
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Trial:
     """Limits of a survey."""
 

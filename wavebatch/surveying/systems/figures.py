@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Key, Range
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.files.toml_file import TomlTable, check_number, describe_record, read_record
@@ -24,7 +25,7 @@ Number = Annotated[float, Range(-MOST_FIGURE, MOST_FIGURE), Key()]
 Size = Annotated[float, Range(0.0, MOST_FIGURE), Key()]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Level:
     """Level and noise of a descriptor's quiet samples, with what is needed for their errors."""
 
@@ -36,7 +37,7 @@ class Level:
     clip: Figure = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Look:
     """What a strip, or all strips of a flight, record; of the main digitizer."""
 
@@ -49,7 +50,7 @@ class Look:
     """What the flight's pulse leaves of the better half of strong echoes, beyond noise, as a share of the amplitude."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
+@frozen(order=True)
 class Kind:
     """How the samples of a descriptor were made."""
 

@@ -7,7 +7,7 @@ strips of other sensors from getting one (tests/surveying/test_known_systems.py)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import robust_std
 from wavebatch.core.units import MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -64,7 +65,7 @@ LARGEST_RINGING = 0.12
 """Largest share of an echo that is taken for an after-pulse where no pulse is known: what is higher is a target."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class KnownSystem:
     """A shipped pulse."""
 

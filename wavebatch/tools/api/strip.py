@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, InputError, nearest
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.strip.packets import StripFacts

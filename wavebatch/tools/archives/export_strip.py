@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.raw_bytes import take_fingerprint
@@ -29,7 +30,7 @@ _BLOCK = 4096
 _WAVES = ("wavepacket_index", "wavepacket_offset", "wavepacket_size", "return_point_wave_location", *VECTORS)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ExportSummary:
     """What was exported."""
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import option
 from wavebatch.core.units import MAD_TO_STD, PS_PER_NS, QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
@@ -192,7 +193,7 @@ ONE_TIME = 64
 """Pulses of one time from which that is no time."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Outgoing:
     """What is known of the outgoing pulses of a file."""
 
@@ -214,7 +215,7 @@ class Outgoing:
     """Mean time of their peaks on the clock of the pulses [samples]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Plan:
     """How the segments of a file become packets and points."""
 
@@ -369,7 +370,7 @@ _ZONES = {4326: 32600, 4979: 32600, 4258: 25800, 4269: 26900}
 """EPSG code of zone 0 north by the code of the geographic CRS."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Frame:
     """How coordinates of a file become those of a strip."""
 
@@ -676,7 +677,7 @@ USER_ID = b"wavebatch_import"
 """User id of the record in a strip that says what it was imported from."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ImportOptions:
     """How files are imported."""
 

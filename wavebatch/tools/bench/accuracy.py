@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import without_nan
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -34,7 +35,7 @@ OUTLIER = 10.0
 """Error of the worst echo of another run, in units of the root mean square."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Figure:
     """A value and its error: the standard error of the difference between two runs that differ in their seed.
 
@@ -251,7 +252,7 @@ GROUPS = 8
 CM_PER_NS = 100 * HALF_C
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Group:
     """Waveforms of one seed, their truth, and their survey."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,6 +21,7 @@ from wavebatch import __version__
 from wavebatch.batch.unit import BLOCK_SAMPLES
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Range, option
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -97,7 +98,7 @@ STRONG = 20.0
 """Signal to noise from which measured widths show the true spread of widths."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Sample:
     """Echoes of decomposed waveforms, to draw from."""
 
@@ -111,7 +112,7 @@ class Sample:
     """Of the main lobe [ns], without the scatter of its error, f8 (m,)."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StripScene(Scene):
     """Waveforms like those of a strip, drawn from a sample of its echoes."""
 
@@ -226,7 +227,7 @@ BenchProgress = Callable[[str], None]
 BenchRows = list[dict[str, Any]]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class BenchOptions:
     """What a benchmark measures."""
 

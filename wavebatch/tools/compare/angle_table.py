@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.publish import check_target
@@ -41,7 +41,7 @@ _WIDEST, _FINE = 40.0, 20_000
 """Largest width that is tried [system widths], and number of widths."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class AngleTable:
     """Widths by angle at one distance and amplitude; NaN where no width means the angle."""
 

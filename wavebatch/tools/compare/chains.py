@@ -7,13 +7,14 @@ positions of echoes are tied to the vendor's returns and would hide differences 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.packets import MAX_SAMPLES
@@ -32,7 +33,7 @@ from wavebatch.tools.compare import pairing
 from wavebatch.tools.even_sample import EvenSample
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Goodness:
     """Goodness of fit E = |f - y|^2 / |f|^2 over waveforms with an echo; NaN without such waveforms."""
 
@@ -111,7 +112,7 @@ _KEPT = 200_000
 """Waveforms and pairs per chain from which medians of goodness and returns are taken; bounds the memory."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Contender:
     """One side of a match on a strip."""
 
@@ -132,7 +133,7 @@ def find_contender(name: str) -> Contender:
     return Contender(name, load_chain(name) if is_chain else None)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Matchup:
     """Comparison of two sides, a and b, on the waveforms of one strip; b may be the vendor's returns."""
 

@@ -11,7 +11,7 @@ that memory does not grow with the clouds.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
@@ -121,7 +122,7 @@ GROUPS = {"class": "classification", "echoes": "total"}
 """By what differences are grouped: the LAS class, and the number of echoes of the pulse."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ErrorSpread:
     """Differences a minus b of one quantity, over the echoes that both sides have."""
 
@@ -251,7 +252,7 @@ MOST_PAIRS = 20_000_000
 """Most pairs of such echoes that are looked at; each needs about 100 bytes."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Comparison:
     """What side a has in common with side b (another cloud or chain, or the truth). A share of nothing is NaN."""
 

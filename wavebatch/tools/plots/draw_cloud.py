@@ -16,6 +16,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
@@ -45,7 +46,7 @@ _LEAST_SPAN = 1e-300
 """A smaller range counts as a single value: float64 is too coarse there to be divided into bins."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Histogram:
     """A histogram of one or several series."""
 
@@ -73,7 +74,7 @@ class Histogram:
     """Mean of each series, of all values inside and outside the edges, f8 (series,); NaN without values."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class FlagCounts:
     """Points per flag."""
 

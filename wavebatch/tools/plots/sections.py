@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
@@ -45,7 +45,7 @@ def open_heights(paths: Sequence[Path], column: str | None, chosen: PointFilter)
     return VoxelFile(paths[0], column, chosen) if voxels else cells.Clouds(paths, (column, "z"), chosen)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Section:
     """The points of a vertical section along a line."""
 
@@ -163,7 +163,7 @@ def _choose_line(clouds: cells.Clouds | VoxelFile) -> tuple[float, float, float,
     return (*(middle + (low - margin) * axis).tolist(), *(middle + (high + margin) * axis).tolist())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Profile:
     """Numbers or sums per height, for one series per cloud."""
 

@@ -26,9 +26,9 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
-from wavebatch.core.suggest import nearest
 from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
@@ -48,7 +48,7 @@ from wavebatch.surveying.sensor import SensorRequest, find_sensor
 from wavebatch.tools.sheets.sheet import format_csv
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class DetectorSignal:
     """The signal of a detector for n waveforms, or for one of them."""
 
@@ -278,7 +278,7 @@ _BLOCK = 4096
 """Waveforms that run through the chain at once when flags are searched."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Wanted:
     """Which waveforms to find; by default a few of them, spread evenly over the strip."""
 
@@ -310,7 +310,7 @@ class Wanted:
         return self.most or (MOST_ON_SHEET if self.sheet else FEW)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Place:
     """Where a waveform is in the strip."""
 
@@ -495,7 +495,7 @@ class Curve(NamedTuple):
         return slice(self.first, self.first + len(self.height))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class WaveformView:
     """One waveform and the result of a chain."""
 

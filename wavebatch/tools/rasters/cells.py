@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader, check_alike
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.disk.temp_store import Spool
@@ -202,7 +203,7 @@ STATISTICS = ("mean", "median", "min", "max", "std", "count", "density")
 """std: standard deviation with n - 1, no-data for one value; density: points with a value per area."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Grid:
     """Square cells of one size; their borders are multiples of it, so that rasters of neighbouring clouds fit."""
 
@@ -432,7 +433,7 @@ SHOWN = (2.0, 98.0)
 _SIDE = 128
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Raster:
     """A map."""
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
@@ -62,7 +63,7 @@ KNOWN, FEW_RAYS, NO_GROUND = range(3)
 """Values of the last band: why the others have no data."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ForestOptions:
     """How metrics are computed."""
 
@@ -328,7 +329,7 @@ _EXACT = float(1 << 23)
 """Steps of a column that float32 holds apart; larger values are written as float64."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class GridOptions:
     """What is written of which points."""
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from wavebatch.batch.counts import COUNTS, LEFT_OUT, list_sums
 from wavebatch.batch.report_file import cloud_path, report_path
 from wavebatch.batch.run import BatchResult, Outcome
 from wavebatch.core.echoes import FLAG_MEANINGS, EchoFlag
+from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.order import robust_std
 from wavebatch.core.units import FWHM_PER_SIGMA
@@ -66,7 +66,7 @@ LEAST_SHARE = 0.05
 """Smallest difference that counts, as a share of the median: strips may agree so well that any is many deviations."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Strip:
     """A strip of the batch."""
 

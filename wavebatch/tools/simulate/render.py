@@ -7,15 +7,15 @@ simulation: lobes of equal length are painted together, noise is drawn in cache-
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cache
 from typing import Annotated, Literal
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.errors import ConfigError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Range, check_options, option
-from wavebatch.core.suggest import nearest
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.strip.packets import MAX_SAMPLES
@@ -31,7 +31,7 @@ START_TIME = 300_000_000.0
 """Adjusted standard GPS time of the first pulse [s]."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FlightLine:
     """How the aircraft flies and scans."""
 
@@ -49,7 +49,7 @@ class FlightLine:
     """Angle off nadir along the flight [deg]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class SceneRays:
     """Pulses in space: sensor, point on the ground, direction away from the sensor."""
 
@@ -146,7 +146,7 @@ TERRAINS = {
 """Ground by name: coordinates [m] to height above GROUND [m] and the two slopes."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PulseModel:
     """The system pulse: a main lobe, Gaussian or skewed, and further lobes.
 
@@ -290,7 +290,7 @@ _ROWS = 2048
 """Waveforms that get noise at a time: few enough for the cache."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Recording:
     """How the simulated receiver records: window, levels, noise and system pulse."""
 

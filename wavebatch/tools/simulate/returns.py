@@ -20,6 +20,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer
@@ -45,7 +46,7 @@ _TOLERANCE = 1e-4
 """Shares that are stored as float32 or in steps of 1e-4 may be above 1 by so much."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Radar:
     """Parameters of the lidar equation besides range and reflectance, see kernels.physics.radiometry."""
 
@@ -72,7 +73,7 @@ class Radar:
         check_options(self)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SynthesisOptions:
     """How returns become waveforms."""
 
@@ -152,7 +153,7 @@ class LightCounts:
     """Sum of all shares."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class ReturnLight:
     """k returns of whole pulses."""
 
@@ -300,7 +301,7 @@ DISTINCT = 1.0
 """Echoes closer than this many full widths at half maximum give one return, that of the strongest."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Returns:
     """Discrete returns sorted by pulse, then time."""
 
@@ -316,7 +317,7 @@ class Returns:
     """Number of returns of the pulse, i8 (k,)."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class DiscreteReceiver:
     """A receiver that is blind for one dead zone after each return (docs/algorithms.md 1.5).
 
@@ -507,7 +508,7 @@ class SynthesisSummary:
         return {**asdict(self), "light_used": self.light_used}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class _Pulses:
     """n whole pulses with k returns, and the echoes that model them."""
 

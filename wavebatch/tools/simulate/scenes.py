@@ -14,13 +14,13 @@ however many pulses are made and however they are cut into blocks.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.kernels.physics.radiometry import transmit
@@ -40,7 +40,7 @@ MARGIN = 6.0
 """Distance that echoes keep from the ends of the window, in sigma of the pulse."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Canopy:
     """Scatterers at random heights: each takes a random part of the light that is left, the ground the rest."""
 
@@ -92,7 +92,7 @@ CANOPIES: dict[str, tuple[str, Canopy]] = {
 from them."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Drawn:
     """Echoes of n waveforms, sorted by waveform, and lobes that are painted but are no echo."""
 
@@ -123,7 +123,7 @@ def tabulate_echoes(time: np.ndarray, amplitude, sigma, ghost: np.ndarray | None
     return Drawn(np.repeat(np.arange(n), k)[keep], flatten(time), flatten(amplitude), flatten(sigma), ghosts)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LogUniform:
     """Amplitudes between low and high [count], evenly spread over their logarithm."""
 
@@ -134,7 +134,7 @@ class LogUniform:
         return np.exp(rng.uniform(np.log(self.low), np.log(self.high), m))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LogNormal:
     """Amplitudes around a median [count], cut at low and high."""
 
@@ -147,7 +147,7 @@ class LogNormal:
         return np.clip(self.median * np.exp(self.spread * rng.standard_normal(m)), self.low, self.high)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Mixture:
     """Amplitudes from the first law with probability `share`, else from the second."""
 
@@ -159,7 +159,7 @@ class Mixture:
         return np.where(rng.random(m) < self.share, self.first(rng, m), self.second(rng, m))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FoldedWidth:
     """sigma = sigma_ref sqrt(1 + g |N|): g = several for echoes in company, g = single for lone ones."""
 
@@ -171,7 +171,7 @@ class FoldedWidth:
         return reference * np.sqrt(1.0 + growth * np.abs(rng.standard_normal(len(alone))))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class HalfBroadened:
     """Half of the echoes at sigma_ref with a relative scatter, half evenly between sigma_ref and `top` times it."""
 
@@ -185,7 +185,7 @@ class HalfBroadened:
         return reference * np.where(rng.random(m) < 0.5, near, wide)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class WithinDepth:
     """Times evenly within a layer `depth` ns deep that lies anywhere in the window."""
 
@@ -200,7 +200,7 @@ class WithinDepth:
         return start + depth * rng.random(len(start))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class WithGaps:
     """Times whose gaps are log-uniform between low and high [ns]; series that leave the window are drawn again."""
 
@@ -377,7 +377,7 @@ AIR_ATTENUATION = 0.22
 """Attenuation by the air in scenes with light, one way [dB/km]."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Scene:
     """A kind of land: how many echoes its waveforms hold, how strong, wide and far apart they are."""
 
@@ -549,7 +549,7 @@ WEAK = 5.0
 """Echoes below this many standard deviations of the noise count as weak, as EchoFlag.WEAK states."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Simulated:
     """Waveforms, the echoes in them, and the rays along which they came."""
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Range, check_options, option
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.npz import NpzWriter, read_array_header, read_array_text, reading_npz
@@ -167,7 +168,7 @@ WKT = (
 """CRS of every simulated strip."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StripOptions:
     """How a simulated strip is stored; its contents are those of the scene."""
 

@@ -14,14 +14,13 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, InputError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.disk.npz import read_npz
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
@@ -144,7 +143,7 @@ def _split(values: np.ndarray, lines: Sequence[ScanLine]) -> list[np.ndarray]:
     return np.split(values, np.cumsum([len(line) for line in lines])[:-1])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class CubeSlice:
     """One slice of a cube, ready to draw."""
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Annotated, Literal
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
@@ -36,7 +37,7 @@ _FLOOR = 0.25
 """Quantile of a waveform that is used as its level without signal: signal fills less than three quarters."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class _Pulses:
     """n pulses, or first their waveforms, in file order, with count[i] samples of pulse i in `time` and `values`, one
     pulse after the other."""
@@ -66,7 +67,7 @@ class _Pulses:
         return _Pulses(**kept, time=self.time[samples], values=self.values[samples])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class ScanLine:
     """n consecutive pulses of one sweep, with m samples."""
 
@@ -221,7 +222,7 @@ _GAP, _PULSES_PER_GAP = 10.0, 3.0
 """Largest hole in a segment [pixels, pulses]: whichever is larger in a plane."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SliceOptions:
     """How slices are cut and searched."""
 
@@ -245,7 +246,7 @@ class SliceOptions:
         check_options(self)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Slice:
     """A scan line with the coordinates of its m samples in the slice, in pixels."""
 
@@ -285,7 +286,7 @@ class Slice:
         return end[0] * self.pixel, end[1]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Segment:
     """A straight piece of a surface in one slice."""
 

@@ -14,15 +14,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import ConfigError, InputError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.npz import NpzWriter, read_npz, reading_npz
@@ -59,7 +58,7 @@ _CLASSES = 40
 _LEAST_PAIRS = 10.0
 """Pairs of neighbours that weigh as much as the spread of all classes."""
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class VoxelColumn:
     """One value of a voxel."""
 
@@ -315,7 +314,7 @@ def check_voxel_target(target: Path, strip: Path) -> None:
         Draft(target, overwrite=True).discard()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class VoxelSpace:
     """Contents of a voxel file besides the values of the voxels."""
 

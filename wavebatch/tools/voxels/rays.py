@@ -23,12 +23,13 @@ them, whether recorded or not.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PlannedFilter
@@ -71,7 +72,7 @@ _PULSE_REACH = 4.0
 """Half length of a Gaussian pulse, and margin around signal, in widths of the system pulse."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Deconvolution:
     """How waveforms are deconvolved, and how much signal counts as noise."""
 
@@ -101,7 +102,7 @@ class Deconvolution:
         return self.iterations or ITERATIONS.get(self.method)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Profiles:
     """Signal of n waveforms along their rays."""
 
@@ -498,7 +499,7 @@ RAY = np.dtype(
 light is known (infinite, unless a packet was lost); its samples; its packets."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Rays:
     """The rays of n pulses."""
 
@@ -686,7 +687,7 @@ WEAKEST = 0.05
 """Quantile of the light in packets that is stated as the most that a gap between packets hides."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LightRule:
     """How signal along a ray becomes light that was caught there."""
 

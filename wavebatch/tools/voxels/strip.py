@@ -16,6 +16,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
 from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
@@ -59,7 +60,7 @@ _MOST_FITTING = 0.9
 """Share of the sampled rays that must fit the grid; fewer mean damaged coordinates or too small voxels."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class VoxelOptions:
     """How a strip becomes voxels."""
 
@@ -301,7 +302,7 @@ def _open_grid(
     )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Tracer:
     """What turns the packets of a strip into rays."""
 

@@ -1,0 +1,128 @@
+"""Frozen classes behave as the frozen dataclasses whose methods they share out."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import pickle
+from dataclasses import KW_ONLY, FrozenInstanceError, asdict, dataclass, field, fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+
+from wavebatch.core.frozen import frozen
+
+
+@frozen
+class Point:
+    """Two fields with every kind of default."""
+
+    x: int
+    y: float = 2.0
+    names: list[str] = field(default_factory=list)
+    note: str = field(default="", compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Twin:
+    """The same class, made by Python."""
+
+    x: int
+    y: float = 2.0
+    names: list[str] = field(default_factory=list)
+    note: str = field(default="", compare=False)
+
+
+@frozen(eq=False)
+class Row:
+    """Holds an array."""
+
+    values: np.ndarray
+
+    def __repr__(self) -> str:
+        return f"Row of {len(self.values)}"
+
+
+@frozen
+class Checked(Point):
+    """Has a field more, and checks it."""
+
+    last: int = 0
+
+    def __post_init__(self) -> None:
+        if self.last < 0:
+            raise ValueError("last is negative")
+
+
+def test_it_is_the_dataclass_that_python_makes():
+    one, twin = Point(1, names=["a"]), Twin(1, names=["a"])
+    assert is_dataclass(Point) and [f.name for f in fields(Point)] == [f.name for f in fields(Twin)]
+    assert asdict(one) == asdict(twin) and repr(one) == repr(twin).replace("Twin", "Point")
+    assert Point.__match_args__ == Twin.__match_args__ and not hasattr(one, "__dict__")
+    ours, theirs = inspect.signature(Point), inspect.signature(Twin)
+    assert list(ours.parameters) == list(theirs.parameters)
+    assert ours.parameters["y"] == theirs.parameters["y"] and ours.parameters["x"] == theirs.parameters["x"]
+    assert replace(one, y=3.0) == Point(1, 3.0, ["a"])
+    assert one.names is not Point(1).names, "each object has a default of its own"
+
+
+def test_equal_values_are_equal_objects():
+    assert Point(1, note="a") == Point(1, note="b") and Point(1) != Point(2) and Point(1) != Twin(1)
+    assert hash(Checked(1, names=(), last=3)) == hash(Checked(1, names=(), last=3))
+    assert Point(1) != Checked(1)
+    row = Row(np.zeros(3))
+    assert row == row and row != Row(row.values) and hash(row) == hash(row)
+    assert repr(row) == "Row of 3", "its own method is kept"
+
+
+@frozen(order=True)
+class Ranked:
+    """Is sorted."""
+
+    first: int
+    _: KW_ONLY
+    second: str = ""
+
+
+def test_objects_are_sorted_by_their_values():
+    ranked = [Ranked(2), Ranked(1, second="b"), Ranked(1, second="a")]
+    assert sorted(ranked) == ranked[::-1] and max(ranked) is ranked[0]
+    with pytest.raises(TypeError, match="takes first, each once"):
+        Ranked(1, "a")
+    with pytest.raises(TypeError):
+        sorted([Point(1), Point(2)])
+
+
+def test_nothing_can_be_changed():
+    point = Point(1)
+    with pytest.raises(FrozenInstanceError, match=r"Point\.x cannot be changed"):
+        point.x = 2
+    with pytest.raises(FrozenInstanceError, match=r"Point\.x cannot be changed"):
+        del point.x
+    with pytest.raises(FrozenInstanceError):
+        point.other = 2
+
+
+def test_objects_are_copied_and_sent_to_processes():
+    one = Checked(1, 3.0, ["a"], "n", 5)
+    for other in (pickle.loads(pickle.dumps(one)), copy.copy(one), copy.deepcopy(one)):
+        assert other == one and other.note == "n" and other is not one
+
+
+@pytest.mark.parametrize(
+    ("values", "named", "text"),
+    [
+        ((), {}, "Checked needs x"),
+        ((1,), {"x": 2}, "takes x, y, names, note, last, each once"),
+        ((1, 2, [], "", 5, 6), {}, "takes x, y, names, note, last, each once"),
+        ((1,), {"z": 2, "w": 3}, "Checked has no z, w"),
+    ],
+)
+def test_wrong_arguments_are_named(values, named, text):
+    with pytest.raises(TypeError, match=text):
+        Checked(*values, **named)
+
+
+def test_a_class_checks_its_values():
+    with pytest.raises(ValueError, match="last is negative"):
+        Checked(1, last=-1)
