@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import pickle
-from dataclasses import FrozenInstanceError, asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import KW_ONLY, FrozenInstanceError, asdict, dataclass, field, fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -58,6 +59,9 @@ def test_it_is_the_dataclass_that_python_makes():
     assert is_dataclass(Point) and [f.name for f in fields(Point)] == [f.name for f in fields(Twin)]
     assert asdict(one) == asdict(twin) and repr(one) == repr(twin).replace("Twin", "Point")
     assert Point.__match_args__ == Twin.__match_args__ and not hasattr(one, "__dict__")
+    ours, theirs = inspect.signature(Point), inspect.signature(Twin)
+    assert list(ours.parameters) == list(theirs.parameters)
+    assert ours.parameters["y"] == theirs.parameters["y"] and ours.parameters["x"] == theirs.parameters["x"]
     assert replace(one, y=3.0) == Point(1, 3.0, ["a"])
     assert one.names is not Point(1).names, "each object has a default of its own"
 
@@ -69,6 +73,24 @@ def test_equal_values_are_equal_objects():
     row = Row(np.zeros(3))
     assert row == row and row != Row(row.values) and hash(row) == hash(row)
     assert repr(row) == "Row of 3", "its own method is kept"
+
+
+@frozen(order=True)
+class Ranked:
+    """Is sorted."""
+
+    first: int
+    _: KW_ONLY
+    second: str = ""
+
+
+def test_objects_are_sorted_by_their_values():
+    ranked = [Ranked(2), Ranked(1, second="b"), Ranked(1, second="a")]
+    assert sorted(ranked) == ranked[::-1] and max(ranked) is ranked[0]
+    with pytest.raises(TypeError, match="takes first, each once"):
+        Ranked(1, "a")
+    with pytest.raises(TypeError):
+        sorted([Point(1), Point(2)])
 
 
 def test_nothing_can_be_changed():

@@ -207,7 +207,7 @@ def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibra
     assert found.channels[0].noise_dn == pytest.approx(0.65, abs=0.1) and found.channels[0].brightest > 1e7
 
 
-@pytest.mark.quick_cases("change1-*")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said", "growth"),
     [
@@ -557,6 +557,7 @@ def turn(xyz, degrees=2.0):
     return np.column_stack([c * east - s * north + middle[0], s * east + c * north + middle[1], xyz[:, 2]])
 
 
+@pytest.mark.quick_cases("0.4")
 @pytest.mark.parametrize("slope", [0.0, 0.4])
 def test_points_of_another_crs_than_their_vectors_are_named(tmp_path, slope):
     """They had no range, for want of a sensor; and with --flight-height one that no hillside entered the error of."""

@@ -84,6 +84,7 @@ def test_roofs_have_right_numbers_with_right_errors(town, plane):
     check(columns, "incidence_angle_normals", true["incidence"], rows)
 
 
+@pytest.mark.slow
 def test_a_level_reflectance_is_wrong_on_roofs_by_its_error(town):
     columns, true, report = town
     level = true["pure"] & (true["plane"] == 4)

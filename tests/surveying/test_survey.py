@@ -99,6 +99,7 @@ def test_the_growth_of_noise_is_not_what_the_fit_leaves_of_it(gain):
     assert np.mean(found) == pytest.approx(gain, rel=0.15)
 
 
+@pytest.mark.quick_cases("3.5-0.18")
 @pytest.mark.parametrize(("width", "least"), [(1.2, 0.15), (2.0, 0.18), (3.5, 0.18)])
 def test_noise_that_grows_most_where_the_fit_takes_most_is_put_back(rng, width, least):
     """In the middle of narrow echoes; 0.12 to 0.18 was found where 0.2 is true."""

@@ -80,9 +80,9 @@ from wavebatch.tools.simulate.render import paint_echoes
 
 SMALL = BenchOptions(
     scenes=("flat",),
-    waveforms=1600,
+    waveforms=800,
     repeats=1,
-    pulses=400,
+    pulses=200,
     tolerance_cm=50.0,
 )
 
@@ -102,8 +102,8 @@ def timed_document():
 
 
 def measure_small():
-    found = run_bench(SMALL, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=60))
-    cases = measure_cases(SMALL, list_cases(["H10"]), lambda text: None, waveforms=90)
+    found = run_bench(SMALL, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=20))
+    cases = measure_cases(SMALL, list_cases(["H10"]), lambda text: None, waveforms=40)
     return {**found, "stability": cases, "promises": judge(found)}
 
 
@@ -152,7 +152,7 @@ def test_stiff_cases_count_failures_by_kind(document):
     assert {row["case"] for row in cases} == {"constant 0, 12 or 255", "noise only"}
     assert any(row["is_auto"] for row in cases)
     for row in cases:
-        assert row["failures"] == dict.fromkeys(FAILURES, 0) and row["waveforms"] == 90
+        assert row["failures"] == dict.fromkeys(FAILURES, 0) and row["waveforms"] == 40
         for name in ("completeness", "correctness", "wrong"):
             assert row["figures"][name]["value"] is None
         assert row["figures"]["false_alarms"]["value"] < 0.05 + (row["chain"] == "balanced")

@@ -44,7 +44,7 @@ def even(tmp_path_factory):
     """Leaves, and voxels of a strip over a layer of them from 4 to 14 m."""
     folder, rng = tmp_path_factory.mktemp("even"), np.random.default_rng(1)
     leaves = grow(rng, SIDE, crowns=None, density=0.3)
-    fly(folder / "s.las", rng, leaves, SIDE)
+    fly(folder / "s.las", rng, leaves, SIDE, pulses=4.0)
     return leaves, voxelize(folder / "s.las", folder / "v.laz")
 
 
@@ -65,7 +65,7 @@ def test_an_even_layer_of_leaves_is_measured_within_its_error(even, tmp_path):
     assert result.reasons == (4, 0, 0) and (found["no_data_reason"] == 0).all()
 
 
-@pytest.mark.quick_cases("hillside")
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["hillside", "packets"])
 def test_crowns_on_hillsides_and_in_several_packets_are_within_the_error(tmp_path, how):
     """Trees leave gaps that voxels do not resolve, and hide leaves: the error says what that may hide."""
@@ -165,7 +165,7 @@ def test_strips_of_a_forest_become_one_raster_with_two_commands(tmp_path):
     pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     rng = np.random.default_rng(7)
     leaves = grow(rng, SIDE, crowns=None, density=0.3)
-    strips = [fly(tmp_path / f"{name}.las", rng, leaves, SIDE, pulses=4.0) for name in "ab"]
+    strips = [fly(tmp_path / f"{name}.las", rng, leaves, SIDE, pulses=1.5) for name in "ab"]
     (tmp_path / "system.toml").write_text(format_survey(SAVED))
     made = ["voxelize", *strips, "--size", 1, "--forest", "--system", tmp_path / "system.toml", "--force", "-o",
             tmp_path / "v"]  # fmt: skip

@@ -39,6 +39,7 @@ def read_blocks(path):
         return [block for block, _ in reader.read_blocks(unit, 100_000, True)]
 
 
+@pytest.mark.quick_cases("1.0")
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_run_finds_the_returns_again(cloud, noise, tmp_path):
     summary = synthesize_strip(cloud, tmp_path / "s.laz", SynthesisOptions(noise=noise))

@@ -61,6 +61,7 @@ def strips(canopy, tmp_path_factory):
     return write_recorded(folder / "joined.las", *pulses), write_recorded(folder / "split.las", *pulses, packets)
 
 
+@pytest.mark.quick_cases("None")
 @pytest.mark.parametrize("ratio", [2.0, None])
 def test_split_pulses_are_joined_ones(strips, canopy, tmp_path, ratio):
     """As pulses of their own, packets make the shares of the canopy half as large again."""

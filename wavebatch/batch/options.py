@@ -9,11 +9,12 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Range, check_options, declared_options, option, typed
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def check_together(given: Mapping[str, Any], known: Collection[str] | None = Non
             raise ConfigError(f"{typed(name)} is of no use without {others}; give that too, or leave it out")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RunOptions:
     """All that can be asked of a run besides the strips; each field is an option of `wavebatch run`."""
 

@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.workers.processes import WorkerDied, Workers, refuse_import
 from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
 from wavebatch.files.disk.publish import protecting, refuse_input, remove_stale, reporting
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.library import load as load_kernels
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from wavebatch.batch.workers.dask_cluster import Cluster
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Outcome:
     """The end of one strip."""
 
@@ -51,7 +52,7 @@ class Outcome:
     """The strip's survey, where it was made for this strip alone in this run."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class BatchResult:
     """The end of a batch: the outcome of every strip, in the order of the jobs."""
 

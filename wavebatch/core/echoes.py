@@ -7,13 +7,14 @@ Names, bits and dtypes are written to files: do not change those that exist, add
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from enum import IntFlag
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wavebatch.core.errors import StageError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.optional import need
 from wavebatch.core.order import find_order
 
@@ -64,7 +65,7 @@ PASSED_THROUGH = EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECH
 """Flags of points that were copied from the input: no echo was found for them."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Column:
     """Declaration of one per-echo quantity, used by the README's table, the LAS extra bytes and the report."""
 
@@ -143,7 +144,7 @@ _FIELDS: dict[str, type] = {
 """Core columns and their dtypes."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@frozen(eq=False)
 class EchoTable:
     """m echoes sorted by waveform, then time: found, fitted or simulated.
 

@@ -7,7 +7,8 @@ one line. Any other exception is a bug.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+
+from wavebatch.core.frozen import frozen
 
 
 class ConfigError(ValueError):
@@ -58,7 +59,7 @@ _OF_FILES = ("header", "packets", "dropped-records")
 """Codes of what is odd about a file, while the results are as good as usual."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
+@frozen(order=True)
 class StripWarning:
     """What makes results of a strip doubtful: a code of WARNINGS, and a line with the figures and the remedy."""
 

@@ -7,12 +7,13 @@ never write into them. The meaning, dtype and unit of a field stand below it, an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, field, replace
 from typing import Annotated, Any
 
 import numpy as np
 
 from wavebatch.core.errors import StageError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Key, Range
 from wavebatch.core.system import (
     Defects,
@@ -25,7 +26,7 @@ from wavebatch.core.system import (
 from wavebatch.core.units import HALF_C
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Digitizer:
     """How samples were made: one LAS wave packet descriptor, in nanoseconds and volts."""
 
@@ -59,7 +60,7 @@ class Digitizer:
         return replace(self, gain=-self.gain, offset=self.offset + self.gain * self.max_count, inverted=True)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class ReturnTable:
     """The k returns of the input that refer to the packets of a block, sorted by waveform, then point."""
 
@@ -77,7 +78,7 @@ class ReturnTable:
         return len(self.waveform)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class WaveformBlock:
     """n waveforms of one digitizer with s samples each, and where they lie in space."""
 
@@ -212,7 +213,7 @@ def _join_returns(blocks: Sequence[WaveformBlock]) -> ReturnTable | None:
     return ReturnTable(np.concatenate(waveform).astype(np.int32), *others)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@frozen(eq=False)
 class Noise:
     """Level without signal, and its spread, for each of n waveforms."""
 
@@ -254,7 +255,7 @@ _Gaussian = tuple[Annotated[float, Range(-10.0, 10.0)], Annotated[float, Range(-
 """Weight, delay and sigma."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SystemPulse:
     """What the survey found out about sensor and scene of a strip: the same for every block of one digitizer.
 

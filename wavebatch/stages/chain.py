@@ -11,7 +11,7 @@ import inspect
 import re
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -225,7 +225,7 @@ def _split_docstring(function: Callable | type) -> tuple[str, dict[str, str]]:
     return prose.strip(), {title: body.strip("\n") for title, body in zip(rest[::2], rest[1::2], strict=True)}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Step:
     """One stage of a chain with the parameters that the chain sets; all others keep their defaults."""
 
@@ -262,7 +262,7 @@ class Solved(NamedTuple):
         return self._replace(block=self.block.without_samples(), noise=replace(self.noise, of_sample=None))
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@frozen
 class Chain:
     """Checked, ordered steps: one noise stage, one detector, one decomposer, then any attributes."""
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.system import Defects, LevelWidths
 from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -88,7 +89,7 @@ class Part(StrEnum):
     """Only where they are."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Decision:
     """Whether the strip needs a part of the chain, and why."""
 
@@ -98,7 +99,7 @@ class Decision:
     reason: str
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@frozen
 class Survey(Shown):
     """What a sample of a strip says of sensor and scene."""
 

@@ -17,7 +17,6 @@ import errno
 import filecmp
 import hashlib
 import os
-import secrets
 import stat
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -396,7 +395,7 @@ def _exists(target: Path) -> str:
 
 def _create(folder: Path) -> tuple[Path, int]:
     """A new file, open for reading and writing."""
-    path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}{_SUFFIX}"
+    path = folder / f"{_PREFIX}{os.getpid()}-{os.urandom(6).hex()}{_SUFFIX}"
     return path, os.open(path, LOCK_FLAGS | os.O_CREAT | os.O_EXCL, 0o666)
 
 

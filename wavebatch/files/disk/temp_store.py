@@ -13,9 +13,9 @@ import atexit
 import contextlib
 import functools
 import os
+import platform
 import re
 import shutil
-import socket
 import tempfile
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -125,7 +125,7 @@ def _open_lock(folder: Path) -> int:
 
 def _prefix() -> str:
     """Start of the names of this machine's folders."""
-    return f"wavebatch-{re.sub('[^A-Za-z0-9.]', '_', socket.gethostname())}-"
+    return f"wavebatch-{re.sub('[^A-Za-z0-9.]', '_', platform.node())}-"
 
 
 SPOOL_MEMORY = 1 << 24

@@ -51,7 +51,7 @@ class Look:
     """What the flight's pulse leaves of the better half of strong echoes, beyond noise, as a share of the amplitude."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
+@frozen(order=True)
 class Kind:
     """How the samples of a descriptor were made."""
 

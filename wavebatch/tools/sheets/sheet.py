@@ -6,7 +6,6 @@ A command makes one sheet of its result. `list_lines` is what it prints, `format
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -170,6 +169,8 @@ def format_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], *, digits: in
 
     digits: significant ones of floating-point numbers.
     """
+    import csv
+
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(head)
