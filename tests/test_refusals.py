@@ -24,11 +24,11 @@ from wavebatch.stages.chain_file import effective, load_profile
 from wavebatch.surveying.calibrating.calibration_file import format_calibration
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.tools.plots.waveform import MOST
-from wavebatch.tools.rasters.grid import ForestOptions
+from wavebatch.tools.raster import ForestOptions
+from wavebatch.tools.scan_slices import Segment, SliceOptions
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions, simulate_strip
 from wavebatch.tools.simulate.returns import Radar, SynthesisOptions
-from wavebatch.tools.slices.output import SegmentWriter
-from wavebatch.tools.slices.segments import Segment, SliceOptions
+from wavebatch.tools.slice_output import SegmentWriter
 from wavebatch.tools.voxels.rays import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions
 

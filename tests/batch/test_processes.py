@@ -14,7 +14,7 @@ import pytest
 
 from wavebatch.batch.workers.processes import WorkerDied, Workers
 from wavebatch.batch.workers.worker_check import _probe_alone
-from wavebatch.tools.bench.speed import Worker
+from wavebatch.tools.bench.command import Worker
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 

@@ -38,8 +38,8 @@ from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.tools.compare.chains import measure_fit
 from wavebatch.tools.plots.waveform import build_views
+from wavebatch.tools.scan_slices import _shape
 from wavebatch.tools.simulate import StripOptions, simulate_strip
-from wavebatch.tools.slices.segments import _shape
 from wavebatch.tools.voxels.rays import Deconvolution, deconvolve_block
 
 DETECTORS = sorted(name for name, stage in STAGES.items() if name.startswith("detect."))

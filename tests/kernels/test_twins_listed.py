@@ -17,6 +17,7 @@ COMPILED = {
     "logarithms": ("log", "math.log"), "solve_equations": ("solve", "np.linalg.solve"),
     "decode_packets": ("decode_packets", "naive_wdz.compress"),
     "describe_waveforms": ("describe_left", "naive_describe.describe"),
+    "describe_widths": ("describe_widths", "naive_describe.describe_widths"),
     "learn_pulse": ("gather_pulse", "naive_describe.gather"),
     "render_pulses": ("render_pulses", "naive_describe.render"),
     "measure_changes": ("measure_changes", "naive_describe.measure_change"),

@@ -1,6 +1,7 @@
 """Surveys and chains of sensors that the simulator does not have: other pulses, noise and baselines, rendered here."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -224,14 +225,18 @@ def test_no_misfit_is_looked_for_below_none(monkeypatch):
     scatter = np.resize([1.0, -1.0], 100)
     looked = []
 
-    def describe(block, system, place, changes):
-        looked.append(place)
-        return [np.full(100, cost[place] / 100) + (5.0 if place == 3 else 0.3) * scatter]
+    def explain_between(block, system, found, place):
+        return SimpleNamespace(place=place, echoes=range(100 + place))
+
+    def describe(block, system, explained, changes):
+        looked.append(explained.place)
+        return [np.full(100, cost[explained.place] / 100) + (5.0 if explained.place == 3 else 0.3) * scatter]
 
     monkeypatch.setattr(choose_pulse, "describe_waveforms", describe)
-    monkeypatch.setattr(choose_pulse, "_explain_between", lambda block, system, found, place: place)
+    monkeypatch.setattr(choose_pulse, "_explain_between", explain_between)
     block = record(gaussian, 5, n=100)[0]
-    assert choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0) == 0.0
+    misfit, doubt = choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0, 0.0)
+    assert misfit == 0.0 and doubt == pytest.approx(4 / 103)
     assert set(looked) <= set(cost)
 
 
@@ -239,7 +244,7 @@ def test_the_misfit_is_at_least_what_the_pulse_misses_of_the_stack():
     block = record(gaussian, 5, n=400)[0]
     system = survey_block(block, learn=False).system
     for missed in (0.0, 0.02):
-        found, _ = settle(block, system, 0.0, missed)
+        found, _, _ = settle(block, system, 0.0, missed)
         assert found.misfit == missed
 
 

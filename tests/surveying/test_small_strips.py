@@ -56,10 +56,13 @@ def test_a_gaussian_stays_one_in_fifty_packets(scene):
 
 @pytest.mark.slow
 def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path, monkeypatch):
-    """LVIS as a stranger: fifty packets had 1.17 to 2.2 times the echoes, its halves differ in a half, in silence."""
+    """LVIS as a stranger: fifty packets had 1.17 to 2.2 times the echoes, its halves differ in a half, in silence.
+
+    With its known pulse misfits that serve as well find 50 to 62 echoes.
+    """
     whole = data_file("lvis/lvis1.las")
     path = cut_strip(whole, tmp_path / "cut.las", 50)
-    assert _survey(path).figures.echoes_in_doubt < 0.05
+    assert MOST_DOUBTED_KNOWN < _survey(path).figures.echoes_in_doubt < 0.25
     _leave_out(monkeypatch, "nasa-lvis")
     assert _survey(path).figures.echoes_in_doubt > MOST_DOUBTED
     assert _survey(whole).figures.echoes_in_doubt > 0.05, "halves differ in a quarter: unknown echoes are left out"

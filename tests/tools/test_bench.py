@@ -57,9 +57,16 @@ from wavebatch.tools.bench.accuracy import (
     root_mean_square,
     share_figure,
 )
-from wavebatch.tools.bench.command import BenchOptions, list_methods, run_bench, shape_scene
+from wavebatch.tools.bench.command import (
+    BenchOptions,
+    BenchWorkerDied,
+    Worker,
+    list_methods,
+    peak_memory,
+    run_bench,
+    shape_scene,
+)
 from wavebatch.tools.bench.report import format_document
-from wavebatch.tools.bench.speed import BenchWorkerDied, Worker, peak_memory
 from wavebatch.tools.simulate import (
     PULSES,
     PulseModel,

@@ -14,8 +14,8 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey, format_survey
-from wavebatch.tools.rasters import cells
-from wavebatch.tools.rasters.grid import COLUMNS, Forest, ForestOptions, GridOptions, write_grid
+from wavebatch.tools import cells
+from wavebatch.tools.raster import COLUMNS, Forest, ForestOptions, GridOptions, write_grid
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 SAVED = SavedSurvey(Survey(SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.1, std=0.58)), 1000))

@@ -19,9 +19,9 @@ from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
 from wavebatch.surveying.calibration import Calibration, StripConstant, TargetResult
 from wavebatch.tools.plots.charts import chart, draw_histogram, draw_values, merge_bins
 from wavebatch.tools.sheets import page
-from wavebatch.tools.sheets.calibrate import write_calibrate_page
 from wavebatch.tools.sheets.run import FIGURES, count_tables, find_outliers
 from wavebatch.tools.sheets.sheet import Code, Table
+from wavebatch.tools.sheets.survey import write_calibrate_page
 
 
 def _run(*arguments, code=0):

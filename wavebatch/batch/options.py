@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -202,6 +202,8 @@ class RunOptions:
     resume: bool = option(
         False, "Skip strips whose output is complete and up to date; redo the others.", RUNNING, usual=True
     )
+    on_event: Callable[[dict[str, Any]], None] | None = None
+    """Of `wavebatch.run` only; jobs do not carry it to other processes."""
 
     @property
     def folder(self) -> Path:
@@ -217,7 +219,7 @@ class RunOptions:
 
     def given(self) -> dict[str, Any]:
         """Return the options that differ from their defaults."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        values = {name: getattr(self, name) for name in OPTIONS}
         return {
             name: value
             for name, value in values.items()
@@ -257,7 +259,7 @@ OPTIONS = declared_options(RunOptions)
 def describe_options() -> str:
     """Return the options as the section Parameters of a docstring."""
     lines = []
-    for one in fields(RunOptions)[1:]:  # the output is no keyword
+    for one in [one for one in fields(RunOptions)[1:] if one.name in OPTIONS]:  # the output is no keyword
         words = OPTIONS[one.name].words
         text = re.sub(r"--([a-z][a-z-]+)", lambda found: f"`{found[1].replace('-', '_')}`", words.help)
         default = words.unset or ("" if one.default in (None, False) else repr(one.default))

@@ -86,7 +86,7 @@ def survey(
         if len(paths) > 1:
             words = "is for one strip, because widths depend on the distance of the ground"
             raise ConfigError(f"--angles {angles}: {words}")
-        from wavebatch.tools.compare.angle_table import check_angles
+        from wavebatch.tools.sheets.survey import check_angles
 
         check_angles(angles, overwrite=overwrite)
     options["angles"] = angles
@@ -133,7 +133,7 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
         packet_file = opened.facts.packets.file
         if options["angles"] is not None:
             from wavebatch.surveying.sensor import SensorRequest, find_sensor
-            from wavebatch.tools.compare.angle_table import write_angles
+            from wavebatch.tools.sheets.survey import write_angles
 
             distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
             sizes = {"spacing": found.figures.spacing_ns, "amplitude": found.figures.amplitude_50}

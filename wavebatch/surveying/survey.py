@@ -404,13 +404,13 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if not (system.components or system.kappa):
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system = choose_whitening(part, system, choice.best.change)
-        system, mirror = settle(block, system, choice.best.seen, choice.best.missed)
+        system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)
         system = limit_faint(system, max(choice.best.seen, float(MISFITS[0])), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
         figures.width_in_doubt = choice.spread
-        figures.echoes_in_doubt = max(choice.doubt, share_unexplained(system, echoes, block.spacing))
+        figures.echoes_in_doubt = max(choice.doubt, doubt, share_unexplained(system, echoes, block.spacing))
         if len(block) < SMALL:
             figures.echoes_in_doubt = max(figures.echoes_in_doubt, share_repeated(echoes, system.sigma_ref))
     else:

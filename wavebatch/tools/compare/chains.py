@@ -15,6 +15,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import EvenSample
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.packets import MAX_SAMPLES
@@ -30,7 +31,6 @@ from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.tools.api.strip import AUTO, load_chain
 from wavebatch.tools.compare import pairing
-from wavebatch.tools.even_sample import EvenSample
 
 
 @frozen

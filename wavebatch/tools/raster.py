@@ -27,7 +27,7 @@ from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
 from wavebatch.files.las.read_points import read_checked_header
-from wavebatch.tools.rasters.cells import (
+from wavebatch.tools.cells import (
     LARGEST_SIZE,
     Box,
     Clouds,
