@@ -220,6 +220,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.quick_cases("True")
 @pytest.mark.parametrize("early", [True, False])
 def test_ctrl_c_while_a_stopped_process_is_waited_for_does_not_hang(tmp_path, early):
     """The interrupt came between the wait for the process and its kill, and Python waited for it at its end."""

@@ -147,7 +147,7 @@ def test_light_that_falls_from_side_to_side_is_fitted_by_three_strips(tmp_path, 
     assert parse_calibration(older, "older").swath == pytest.approx((*found.swath[:3], 0.0))
 
 
-@pytest.mark.quick_cases("ab")
+@pytest.mark.slow
 @pytest.mark.parametrize("strips", ["ab", "ac"])
 def test_light_that_falls_from_side_to_side_is_an_error_where_strips_leave_it_open(tmp_path, one_side, strips):
     found, said = calibrate(one_side, "--scan-angle", strips=[f"{name}.las" for name in strips])
@@ -383,7 +383,7 @@ def write_off(monkeypatch, path, off, sensor=FAST, ground=HILLY, pulses=8000):
 JUMP = "pulses jump by a whole number of the 600 m between two pulses"
 
 
-@pytest.mark.quick_cases("short", "long", "right", "late")
+@pytest.mark.quick_cases("short", "right")
 @pytest.mark.parametrize(
     ("off", "said"),
     [

@@ -76,6 +76,7 @@ def test_flat_tops_are_learned_and_found(seed):
     assert whole > 0.94 and np.std(error) < 0.12
 
 
+@pytest.mark.quick_cases("0.2")
 @pytest.mark.parametrize("noise", [0.0, 0.2])
 def test_counts_that_hardly_scatter_do_not_spoil_the_pulse(noise):
     block, time, height = record(gaussian, 3, noise=noise, wide=0.3)

@@ -116,6 +116,7 @@ def test_fifty_widened_echoes_make_no_odd_pulse_of_a_gaussian(seed):
     assert len(choose_chain(survey).run(block, survey.system)) == pytest.approx(50 + np.count_nonzero(two), rel=0.05)
 
 
+@pytest.mark.quick_cases("leica")
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_fifty_packets_of_level_ground_are_sure(strip, request, tmp_path):
     survey = _survey(cut_strip(request.getfixturevalue(strip), tmp_path / "cut.las", 120))

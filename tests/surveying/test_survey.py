@@ -15,7 +15,7 @@ from wavebatch.surveying.measuring.noise_and_width import FIRST_LOOK
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
 
-@pytest.mark.quick_cases("14.0")
+@pytest.mark.quick_cases("4.0")
 @pytest.mark.parametrize("sigma", [0.5, 0.64, 0.85, 1.0, 1.4, 4.0, 10.0, 14.0])
 def test_the_width_is_found_however_far_from_the_first_guess(sigma):
     scene = make_scene("flat", pulse=PulseModel(sigma=sigma), n_samples=max(80, int(20 * sigma)))

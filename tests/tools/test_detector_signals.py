@@ -106,6 +106,7 @@ def test_the_chains_own_detector_keeps_its_parameters():
     assert view.seen.stage == "detect.maximum"
 
 
+@pytest.mark.quick_cases("detector", "wavelet")
 @pytest.mark.parametrize("show", ["detector", *list_signals()])
 def test_pictures_have_the_signal_and_its_rule(tiny_strip, tmp_path, show):
     pytest.importorskip("matplotlib")

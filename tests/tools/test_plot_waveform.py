@@ -217,6 +217,7 @@ def test_strips_without_waveforms(tmp_path, riegl, data):
         assert not (tmp_path / "p.png").exists()
 
 
+@pytest.mark.quick_cases("1")
 @pytest.mark.parametrize("samples", [1, 2, 8])
 def test_short_waveforms_can_be_drawn(tmp_path, samples):
     pytest.importorskip("matplotlib")

@@ -249,6 +249,7 @@ def naive_voxels(strip, size, headroom):
     return rays
 
 
+@pytest.mark.quick_cases("4.0")
 @pytest.mark.parametrize("headroom", [0.0, 4.0])
 def test_rays_through_voxels_are_those_of_a_slow_tracer(tmp_path, headroom):
     rng = np.random.default_rng(12)
