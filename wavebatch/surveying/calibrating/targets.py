@@ -21,7 +21,7 @@ from wavebatch.core.units import ASSUMED_DIVERGENCE, FWHM_PER_SIGMA, INSET, MAD_
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.geojson import describe_miss
 from wavebatch.files.las.header import decode_text
-from wavebatch.kernels.geometry.facets import fit_facet
+from wavebatch.kernels.geometry.planes import fit_facet
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.surveying.calibrating.compression import find_compression
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
