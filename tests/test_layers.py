@@ -27,8 +27,7 @@ INSIDE = {
         {"serve", "worker_check"}, {"processes"}, {"dask_cluster"},
     ],
     "surveying": [
-        {"measuring"}, {"flat_ground", "predict_error"}, {"hidden_neighbours"}, {"survey", "sensor"},
-        {"system_file", "auto_chain"}, {"outgoing"},
+        {"measuring"}, {"flat_ground", "predict_error"}, {"survey", "sensor"}, {"system_file"}, {"outgoing"},
         {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"prepare"},
     ],
 }

@@ -195,7 +195,7 @@ def write_survey_page(
 def _page_parts(
     survey: Survey, document: Mapping[str, Any], strips: Sequence[Path], reading: Mapping[str, Any]
 ) -> Iterator[Part]:
-    from wavebatch.surveying.auto_chain import choose_chain
+    from wavebatch.surveying.choose_chain import choose_chain
     from wavebatch.tools.plots.charts import draw_waveforms
 
     yield from list_doubts(document)
