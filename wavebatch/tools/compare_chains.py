@@ -28,8 +28,8 @@ from wavebatch.surveying import Survey
 from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.tools import pairing
 from wavebatch.tools.api.strip import AUTO, load_chain
-from wavebatch.tools.compare import pairing
 
 
 @frozen
