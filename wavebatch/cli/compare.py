@@ -1,6 +1,7 @@
 """`wavebatch compare`: two clouds, two chains, or one of them with the vendor's returns or the truth.
 
-Reads options and checks thresholds; figures come from `wavebatch.tools.pairing` and `compare_chains`, their sheet from `tools.sheets`.
+Reads options and checks thresholds; figures come from `wavebatch.tools.pairing` and `compare_chains`, their
+sheet from `tools.sheets`.
 """
 
 from __future__ import annotations
