@@ -22,7 +22,7 @@ from wavebatch.surveying.calibrating.calibration_file import format_calibration,
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.matching import setting
 from wavebatch.surveying.matching.setting import NO_CHANGE, keep_places, weigh_change
-from wavebatch.surveying.matching.strip_conditions import judge_fading
+from wavebatch.surveying.matching.strip_match import judge_fading
 
 pytestmark = pytest.mark.kept_surveys
 
