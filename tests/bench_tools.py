@@ -19,5 +19,5 @@ class _Here:
 
 def time_here(patch):
     """Let the bench time chains in this process; `patch` is a pytest.MonkeyPatch."""
-    for module in ("wavebatch.tools.bench.speed", "bench.peers"):
+    for module in ("wavebatch.tools.bench.command", "bench.peers"):
         patch.setattr(f"{module}.Worker", _Here)

@@ -31,7 +31,7 @@ def pytest_configure(config):
 
 
 LONG = (
-    "test_fuzz.py", "test_processor.py", "test_canopy.py", "test_kill.py", "test_wdz.py", "test_village.py",
+    "test_fuzz.py", "test_processor.py", "test_kill.py", "test_wdz.py", "test_village.py",
     "test_signed_physics.py", "test_processes.py", "test_dask_cluster.py", "test_signals.py", "test_neighbour_pass.py",
 )  # fmt: skip
 """Files of few tests that take long: started last, they would keep one process busy while the others have ended."""

@@ -32,7 +32,7 @@ def test_what_failed_once_does_not_fail_again(fuzzer, case):
     assert fuzzer.run(case) == ""
 
 
-@pytest.mark.quick_cases("cloud.laz", "*.toml", "*.txt", "*son", "c*.npz", "t*.npz")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(COMMANDS))
 def test_sound_inputs_do_not_fail(fuzzer, kind):
     """Else the fuzzer would only see how commands refuse."""
@@ -47,6 +47,7 @@ def test_sound_inputs_do_not_fail(fuzzer, kind):
         assert done["code"] == 0 or notes or small or far or "pip install" in done["err"], (command, done)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", SOUND.values(), ids=SOUND)
 def test_sound_options_do_not_fail(fuzzer, command):
     if "bench" not in command:  # takes seconds
@@ -142,6 +143,7 @@ def _drop(words):
     Dropped()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "why"),
     [
@@ -171,6 +173,7 @@ def test_the_fuzzer_sees_every_kind_of_failure(fuzzer, what, why):
     planted.close()
 
 
+@pytest.mark.slow
 def test_a_failing_case_is_made_small(fuzzer):
     """Hypothesis finds damage that matters and keeps little else."""
 

@@ -1,8 +1,8 @@
 """Slow, plain references for the fast kernels: loops over waveforms, scipy per problem, differences for derivatives."""
 
 import numpy as np
+import scipy  # its parts load when they are first asked for
 from scipy.optimize import least_squares
-from scipy.stats import f as f_distribution
 
 
 def smooth_121(waveform):
@@ -333,7 +333,7 @@ def compare_halves(xyz):
         if min(one.sum(), (~one).sum()) >= 4:
             best = min(best, left(one) + left(~one))
     noise = best + len(r) * 1e-6
-    return min(6 * f_distribution.sf((whole - best) / 3 / (noise / (len(r) - 6)), 3, len(r) - 6), 1.0), whole - best
+    return min(6 * scipy.stats.f.sf((whole - best) / 3 / (noise / (len(r) - 6)), 3, len(r) - 6), 1.0), whole - best
 
 
 def fit_slope(across, along, shared):

@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.special import gammaln
+from scipy.stats import norm
 
 FREEDOM = 4
 
@@ -94,3 +95,22 @@ def gather(left, model, used, echoes, std, gain, change, delay, sigma, reference
         columns.append(column)
     rows = np.array([*columns, np.ones(len(x))])
     return rows * weight @ rows.T, rows * weight @ (left + model)
+
+
+def describe_widths(ratio, error, known, scatters, wider, anywhere):
+    """Costs of widths, by a mixture of the pulse's own width and uniform laws, learned from the known ones."""
+    found = []
+    for scatter in scatters:
+        spread = np.hypot(error, scatter)
+        below = norm.cdf((ratio - 1) / spread)
+        laws = [norm.pdf(ratio, 1, spread)]
+        laws += [(below - norm.cdf((ratio - end) / spread)) / (end - 1) for end in wider]
+        laws = np.array(laws).T
+        share = np.full(laws.shape[1], 1 / laws.shape[1])
+        for _ in range(15):
+            belongs = laws[known] * share
+            belongs /= belongs.sum(axis=1, keepdims=True)
+            share = (belongs.sum(axis=0) + 0.5) / (known.sum() + 0.5 * len(share))
+        found.append(-np.log((1 - anywhere) * laws @ share + anywhere / wider[-1]))
+    best = min(found, key=lambda cost: cost[known].sum())
+    return best - np.log(np.sqrt(2 * np.pi) * error)

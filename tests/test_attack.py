@@ -48,6 +48,7 @@ def _begin(words, **how):
 _POPEN = attacking.subprocess.Popen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "why"),
     [

@@ -27,6 +27,7 @@ def test_example_chains_run(chain, tiny_strip, tmp_path):
     assert len(cloud) > 300
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib").use("Agg")
     from matplotlib import pyplot

@@ -71,6 +71,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, command):
         assert invoke(command, tmp_path / name, tmp_path / "out"), name
 
 
+@pytest.mark.quick_cases(".laz")
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_damaged_strips_through_every_command(tmp_path, suffix):
     rng = random.Random(suffix)

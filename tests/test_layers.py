@@ -27,8 +27,7 @@ INSIDE = {
         {"serve", "worker_check"}, {"processes"}, {"dask_cluster"},
     ],
     "surveying": [
-        {"measuring"}, {"flat_ground", "predict_error"}, {"hidden_neighbours"}, {"survey", "sensor"},
-        {"system_file", "auto_chain"}, {"outgoing"},
+        {"measuring"}, {"flat_ground", "predict_error"}, {"survey", "sensor"}, {"system_file"}, {"outgoing"},
         {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"prepare"},
     ],
 }
@@ -42,10 +41,15 @@ def _part(path: Path) -> str:
 
 
 @functools.cache
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"))
+
+
+@functools.cache
 def _imports(path: Path) -> set[str]:
     """Full names of all modules that a file imports, anywhere in it."""
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for node in ast.walk(_tree(path)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -56,7 +60,7 @@ def _imports(path: Path) -> set[str]:
 
 def _imports_at_once(path: Path) -> list[str]:
     """Our modules that are imported with the file itself: not those that only type checkers import."""
-    nodes = ast.parse(path.read_text("utf-8")).body
+    nodes = _tree(path).body
     froms = [node.module for node in nodes if isinstance(node, ast.ImportFrom)]
     names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
     return [name for name in (*froms, *names) if name.split(".")[0] == "wavebatch"]
@@ -147,7 +151,7 @@ def test_only_the_command_line_knows_click_prints_or_exits():
         if _part(path) in {"cli", "__main__"}:
             continue
         assert not _outside(path) & {"click", "tqdm"}, path
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        for node in ast.walk(_tree(path)):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 assert node.func.id not in {"print", "exit", "quit"}, f"{path}:{node.lineno}"
             if isinstance(node, ast.Attribute) and node.attr == "exit" and isinstance(node.value, ast.Name):
@@ -185,7 +189,7 @@ def test_no_two_classes_or_functions_have_one_name():
     """A public name of a module says what it is without its folder."""
     places: dict[str, list[Path]] = {}
     for path in MODULES:
-        for node in ast.parse(path.read_text("utf-8")).body:
+        for node in _tree(path).body:
             named = isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_")
             if named and not _is_command(node):
                 places.setdefault(node.name, []).append(path)

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import run_command
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -65,8 +66,8 @@ def _wavebatch(environment, *words, **more) -> subprocess.CompletedProcess:
 def cloud(tiny_strip, tmp_path_factory) -> bytes:
     """The cloud of an undisturbed run."""
     folder = tmp_path_factory.mktemp("here")
-    done = _wavebatch({**os.environ, "PYTHONPATH": str(ROOT)}, "run", tiny_strip, "-o", folder, "-q")
-    assert done.returncode == 0, done.stderr
+    done = run_command("run", tiny_strip, "-o", folder, "-q")
+    assert done.exit_code == 0, done.output
     return (folder / "tiny.laz").read_bytes()
 
 
@@ -84,7 +85,8 @@ def test_a_run_without_posix_gives_the_same_cloud(elsewhere, tiny_strip, cloud, 
     assert done.returncode == 0 and not done.stderr, done.stderr
     assert (tmp_path / "tiny.laz").read_bytes() == cloud
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
-    assert _wavebatch(elsewhere, *command).returncode == 4  # the cloud is there
+    if jobs == 1:
+        assert _wavebatch(elsewhere, *command).returncode == 4  # the cloud is there
     assert _wavebatch(elsewhere, *command, "--resume").returncode == 0
 
 
@@ -104,6 +106,7 @@ def test_lists_of_windows_and_a_console_of_an_old_code_page(elsewhere, tiny_stri
         assert done.returncode == 1 and len(done.stderr.splitlines()) == 1 and b"Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_names_with_drive_letters_are_names_of_files(elsewhere, tiny_strip, tmp_path):
     """A colon is no separator anywhere: `C:\\data\\a.las` reaches the system whole."""
     (tmp_path / "C:").mkdir()

@@ -24,11 +24,11 @@ from wavebatch.stages.chain_file import effective, load_profile
 from wavebatch.surveying.calibrating.calibration_file import format_calibration
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.tools.plots.waveform import MOST
-from wavebatch.tools.rasters.grid import ForestOptions
+from wavebatch.tools.raster import ForestOptions
+from wavebatch.tools.scan_slices import Segment, SliceOptions
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions, simulate_strip
 from wavebatch.tools.simulate.returns import Radar, SynthesisOptions
-from wavebatch.tools.slices.output import SegmentWriter
-from wavebatch.tools.slices.segments import Segment, SliceOptions
+from wavebatch.tools.slice_output import SegmentWriter
 from wavebatch.tools.voxels.rays import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions
 
@@ -239,10 +239,10 @@ TOOLS = [
     (f"{COMPARE} strip.las --within 1e9", 2, "tolerance 1e+09 ns (--within): must be above 0 and below 1e6"),
     (f"{COMPARE} other.las --min-exact 95", 2, "invalid value for '--min-exact': 95.0 is not in"),
     ("compare fast accurate", 2, "--strip STRIP"), ("compare none.toml strip.las", 2, "--strip STRIP"),
-    (f"{COMPARE} strip.las --limit 5", 2, "--limit is for chains"),
-    (f"{COMPARE} strip.las --system x.toml", 2, "--system is for chains"),
+    (f"{COMPARE} strip.las --limit 5", 2, "--limit is of no use without --strip"),
+    (f"{COMPARE} strip.las --system x.toml", 2, "--system is of no use without --strip"),
     (f"{CHAINS} fats", 2, "fats: is neither a file nor a shipped chain; did you mean 'fast'?"),
-    (f"{CHAINS} fast --truth truth.npz", 2, "--truth is for a cloud"),
+    (f"{CHAINS} fast --truth truth.npz", 2, "--strip and --truth exclude each other"),
     (f"{CHAINS} fast run/strip.laz --limit 5", 2, "leave --limit out"),
     (f"{CHAINS} run/strip.laz", 2, "without --strip"), (f"{CHAINS} run/strip.laz cloud.laz", 2, "without --strip"),
     (f"{CHAINS} fast none.toml", 2, "none.toml"), (f"{CHAINS} fast none.las", 2, "none.las"),
@@ -301,19 +301,21 @@ PICTURES = [
       for words in ("--sheet", "--show detector", "--times all")),
     (f"{WAVEFORM} --chain c --profile fast", 2, "--chain and --profile exclude each other"),
     (f"{WAVEFORM} --seed 3", 2, "--seed is of no use without --random"),
-    (f"{WAVEFORM} --packet 3 --most 2", 2, "--most is for --flags, --where and the default"),
+    (f"{WAVEFORM} --packet 3 --most 2", 2, "--most and --packet exclude each other"),
     (f"{WAVEFORM} --times 5000:6000", 2, "no sample lies there; the waveforms end at"),
     (f"{WAVEFORM} --times 5", 2, "LOW:HIGH"), (f"{WAVEFORM} --profile fastt", 2, "did you mean 'fast'"),
     (f"{WAVEFORM} --packet 99999", 2, "there is no packet 99999; packets are 0 to"),
     (f"{WAVEFORM} --packet 5:3", 2, "'5:3' is empty; END is the number after the last one"),
     (f"{WAVEFORM} --packet x", 2, "neither a number nor FIRST:END"),
     (f"{WAVEFORM} --packet 0:{MOST + 1}", 2, f"{MOST} fit"),
-    (f"{WAVEFORM} --random 3 --packet 2", 2, "--random chooses the waveforms"),
+    (f"{WAVEFORM} --random 3 --packet 2", 2, "--random and --packet exclude each other"),
     (f"{WAVEFORM} --point 99999", 2, "there is no point 99999"),
     (f"{WAVEFORM} --gps-time 3", 2, "no pulse lies within"),
     (f"{WAVEFORM} --flags SATURATED --packet 3", 2, "--flags"),
     (f"{WAVEFORM} --flags SATURATD", 2, "did you mean 'SATURATED'"),
-    (f"{WAVEFORM} --where amplitude>1 --point 3", 2, "--where chooses the waveforms"),
+    (f"{WAVEFORM} --where amplitude>1 --point 3", 2, "--where and --point exclude each other"),
+    (f"{WAVEFORM} --random 3 --most 2", 2, "--random and --most exclude each other"),
+    (f"{WAVEFORM} --sheet --echoes", 2, "--sheet and --echoes exclude each other"),
     (f"{WAVEFORM} --where amplitud>1", 2, "did you mean 'amplitude'"),
     (f"{WAVEFORM} --where amplitude>1e6", 1, "no echo meets"), (f"{WAVEFORM} --chain none.toml", 2, "none.toml"),
     (f"{WAVEFORM} --show asdff", 2, "must be one of"), (f"{WAVEFORM} --sheet --show asdf", 2, "--show"),

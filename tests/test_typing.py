@@ -6,13 +6,9 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
-
-from wavebatch.batch.options import RunOptions
-from wavebatch.tools.api.run import RunKeywords
 
 ROOT = Path(__file__).resolve().parent.parent
 CHECKERS = {
@@ -79,9 +75,3 @@ def test_the_documented_python_has_types(check):
 def test_what_a_run_refuses_a_type_checker_refuses(check):
     found, told = check("import wavebatch as wb\n" + BAD)
     assert found == set(range(2, 2 + len(BAD.splitlines()))), told
-
-
-def test_keywords_of_run_are_its_options():
-    ours = {one.name: re.sub(r"^Annotated\[(.*?), Range.*\]$", r"\1", str(one.type)) for one in fields(RunOptions)}
-    del ours["output"]
-    assert {name: hint.__forward_arg__ for name, hint in RunKeywords.__annotations__.items()} == ours

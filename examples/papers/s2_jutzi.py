@@ -26,9 +26,9 @@ from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
 from wavebatch.stages.decompose.fit import gauss_newton
 from wavebatch.stages.detect.classic import sustained_threshold
 from wavebatch.stages.detect.maximum import matched_filter
+from wavebatch.tools.scan_slices import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import GROUND
-from wavebatch.tools.slices.segments import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
 
 RATIOS = (2, 3, 4, 5, 6, 7, 8, 10)
 DETECTORS = {

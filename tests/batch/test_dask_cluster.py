@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import types
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from commands import run_command
 from wavebatch.batch.workers import dask_cluster
 from wavebatch.tools.simulate import simulate_strip
 
-distributed = pytest.importorskip("distributed", reason="needs dask's distributed: pip install distributed")
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs dask's: pip install distributed")
 
 CONNECT = dask_cluster._CONNECT
 _WORKER = [sys.executable, "-m", "distributed.cli.dask_worker"]
@@ -38,6 +39,11 @@ class Dask:
         )
         self.wait_until(lambda: file.exists() and file.stat().st_size)
         self.address = json.loads(file.read_text())["address"]
+
+    def client(self):
+        from distributed import Client  # takes a second
+
+        return Client(self.address, set_as_default=False)
 
     def start_worker(self, **env):
         return self.start_workers(1, **env)[0]
@@ -106,6 +112,7 @@ def run(*arguments):
     return done.exit_code, done.stderr
 
 
+@pytest.mark.slow
 def test_a_cluster_writes_the_same_bytes(dask, strips, tmp_path, monkeypatch):
     monkeypatch.chdir(strips.parent)
     relative = os.path.relpath(strips)
@@ -129,7 +136,7 @@ def test_spooled_packets_travel_through_the_output_folder(dask, strips, tmp_path
     from wavebatch.batch.options import RunOptions
     from wavebatch.batch.run import run_batch
 
-    with distributed.Client(dask.address, set_as_default=False) as client:
+    with dask.client() as client:
         client.wait_for_workers(2)
         client.run(_spool_everything)
         try:
@@ -162,6 +169,7 @@ def _spool_as_ever():
     return temp_store.made
 
 
+@pytest.mark.quick_cases("tcp://127.0.0.1:9", "nonsense", "a:b")
 @pytest.mark.parametrize(
     "address", ["tcp://127.0.0.1:9", "nonsense", "foo://127.0.0.1:9", "tcp://none.invalid:8786", "tcp://", "a:b"]
 )
@@ -180,7 +188,7 @@ def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatc
 )
 def test_workers_with_other_versions_are_refused(tmp_path, dask, package, words):
     """The worker says that it has another package, or does not find it."""
-    with distributed.Client(dask.address, set_as_default=False) as client:
+    with dask.client() as client:
         client.wait_for_workers(2)
         try:
             client.run(_pretend, package)
@@ -240,7 +248,7 @@ def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, s
     out = tmp_path / "out"
     try:
         cluster.start_worker()
-        with distributed.Client(cluster.address, set_as_default=False) as client:
+        with cluster.client() as client:
             client.wait_for_workers(1)
             client.run(_hold, str(tmp_path / "never"))
         command = [sys.executable, "-W", "error", "-m", "wavebatch", "run", "--profile", "fast", "-q"]
@@ -267,7 +275,7 @@ def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, s
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path, tmp_path_factory):
     go_on = tmp_path_factory.mktemp("go") / "on"
-    with distributed.Client(dask.address, set_as_default=False) as client:
+    with dask.client() as client:
         client.wait_for_workers(2)
         client.run(_hold, str(go_on))
     command = [sys.executable, "-W", "error", "-m", "wavebatch", "run", str(strips), "--profile", "fast", "-q"]
@@ -297,7 +305,7 @@ def test_a_peer_that_is_no_scheduler_is_one_line_within_seconds(strips, tmp_path
 @pytest.mark.slow
 def test_strips_that_a_worker_does_not_see_are_named_before_anything_starts(dask, strips, tmp_path):
     out = tmp_path / "out"
-    with distributed.Client(dask.address, set_as_default=False) as client:
+    with dask.client() as client:
         client.wait_for_workers(2)
         worker = sorted(client.nthreads())[0]
         try:

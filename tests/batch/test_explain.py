@@ -144,15 +144,15 @@ def test_a_known_pulse_is_no_guess_but_its_noise_may_be(tmp_path):
     assert "found 8 % of the echoes in doubt: the noise is a guess" in line and "--system" in line
 
 
-def test_a_noise_without_quiet_samples_is_a_guess(tmp_path):
+def test_a_noise_without_quiet_samples_is_a_guess(tiny_strip, tmp_path):
     """Packets that begin in their canopy: a fifth of their echoes depends on it, and none was in doubt."""
-    neon, system = data_file("neon/neon_harv_a.las"), tmp_path / "system.toml"
-    assert run_command("survey", neon, "-o", system).exit_code == 0
+    system = tmp_path / "system.toml"
+    assert run_command("survey", tiny_strip, "-o", system).exit_code == 0
     sure = re.sub("echoes_in_doubt = .*", "echoes_in_doubt = 0.0", system.read_text())
     system.write_text(sure)
-    assert warn_quietly(neon, tmp_path / "sure", "--system", str(system)) == []
+    assert warn_quietly(tiny_strip, tmp_path / "sure", "--system", str(system)) == []
     system.write_text(re.sub("quiet = .*", "quiet = 0.0", sure))
-    (line,) = warn_quietly(neon, tmp_path / "unseen", "--system", str(system))
+    (line,) = warn_quietly(tiny_strip, tmp_path / "unseen", "--system", str(system))
     assert "found too few samples without signal: the noise is a guess" in line and "--system" in line
 
 

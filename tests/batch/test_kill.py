@@ -104,7 +104,7 @@ def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips,
     assert read_outputs(out) == undisturbed
 
 
-@pytest.mark.quick_cases("15")
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path, number):
     out = tmp_path / "out"

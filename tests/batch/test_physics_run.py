@@ -37,9 +37,9 @@ def calibration(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory, wide_strip, calibration):
+def plain(tmp_path_factory, tiny_strip, calibration):
     folder = tmp_path_factory.mktemp("plain")
-    done = run(wide_strip, "-o", folder, "--profile", "fast", "--calibration", calibration)
+    done = run(tiny_strip, "-o", folder, "--profile", "fast", "--calibration", calibration)
     assert done.exit_code == 0, done.output
     return folder
 
@@ -84,10 +84,11 @@ def test_errors_of_level_reflectances_take_the_slopes_of_the_strip(
 
 
 @pytest.mark.slow
-def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, plain, wide_strip, calibration):
-    done = run(wide_strip, "-o", tmp_path, "--profile", "fast", "--calibration", calibration,
-               "--jobs", "2", "--block-size", "999")  # fmt: skip
-    assert done.exit_code == 0, done.output
+def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, tmp_path_factory, wide_strip, calibration):
+    plain = tmp_path_factory.mktemp("wide")
+    for folder, options in ((plain, ()), (tmp_path, ("--jobs", "2", "--block-size", "999"))):
+        done = run(wide_strip, "-o", folder, "--profile", "fast", "--calibration", calibration, *options)
+        assert done.exit_code == 0, done.output
     assert next(tmp_path.glob("*.laz")).read_bytes() == next(plain.glob("*.laz")).read_bytes()
     told = report(plain)
     for name, counts in told["counts"]["no_data"].items():
@@ -131,10 +132,10 @@ def write_trajectory(path):
 
 
 @pytest.mark.slow
-def test_a_trajectory_gives_the_same_as_the_vectors(tmp_path, plain, wide_strip, calibration):
+def test_a_trajectory_gives_the_same_as_the_vectors(tmp_path, plain, tiny_strip, calibration):
     path = write_trajectory(tmp_path / "t.csv")
     folder = tmp_path / "out"
-    done = run(wide_strip, "-o", folder, "--profile", "fast", "--calibration", calibration, "--trajectory", path)
+    done = run(tiny_strip, "-o", folder, "--profile", "fast", "--calibration", calibration, "--trajectory", path)
     assert done.exit_code == 0, done.output
     a, b = columns(folder, "cross_section")[0], columns(plain, "cross_section")[0]
     known = a != -9999
@@ -143,24 +144,24 @@ def test_a_trajectory_gives_the_same_as_the_vectors(tmp_path, plain, wide_strip,
     assert report(folder)["strip"]["sensor"]["share_covered"] == 1.0
 
 
-def test_heights_of_another_kind_are_told(tmp_path, wide_strip):
+def test_heights_of_another_kind_are_told(tmp_path, tiny_strip):
     path = write_trajectory(tmp_path / "t.csv")
     head, *rows = path.read_text().splitlines()
     raised = [f"{left},{float(height) + 45.0}" for left, _, height in (row.rpartition(",") for row in rows)]
     path.write_text("\n".join([head, *raised]))
-    done = run(wide_strip, "-o", tmp_path / "out", "--profile", "fast", "--trajectory", path)
+    done = run(tiny_strip, "-o", tmp_path / "out", "--profile", "fast", "--trajectory", path)
     assert done.exit_code == 0, done.output
     (remark,) = report(tmp_path / "out")["remarks"]
     assert remark.startswith("range: by the trajectory echoes are 4") and "geoid" in remark and remark in done.stderr
 
 
 @pytest.mark.slow
-def test_verbose_says_where_the_sensor_was(tmp_path, wide_strip, calibration):
-    done = run(wide_strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", calibration, "-v")
+def test_verbose_says_where_the_sensor_was(tmp_path, tiny_strip, calibration):
+    done = run(tiny_strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", calibration, "-v")
     (line,) = [line for line in done.stderr.splitlines() if "sensor from direction vectors: " in line]
     for words in ("m above the points", "60.0 m/s", "heading 90 degrees", "smooth to", "ranges to"):
         assert words in line
-    assert "sensor from" not in run(wide_strip, "-o", tmp_path / "bare", "--profile", "fast", "-v").stderr
+    assert "sensor from" not in run(tiny_strip, "-o", tmp_path / "bare", "--profile", "fast", "-v").stderr
 
 
 def test_resume_makes_it_anew_when_the_calibration_changes(tmp_path, tiny_strip):

@@ -14,7 +14,7 @@ import pytest
 
 from wavebatch.batch.workers.processes import WorkerDied, Workers
 from wavebatch.batch.workers.worker_check import _probe_alone
-from wavebatch.tools.bench.speed import Worker
+from wavebatch.tools.bench.command import Worker
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 
@@ -117,6 +117,7 @@ def test_a_stopped_process_does_not_keep_this_one_from_ending(tmp_path, function
     assert not workers._workers
 
 
+@pytest.mark.slow
 def test_calls_that_nobody_has_taken_are_given_up_when_all_processes_are_dead():
     with Workers(2) as workers:
         futures = [workers.submit(die_while_sending) for _ in range(6)]
@@ -220,6 +221,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.quick_cases("True")
 @pytest.mark.parametrize("early", [True, False])
 def test_ctrl_c_while_a_stopped_process_is_waited_for_does_not_hang(tmp_path, early):
     """The interrupt came between the wait for the process and its kill, and Python waited for it at its end."""

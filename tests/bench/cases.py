@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, nearest
+from wavebatch.core.frozen import frozen
 from wavebatch.tools.simulate import PulseModel, Recording, Scene
 from wavebatch.tools.simulate.scenes import (
     Draw,
@@ -39,7 +40,7 @@ class Case:
     recording: Recording = field(default_factory=Recording)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class CaseScene(Scene):
     """A scene that holds one case."""
 

@@ -32,8 +32,8 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import UNIT_POINTS
 from wavebatch.files.strip.scanner import PART_UNITS
 from wavebatch.tools.api.run import plan_run
+from wavebatch.tools.bench.command import Worker
 from wavebatch.tools.bench.report import write_texts
-from wavebatch.tools.bench.speed import Worker
 
 JOBS = (1, 2, 4, 16, 64)
 """Numbers of jobs of the table."""

@@ -24,8 +24,7 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled
 from wavebatch.tools.bench.accuracy import AccuracyTally, Group
-from wavebatch.tools.bench.command import make_row
-from wavebatch.tools.bench.speed import BenchWorkerDied, Laps, Worker
+from wavebatch.tools.bench.command import BenchWorkerDied, Laps, Worker, make_row
 from wavebatch.tools.simulate import Scene
 
 PEER_GROUPS = 6

@@ -11,7 +11,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.stages.chain_file import load_chain_file
 from wavebatch.surveying import Survey
-from wavebatch.surveying.auto_chain import chain_text, decide
+from wavebatch.surveying.choose_chain import chain_text, decide
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems.figures import Figures, describe_figures
 from wavebatch.tools.sheets.sheet import list_lines
@@ -155,8 +155,7 @@ def test_a_strip_of_a_flight_that_cannot_be_read_is_one_line(flat_strip, tmp_pat
 
 def test_the_sensor_that_a_pulse_looks_like_is_named(riegl, flat_strip, tmp_path):
     sentence = "this strip's pulse looks like RIEGL LMS-Q680i; it differs by "
-    used = "RIEGL LMS-Q680i: its shipped pulse is used"
-    assert any(line.startswith("sensor") and used in line for line in _survey(riegl).stdout.splitlines())
+    assert any(line.startswith("sensor") and sentence in line for line in _survey(riegl).stdout.splitlines())
     small = _survey(cut_strip(riegl, tmp_path / "small.las", 11)).stdout
     assert "RIEGL LMS-Q680i: its shipped pulse is used" in small and "riegl-q680i: " in small
     assert "looks like" not in _survey(flat_strip).stdout

@@ -20,9 +20,9 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.geojson import AreaFile, describe_miss, load_polygons, place_rings, plan_crs, read_area_file
 from wavebatch.files.las.crs import build_utm, read_crs, read_crs_definition
 from wavebatch.files.las.header import build_wkt, read_header
+from wavebatch.tools.scan_slices import Segment
 from wavebatch.tools.simulate import simulate_strip
-from wavebatch.tools.slices.output import SegmentWriter
-from wavebatch.tools.slices.segments import Segment
+from wavebatch.tools.slice_output import SegmentWriter
 
 ZONE = build_utm(32633)
 

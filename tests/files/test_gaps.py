@@ -36,10 +36,10 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.noise import pooled, tail
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample
-from wavebatch.tools.compare.chains import measure_fit
+from wavebatch.tools.compare_chains import measure_fit
 from wavebatch.tools.plots.waveform import build_views
+from wavebatch.tools.scan_slices import _shape
 from wavebatch.tools.simulate import StripOptions, simulate_strip
-from wavebatch.tools.slices.segments import _shape
 from wavebatch.tools.voxels.rays import Deconvolution, deconvolve_block
 
 DETECTORS = sorted(name for name, stage in STAGES.items() if name.startswith("detect."))
@@ -281,6 +281,7 @@ def test_decomposers_find_the_same_echoes_as_without_a_gap(whole, tmp_path, name
         assert np.nanquantile(change, 0.5) < usual and np.nanquantile(change, 0.9) < large
 
 
+@pytest.mark.slow
 def test_recordings_of_different_level_have_their_own_baseline(whole, tmp_path):
     for shift in (0, 7):
         plain, block, system, found = two_levels(whole, tmp_path, shift)

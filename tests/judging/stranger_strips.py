@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy  # its parts load when they are first asked for
 
 SEED = 34
 """Of the whole list. Who changes this, or a draw in this file, makes other strips, and no older result compares."""
@@ -135,7 +135,7 @@ def make_shape(sensor: Sensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         inside = 1 + value * x
         pulse = np.where(inside > 0, np.exp(-0.5 * (np.log(np.maximum(inside, 1e-9)) / value) ** 2), 0)
     elif sensor.shape == "exponential":
-        pulse = lfilter([1.0], [1.0, -np.exp(-(x[1] - x[0]) / value)], gaussian)
+        pulse = scipy.signal.lfilter([1.0], [1.0, -np.exp(-(x[1] - x[0]) / value)], gaussian)
     elif sensor.shape == "gamma":
         rise = np.maximum(x / np.sqrt(value) + 1, 1e-9)
         pulse = np.where(rise > 1e-9, np.exp(value * (np.log(rise) - rise + 1)), 0)
@@ -223,7 +223,7 @@ def render(sensor: Sensor, echoes: dict[str, np.ndarray], rng: np.random.Generat
             place = (packet[part, None] * s + at)[inside]
             signal += np.bincount(place, (value * amplitude[part, None])[inside], n * s).reshape(n, s)
     colour = [1.0, *(-a for a in sensor.filter)]
-    noise = lfilter([1.0], colour, rng.standard_normal((n, s + 200)), axis=1)[:, 200:]
+    noise = scipy.signal.lfilter([1.0], colour, rng.standard_normal((n, s + 200)), axis=1)[:, 200:]
     noise *= sensor.noise / noise.std()
     if sensor.gain:
         noise += rng.standard_normal((n, s)) * np.sqrt(sensor.gain * np.maximum(signal, 0))
@@ -241,7 +241,7 @@ def _see(sensor: Sensor, lag: np.ndarray, height: np.ndarray, amplitude: np.ndar
     """1 over the error of an amplitude by a plain matched filter, for echoes of these amplitudes."""
     x = np.arange(-int(2 * sensor.fwhm) - 1, int(2 * sensor.fwhm) + 2)
     pulse = np.interp(x / sensor.fwhm, lag, height)
-    impulse = lfilter([1.0], [1.0, *(-a for a in sensor.filter)], np.r_[1.0, np.zeros(400)])
+    impulse = scipy.signal.lfilter([1.0], [1.0, *(-a for a in sensor.filter)], np.r_[1.0, np.zeros(400)])
     lags = np.correlate(impulse, impulse, "full")[400:]
     colour = np.interp(np.abs(x[:, None] - x), np.arange(401), lags / lags[0])
     seen = sensor.noise**2 * pulse @ colour @ pulse + pulse @ pulse / 12

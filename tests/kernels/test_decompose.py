@@ -130,7 +130,6 @@ def draw_crowd(rng):
 
 @pytest.mark.quick_cases(
     "3.0-whitening2-draw_random-inf-learned", "0.0-whitening0-draw_stiff-200.0-gaussian",
-    "3.0-whitening1-draw_crowd-inf-gaussian", "3.0-whitening1-draw_random-200.0-learned",
 )  # fmt: skip
 @pytest.mark.parametrize("shape", [GAUSSIAN, LEARNED], ids=["gaussian", "learned"])
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from wavebatch.kernels.fit.describe import (
     Sums,
     count_echoes,
     describe_left,
+    describe_widths,
     gather_pulse,
     measure_changes,
     render_pulses,
@@ -96,6 +97,19 @@ def test_many_echoes_of_a_long_waveform_take_time_in_proportion(rng):
     sums = Sums(PulseShape(), np.array([0, m]), main, np.zeros_like(model), model, np.ones(model.shape, bool))
     length, volume = describe_left(sums, SampleNoise(1.0), [0.01])
     assert np.isfinite(length).all() and np.isfinite(volume).all()
+
+
+@pytest.mark.parametrize("scatter", [0.005, 0.05])
+def test_widths_cost_what_the_loop_says(scatter, rng):
+    """Widths of level ground, of slopes, and wild ones, with errors of any size."""
+    error = np.exp(rng.uniform(np.log(1e-3), np.log(0.5), 300))
+    ratio = 1 + np.r_[np.zeros(150), rng.uniform(0, 0.8, 145), np.full(5, 4.0)]
+    ratio += rng.normal(0, np.hypot(error, scatter))
+    known = error < 0.15
+    widths = ratio, error, known, (0.01, 0.02, 0.04, 0.06), 1 + 0.02 * 2.0 ** np.arange(9), 0.01
+    np.testing.assert_allclose(describe_widths(*widths), naive.describe_widths(*widths), atol=1e-4)
+    with pytest.raises(ValueError, match="errors above 0"):
+        describe_widths(ratio, 0 * error, *widths[2:])
 
 
 def test_echoes_that_are_not_sorted_are_refused():

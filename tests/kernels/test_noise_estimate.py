@@ -135,6 +135,7 @@ def test_levels_are_not_taken_for_slow_noise(rng, kind, spread):
     assert pooled.std < 2.1 and pooled.spread == pytest.approx(spread, rel=0.1, abs=0.2)
 
 
+@pytest.mark.quick_cases("2.0")
 @pytest.mark.parametrize("spread", [0.0, 0.5, 2.0, 6.0])
 def test_baselines_of_waveforms_are_recovered(spread):
     """noise.pooled weighs the waveform's own quiet samples against the strip's baseline: never worse than either."""
@@ -230,6 +231,7 @@ def test_baselines_at_count_0_are_recovered(rng, level):
     assert abs(np.mean(error)) < 0.05 and np.std(error) < 0.3
 
 
+@pytest.mark.quick_cases("0.0-0.5-*", "40.0-0.9-24-7")
 @pytest.mark.parametrize(
     ("level", "rho", "s", "edge"),
     [(0.0, 0.0, 80, 20), (0.5, 0.0, 80, 20), (0.0, 0.5, 80, 20), (40.0, 0.9, 24, 7), (40.0, 0.9, 40, 10)],

@@ -46,6 +46,7 @@ def shared_light(rng, n, ratio, scatter):
     return canopy, ground
 
 
+@pytest.mark.quick_cases("80-*", "130-*")
 @pytest.mark.parametrize(("n", "ratio", "scatter"), [(160, 0.4, 0.1), (160, 2.5, 0.3), (80, 1.0, 0.1), (130, 1.0, 2.5)])
 def test_the_ratio_of_canopy_and_ground_is_that_of_a_loop(rng, n, ratio, scatter):
     """Outliers, pulses that know nothing, too few of them, and light that is all chance."""

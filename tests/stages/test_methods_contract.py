@@ -54,11 +54,17 @@ def test_variants_keep_the_contract_on_any_waveforms(name, parameters, s, system
         check_echoes(table, block, SYSTEMS[system], fitted=name.startswith("decompose"))
 
 
+@pytest.fixture(scope="module")
+def mixed():
+    """A block and its survey."""
+    block = scene_blocks()["mixed"].rows(slice(0, 60))
+    return block, surveying.survey_block(block).system
+
+
 @pytest.mark.quick_cases("detect.a*", "detect.c*", "decompose.asdf*", "decompose.adaptive*", "*reference-*18")
 @pytest.mark.parametrize(("name", "parameters"), VARIANTS)
-def test_variants_give_the_same_bits_for_any_block_size(name, parameters):
-    block = scene_blocks()["mixed"].rows(slice(0, 29))
-    system = surveying.survey_block(block).system
+def test_variants_give_the_same_bits_for_any_block_size(mixed, name, parameters):
+    block, system = mixed[0].rows(slice(0, 29)), mixed[1]
     whole = call(name, parameters, block, system)
     assert len(whole) > 15
     for size in (1, 7):
@@ -67,11 +73,9 @@ def test_variants_give_the_same_bits_for_any_block_size(name, parameters):
         assert_same(EchoTable.concatenate(parts), whole)
 
 
-def test_parts_of_a_block_do_not_show(monkeypatch):
+def test_parts_of_a_block_do_not_show(mixed, monkeypatch):
     """More waveforms than are worked on at a time."""
-
-    block = scene_blocks()["mixed"].rows(slice(0, 60))
-    system = surveying.survey_block(block).system
+    block, system = mixed
     names = ("detect.asdf", "detect.correlation", "detect.richardson_lucy")
     whole = [call(name, {}, block, system) for name in names]
     monkeypatch.setattr(transformed, "COLUMNS_AT_A_TIME", 7)

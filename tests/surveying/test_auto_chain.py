@@ -10,7 +10,7 @@ from scoring import score
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.surveying import Decision, Survey, survey_block
-from wavebatch.surveying.auto_chain import (
+from wavebatch.surveying.choose_chain import (
     LOST,
     chain_text,
     choose_chain,
@@ -108,7 +108,7 @@ def test_the_widest_chain_computes_what_accurate_does():
     assert widest_chain().steps[2].effective() == load_profile("accurate").steps[2].effective()
 
 
-@pytest.mark.quick_cases("flat", "forest")
+@pytest.mark.quick_cases("forest")
 @pytest.mark.parametrize(
     ("scene", "grows"),
     [

@@ -91,6 +91,7 @@ def test_energies_that_only_one_of_both_has_are_named_and_in_the_error(
     assert np.mean(np.abs(off) < stated) > 0.62
 
 
+@pytest.mark.quick_cases("held", "right")
 @pytest.mark.parametrize(
     ("change", "said"),
     [

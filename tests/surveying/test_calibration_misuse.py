@@ -22,7 +22,7 @@ from wavebatch.surveying.calibrating.calibration_file import format_calibration,
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.matching import setting
 from wavebatch.surveying.matching.setting import NO_CHANGE, keep_places, weigh_change
-from wavebatch.surveying.matching.strip_conditions import judge_fading
+from wavebatch.surveying.matching.strip_match import judge_fading
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -147,7 +147,7 @@ def test_light_that_falls_from_side_to_side_is_fitted_by_three_strips(tmp_path, 
     assert parse_calibration(older, "older").swath == pytest.approx((*found.swath[:3], 0.0))
 
 
-@pytest.mark.quick_cases("ab")
+@pytest.mark.slow
 @pytest.mark.parametrize("strips", ["ab", "ac"])
 def test_light_that_falls_from_side_to_side_is_an_error_where_strips_leave_it_open(tmp_path, one_side, strips):
     found, said = calibrate(one_side, "--scan-angle", strips=[f"{name}.las" for name in strips])
@@ -207,7 +207,7 @@ def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibra
     assert found.channels[0].noise_dn == pytest.approx(0.65, abs=0.1) and found.channels[0].brightest > 1e7
 
 
-@pytest.mark.quick_cases("change1-*")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said", "growth"),
     [
@@ -383,7 +383,7 @@ def write_off(monkeypatch, path, off, sensor=FAST, ground=HILLY, pulses=8000):
 JUMP = "pulses jump by a whole number of the 600 m between two pulses"
 
 
-@pytest.mark.quick_cases("short", "long", "right", "late")
+@pytest.mark.quick_cases("short", "right")
 @pytest.mark.parametrize(
     ("off", "said"),
     [
@@ -508,7 +508,7 @@ def test_one_bright_target_and_a_receiver_that_compresses(tmp_path, monkeypatch,
     for row, gain in zip(found.channels, (1.0, 0.5), strict=True):
         if len(pulse) < 2:
             off = row.constant * LIGHT * gain * pulse[0][2] / 4.0 - 1
-            assert 0.1 < off < 0.2 and 0.4 < row.relative_error / off < 1.0
+            assert 0.09 < off < 0.2 and 0.4 < row.relative_error / off < 1.0
         assert 0.06 < row.relative_error < 0.13
 
 
@@ -521,6 +521,7 @@ def test_the_assumed_chance_of_a_change_says_how_much_error_holds_it(spread):
     assert all(weigh_change(0.5, 0.04, 0.5, chance=chance).chance > 0.9 for chance in (0.05, 0.3, 0.6))
 
 
+@pytest.mark.slow
 def test_a_chance_of_zero_in_the_file_takes_the_check_away(tmp_path, calibrated):
     text = (calibrated / "cal.toml").read_text()
     assert "\nchange_chance = 0.3" in text
@@ -557,6 +558,7 @@ def turn(xyz, degrees=2.0):
     return np.column_stack([c * east - s * north + middle[0], s * east + c * north + middle[1], xyz[:, 2]])
 
 
+@pytest.mark.quick_cases("0.4")
 @pytest.mark.parametrize("slope", [0.0, 0.4])
 def test_points_of_another_crs_than_their_vectors_are_named(tmp_path, slope):
     """They had no range, for want of a sensor; and with --flight-height one that no hillside entered the error of."""
@@ -593,6 +595,7 @@ def test_a_target_that_is_listed_twice_does_not_halve_the_error(tmp_path, calibr
     assert done.exit_code == 2 and "targets 1 and 2 are one target: its reflectance would count twice" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_strip_whose_times_show_no_day_is_said_to_count_as_of_the_same_day(tmp_path, calibrated):
     write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 90 * 86400), 10_000, seed=87)
     content = bytearray((tmp_path / "s.las").read_bytes())

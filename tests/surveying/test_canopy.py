@@ -7,7 +7,7 @@ from helpers_scenes import CANOPY_NOISE, CANOPY_SIGMA, grow_canopy
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.surveying import survey_block
-from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.systems.known_systems import compare_pulses
 
 
@@ -29,6 +29,7 @@ def test_a_canopy_is_no_noise_and_no_pulse(surveys):
         assert system.misfit < 0.01 and max((share for _, share in system.tail_misfit), default=0.0) < 0.05
 
 
+@pytest.mark.slow
 def test_echoes_of_a_canopy_are_found_with_the_survey_of_any_tile(surveys):
     """Of 2.8 that the true pulse and noise show; before, 2.5 were found, other ones by every tile's misfit."""
     block, found = surveys

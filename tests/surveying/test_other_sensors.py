@@ -1,6 +1,7 @@
 """Surveys and chains of sensors that the simulator does not have: other pulses, noise and baselines, rendered here."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey, survey_block, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.measuring import choose_pulse
 from wavebatch.surveying.measuring.choose_pulse import settle
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, load_survey, parse_survey
@@ -75,6 +76,7 @@ def test_flat_tops_are_learned_and_found(seed):
     assert whole > 0.94 and np.std(error) < 0.12
 
 
+@pytest.mark.quick_cases("0.2")
 @pytest.mark.parametrize("noise", [0.0, 0.2])
 def test_counts_that_hardly_scatter_do_not_spoil_the_pulse(noise):
     block, time, height = record(gaussian, 3, noise=noise, wide=0.3)
@@ -223,14 +225,18 @@ def test_no_misfit_is_looked_for_below_none(monkeypatch):
     scatter = np.resize([1.0, -1.0], 100)
     looked = []
 
-    def describe(block, system, place, changes):
-        looked.append(place)
-        return [np.full(100, cost[place] / 100) + (5.0 if place == 3 else 0.3) * scatter]
+    def explain_between(block, system, found, place):
+        return SimpleNamespace(place=place, echoes=range(100 + place))
+
+    def describe(block, system, explained, changes):
+        looked.append(explained.place)
+        return [np.full(100, cost[explained.place] / 100) + (5.0 if explained.place == 3 else 0.3) * scatter]
 
     monkeypatch.setattr(choose_pulse, "describe_waveforms", describe)
-    monkeypatch.setattr(choose_pulse, "_explain_between", lambda block, system, found, place: place)
+    monkeypatch.setattr(choose_pulse, "_explain_between", explain_between)
     block = record(gaussian, 5, n=100)[0]
-    assert choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0) == 0.0
+    misfit, doubt = choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0, 0.0)
+    assert misfit == 0.0 and doubt == pytest.approx(4 / 103)
     assert set(looked) <= set(cost)
 
 
@@ -238,7 +244,7 @@ def test_the_misfit_is_at_least_what_the_pulse_misses_of_the_stack():
     block = record(gaussian, 5, n=400)[0]
     system = survey_block(block, learn=False).system
     for missed in (0.0, 0.02):
-        found, _ = settle(block, system, 0.0, missed)
+        found, _, _ = settle(block, system, 0.0, missed)
         assert found.misfit == missed
 
 

@@ -50,7 +50,7 @@ def share_within(folder, planes, flight, seed):
         (TOWN, Flight(), 11),
         pytest.param(TOWN, Flight(point_error=0.02, height=900.0, light=3e8), 12, marks=pytest.mark.slow),
         pytest.param(TOWN, Flight(point_error=0.005, height=300.0, half_angle=25.0), 13, marks=pytest.mark.slow),
-        (HILL, Flight(point_error=0.03), 14),
+        pytest.param(HILL, Flight(point_error=0.03), 14, marks=pytest.mark.slow),
         pytest.param(HILL, Flight(spacing=1.0, point_error=0.01), 15, marks=pytest.mark.slow),
     ],
 )
@@ -60,6 +60,7 @@ def test_two_of_three_places_and_ranges_are_within_their_errors(tmp_path, planes
     assert 0.60 < ranges < 0.80
 
 
+@pytest.mark.quick_cases("0.05")
 @pytest.mark.parametrize("scatter", [0.005, 0.05])
 def test_the_scatter_of_points_is_measured(tmp_path, scatter):
     write_strip(tmp_path / "a.las", TOWN, Flight(point_error=scatter), 6000, 3)
@@ -104,6 +105,7 @@ def test_few_residuals_never_say_that_returns_are_exact(rng, ratio, number):
     assert 0.6 < np.mean(np.abs(off) < np.hypot(found, 0.002)) < 0.86
 
 
+@pytest.mark.slow
 def test_real_strips(riegl, leica):
     assert measure(riegl).scatter < 0.012
     assert measure(leica) == ReturnScatter(

@@ -9,8 +9,7 @@ from writer_tools import data_file
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.systems import known_systems as module
 from wavebatch.surveying.systems.doubt import MOST_DOUBTED, MOST_DOUBTED_KNOWN
 from wavebatch.surveying.systems.known_systems import find_source
@@ -56,10 +55,13 @@ def test_a_gaussian_stays_one_in_fifty_packets(scene):
 
 @pytest.mark.slow
 def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path, monkeypatch):
-    """LVIS as a stranger: fifty packets had 1.17 to 2.2 times the echoes, its halves differ in a half, in silence."""
+    """LVIS as a stranger: fifty packets had 1.17 to 2.2 times the echoes, its halves differ in a half, in silence.
+
+    With its known pulse misfits that serve as well find 50 to 62 echoes.
+    """
     whole = data_file("lvis/lvis1.las")
     path = cut_strip(whole, tmp_path / "cut.las", 50)
-    assert _survey(path).figures.echoes_in_doubt < 0.05
+    assert MOST_DOUBTED_KNOWN < _survey(path).figures.echoes_in_doubt < 0.25
     _leave_out(monkeypatch, "nasa-lvis")
     assert _survey(path).figures.echoes_in_doubt > MOST_DOUBTED
     assert _survey(whole).figures.echoes_in_doubt > 0.05, "halves differ in a quarter: unknown echoes are left out"
@@ -113,6 +115,7 @@ def test_fifty_widened_echoes_make_no_odd_pulse_of_a_gaussian(seed):
     assert len(choose_chain(survey).run(block, survey.system)) == pytest.approx(50 + np.count_nonzero(two), rel=0.05)
 
 
+@pytest.mark.quick_cases("leica")
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_fifty_packets_of_level_ground_are_sure(strip, request, tmp_path):
     survey = _survey(cut_strip(request.getfixturevalue(strip), tmp_path / "cut.las", 120))

@@ -9,13 +9,12 @@ from helpers_scenes import make_block, make_scene
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import join_digitizers, survey_block, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.measuring.noise_and_width import FIRST_LOOK
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
 
-@pytest.mark.quick_cases("14.0")
+@pytest.mark.quick_cases("4.0")
 @pytest.mark.parametrize("sigma", [0.5, 0.64, 0.85, 1.0, 1.4, 4.0, 10.0, 14.0])
 def test_the_width_is_found_however_far_from_the_first_guess(sigma):
     scene = make_scene("flat", pulse=PulseModel(sigma=sigma), n_samples=max(80, int(20 * sigma)))
@@ -99,6 +98,7 @@ def test_the_growth_of_noise_is_not_what_the_fit_leaves_of_it(gain):
     assert np.mean(found) == pytest.approx(gain, rel=0.15)
 
 
+@pytest.mark.quick_cases("3.5-0.18")
 @pytest.mark.parametrize(("width", "least"), [(1.2, 0.15), (2.0, 0.18), (3.5, 0.18)])
 def test_noise_that_grows_most_where_the_fit_takes_most_is_put_back(rng, width, least):
     """In the middle of narrow echoes; 0.12 to 0.18 was found where 0.2 is true."""

@@ -2,6 +2,7 @@
 
 import laspy
 import numpy as np
+import pytest
 
 from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.options import RunOptions
@@ -23,6 +24,7 @@ def read_angles(cloud, name):
     return [np.where(values == -9999, np.nan, values) for values in columns]
 
 
+@pytest.mark.slow
 def test_both_kinds_of_angle_agree(tmp_path):
     simulate_strip("village", tmp_path / "village.las", pulses=6000, seed=4)
     chain = parse_chain(CHAIN, "test")

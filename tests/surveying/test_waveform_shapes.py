@@ -214,6 +214,7 @@ def test_converters_are_made_alike_where_no_echo_stands_alone():
     assert np.ptp(survey.system.defects.pattern) == pytest.approx(2.4, rel=0.1)
 
 
+@pytest.mark.quick_cases("True")
 @pytest.mark.parametrize("everywhere", [True, False])
 def test_jumps_at_the_start_are_no_echoes(everywhere):
     signal, rows, time, _ = render(bell, 7)
@@ -362,6 +363,7 @@ def test_coloured_noise_is_no_slope(riegl):
     assert system.defects.slope_spread == 0
 
 
+@pytest.mark.quick_cases("-9.0")
 @pytest.mark.parametrize("early", [-6.0, -9.0])
 def test_what_comes_before_every_echo_is_none(early):
     """3 % of the pulse: a third of the echoes was false, because no pulse is learned that far before its peak."""
@@ -370,6 +372,7 @@ def test_what_comes_before_every_echo_is_none(early):
     assert found > 0.99 and correct > 0.96
 
 
+@pytest.mark.quick_cases("0.0")
 @pytest.mark.parametrize("height", [0.0, 2.5])
 def test_targets_too_weak_to_be_found_are_measured_beside_strong_echoes(height):
     """Targets of up to `height` DN from 4 to 8 widths after each echo: they count as noise there, and nowhere else."""

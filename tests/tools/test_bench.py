@@ -57,9 +57,16 @@ from wavebatch.tools.bench.accuracy import (
     root_mean_square,
     share_figure,
 )
-from wavebatch.tools.bench.command import BenchOptions, list_methods, run_bench, shape_scene
+from wavebatch.tools.bench.command import (
+    BenchOptions,
+    BenchWorkerDied,
+    Worker,
+    list_methods,
+    peak_memory,
+    run_bench,
+    shape_scene,
+)
 from wavebatch.tools.bench.report import format_document
-from wavebatch.tools.bench.speed import BenchWorkerDied, Worker, peak_memory
 from wavebatch.tools.simulate import (
     PULSES,
     PulseModel,
@@ -73,9 +80,9 @@ from wavebatch.tools.simulate.render import paint_echoes
 
 SMALL = BenchOptions(
     scenes=("flat",),
-    waveforms=1600,
+    waveforms=800,
     repeats=1,
-    pulses=400,
+    pulses=200,
     tolerance_cm=50.0,
 )
 
@@ -95,9 +102,8 @@ def timed_document():
 
 
 def measure_small():
-    found = run_bench(SMALL, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=60))
-    cases = measure_cases(SMALL, list_cases(["H10"]), lambda text: None, waveforms=90)
-    return {**found, "stability": cases, "promises": judge(found)}
+    found = run_bench(SMALL, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=20))
+    return {**found, "promises": judge(found)}
 
 
 def find_row(document, name):
@@ -132,20 +138,23 @@ def test_isolated_echoes_are_at_the_bound(document):
 
 def test_document_is_plain_json_and_its_tables_show_all(document):
     assert json.loads(json.dumps(document, allow_nan=False)) == document
-    text = format_release(document)
-    assert text.startswith(format_document(document)) and "isolated, time error / bound" in text
+    text = format_document(document)
     for row in document["scenes"][0]["rows"]:
         assert f"\n  {row['name']}" in text
-    assert "constant 0, 12 or 255" in text and "cheapest chain with an error of 50 cm" in text
+    assert "cheapest chain with an error of 50 cm" in text
     assert f"{100 * find_row(document, 'fast')['figures']['exact_count']['value']:.2f} +-" in text
 
 
+@pytest.mark.slow
 def test_stiff_cases_count_failures_by_kind(document):
-    cases = document["stability"]
+    cases = measure_cases(SMALL, list_cases(["H10"]), lambda text: None, waveforms=40)
+    text = format_release({**document, "stability": cases})
+    assert text.startswith(format_document(document)) and "isolated, time error / bound" in text
+    assert "constant 0, 12 or 255" in text
     assert {row["case"] for row in cases} == {"constant 0, 12 or 255", "noise only"}
     assert any(row["is_auto"] for row in cases)
     for row in cases:
-        assert row["failures"] == dict.fromkeys(FAILURES, 0) and row["waveforms"] == 90
+        assert row["failures"] == dict.fromkeys(FAILURES, 0) and row["waveforms"] == 40
         for name in ("completeness", "correctness", "wrong"):
             assert row["figures"][name]["value"] is None
         assert row["figures"]["false_alarms"]["value"] < 0.05 + (row["chain"] == "balanced")

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+import scipy  # its parts load when they are first asked for
 from bench.real import pool, templates
 from bench.real.__main__ import main
 from bench.real.agreement import compare_models, compare_solvers, find_sensor
@@ -14,7 +15,6 @@ from bench.real.noise import QuietNoise, measure_noise, unround
 from bench.real.pool import Pool, Solver, find_fill, read_pool
 from bench.real.report import format_report
 from bench.real.templates import learn_templates
-from scipy.signal import lfilter
 from strips import make_raw
 from writer_tools import data_file
 
@@ -23,7 +23,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.surveying import Survey, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.measuring.trial import Trial, limit_surveys
 from wavebatch.surveying.systems.known_systems import find_source, known_systems
 from wavebatch.tools.simulate import simulate_strip
@@ -45,7 +45,7 @@ def report(strip):
 def correlated(n, s, rho=0.6, std=0.9, seed=1):
     """Values of first-order autoregressive noise."""
     white = np.random.default_rng(seed).normal(0, std * np.sqrt(1 - rho**2), (n, s + 50))
-    return lfilter([1], [1, -rho], white, axis=1)[:, 50:]
+    return scipy.signal.lfilter([1], [1, -rho], white, axis=1)[:, 50:]
 
 
 def make_pool(samples, path="made.las"):
@@ -77,6 +77,7 @@ def test_reported_errors_are_right_where_the_noise_is_white(report):
     assert np.abs(whole.bias) == pytest.approx(0, abs=0.1) and abs(whole.bias[0]) < 0.01
 
 
+@pytest.mark.slow
 def test_few_false_echoes(report):
     false = report.false_echoes
     assert false.correctness > 0.995 and false.before.length > 1e4
@@ -84,6 +85,7 @@ def test_few_false_echoes(report):
         assert part.echoes < 1e-4 * part.length + 3 and part.mirrored < 1e-4 * part.length + 3
 
 
+@pytest.mark.slow
 def test_noise_and_templates_are_those_that_were_simulated(report):
     assert report.noise.std == pytest.approx(np.hypot(1.0, 12**-0.5), rel=0.03)
     assert np.abs(report.noise.correlation).max() < 0.03
@@ -208,6 +210,7 @@ def test_models_that_were_not_chosen_are_compared(strip):
     assert compare_models(whole, chosen, "") == []
 
 
+@pytest.mark.slow
 def test_errors_and_further_echoes_are_given_by_separation(report):
     near = [row for row in report.near_by_separation if abs(row.apart[0]) >= 1.5 and row.low >= 10 and row.found > 50]
     assert len(near) > 4 and all(0.75 < row.ratio[0] < 1.3 and row.extra < 0.03 * row.injected for row in near)

@@ -7,10 +7,10 @@ from plot_tools import PULSE, make_chain, simulate
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.kernels.fit.pulse_shape import PulseShape
-from wavebatch.kernels.signal.square_differences import find_minima, keep_prominent
+from wavebatch.kernels.signal.filters import find_minima, keep_prominent
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.noise import pooled
-from wavebatch.tools.plots.waveform import _SIGNALS, KINDS, build_views, choose_step, see_block
+from wavebatch.tools.plots.waveform import build_views, choose_step, list_signals, see_block
 
 
 def run(*words):
@@ -25,8 +25,10 @@ def see(name, **parameters):
 
 
 def test_every_detector_has_a_signal():
-    assert set(_SIGNALS) == {name for name in STAGES if name.startswith("detect.")}
-    assert KINDS == ("asdf", "wavelet", "correlation", "deconvolved", "derivative")
+    assert all(one.searches for name, one in STAGES.items() if name.startswith("detect."))
+    kinds = {kind: name.removeprefix("detect.") for kind, name in list_signals().items()}
+    assert kinds == {"asdf": "asdf", "correlation": "correlation", "deconvolved": "richardson_lucy",
+                     "derivative": "second_derivative", "wavelet": "wavelet"}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -104,7 +106,8 @@ def test_the_chains_own_detector_keeps_its_parameters():
     assert view.seen.stage == "detect.maximum"
 
 
-@pytest.mark.parametrize("show", ["detector", *KINDS])
+@pytest.mark.quick_cases("detector", "wavelet")
+@pytest.mark.parametrize("show", ["detector", *list_signals()])
 def test_pictures_have_the_signal_and_its_rule(tiny_strip, tmp_path, show):
     pytest.importorskip("matplotlib")
     result = run(tiny_strip, "-o", tmp_path / "p.svg", "--packet", 3, "--show", show, "--profile", "fast")

@@ -9,7 +9,7 @@ from naive_wdz import pack_strip
 
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.inspect_strip import check_file
-from wavebatch.tools.archives.export_strip import USER_ID, export_strip
+from wavebatch.tools.export_strip import USER_ID, export_strip
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.strip import StripOptions
 

@@ -14,8 +14,8 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey, format_survey
-from wavebatch.tools.rasters import cells
-from wavebatch.tools.rasters.grid import COLUMNS, Forest, ForestOptions, GridOptions, write_grid
+from wavebatch.tools import cells
+from wavebatch.tools.raster import COLUMNS, Forest, ForestOptions, GridOptions, write_grid
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 SAVED = SavedSurvey(Survey(SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.1, std=0.58)), 1000))
@@ -44,7 +44,7 @@ def even(tmp_path_factory):
     """Leaves, and voxels of a strip over a layer of them from 4 to 14 m."""
     folder, rng = tmp_path_factory.mktemp("even"), np.random.default_rng(1)
     leaves = grow(rng, SIDE, crowns=None, density=0.3)
-    fly(folder / "s.las", rng, leaves, SIDE)
+    fly(folder / "s.las", rng, leaves, SIDE, pulses=4.0)
     return leaves, voxelize(folder / "s.las", folder / "v.laz")
 
 
@@ -65,7 +65,7 @@ def test_an_even_layer_of_leaves_is_measured_within_its_error(even, tmp_path):
     assert result.reasons == (4, 0, 0) and (found["no_data_reason"] == 0).all()
 
 
-@pytest.mark.quick_cases("hillside")
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["hillside", "packets"])
 def test_crowns_on_hillsides_and_in_several_packets_are_within_the_error(tmp_path, how):
     """Trees leave gaps that voxels do not resolve, and hide leaves: the error says what that may hide."""
@@ -160,12 +160,13 @@ def forest_strip(tmp_path):
     return fly(tmp_path / "p.las", rng, grow(rng, 4.0, crowns=None, density=0.1), 4.0, pulses=1.0)
 
 
+@pytest.mark.slow
 def test_strips_of_a_forest_become_one_raster_with_two_commands(tmp_path):
     """Each strip sees half of the plot; voxels in a folder are clouds, which grid reads as one."""
     pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     rng = np.random.default_rng(7)
     leaves = grow(rng, SIDE, crowns=None, density=0.3)
-    strips = [fly(tmp_path / f"{name}.las", rng, leaves, SIDE, pulses=4.0) for name in "ab"]
+    strips = [fly(tmp_path / f"{name}.las", rng, leaves, SIDE, pulses=1.5) for name in "ab"]
     (tmp_path / "system.toml").write_text(format_survey(SAVED))
     made = ["voxelize", *strips, "--size", 1, "--forest", "--system", tmp_path / "system.toml", "--force", "-o",
             tmp_path / "v"]  # fmt: skip

@@ -19,7 +19,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.group_returns import fit_rays, group_pulses
 from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section, transmit
 from wavebatch.surveying.inspect_strip import check_file
-from wavebatch.tools.compare.pairing import compare_clouds
+from wavebatch.tools.pairing import compare_clouds
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions, returns, simulate_returns
 from wavebatch.tools.simulate.returns import Radar, SynthesisOptions, synthesize_strip
 
@@ -39,6 +39,7 @@ def read_blocks(path):
         return [block for block, _ in reader.read_blocks(unit, 100_000, True)]
 
 
+@pytest.mark.quick_cases("1.0")
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_run_finds_the_returns_again(cloud, noise, tmp_path):
     summary = synthesize_strip(cloud, tmp_path / "s.laz", SynthesisOptions(noise=noise))

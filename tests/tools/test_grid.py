@@ -9,8 +9,8 @@ from commands import run_command
 
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
-from wavebatch.tools.rasters import cells as module
-from wavebatch.tools.rasters.cells import STATISTICS, compute_cells
+from wavebatch.tools import cells as module
+from wavebatch.tools.cells import STATISTICS, compute_cells
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # inside rasterio
 

@@ -13,7 +13,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.files import pulsewaves_file as pulse_reader
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.system_file import load_survey
-from wavebatch.tools.archives.import_file import ImportOptions, find_utm_zone, import_file, project_utm
+from wavebatch.tools.import_file import ImportOptions, find_utm_zone, import_file, project_utm
 
 SENT, ECHO = Sampling(kind=1, channel=3, scale=0.01), Sampling(scale=0.5, duration_bits=32)
 C = 0.149896

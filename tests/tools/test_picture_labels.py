@@ -134,6 +134,7 @@ def test_axes_in_metres_have_equal_scales(tmp_path, riegl, monkeypatch):
         assert box.width / (x1 - x0) == pytest.approx(box.height / (y1 - y0), rel=0.01)
 
 
+@pytest.mark.quick_cases("True")
 @pytest.mark.parametrize("compress", [False, True])
 def test_axes_lie_at_round_places(tmp_path, compress):
     """The solver of the layout gives other last digits in each run, and ids of clip paths follow from them."""

@@ -15,14 +15,14 @@ from plot_tools import POINTS, write_cloud
 from wavebatch.core.condition import read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.order import EvenSample
 from wavebatch.files.cloud import cloud_reader as io_cloud
 from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.tools.even_sample import EvenSample
+from wavebatch.tools import cells
+from wavebatch.tools.cells import grid_values, robust_limits
 from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values, place_edges
 from wavebatch.tools.plots.sections import cut_section
-from wavebatch.tools.rasters import cells
-from wavebatch.tools.rasters.cells import grid_values, robust_limits
 
 
 @pytest.fixture(scope="module")

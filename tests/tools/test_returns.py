@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.cli.stats import SHOWN, stats
+from wavebatch.cli.clouds import SHOWN, stats
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import temp_store

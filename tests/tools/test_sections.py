@@ -15,8 +15,8 @@ from wavebatch.core.units import HALF_C
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.plots import sections
 from wavebatch.tools.plots.sections import cut_section, measure_profile
-from wavebatch.tools.slices.output import SegmentWriter, align_pulses, build_cube, cut_cube, profile_segments
-from wavebatch.tools.slices.segments import ScanLine, Segment, read_scan_lines
+from wavebatch.tools.scan_slices import ScanLine, Segment, read_scan_lines
+from wavebatch.tools.slice_output import SegmentWriter, align_pulses, build_cube, cut_cube
 from wavebatch.tools.voxels.grid import COLUMNS
 
 LINE = (500_005.0, 5_400_003.0, 500_030.0, 5_400_020.0)
@@ -202,16 +202,16 @@ def test_segments_count_at_their_heights(tmp_path, suffix):
     heights = np.stack([low, low + rng.choice([0.0, 0.0, 0.3, 7.0, -5.0], 300)], axis=1).round(4)
     lengths = rng.uniform(1, 9, 300).round(5)
     path = _write_segments(tmp_path / f"s{suffix}", heights, lengths)
-    found = profile_segments([path], None, "count", size=2.0)
+    found = measure_profile([path], None, "count", size=2.0)
     fine = (np.arange(4000) + 0.5) / 4000
     pieces = heights[:, :1] + fine * (heights[:, 1] - heights[:, 0])[:, None]
     expected = np.histogram(pieces.ravel(), found.edges)[0] / 4000
     assert found.values[0] == pytest.approx(expected, abs=0.02) and found.values.sum() == pytest.approx(300)
     assert found.label == "segments per 2 units of height" and found.outside == 0
-    sums = profile_segments([path], "length", "sum", size=2.0)
+    sums = measure_profile([path], "length", "sum", size=2.0)
     expected = np.histogram(pieces.ravel(), found.edges, weights=np.repeat(lengths, 4000))[0] / 4000
     assert sums.values[0] == pytest.approx(expected, abs=0.1)
-    mean = profile_segments([path, path], "length", "mean", size=2.0, each=True)
+    mean = measure_profile([path, path], "length", "mean", size=2.0, each=True)
     full = found.values[0] > 0.1
     for row in mean.values:
         assert row[full] == pytest.approx((sums.values / found.values)[0][full])
@@ -291,7 +291,7 @@ def test_logarithmic_profiles_have_plain_labels(cloud, tmp_path):
 def test_level_segments_on_an_edge_lie_above_it(tmp_path):
     """As points do: a bin holds its lower edge."""
     heights = [(100.0, 100.0), (102.0, 102.0), (104.0, 104.0), (104.0, 106.0)]
-    found = profile_segments([_write_segments(tmp_path / "s.csv", heights, [1, 2, 4, 8])], "length", "sum", size=2.0)
+    found = measure_profile([_write_segments(tmp_path / "s.csv", heights, [1, 2, 4, 8])], "length", "sum", size=2.0)
     sums = dict(zip(found.edges[:-1].tolist(), found.values[0].tolist(), strict=True))
     assert [sums[edge] for edge in (100.0, 102.0, 104.0)] == pytest.approx([1, 2, 12])
     assert found.values.sum() == pytest.approx(15)

@@ -16,10 +16,11 @@ from wavebatch.cli.slice import slice_
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.tools import scan_slices as segments
+from wavebatch.tools import slice_output as output
+from wavebatch.tools.scan_slices import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import EAST, GROUND, NORTH, FlightLine
-from wavebatch.tools.slices import output, segments
-from wavebatch.tools.slices.segments import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
 
 FLIGHT = FlightLine(pulse_rate=50_000, half_angle=12.0, look_ahead=0.0)
 PULSES = 4000

@@ -61,10 +61,17 @@ def strips(canopy, tmp_path_factory):
     return write_recorded(folder / "joined.las", *pulses), write_recorded(folder / "split.las", *pulses, packets)
 
 
+@pytest.fixture(scope="module")
+def whole(strips, tmp_path_factory):
+    """What the pulses with one packet each give."""
+    return voxelize(strips[0], tmp_path_factory.mktemp("whole"))
+
+
+@pytest.mark.quick_cases("None")
 @pytest.mark.parametrize("ratio", [2.0, None])
-def test_split_pulses_are_joined_ones(strips, canopy, tmp_path, ratio):
+def test_split_pulses_are_joined_ones(strips, canopy, whole, tmp_path, ratio):
     """As pulses of their own, packets make the shares of the canopy half as large again."""
-    (_, joined), (summary, split) = (voxelize(strip, tmp_path, ratio=ratio) for strip in strips)
+    (_, joined), (summary, split) = whole, voxelize(strips[1], tmp_path, ratio=ratio)
     assert summary.pulses == N and summary.waveforms > 1.8 * N and summary.several_packets > 0.7 * N
     assert shares(split, LAYERS) == pytest.approx(shares(joined, LAYERS), rel=0.005)
     assert shares(split, LAYERS) == pytest.approx(canopy[-1], abs=0.01)
@@ -120,12 +127,12 @@ def test_five_packets_are_one_pulse(tmp_path):
     assert ground == pytest.approx(true, abs=60)
 
 
-def test_packets_that_overlap_count_once(canopy, strips, tmp_path):
+def test_packets_that_overlap_count_once(canopy, whole, tmp_path):
     """All samples twice, in packets that overlap by half or lie inside another."""
     *pulses, _ = canopy
     twice = write_recorded(tmp_path / "s.las", *pulses, [[(0, 159), (96, 223), (100, 131)]] * N)
     summary, found = voxelize(twice, tmp_path)
-    whole, joined = voxelize(strips[0], tmp_path)
+    whole, joined = whole
     assert summary.pulses == N and summary.waveforms == 3 * N and max(LENGTHS) > 224
     assert summary.energy == pytest.approx(whole.energy, rel=0.002)
     assert shares(found, LAYERS) == pytest.approx(shares(joined, LAYERS), rel=0.005)
@@ -231,6 +238,7 @@ def test_errors_of_shares_cover_the_truth(tmp_path, clumps, density):
     assert 0.6 < np.mean(np.abs(off) < 1) < 0.8 and len(off) > 600 and abs(np.mean(off)) < 0.25
 
 
+@pytest.mark.slow
 def test_a_wrong_ratio_is_within_the_errors(tmp_path):
     """Two kinds of soil: the ratio is that of one of them, and its error says how much the other differs."""
     rng = np.random.default_rng(4)

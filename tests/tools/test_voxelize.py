@@ -249,6 +249,7 @@ def naive_voxels(strip, size, headroom):
     return rays
 
 
+@pytest.mark.quick_cases("4.0")
 @pytest.mark.parametrize("headroom", [0.0, 4.0])
 def test_rays_through_voxels_are_those_of_a_slow_tracer(tmp_path, headroom):
     rng = np.random.default_rng(12)
@@ -610,7 +611,7 @@ def test_memory_does_not_grow_with_the_strip(tmp_path):
         simulate_strip("urban", strip, pulses=pulses, seed=1)
         script = f"""
             from pathlib import Path
-            from wavebatch.tools.bench.speed import peak_memory
+            from wavebatch.tools.bench.command import peak_memory
             from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
             voxelize_strip(Path({str(strip)!r}), Path({str(strip)!r}).with_suffix(".npz"), VoxelOptions(0.25))
             print(peak_memory())

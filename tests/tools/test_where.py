@@ -12,7 +12,7 @@ from wavebatch.core.condition import parse_condition
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.tools.compare.pairing import compare_clouds
+from wavebatch.tools.pairing import compare_clouds
 from wavebatch.tools.plots.draw_cloud import count_values
 from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
@@ -75,9 +75,9 @@ def test_clouds_are_compared_at_them(cloud, split):
     assert (found.left_out_a, found.left_out_b) == (total - number, 0)
 
 
-def test_voxels_are_of_waveforms_with_such_a_return(riegl, tmp_path):
+def test_voxels_are_of_waveforms_with_such_a_return(tiny_strip, tmp_path):
     all_, some, rest = (
-        voxelize_strip(riegl, tmp_path / f"{number}.npz", VoxelOptions(2.0, chosen=PointFilter(where=where)))
+        voxelize_strip(tiny_strip, tmp_path / f"{number}.npz", VoxelOptions(2.0, chosen=PointFilter(where=where)))
         for number, where in enumerate(
             [None, parse_condition("number_of_returns >= 2"), parse_condition("not number_of_returns >= 2")]
         )
@@ -88,8 +88,8 @@ def test_voxels_are_of_waveforms_with_such_a_return(riegl, tmp_path):
     assert some.energy + rest.energy == pytest.approx(all_.energy, rel=1e-6)
 
 
-def test_voxels_may_lack_any_waveform(riegl, tmp_path):
-    found = voxelize_strip(riegl, tmp_path / "x.npz", VoxelOptions(2.0, chosen=PointFilter.build(where="z > 1e6")))
+def test_voxels_may_lack_any_waveform(tiny_strip, tmp_path):
+    found = voxelize_strip(tiny_strip, tmp_path / "x.npz", VoxelOptions(2.0, chosen=PointFilter.build(where="z > 1e6")))
     assert (found.waveforms, found.voxels) == (0, 0) and found.left_out > 0
 
 

@@ -78,8 +78,8 @@ def calibrate(
     from wavebatch.surveying.calibrating.calibration_file import format_calibration
     from wavebatch.surveying.calibrating.target_file import load_targets
     from wavebatch.tools.api.run import find_request, read_sensor
-    from wavebatch.tools.sheets.calibrate import calibration_sheet, write_calibrate_page
     from wavebatch.tools.sheets.sheet import list_lines
+    from wavebatch.tools.sheets.survey import calibration_sheet, write_calibrate_page
 
     if (targets is None) == (options["column"] is None):
         raise click.UsageError("give --targets FILE, or --from-column NAME, and not both")

@@ -115,8 +115,8 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
       # widths of all clouds
       wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png
     """  # fmt: skip
+    from wavebatch.tools.cells import Clouds
     from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values
-    from wavebatch.tools.rasters.cells import Clouds
 
     column, chosen = options["column"], choose_points(options)
     if Clouds(clouds, (column,), chosen).facts.is_flags:
@@ -162,7 +162,7 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
       # mean amplitude in cells of 1 m
       wavebatch plot map clouds/ --column amplitude --size 1 -o map.png
     """  # fmt: skip
-    from wavebatch.tools.rasters.cells import grid_values
+    from wavebatch.tools.cells import grid_values
 
     column, statistic = options["column"], options["statistic"]
     found = grid_values(clouds, column, statistic, choose_points(options), size=options["size"], bounds=options["bbox"])
@@ -179,7 +179,7 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
 
 def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> list[Path]:
     """Clouds, one file of voxels, or files of segments: these from a folder or pattern where it has no clouds."""
-    from wavebatch.tools.slices.output import SEGMENT_SUFFIXES, check_alone, is_segments
+    from wavebatch.tools.slice_output import SEGMENT_SUFFIXES, check_alone, is_segments
 
     kinds = (SUFFIXES, SEGMENT_SUFFIXES) if or_segments else (SUFFIXES,)
     paths = shared.find_inputs(clouds, recursive=options["recursive"], kinds=kinds)
@@ -257,22 +257,16 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
       # length of surface lines by height
       wavebatch plot profile lines.csv --column length -o lines.png
     """  # fmt: skip
-    from wavebatch.tools.plots.sections import measure_profile
-    from wavebatch.tools.slices.output import is_segments, profile_segments
+    from wavebatch.tools.plots.sections import draw_profile, measure_profile
 
     column = options["column"]
     statistic = options["statistic"] or ("count" if column is None else "sum")
     how = {"size": options["size"], "each": options["each"]}
-    if segments := is_segments(paths[0]):
-        found = profile_segments(paths, column, statistic, **how)
-    else:
-        found = measure_profile(paths, column, statistic, choose_points(options), **how)
-    from wavebatch.tools.plots.sections import draw_profile
-
+    found = measure_profile(paths, column, statistic, choose_points(options), **how)
     draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
     series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]
     more = {"statistic": statistic, "outside": found.outside, "edges": found.edges.tolist(), "series": series}
-    text = describe_tally(found.total, found.outside, "segment" if segments else "value")
+    text = describe_tally(found.total, found.outside, found.noun.removesuffix("s"))
     return text, {"column": column, **list_tally(found.total), **more, "unit": found.unit}
 
 
@@ -294,11 +288,11 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
       # scan line 3, and all pulses at 250 ns
       wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png
     """  # fmt: skip
-    from wavebatch.tools.slices.output import cut_cube
+    from wavebatch.tools.slice_output import cut_cube
 
     check_picture(output, overwrite=options["overwrite"])
     slices = cut_cube(cube_file, {name: options[name] for name in "xyt"})
-    from wavebatch.tools.slices.output import draw_cube
+    from wavebatch.tools.slice_output import draw_cube
 
     draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
     tell(f"{output}: {', '.join(one.title for one in slices)}")
@@ -307,7 +301,7 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
     answer({"output": str(output), "cube": str(cube_file), "slices": drawn})
 
 
-_SHOWN = ("detector", "asdf", "wavelet", "correlation", "deconvolved", "derivative")
+_SHOWN = ("detector", "asdf", "correlation", "deconvolved", "derivative", "wavelet")
 
 
 @click.group(cls=NearestGroup)
@@ -368,16 +362,6 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     from wavebatch.files.cloud.point_filter import PointFilter
     from wavebatch.tools.plots.waveform import Wanted
 
-    named = any(options[name] for name in ("packets", "point_numbers", "times"))
-    for option in ("flags", "where"):
-        if options[option] and (named or options["random"]):
-            raise ConfigError(f"--{option} chooses the waveforms; leave out --packet, --point, --gps-time and --random")
-    if options["random"] and named:
-        raise ConfigError("--random chooses the waveforms; leave out --packet, --point and --gps-time")
-    if options["most"] and (named or options["random"]):
-        raise ConfigError("--most is for --flags, --where and the default; leave it out, or leave out the numbers")
-    if options["sheet"] and (options["show"] or options["table"]):
-        raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
     tabular = output.suffix.lower() == ".csv"
     for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
         if options[name]:

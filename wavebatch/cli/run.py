@@ -17,22 +17,8 @@ from typing import Any
 import click
 
 from wavebatch.batch.options import OPTIONS, RunOptions
+from wavebatch.cli import messages
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import (
-    EXIT_USAGE,
-    Interrupted,
-    format_json,
-    log_text,
-    one_line,
-    print_json,
-    print_safely,
-    print_text,
-    printable,
-    talk,
-    tell,
-    typed_command,
-    write_message,
-)
 from wavebatch.core.errors import WARNINGS, ConfigError, InputError, StripWarning, nearest
 from wavebatch.core.process import importing
 from wavebatch.core.units import count
@@ -74,8 +60,8 @@ class Progress:
         """Shows one event of `run_batch`."""
         error = event.get("error")
         if self._json:
-            plain = event if error is None else {**event, "error": one_line(error)}
-            self._json = self.is_written = print_safely(json.dumps(plain, sort_keys=True, ensure_ascii=False))
+            plain = event if error is None else {**event, "error": messages.one_line(error)}
+            self._json = self.is_written = messages.print_safely(json.dumps(plain, sort_keys=True, ensure_ascii=False))
         kind, strip = event["event"], event["strip"]
         if self._bar is not None:
             share = event["done"] / event["of"] if kind == "unit" else float(kind != "start")
@@ -83,16 +69,16 @@ class Progress:
         if error is not None and not event["again"]:
             if self._debug:
                 self._say("".join(traceback.format_exception(error)).rstrip())
-            self._say(f"error: {_place(printable(strip), one_line(error))}")
+            self._say(f"error: {_place(messages.printable(strip), messages.one_line(error))}")
         elif kind == "incomplete" and "decisions" not in event:
             cut = count(event["counts"]["points_cut"], "point")
-            remedy = "get its waveform data again, whole"
-            self._say(printable(f"{strip}: is incomplete as before: the packets of {cut} are missing; {remedy}"))
+            words = f"the packets of {cut} are missing; get its waveform data again, whole"
+            self._say(messages.printable(f"{strip}: is incomplete as before: {words}"))
         elif kind in ("written", "incomplete"):
             self._tell(_summary(event, self._level > 0))
             for one in event["warnings"]:
                 say = self._say if StripWarning(**one).is_loud else self._tell
-                say(printable(f"{strip}: warning: {one['text']}"))
+                say(messages.printable(f"{strip}: warning: {one['text']}"))
             chosen = [f"{one['part']}: {'kept' if one['needed'] else 'left out'}: {one['reason']}"
                       for one in event["decisions"]]  # fmt: skip
             more = [*chosen, *_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])]
@@ -101,7 +87,7 @@ class Progress:
         elif kind == "skipped":
             self._tell(f"{strip}: is up to date, skipped")
         elif kind == "flight" and self._level > 0:
-            self._say(printable(f"{strip}: survey of {count(event['strips'], 'strip')} together"))
+            self._say(messages.printable(f"{strip}: survey of {count(event['strips'], 'strip')} together"))
 
     def _advance(self, strip: str, share: float) -> None:
         done = round(self._sizes.get(strip, 0) * share)
@@ -112,15 +98,15 @@ class Progress:
     def _tell(self, line: str) -> None:
         """A message that --quiet leaves to the log."""
         if self._level >= 0:
-            self._say(printable(line))
+            self._say(messages.printable(line))
         else:
-            log_text(printable(line))
+            messages.log_text(messages.printable(line))
 
     def _say(self, line: str) -> None:
         if self._bar is not None:
             self._bar.clear()
-        write_message(line)
-        log_text(line)
+        messages.write_message(line)
+        messages.log_text(line)
         if self._bar is not None:
             self._bar.refresh()
 
@@ -266,7 +252,7 @@ def run(**options: Any) -> None:
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
-        raise Interrupted(text) from None
+        raise messages.Interrupted(text) from None
 
 
 def _start_processes(options: dict[str, Any]) -> None:
@@ -313,9 +299,9 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     if level > 0:
         timing = result.to_json()["timing"]
         parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["processor_seconds"].items()))
-        talk(f"{timing['elapsed_seconds']:.1f} s elapsed" + (f"; processor time: {parts}" if parts else ""))
+        messages.talk(f"{timing['elapsed_seconds']:.1f} s elapsed" + (f"; processor time: {parts}" if parts else ""))
         if advice := result.advice:
-            talk(advice)
+            messages.talk(advice)
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     is_reported = _write_page(result, batch_options.folder, options) and is_reported
@@ -324,8 +310,8 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     codes = set(options["fail_on"] or ())
     warned = [one.job.path for one in result.outcomes if {w.code for w in one.report.warnings} & codes]
     if not code and warned:
-        talk(f"error: --fail-on: {count(len(warned), 'strip')} with such a warning, the first is {warned[0]}; the "
-             "clouds are written")  # fmt: skip
+        some = f"{count(len(warned), 'strip')} with such a warning, the first is {warned[0]}"
+        messages.talk(f"error: --fail-on: {some}; the clouds are written")
     if not code and (warned or any(outcome.status == "incomplete" for outcome in result.outcomes)):
         code = EXIT_SOME_FAILED
     return code or (0 if is_reported else EXIT_UNREPORTED)
@@ -336,13 +322,13 @@ def _report(document: dict[str, Any], target: str | None) -> bool:
     from wavebatch.batch.report_file import write_json
 
     if target == "-":
-        return print_safely(format_json(document))
+        return messages.print_safely(messages.format_json(document))
     try:
         if target is not None:
             Path(target).parent.mkdir(parents=True, exist_ok=True)
             write_json(Path(target), document, overwrite=True)
     except InputError as error:
-        talk(f"error: --report: {one_line(error)}")
+        messages.talk(f"error: --report: {messages.one_line(error)}")
         return False
     return True
 
@@ -356,13 +342,13 @@ def _write_page(result: Any, folder: Path, options: dict[str, Any]) -> bool:
 
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_run_page(target, result, folder, typed_command(click.get_current_context()))
+        write_run_page(target, result, folder, messages.typed_command(click.get_current_context()))
     except Exception as error:  # the clouds are written, whatever becomes of the page
         if options["debug"]:
             traceback.print_exc()
-        talk(f"error: --html: {one_line(error)}")
+        messages.talk(f"error: --html: {messages.one_line(error)}")
         return False
-    tell(f"{target}: written")
+    messages.tell(f"{target}: written")
     return True
 
 
@@ -372,7 +358,7 @@ def find_exit_code(errors: Sequence[BaseException | None]) -> int:
     failed = [error for error in errors if error is not None]
     if not failed or len(failed) < len(errors):
         return EXIT_SOME_FAILED if failed else 0
-    return EXIT_USAGE if all(isinstance(error, ConfigError) for error in failed) else EXIT_NOTHING
+    return messages.EXIT_USAGE if all(isinstance(error, ConfigError) for error in failed) else EXIT_NOTHING
 
 
 def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
@@ -388,7 +374,7 @@ def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> in
             errors.append(error)
             if options["debug"]:
                 traceback.print_exc()
-            talk(f"error: {one_line(error)}")
+            messages.talk(f"error: {messages.one_line(error)}")
             continue
         errors.append(None)
         plans.append(plan)
@@ -398,12 +384,12 @@ def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> in
             f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
         )
         if not as_json:
-            print_text(printable(line))
+            messages.print_text(messages.printable(line))
     for line in () if as_json else click.get_current_context().meta.get("wavebatch.settings", ()):
-        print_text(f"# setting: {line}")
+        messages.print_text(f"# setting: {line}")
     by = jobs[0].request.describe(jobs[0].chain)
     if as_json:
-        print_json({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, "plan")
+        messages.print_json({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, "plan")
         return find_exit_code(errors)
     if by is not None:
         click.echo(f"\n# the chain is chosen per strip ({by}); the largest possible one:", nl=False)

@@ -1,6 +1,6 @@
 """`wavebatch slice`: the straight surface lines in the scan lines of a strip.
 
-Reads options and loops over the scan lines; cutting and searching them is in `wavebatch.tools.slices`.
+Reads options and loops over the scan lines; cutting and searching them is in `wavebatch.tools.scan_slices`.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from wavebatch.files.geojson import GEOJSON_CRS, plan_crs
 from wavebatch.files.las.crs import describe_crs, read_crs_definition
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
-from wavebatch.tools.slices.output import SEGMENT_SUFFIXES, CubeBuilder, SegmentWriter, draw_segments, draw_slice
-from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments, read_scan_lines
+from wavebatch.tools.scan_slices import SliceOptions, cut_slice, find_segments, read_scan_lines
+from wavebatch.tools.slice_output import SEGMENT_SUFFIXES, CubeBuilder, SegmentWriter, draw_segments, draw_slice
 
 EXIT_SOME_FAILED = 1
 """Some strips failed."""

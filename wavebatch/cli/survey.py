@@ -70,7 +70,7 @@ def survey(
     from wavebatch.core.errors import ConfigError
     from wavebatch.files.disk.publish import check_target
     from wavebatch.files.text_file import write_text
-    from wavebatch.surveying.auto_chain import chain_text
+    from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
     from wavebatch.tools.sheets.sheet import Sheet
     from wavebatch.tools.sheets.survey import list_doubts, survey_sheet, write_survey_page
@@ -86,7 +86,7 @@ def survey(
         if len(paths) > 1:
             words = "is for one strip, because widths depend on the distance of the ground"
             raise ConfigError(f"--angles {angles}: {words}")
-        from wavebatch.tools.compare.angle_table import check_angles
+        from wavebatch.tools.sheets.survey import check_angles
 
         check_angles(angles, overwrite=overwrite)
     options["angles"] = angles
@@ -133,7 +133,7 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
         packet_file = opened.facts.packets.file
         if options["angles"] is not None:
             from wavebatch.surveying.sensor import SensorRequest, find_sensor
-            from wavebatch.tools.compare.angle_table import write_angles
+            from wavebatch.tools.sheets.survey import write_angles
 
             distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
             sizes = {"spacing": found.figures.spacing_ns, "amplitude": found.figures.amplitude_50}
@@ -179,7 +179,7 @@ def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Pat
 
 
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
-    from wavebatch.surveying.auto_chain import chain_text
+    from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import SYSTEM_SCHEMA, describe_system
     from wavebatch.surveying.systems.doubt import doubt_survey
     from wavebatch.surveying.systems.figures import describe_figures

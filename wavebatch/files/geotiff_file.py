@@ -1,6 +1,6 @@
 """GeoTIFF files, written tile by tile with rasterio (optional extra `gis`), so that a raster never is in memory.
 
-`tools/rasters` writes with it. rasterio is imported only here, when a raster is written.
+`tools/raster.py` writes with it. rasterio is imported only here, when a raster is written.
 """
 
 from __future__ import annotations

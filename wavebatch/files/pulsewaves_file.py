@@ -1,6 +1,6 @@
 """PulseWaves files: header and descriptors, checked against the sizes of both files; pulses and segments of waves.
 
-`tools.archives` reads all of a file through `PulseReader`, which starts with `read_pulse_header`. The format is
+`tools.import_file` reads all of a file through `PulseReader`, which starts with `read_pulse_header`. The format is
 PulseWaves 0.3 revision 6 (docs/las-waveforms.md 10). The files may hold any bytes: every check here is there because
 the reader relies on it. What varies from pulse to pulse stands inside the waves, so each piece of them is walked
 through once: sampling by sampling, segment by segment, for all its pulses together, in bounded memory.

@@ -308,10 +308,11 @@ def list_entries(kind: Any) -> tuple[Entry, ...]:
             continue
         optional = get_origin(hint) in (types.UnionType, typing.Union)
         hint = next(part for part in get_args(hint) if part is not type(None)) if optional else hint
-        shape, parts = _read_shape(hint, keys[0])
+        # That of the field stands behind that of a shared annotation.
+        shape, parts = _read_shape(hint, keys[-1])
         split = [(hint, notes)] if shape == "value" else list(map(_split, parts))
         limits = tuple(next((note for note in more if isinstance(note, Range)), _EVERY) for _, more in split)
-        key = keys[0] if shape == "record" else keys[0]._replace(name=keys[0].name or one.name)
+        key = keys[-1] if shape == "record" else keys[-1]._replace(name=keys[-1].name or one.name)
         has_none = one.default is one.default_factory is dataclasses.MISSING and key.missing is None
         kinds = tuple(part for part, _ in split)
         found.append(Entry(one.name, shape, kinds, limits, key, key.needed or has_none, optional))

@@ -19,8 +19,8 @@ _POINTER = ctypes.c_void_p
 
 FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "filter_rows", "find_maxima", "group_candidates",
-    "exponentials", "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "learn_pulse",
-    "render_pulses", "measure_changes", "pair_differences", "judge_packets",
+    "exponentials", "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "describe_widths",
+    "learn_pulse", "render_pulses", "measure_changes", "pair_differences", "judge_packets",
     "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes",
     "match_returns",
 )  # fmt: skip

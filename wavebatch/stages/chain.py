@@ -84,6 +84,9 @@ class Stage:
     exponent was fitted carry it as a column."""
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None
     """What is wrong with this stage in a chain and for a strip (None before the strip is known); empty if nothing."""
+    searches: tuple[str, Callable[..., Any]] | None = None
+    """Of a detector: the kind of signal in which it searches, by which `plot waveform --show` names it, or empty, and
+    the function that gives this signal as `stages.detect.candidates.Searched`. It takes what the stage takes."""
 
     @property
     def summary(self) -> str:
@@ -111,6 +114,7 @@ def stage(
     fits: Callable[[SystemPulse, Mapping[str, Any]], SystemPulse] | None = None,
     shape: Callable[[SystemPulse, float, Mapping[str, Any]], PulseShape | None] | None = None,
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None,
+    searches: tuple[str, Callable[..., Any]] | None = None,
     shares: Any = None,
 ) -> Callable[[Callable], Callable]:
     """Register the decorated function as stage `kind.<function name>`.
@@ -123,7 +127,7 @@ def stage(
         Attribute columns that the stage adds. A Column declares a new one, so that `run` can write it.
     needs : tuple of str, or function of the parameters
         Attribute columns that earlier stages must have added.
-    second_pass, fits, shape, check : optional
+    second_pass, fits, shape, check, searches : optional
         See `Stage`.
     shares : dataclass instance, optional
         Parameters that stages share: its fields with their annotations, its values as defaults, its docstring for their
@@ -156,7 +160,7 @@ def stage(
             raise StageError(f"stage {name} declares column {min(taken)}, which there is already")
         COLUMNS.update(new)
         names = tuple(column.name if isinstance(column, Column) else column for column in makes)
-        STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass, fits, shape, check)
+        STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass, fits, shape, check, searches)
         return function
 
     return register

@@ -241,7 +241,7 @@ def _usual(limits: ShapeLimits) -> float:
     return max(MOST_WIDTH * limits.ref, 1.01 * limits.low)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)
 def noise_factors(shape: PulseShape, width: float, correlation: tuple[float, ...]) -> np.ndarray:
     """What coloured noise does to a pulse of this width [samples], over white noise of the same variance (4,).
 
@@ -311,7 +311,7 @@ def error_factors(
     return np.hypot(found, level_err[:, None] * interpolate(width, widths, by_level))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)
 def _factor_table(
     shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...], whitening: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

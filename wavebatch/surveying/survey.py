@@ -19,7 +19,6 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.hidden_neighbours import measure_hidden
 from wavebatch.surveying.measuring.choose_pulse import MISFITS, Tried, choose_pulse, settle
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
@@ -45,6 +44,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening
+from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.doubt import share_repeated, share_unexplained
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known
@@ -404,13 +404,13 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if not (system.components or system.kappa):
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system = choose_whitening(part, system, choice.best.change)
-        system, mirror = settle(block, system, choice.best.seen, choice.best.missed)
+        system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)
         system = limit_faint(system, max(choice.best.seen, float(MISFITS[0])), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
         figures.width_in_doubt = choice.spread
-        figures.echoes_in_doubt = max(choice.doubt, share_unexplained(system, echoes, block.spacing))
+        figures.echoes_in_doubt = max(choice.doubt, doubt, share_unexplained(system, echoes, block.spacing))
         if len(block) < SMALL:
             figures.echoes_in_doubt = max(figures.echoes_in_doubt, share_repeated(echoes, system.sigma_ref))
     else:

@@ -12,13 +12,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Annotated, NamedTuple, Protocol
 
 import numpy as np
 
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.schema import Key
 from wavebatch.core.units import HALF_C
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
@@ -168,7 +169,10 @@ def describe_pairs(pairs: int, total: float, least: float) -> Separation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PulseStats:
-    """What is counted of the returns of a cloud, and of each of its areas."""
+    """What is counted of the returns of a cloud, and of each of its areas.
+
+    A field with a Key is a column of `stats -o` of this name, and a line of its text if the Key says how it is shown.
+    """
 
     points: int
     pulses: int
@@ -179,9 +183,9 @@ class PulseStats:
     separations: dict[str, Separation]
     """By return number, as far as there are pairs, without points passed through without an echo: of a cloud `all`, and
     `1-2`, `2-3` ...; of an area `1-2`, `2-3`, `3-4` and `4-`."""
-    several: int
+    several: Annotated[int, Key("pulses_with_several")]
     """Pulses with two or more returns."""
-    depth: float
+    depth: Annotated[float, Key("first_above_last_m")]
     """Mean height of the first above the last return of these pulses [m]: how deep they reach into the vegetation; NaN
     without any."""
 

@@ -4,6 +4,7 @@
 static const double FREEDOM = 4;               /* of Student's law: what no pulse explains must not decide */
 static const double NEARLY_SINGULAR = 1e-6;    /* of a scaled matrix, which is no better known in float32 */
 static const double PEAK = 0.83698821678583584; /* -ln of Student's density at 0, of a scale of root 3/4 */
+static const double ROOT_2PI_INVERSE = 0.39894228040143268; /* one over the root of 2 pi */
 static const double REACH = 6;                 /* widths beyond which nothing of a Gaussian is left */
 static const double NARROWEST = 0.1;           /* variance of a Gaussian under an echo narrower than the pulse, over its own */
 enum { CHANGED = 3, TOGETHER = 6 };            /* strongest echoes of a waveform whose shapes may change; echoes whose errors
@@ -235,6 +236,67 @@ EXPORT int64_t measure_changes(const Described *w, double *heights, double *ener
     }
     clear_desk(&d);
     return good ? 0 : -1;
+}
+
+enum { LEARNED = 15 };                         /* rounds after which shares of laws hardly move */
+
+/* Share of normal values below z, exact to 1e-7 (Abramowitz and Stegun 26.2.17). */
+static double normal_below(double z) {
+    if (fabs(z) > 6) return z > 0;
+    const double t = 1 / (1 + 0.2316419 * fabs(z));
+    const double series = t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))));
+    const double above = exp_double(-0.5 * z * z) * ROOT_2PI_INVERSE * series;
+    return z > 0 ? 1 - above : above;
+}
+
+/* Density of a width by each law through its error: the pulse's own width, and uniform ones from there up to `wider`. */
+static void weigh_laws(double ratio, double error, int64_t laws, const double *wider, double *density) {
+    const double z = (ratio - 1) / error, below = normal_below(z);
+    density[0] = exp_double(-0.5 * fmin(z * z, 1400)) * ROOT_2PI_INVERSE / error;
+    for (int64_t k = 1; k < laws; k++) density[k] = (below - normal_below((ratio - wider[k - 1]) / error)) / (wider[k - 1] - 1);
+}
+
+/* Cost of each of n widths [nats] by the sum of laws that makes the known ones likeliest, with the scatter beyond their
+   errors that serves best; a share `anywhere` of them lies anywhere up to the widest. */
+EXPORT int64_t describe_widths(int64_t n, const double *ratio, const double *error, const uint8_t *known, int64_t scatters,
+                               const double *scatter, int64_t uniform, const double *wider, double anywhere, double *cost) {
+    const int64_t laws = uniform + 1;
+    double *density = malloc((n * laws + n + 2 * laws + 1) * sizeof(double)), least = INFINITY;
+    if (!density) return -1;
+    double *tried = density + n * laws, *share = tried + n, *next = share + laws;
+    for (int64_t s = 0; s < scatters; s++) {
+        double sum = 0, number = 0;
+        for (int64_t i = 0; i < n; i++) {
+            weigh_laws(ratio[i], sqrt(error[i] * error[i] + scatter[s] * scatter[s]), laws, wider, density + i * laws);
+            number += known[i];
+        }
+        for (int64_t k = 0; k < laws; k++) share[k] = 1.0 / laws;
+        for (int round = 0; round < LEARNED; round++) {
+            for (int64_t k = 0; k < laws; k++) next[k] = 0;
+            for (int64_t i = 0; i < n; i++) {
+                if (!known[i]) continue;
+                const double *own = density + i * laws;
+                double whole = 0;
+                for (int64_t k = 0; k < laws; k++) whole += own[k] * share[k];
+                whole = 1 / fmax(whole, 1e-300);
+                for (int64_t k = 0; k < laws; k++) next[k] += own[k] * share[k] * whole;
+            }
+            for (int64_t k = 0; k < laws; k++) share[k] = (next[k] + 0.5) / (number + 0.5 * laws);
+        }
+        for (int64_t i = 0; i < n; i++) {
+            double whole = 0;
+            for (int64_t k = 0; k < laws; k++) whole += density[i * laws + k] * share[k];
+            tried[i] = -log_double((1 - anywhere) * whole + anywhere / wider[uniform - 1]);
+            if (known[i]) sum += tried[i];
+        }
+        if (sum < least) {
+            least = sum;
+            memcpy(cost, tried, n * sizeof(double));
+        }
+    }
+    for (int64_t i = 0; i < n; i++) cost[i] -= log_double(error[i] / ROOT_2PI_INVERSE);
+    free(density);
+    return 0;
 }
 
 /* Normal equations of a pulse that is a sum of `number` Gaussians of given delays and variances, and of an offset of the

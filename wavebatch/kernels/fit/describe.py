@@ -107,6 +107,46 @@ def describe_left(sums: Sums, noise: SampleNoise, changes: Sequence[float]) -> t
     return length, volume
 
 
+def describe_widths(
+    ratio: np.ndarray, error: np.ndarray, known: np.ndarray, scatters: Sequence[float], wider: np.ndarray,
+    anywhere: float,
+) -> np.ndarray:  # fmt: skip
+    """Return how long the description of widths is, by a density that falls from the pulse's own width on.
+
+    Parameters
+    ----------
+    ratio, error : float (m,)
+        Widths over the pulse's, and their errors, above 0.
+    known : bool (m,)
+        Those that tell of the density.
+    scatters : sequence of float
+        Scatter beyond the errors; the one that serves best is taken.
+    wider : float (k,)
+        Upper ends of uniform laws from the pulse's own width on, ascending, above 1.
+    anywhere : float
+        Share of the widths that may be anything up to the last of them.
+
+    Returns
+    -------
+    float64 (m,)
+        Negative logarithm of the density over that of the error [nats]. Shares of the laws are those that make the
+        known widths likeliest.
+
+    References
+    ----------
+    docs/algorithms.md R2.
+    """
+    if not (len(ratio) == len(error) == len(known)) or not len(wider) or not (error > 0).all():
+        raise ValueError("widths, errors and marks must be as many, errors above 0, and laws at least one")
+    columns = [np.ascontiguousarray(column, np.float64) for column in (ratio, error, scatters, wider)]
+    (ratio, error, scatter, ends), cost = columns, np.zeros(len(ratio))
+    call(
+        "describe_widths", ctypes.c_int64(len(ratio)), ratio, error, np.ascontiguousarray(known, np.bool_),
+        ctypes.c_int64(len(scatter)), scatter, ctypes.c_int64(len(ends)), ends, ctypes.c_double(anywhere), cost,
+    )  # fmt: skip
+    return cost
+
+
 def measure_changes(sums: Sums, noise: SampleNoise) -> tuple[np.ndarray, np.ndarray]:
     """Return how the shape of the strongest echo of each waveform differs from the pulse.
 

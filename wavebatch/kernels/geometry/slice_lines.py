@@ -1,4 +1,4 @@
-"""Scan lines, and the straight lines in slices of them: called by tools/slices/segments.
+"""Scan lines, and the straight lines in slices of them: called by tools/scan_slices.
 
 `find_sweeps`: a scan line ends where the mirror turns, jumps back or pauses, seen in the angles of consecutive pulses.
 Oscillating and rotating mirrors look different: the first turn, the second jump.

@@ -5,10 +5,36 @@ from __future__ import annotations
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.kernels.signal.signal import transpose_samples
+
+
+@frozen(eq=False)
+class Searched:
+    """The signal in which a detector searches n waveforms for echoes; `wavebatch plot waveform --show` draws it."""
+
+    label: str
+    """What it is, with its unit."""
+    rule: str
+    """When a maximum or a minimum of it is an echo."""
+    values: np.ndarray
+    """(q, n) as kernels give it."""
+    least: np.ndarray
+    """Threshold: a level, or the depth that a minimum needs, (n,); NaN without one."""
+    signal: np.ndarray
+    """What it was made of: waveforms above their baselines [DN], f4 (s, n)."""
+    unit: float = 1.0
+    """What one DN is in it: pictures divide by it."""
+    first: float = 0.0
+    """Place of the first value [samples]."""
+    deep: bool = False
+    """Whether `least` is the depth of minima instead of a level."""
+    second: np.ndarray | None = None
+    """A further line with the same unit and times, to which `least` belongs, as `values`."""
+    second_label: str = ""
 
 
 def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:

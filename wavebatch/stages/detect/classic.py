@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -15,17 +15,11 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.closed_form import estimate_starts
-from wavebatch.kernels.signal.filters import (
-    curvature_taps,
-    filter_antisymmetric,
-    filter_energy,
-    filter_symmetric,
-    slope_taps,
-)
+from wavebatch.kernels.signal import filters
 from wavebatch.kernels.signal.runs import find_runs, highest_samples, run_moments, walk_down
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.detect.candidates import candidate_table, signal_above
+from wavebatch.stages.detect.candidates import Searched, candidate_table, signal_above
 from wavebatch.stages.detect.maximum import LEAST_BLUR
 
 INFLECTED = 2.0
@@ -55,7 +49,14 @@ def _time_to_peak(edge: np.ndarray, ratio: np.ndarray, ref: float) -> np.ndarray
     return away + np.where(after > 1, np.clip(late, 0.0, 0.5), 0.0)
 
 
-@stage("detect")
+def _smooth(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float, **_: Any) -> Searched:
+    """What most classic detectors search."""
+    signal = signal_above(block, noise)
+    least = np.float32(level * SMOOTH_GAIN) * noise.std
+    return Searched("smoothed [DN]", f"level {level:g} std", smooth_121(signal), least, signal)
+
+
+@stage("detect", searches=("", _smooth))
 def threshold(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     level: Annotated[float, Range(0.1, 1e6)] = 4.0,
@@ -77,15 +78,14 @@ def threshold(
     ----------
     Wagner et al. (2007), section 3.
     """
-    smoothed = smooth_121(signal_above(block, noise))
-    s = len(smoothed)
-    limit = np.float32(level * SMOOTH_GAIN) * noise.std
-    starts, ends = find_runs(smoothed, limit)
+    found = _smooth(block, noise, system, level=level)
+    smoothed, s = found.values, len(found.values)
+    starts, ends = find_runs(smoothed, found.least)
     waveform = starts // s
     peak = highest_samples(smoothed, starts, ends)
     ref = system.sigma_ref / block.spacing
     amplitude, width, height = _smoothed_height(smoothed, peak, waveform, ref)
-    first, trigger = starts - waveform * s, limit[waveform]
+    first, trigger = starts - waveform * s, found.least[waveform]
     inside, outside = smoothed[first, waveform], smoothed[np.maximum(first - 1, 0), waveform]
     rise = np.where(first > 0, inside - outside, np.float32(np.inf))
     time = first - (inside - trigger) / rise
@@ -94,7 +94,7 @@ def threshold(
     return candidate_table(block, system, waveform, time, amplitude, width)
 
 
-@stage("detect")
+@stage("detect", searches=("", _smooth))
 def constant_fraction(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     fraction: Annotated[float, Range(0.0, 1.0)] = 0.5,
@@ -118,9 +118,9 @@ def constant_fraction(
     """
     if not 0 < fraction < 1:
         raise ConfigError(f"fraction must lie between 0 and 1, got {fraction}")
-    smoothed = smooth_121(signal_above(block, noise))
-    ref = system.sigma_ref / block.spacing
-    waveform, sample = find_peaks(smoothed, np.float32(level * SMOOTH_GAIN) * noise.std)
+    found = _smooth(block, noise, system, level=level)
+    smoothed, ref = found.values, system.sigma_ref / block.spacing
+    waveform, sample = find_peaks(smoothed, found.least)
     amplitude, width, height = _smoothed_height(smoothed, sample, waveform, ref)
     level = np.minimum(fraction * height, 0.999 * smoothed[sample, waveform])
     edge = walk_down(smoothed, waveform, sample, np.full(len(sample), level), -1)
@@ -128,7 +128,14 @@ def constant_fraction(
     return candidate_table(block, system, waveform, time, amplitude, width)
 
 
-@stage("detect")
+def _list_samples(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float, duration: float
+) -> Searched:
+    signal, rule = signal_above(block, noise), f"runs above {level:g} std for {duration:g} pulses"
+    return Searched("above the baseline [DN]", rule, signal, np.float32(level) * noise.std, signal)
+
+
+@stage("detect", searches=("", _list_samples))
 def sustained_threshold(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     level: Annotated[float, Range(0.1, 1e6)] = 3.0,
@@ -150,11 +157,11 @@ def sustained_threshold(
     ----------
     Jutzi and Stilla (2005); docs/algorithms.md 1.3.
     """
-    signal = signal_above(block, noise)
-    smoothed = smooth_121(signal)
+    found = _list_samples(block, noise, system, level=level, duration=duration)
+    signal, smoothed = found.signal, smooth_121(found.signal)
     ref = system.sigma_ref / block.spacing
     least = max(round(duration * FWHM_PER_SIGMA * ref), 1)
-    starts, ends = find_runs(signal, np.float32(level) * noise.std)
+    starts, ends = find_runs(signal, found.least)
     long = ends - starts >= least
     starts, ends = starts[long], ends[long]
     waveform = starts // len(signal)
@@ -163,7 +170,7 @@ def sustained_threshold(
     return candidate_table(block, system, waveform, time, amplitude, width)
 
 
-@stage("detect")
+@stage("detect", searches=("", _smooth))
 def center_of_gravity(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: Annotated[float, Range(0.1, 1e6)] = 4.0
 ) -> EchoTable:
@@ -181,16 +188,30 @@ def center_of_gravity(
     ----------
     Wagner et al. (2007), section 3.
     """
-    signal = signal_above(block, noise)
-    smoothed = smooth_121(signal)
-    starts, ends = find_runs(smoothed, np.float32(level * SMOOTH_GAIN) * noise.std)
+    found = _smooth(block, noise, system, level=level)
+    signal, smoothed = found.signal, found.values
+    starts, ends = find_runs(smoothed, found.least)
     waveform = starts // len(signal)
     peak = highest_samples(smoothed, starts, ends)
     time, width = run_moments(signal, starts, ends)
     return candidate_table(block, system, waveform, time, smoothed[peak, waveform], width)
 
 
-@stage("detect")
+def _differentiate(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, derivative: str, level: float, scale: float
+) -> Searched:
+    signal, high = signal_above(block, noise), f"where the smoothed signal is above {level:g} std"
+    blur = max(scale * system.sigma_ref / block.spacing, LEAST_BLUR)
+    if derivative == "first":
+        values, least = filters.filter_antisymmetric(signal, filters.slope_taps(blur)), np.full(len(block), np.nan)
+        return Searched("derivative [DN/sample]", f"falls through zero {high}", values, least, signal)
+    taps = filters.curvature_taps(blur)
+    values = filters.filter_symmetric(signal, taps)
+    least = np.float32(INFLECTED * np.sqrt(filters.filter_energy(taps))) * noise.std
+    return Searched("- second derivative [DN/sample2]", f"middle of two zeros {high}", values, least, signal)
+
+
+@stage("detect", searches=("derivative", _differentiate))
 def zero_crossing(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     derivative: Literal["first", "second"] = "first",
@@ -215,16 +236,14 @@ def zero_crossing(
     ----------
     Wagner et al. (2007), section 3; Hofton et al. (2000).
     """
-    signal = signal_above(block, noise)
-    smoothed = smooth_121(signal)
+    found = _differentiate(block, noise, system, derivative=derivative, level=level, scale=scale)
+    smoothed = smooth_121(found.signal)
     ref = system.sigma_ref / block.spacing
-    blur = max(scale * ref, LEAST_BLUR)
     if derivative == "first":
-        waveform, time = _falls_through_zero(filter_antisymmetric(signal, slope_taps(blur)))
+        waveform, time = _falls_through_zero(found.values)
         width = np.full(len(time), ref)
     else:
-        taps = curvature_taps(blur)
-        waveform, time, width = _between_inflections(filter_symmetric(signal, taps), taps, noise, blur)
+        waveform, time, width = _between_inflections(found, max(scale * ref, LEAST_BLUR))
     sample = np.clip(np.rint(time), 0, len(smoothed) - 1).astype(np.int64)
     amplitude = smoothed[sample, waveform]
     high = amplitude > (level * SMOOTH_GAIN) * noise.std[waveform]
@@ -241,13 +260,10 @@ def _falls_through_zero(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return waveform, sample + before / (before - after)
 
 
-def _between_inflections(
-    curvature: np.ndarray, taps: np.ndarray, noise: Noise, blur: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _between_inflections(found: Searched, blur: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Waveform, time and width (m,) of the stretches of positive curvature that exceed the noise."""
-    waveform, sample = find_peaks(curvature, np.float32(INFLECTED * np.sqrt(filter_energy(taps))) * noise.std)
+    waveform, sample = find_peaks(found.values, found.least)
     zero = np.zeros(len(sample))
-    left = walk_down(curvature, waveform, sample, zero, -1)
-    right = walk_down(curvature, waveform, sample, zero, 1)
+    left, right = (walk_down(found.values, waveform, sample, zero, side) for side in (-1, 1))
     half = 0.5 * (right - left)
     return waveform, left + half, np.sqrt(np.maximum(half * half - blur * blur, 0.0))

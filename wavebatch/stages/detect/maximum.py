@@ -9,17 +9,10 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import estimate_starts
-from wavebatch.kernels.signal.filters import (
-    curvature_taps,
-    filter_energy,
-    filter_symmetric,
-    find_maxima,
-    gaussian_taps,
-    refine_peaks,
-)
+from wavebatch.kernels.signal import filters
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.detect.candidates import make_table, samples_of, signal_above
+from wavebatch.stages.detect.candidates import Searched, make_table, samples_of, signal_above
 
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
 """Standard deviation of white noise after two passes of the [1 2 1]/4 filter."""
@@ -31,7 +24,16 @@ BROAD = 4.0
 """Width of the system pulse [samples] from which the smoothing grows with it."""
 
 
-@stage("detect")
+def _smooth(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float) -> Searched:
+    """What `maximum` searches: its kernel smooths one waveform after the other."""
+    _, taps, gain = choose_smoothing(system.sigma_ref / block.spacing)
+    signal = signal_above(block, noise)
+    smoothed = smooth_121(smooth_121(signal)) if taps is None else filters.filter_symmetric(signal, taps)
+    least = threshold * gain * noise.std
+    return Searched("smoothed [DN]", f"maxima above {threshold:g} std", smoothed, least, signal)
+
+
+@stage("detect", searches=("", _smooth))
 def maximum(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: Annotated[float, Range(0.0, 1e6)] = 4.0
 ) -> EchoTable:
@@ -52,7 +54,7 @@ def maximum(
     """
     ref = system.sigma_ref / block.spacing
     broad, taps, gain = choose_smoothing(ref)
-    waveform, time, amplitude, width = find_maxima(samples_of(block, noise), threshold * gain, ref, broad, taps)
+    waveform, time, amplitude, width = filters.find_maxima(samples_of(block, noise), threshold * gain, ref, broad, taps)
     return make_table(block, waveform, time, amplitude, width)
 
 
@@ -83,12 +85,20 @@ def choose_smoothing(ref: float) -> Smoothing:
     if ref <= BROAD:
         return Smoothing(0.0, None, TWICE_SMOOTHED_GAIN)
     broad = 0.5 * (ref - BROAD) + 1.0
-    taps = gaussian_taps(broad)
+    taps = filters.gaussian_taps(broad)
     taps = taps / (taps[0] + 2 * taps[1:].sum())
-    return Smoothing(broad, taps, float(np.sqrt(filter_energy(taps))))
+    return Smoothing(broad, taps, float(np.sqrt(filters.filter_energy(taps))))
 
 
-@stage("detect")
+def _correlate(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float) -> Searched:
+    taps, signal = filters.gaussian_taps(system.sigma_ref / block.spacing), signal_above(block, noise)
+    energy = filters.filter_energy(taps)
+    least = np.float32(threshold * np.sqrt(energy)) * noise.std
+    rule = f"maxima above {threshold:g} std"
+    return Searched("correlation [DN]", rule, filters.filter_symmetric(signal, taps), least, signal, energy)
+
+
+@stage("detect", searches=("correlation", _correlate))
 def matched_filter(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: Annotated[float, Range(0.0, 1e6)] = 4.27
 ) -> EchoTable:
@@ -108,17 +118,24 @@ def matched_filter(
     docs/algorithms.md 1.1 (4), 1.3, 4.1.
     """
     ref = system.sigma_ref / block.spacing
-    taps = gaussian_taps(ref)
-    energy = filter_energy(taps)
+    found = _correlate(block, noise, system, threshold=threshold)
+    waveform, sample = find_peaks(found.values, found.least)
+    time, height = filters.refine_peaks(found.values, waveform, sample)
+    _, _, width = estimate_starts(smooth_121(found.signal), waveform, sample, ref)
+    return make_table(block, waveform, time, height / found.unit, np.clip(width, 0.8 * ref, 2.0 * ref))
+
+
+def _curve(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float, scale: float, level: float
+) -> Searched:
+    taps = filters.curvature_taps(max(scale * system.sigma_ref / block.spacing, LEAST_BLUR))
     signal = signal_above(block, noise)
-    correlation = filter_symmetric(signal, taps)
-    waveform, sample = find_peaks(correlation, np.float32(threshold * np.sqrt(energy)) * noise.std)
-    time, height = refine_peaks(correlation, waveform, sample)
-    _, _, width = estimate_starts(smooth_121(signal), waveform, sample, ref)
-    return make_table(block, waveform, time, height / energy, np.clip(width, 0.8 * ref, 2.0 * ref))
+    least = np.float32(threshold * np.sqrt(filters.filter_energy(taps))) * noise.std
+    rule = f"maxima above {threshold:g} std where the smoothed signal is above {level:g} std"
+    return Searched("- second derivative [DN/sample2]", rule, filters.filter_symmetric(signal, taps), least, signal)
 
 
-@stage("detect")
+@stage("detect", searches=("derivative", _curve))
 def second_derivative(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     threshold: Annotated[float, Range(0.0, 1e6)] = 2.0,
@@ -143,14 +160,12 @@ def second_derivative(
     ----------
     Hofton et al. (2000), inflection points; docs/algorithms.md 1.2, 2.2.
     """
-    signal = signal_above(block, noise)
-    smoothed = smooth_121(signal)
     ref = system.sigma_ref / block.spacing
-    taps = curvature_taps(max(scale * ref, LEAST_BLUR))
-    curvature = filter_symmetric(signal, taps)
-    waveform, sample = find_peaks(curvature, np.float32(threshold * np.sqrt(filter_energy(taps))) * noise.std)
+    found = _curve(block, noise, system, threshold=threshold, scale=scale, level=level)
+    smoothed = smooth_121(found.signal)
+    waveform, sample = find_peaks(found.values, found.least)
     high = smoothed[sample, waveform] > (level * SMOOTH_GAIN) * noise.std[waveform]
     waveform, sample = waveform[high], sample[high]
-    time, _ = refine_peaks(curvature, waveform, sample)
+    time, _ = filters.refine_peaks(found.values, waveform, sample)
     amplitude, _, width = estimate_starts(smoothed, waveform, sample, ref)
     return make_table(block, waveform, time, amplitude, np.clip(width, 0.8 * ref, 2.0 * ref))

@@ -17,31 +17,13 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.elementary import log as logarithm
+from wavebatch.kernels.signal import filters
 from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
-from wavebatch.kernels.signal.filters import (
-    b3_detail,
-    b3_gain,
-    b3_level,
-    curvature_taps,
-    filter_energy,
-    filter_symmetric,
-    refine_peaks,
-)
 from wavebatch.kernels.signal.runs import list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
-from wavebatch.kernels.signal.square_differences import (
-    COLUMNS_AT_A_TIME,
-    Minima,
-    find_minima,
-    keep_prominent,
-    pad_samples,
-    slide_energy,
-    slide_taps,
-    square_differences,
-)
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.detect.candidates import candidate_table, signal_above
-from wavebatch.stages.pulse_tables import reference_pulse
+from wavebatch.stages.detect.candidates import Searched, candidate_table, signal_above
+from wavebatch.stages.pulse_tables import ReferenceKind, reference_pulse
 
 HAT_WIDTH = 0.75
 """Width of the Mexican hat that separates echoes as the B3 wavelet does [system widths] (docs/algorithms.md 1.2)."""
@@ -56,7 +38,16 @@ AT_A_TIME = 1024
 """Waveforms whose arrays stay in the cache together."""
 
 
-@stage("detect")
+def _transform(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, wavelet: str, threshold: float, scale: float
+) -> Searched:
+    signal = signal_above(block, noise)
+    detail, gain = transform(signal, system.sigma_ref / block.spacing, wavelet, scale, block.spacing)
+    rule, least = f"maxima above {threshold:g} std", np.float32(threshold * gain) * noise.std
+    return Searched(f"{wavelet} coefficients [DN]", rule, detail, least, signal)
+
+
+@stage("detect", searches=("wavelet", _transform))
 def wavelet(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     wavelet: Literal["b3", "mexican_hat"] = "b3",
@@ -81,12 +72,10 @@ def wavelet(
     ----------
     Wang, Wang and Tseng; docs/algorithms.md 1.2.
     """
-    ref = system.sigma_ref / block.spacing
-    signal = signal_above(block, noise)
-    detail, gain = transform(signal, ref, wavelet, scale, block.spacing)
-    waveform, sample = find_peaks(detail, np.float32(threshold * gain) * noise.std)
-    time, _ = refine_peaks(detail, waveform, sample)
-    amplitude = smooth_121(signal)[sample, waveform]
+    found = _transform(block, noise, system, wavelet=wavelet, threshold=threshold, scale=scale)
+    waveform, sample = find_peaks(found.values, found.least)
+    time, _ = filters.refine_peaks(found.values, waveform, sample)
+    amplitude = smooth_121(found.signal)[sample, waveform]
     return candidate_table(block, system, waveform, time, amplitude)
 
 
@@ -118,15 +107,29 @@ def transform(signal: np.ndarray, ref: float, wavelet: str, scale: float, spacin
         For a level of the B3 transform that is too coarse.
     """
     if wavelet != "b3":
-        taps = curvature_taps(max(scale / spacing if scale > 0 else HAT_WIDTH * ref, 0.5))
-        return filter_symmetric(signal, taps), float(np.sqrt(filter_energy(taps)))
-    level = max(round(scale), 1) if scale > 0 else b3_level(ref)
+        taps = filters.curvature_taps(max(scale / spacing if scale > 0 else HAT_WIDTH * ref, 0.5))
+        return filters.filter_symmetric(signal, taps), float(np.sqrt(filters.filter_energy(taps)))
+    level = max(round(scale), 1) if scale > 0 else filters.b3_level(ref)
     if level > COARSEST:
         raise ConfigError(f"scale is the level of the b3 wavelet, at most {COARSEST}, it is {scale:g}")
-    return b3_detail(signal, level), b3_gain(level)
+    return filters.b3_detail(signal, level), filters.b3_gain(level)
 
 
-@stage("detect")
+def _deconvolve(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, reference: ReferenceKind, iterations: int,
+    threshold: float, reach: float, pulse: str,
+) -> Searched:  # fmt: skip
+    """What `richardson_lucy` searches in parts: deconvolved waveforms, and about the sums of its spikes."""
+    given, signal = reference_pulse(system, block.spacing, reference, reach, pulse), signal_above(block, noise)
+    profile = deconvolve_richardson_lucy(signal, given.taps, BACKGROUND * noise.std, iterations)
+    wide = 2 * spike_reach(system.sigma_ref / block.spacing) + 1
+    sums = filters.slide_taps(filters.pad_samples(profile.astype(np.float64), wide // 2), np.ones(wide))
+    rule, least = f"spikes whose sum is above {threshold:g} std", threshold / np.sqrt(np.sum(given.taps**2)) * noise.std
+    return Searched("deconvolved [DN]", rule, profile, least, signal, first=given.peak - given.middle,
+                    second=sums, second_label=f"sum of {wide} samples")  # fmt: skip
+
+
+@stage("detect", searches=("deconvolved", _deconvolve))
 def richardson_lucy(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     reference: Literal["gaussian", "system", "given"] = "system",
@@ -203,7 +206,7 @@ Peaks = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _in_parts(
-    signal: np.ndarray, std: np.ndarray, detect: Callable[..., Peaks], most: int = COLUMNS_AT_A_TIME
+    signal: np.ndarray, std: np.ndarray, detect: Callable[..., Peaks], most: int = filters.COLUMNS_AT_A_TIME
 ) -> Peaks:
     """Candidates of the columns of signal (s, n), `most` at a time, so that arrays stay in the cache."""
     found: list[Peaks] = [(np.empty(0, np.int64), np.empty(0), np.empty(0))]
@@ -215,7 +218,20 @@ def _in_parts(
     return waveform, time, amplitude
 
 
-@stage("detect")
+def _correlate(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, reference: ReferenceKind, threshold: float,
+    similarity: float, reach: float, pulse: str,
+) -> Searched:  # fmt: skip
+    """What `correlation` searches in parts."""
+    given, signal = reference_pulse(system, block.spacing, reference, reach, pulse), signal_above(block, noise)
+    energy = float(np.sum(given.taps**2))
+    rule = f"maxima above {threshold:g} std, coefficient at least {similarity:g}"
+    values = filters.slide_taps(filters.pad_samples(signal, given.middle), given.taps)
+    least = threshold * np.sqrt(energy) * noise.std
+    return Searched("correlation [DN]", rule, values, least, signal, energy, given.peak - given.middle)
+
+
+@stage("detect", searches=("correlation", _correlate))
 def correlation(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     reference: Literal["gaussian", "system", "given"] = "system",
@@ -249,20 +265,38 @@ def correlation(
     energy = float(np.sum(given.taps**2))
 
     def detect(signal: np.ndarray, std: np.ndarray) -> Peaks:
-        padded = pad_samples(signal, given.middle)
-        correlations = slide_taps(padded, given.taps)
+        padded = filters.pad_samples(signal, given.middle)
+        correlations = filters.slide_taps(padded, given.taps)
         waveform, sample = find_peaks(correlations, np.float32(threshold * np.sqrt(energy)) * std)
-        squares = slide_energy(padded, len(given.taps))[sample, waveform]
+        squares = filters.slide_energy(padded, len(given.taps))[sample, waveform]
         value = correlations[sample, waveform]
         alike = value >= similarity * np.sqrt(np.maximum(squares, 0) * np.float32(energy))
         waveform, sample = waveform[alike], sample[alike]
-        time, height = refine_peaks(correlations, waveform, sample)
+        time, height = filters.refine_peaks(correlations, waveform, sample)
         return waveform, time + (given.peak - given.middle), height / energy
 
     return candidate_table(block, system, *_in_parts(signal_above(block, noise), noise.std, detect))
 
 
-@stage("detect")
+def _compare(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, reference: ReferenceKind, rule: str,
+    fraction: float, threshold: float, interpolation: str, reach: float, pulse: str,
+) -> Searched:  # fmt: skip
+    """What `asdf` searches in parts."""
+    given, signal = reference_pulse(system, block.spacing, reference, reach, pulse), signal_above(block, noise)
+    height = signal.max(axis=0)
+    difference, _ = filters.square_differences(signal, given.taps, height)
+    if rule == "paper":
+        least = fraction * np.ptp(difference, axis=0)
+        words = f"minima as deep as {fraction:g} of the range (bars)"
+    else:
+        least = 2 * threshold * np.sqrt(np.sum(given.taps**2)) * noise.std * np.maximum(height, 0)
+        words = f"minima as deep as the bars ({threshold:g} std), with a correlation above {threshold:g} std"
+    first = given.peak - (len(given.taps) - 1)
+    return Searched("square difference R [DN2]", words, difference, least, signal, first=first, deep=True)
+
+
+@stage("detect", searches=("asdf", _compare))
 def asdf(
     block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     reference: Literal["gaussian", "system", "given"] = "gaussian",
@@ -305,15 +339,15 @@ def asdf(
 
     def detect(signal: np.ndarray, std: np.ndarray) -> Peaks:
         height = signal.max(axis=0)
-        difference, correlations = square_differences(signal, given.taps, height)
+        difference, correlations = filters.square_differences(signal, given.taps, height)
         values = np.ascontiguousarray(difference.T)
         if rule == "paper":
-            minima = find_minima(values)
+            minima = filters.find_minima(values)
             least = np.float32(fraction) * (difference.max(axis=0) - difference.min(axis=0))
         else:
-            minima = find_minima(values, np.ascontiguousarray((correlations > gain * std).T))
+            minima = filters.find_minima(values, np.ascontiguousarray((correlations > gain * std).T))
             least = 2 * gain * std * np.maximum(height, 0)
-        kept = minima.take(keep_prominent(minima, least))
+        kept = minima.take(filters.keep_prominent(minima, least))
         shift, peaked = _refine(values, correlations, kept, interpolation == "log")
         time = kept.row - (len(given.taps) - 1) + given.peak + shift
         amplitude = correlations[kept.row, kept.waveform] / np.sum(given.taps**2)
@@ -350,7 +384,9 @@ def parabola_bias(width: float) -> float:
     return float(np.sqrt(np.mean((parabola_shift(*near) - phase) ** 2)))
 
 
-def _refine(values: np.ndarray, correlations: np.ndarray, minima: Minima, log: bool) -> tuple[np.ndarray, np.ndarray]:
+def _refine(
+    values: np.ndarray, correlations: np.ndarray, minima: filters.Minima, log: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Distance from minima of values (n, rows) to the peak [samples]; whether the correlation (rows, n) peaks there."""
     waveform, row = minima.waveform, minima.row
     shift = parabola_shift(*(values[waveform, row + d] for d in (-1, 0, 1)))

@@ -53,19 +53,19 @@ COVERED = 3.2
 200 (chi2 with two degrees of freedom exceeds 10.6 so often)."""
 
 HOPELESS = 5.0
-"""Standard errors by which a description is longer where a pulse is not looked at any further: chance makes so many
-once in three million times."""
+"""Standard errors by which a description is longer where a pulse is not looked at any further: of FEWEST waveforms,
+chance makes so many once in 40,000 times."""
 
 HINT, FEWER = 1.5, 0.95
 """Standard errors by which another pulse must describe shorter, in place of SURE, where it needs at most this share of
-a learned pulse's echoes, or where that is known to miss the stacked echoes by more than the change from shot to shot.
-Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes so many errors once in fifteen times.
-"""
+a learned pulse's echoes, or where that is known to miss the stacked echoes by more than the change from shot to shot;
+and beyond SURE, where it needs more echoes than any. Each echo is a claim too; one in twenty is what `run` calls a
+doubt. Chance makes so many errors once in fifteen times."""
 
 AS_FEW = 0.98
 """Share of its echoes to which another number of them is the same: a fiftieth of them comes and goes with the noise."""
 
-FEWEST = 48
+FEWEST = 24
 """Waveforms on which each candidate is judged first."""
 
 MISFITS = 0.0005 * 2.0 ** np.arange(9)
@@ -282,14 +282,13 @@ def _decide(found: list[Candidate]) -> Choice:
     for number in sorted({one.gaussians for one in found}):
         alike = [one for one in found if one.gaussians == number]
         shortest = min(alike, key=lambda one: (one.typical, one.name))
-        level = [one for one in alike if one.exceeds(shortest) < SURE]
+        level = [one for one in alike if one.exceeds(shortest) < _bound_errors(shortest, one)]
         fewest = min(one.echoes for one in level)
         first = min((one for one in level if AS_FEW * one.echoes <= fewest), key=lambda one: (one.typical, one.name))
         ordered += [first, *(one for one in alike if one is not first)]
     best = ordered[0]
     for one in ordered[1:]:
-        doubtful = one.echoes <= FEWER * best.echoes or best.missed > max(COVERED * best.change, one.missed)
-        if best.exceeds(one) > (HINT if doubtful and not best.known else SURE):
+        if best.exceeds(one) > _bound_errors(one, best):
             best = one
     tied = [one for one in ordered if one.exceeds(best) < SURE]
     echoes, widths = [*best.as_likely, *(one.echoes for one in tied)], [one.system.sigma_ref for one in tied]
@@ -298,9 +297,17 @@ def _decide(found: list[Candidate]) -> Choice:
     return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt, spread)
 
 
+def _bound_errors(shorter: Candidate, longer: Candidate) -> float:
+    """Standard errors by which a candidate must describe shorter to be taken in place of the other."""
+    doubtful = shorter.echoes <= FEWER * longer.echoes or longer.missed > max(COVERED * longer.change, shorter.missed)
+    if doubtful and not longer.known:
+        return HINT
+    return SURE + HINT if longer.echoes <= FEWER * shorter.echoes else SURE
+
+
 def settle(
-    block: WaveformBlock, system: SystemPulse, seen: float = 1.0, missed: float = 0.0
-) -> tuple[SystemPulse, Mirror]:
+    block: WaveformBlock, system: SystemPulse, seen: float = 1.0, missed: float = 0.0, change: float = 0.0
+) -> tuple[SystemPulse, Mirror, float]:
     """Choose the misfit by the length of descriptions, then raise the significance until noise adds no echoes.
 
     Parameters
@@ -313,6 +320,8 @@ def settle(
         Change of the pulse from shot to shot that its strongest echoes show, as a share of the amplitude.
     missed : float
         What the pulse is known to miss of the strip's stacked echoes, as a share of the amplitude: the least misfit.
+    change : float
+        Change of the pulse from shot to shot that describes waveforms best, from which misfits are looked for.
 
     Returns
     -------
@@ -320,24 +329,28 @@ def settle(
         With `misfit` and `significance`.
     mirror : Mirror
         Echoes of mirrored residuals that are left.
+    doubt : float
+        Share by which the number of echoes differs between misfits that cost the same.
     """
     part = thin_block(block, int(np.clip(4 * SAMPLES // block.samples.shape[1], 2 * LEAST, 2048)))
-    system = replace(system, misfit=max(_choose_misfit(part, system, seen), missed))
+    misfit, doubt = _choose_misfit(part, system, seen, change)
+    system = replace(system, misfit=max(misfit, missed))
     harder = np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER)
     tried = []
     for significance, mirror in look_in_mirror(part, system, [0.0, *map(float, harder)]):
         tried.append((replace(system, significance=significance), mirror))
         if mirror.quiet <= _bound(FALSE_QUIET, mirror.echoes):
             break
-    return max(tried, key=lambda one: one[1].worth)
+    return *max(tried, key=lambda one: one[1].worth), doubt
 
 
-def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> float:
-    """Return the least misfit whose description is longer than the shortest by at most one standard error.
+def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float, change: float) -> tuple[float, float]:
+    """Return the least misfit whose description is longer than the shortest by at most one standard error, and a doubt.
 
     It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
     much of it neighbours are not found, and both lengthen the description. Between two misfits that are tried it is
-    found by their standard errors: halves of a strip then agree.
+    found by their standard errors: halves of a strip then agree. The doubt is the share by which the number of echoes
+    differs between misfits whose descriptions are longer by at most one.
     """
     # What clipped echoes hide is no misfit.
     whole = np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1))
@@ -357,22 +370,30 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float) -> fl
         least = lengths[best][change]
         return best, [count_errors(lengths[place][change] - least) for place in sorted(lengths)]
 
-    # From coarse to fine, and no further up than echoes are lost for sure.
-    best, longer = look(0, 4, 2)
-    while longer[-1] < HOPELESS and max(lengths) + 4 < len(MISFITS):
+    # From coarse to fine, and no further down or up than echoes are false, or lost, for sure. Each step looks first at
+    # its ends: what they explain alike is not fitted again.
+    middle = 6 if COVERED * change > MISFITS[5] else 2
+    best, longer = look(middle - 2, middle + 2, middle)
+    while longer[0] < SURE and min(lengths) > 0:
+        best, longer = look(min(lengths) - 4, min(lengths) - 2)
+    while longer[-1] < SURE and max(lengths) + 4 < len(MISFITS):
         best, longer = look(max(lengths) + 4, max(lengths) + 2)
     if longer[0] > 1:
         best, longer = look(*(place for place in (best - 1, best + 1) if place < len(MISFITS)))
         first = next(place for place, errors in zip(sorted(lengths), longer, strict=True) if errors <= 1)
         if first:
             best, longer = look(first - 1)
-    if longer[0] <= 1:
-        return 0.0
     places = sorted(lengths)
+    numbers = [len(found[place].echoes) for place, errors in zip(places, longer, strict=True) if errors <= 1]
+    doubt = (max(numbers) - min(numbers)) / max(len(found[best].echoes), 1)
+    if longer[0] <= 1:
+        return 0.0, doubt
     first = next(place for place, errors in enumerate(longer) if errors <= 1)
     before, after = MISFITS[places[first - 1]], MISFITS[places[first]]
-    share = (longer[first - 1] - 1) / (longer[first - 1] - longer[first])
-    return float(before * (after / before) ** share)
+    # Near its least a length is a parabola.
+    over, under = np.sqrt(longer[first - 1]), np.sqrt(max(longer[first], 0.0))
+    share = (over - 1) / (over - under)
+    return float(before * (after / before) ** share), doubt
 
 
 def _explain_between(block: WaveformBlock, system: SystemPulse, found: dict[int, Explained], place: int) -> Explained:

@@ -15,12 +15,13 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.frozen import frozen
 from wavebatch.core.units import SQRT_2PI, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import exp, log
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.describe import (
     SampleNoise,
     Sums,
     count_echoes,
     describe_left,
+    describe_widths,
     measure_changes,
     render_pulses,
 )
@@ -161,14 +162,15 @@ def describe_waveforms(
     echoes, sums = explained.echoes, explained.sums
     n, s = sums.left.shape
     length, volume = describe_left(sums, sample_noise(system), changes)
-    ratio, error, known = _measure_widths(explained, shape_limits(system, block.spacing).ref)
+    ratio, error, known = _measure_widths(echoes, echoes.sigma.astype(np.float64) / system.sigma_ref)
     amplitude = echoes.amplitude.astype(np.float64)
     typical = max(float(np.mean(amplitude)), 1.0) if len(amplitude) else 1.0
     by_time = np.clip(np.nan_to_num(echoes.time_err / block.spacing, nan=s), 1e-3, s)
     by_amplitude = np.maximum(np.nan_to_num(echoes.amplitude_err, nan=typical), 1e-3 * system.noise.quiet)
     cost = np.maximum(log(s / (SQRT_2PI * by_time)), 0.0)
     cost += np.maximum(log(typical / (SQRT_2PI * by_amplitude)), 0.0) + log(1.0 + (amplitude / typical) ** 2)
-    cost += _describe_widths(ratio, error, known)
+    if np.count_nonzero(known) >= LEAST_KNOWN:
+        cost += describe_widths(ratio, error, known, SCATTERS, WIDER, ANYWHERE)
     number = np.diff(sums.first)
     mean = max(float(number.mean()), 0.01) if n else 1.0
     # Of k echoes in any order: their factorial is the number of orders.
@@ -188,54 +190,17 @@ def find_own_width(explained: Explained, ref: float) -> float:
     Of those at least half as high as the strongest of their waveform: what a wrong pulse makes of its after-pulses
     repeats too, and is narrower. 1 with too few widths that are known.
     """
-    ratio, error, known = _measure_widths(explained, ref)
     echoes = explained.echoes
+    ratio, error, known = _measure_widths(echoes, explained.sums.main[:, 2] / ref)
     strongest = np.zeros(len(explained.sums.left), np.float32)
     np.maximum.at(strongest, echoes.waveform, echoes.amplitude)
     known &= echoes.amplitude >= 0.5 * strongest[echoes.waveform]
     return find_edge(ratio[known], error[known]) if np.count_nonzero(known) >= LEAST_KNOWN else 1.0
 
 
-def _measure_widths(explained: Explained, ref: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _measure_widths(echoes: EchoTable, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Widths over the pulse's, their errors, and which of them are known (m,)."""
-    echoes, ratio = explained.echoes, explained.sums.main[:, 2] / ref
     with np.errstate(invalid="ignore"):
         error = np.nan_to_num(echoes.sigma_err / np.maximum(echoes.sigma, 1e-6), nan=2.0).astype(np.float64)
     error = np.clip(error, 1e-3, 2.0) * ratio
     return ratio, error, ((echoes.flags & _DOUBTFUL) == 0) & (error < KNOWN * ratio)
-
-
-def _describe_widths(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Cost of each width (m,) by the density of those that are known, with the scatter that serves best; 0 for few."""
-    if np.count_nonzero(known) < LEAST_KNOWN:
-        return np.zeros(len(ratio))
-    costs = [_describe_scattered(ratio, np.hypot(error, scatter), known) for scatter in SCATTERS]
-    return min(costs, key=lambda cost: float(np.sum(cost[known]))) - log(SQRT_2PI * error)
-
-
-def _describe_scattered(ratio: np.ndarray, error: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Cost of each width (m,), each with its error, by the sum of laws that makes the known ones likeliest."""
-    laws = _densities(ratio, error)
-    seen = laws[known]
-    share = np.full(laws.shape[1], 1.0 / laws.shape[1])
-    for _ in range(15):
-        weight = seen * share
-        weight /= np.maximum(np.einsum("mk->m", weight), 1e-300)[:, None]
-        share = (np.einsum("mk->k", weight) + 0.5) / (len(seen) + 0.5 * len(share))
-    return -log((1 - ANYWHERE) * np.einsum("mk,k->m", laws, share) + ANYWHERE / WIDER[-1])
-
-
-def _densities(ratio: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Density of each width (m,) by each law through its error (m, k): the pulse's own width, and uniform ones."""
-    from_own = _normal((ratio - 1.0) / error)
-    uniform = (from_own[:, None] - _normal((ratio[:, None] - WIDER) / error[:, None])) / (WIDER - 1.0)
-    own = exp(-0.5 * np.minimum(((ratio - 1.0) / error) ** 2, 1400.0)) / (SQRT_2PI * error)
-    return np.concatenate([own[:, None], uniform], axis=1)
-
-
-def _normal(z: np.ndarray) -> np.ndarray:
-    """Share of normal values below z, exact to 1e-7 (Abramowitz and Stegun 26.2.17)."""
-    t = 1.0 / (1.0 + 0.2316419 * np.abs(z))
-    series = t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))))
-    above = exp(-0.5 * np.minimum(z * z, 1400.0)) / SQRT_2PI * series
-    return np.where(z > 0, 1.0 - above, above)

@@ -1,6 +1,7 @@
 """What a survey measured beside the system: echoes and pulse models, the scene, and what strips of the flight record.
 
-`survey` fills it in, decisions and reports are made from it, and `system_file` keeps it as the table [figures].
+`survey` fills it in, decisions and reports are made from it, and `system_file` keeps it as the table [figures]. A field
+whose Key says how it is `shown` is a line of `wavebatch survey` too.
 Before you change it: files of earlier versions lack figures and have others, so each may be missing.
 """
 
@@ -107,7 +108,7 @@ class Figures:
     overlapped_share: Share = None
     echoes_per_waveform: Figure = None
     amplitude_50: Figure = None
-    amplitude_99: Figure = None
+    amplitude_99: Annotated[Figure, Key(shown="amplitudes: 99 % below {:.1f} DN")] = None
     saturated_share: Share = None
     system_width_share: Share = None
     """Clear echoes that have the width of the system pulse."""

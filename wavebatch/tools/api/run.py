@@ -10,12 +10,11 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Any, Concatenate, ParamSpec
 
 from wavebatch.batch.job import StripJob, choose_columns, list_column_names
 from wavebatch.batch.options import RunOptions, describe_options
 from wavebatch.batch.run import BatchResult, check_outputs, plan_memory, run_batch
-from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
@@ -32,61 +31,32 @@ from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
 from wavebatch.tools.api.strip import AUTO, load_chain
 
-
-class RunKeywords(TypedDict, total=False):
-    """What RunOptions takes beside the output."""
-
-    chain: Chain | Path | str | None
-    profile: str | None
-    tolerance: float | None
-    system: Survey | Path | str | None
-    force: bool
-    survey: Literal["each", "flight"]
-    calibration: Path | str | None
-    direction: Literal["auto", "toward", "away"]
-    headerless: bool
-    recursive: bool
-    trajectory: Path | str | None
-    lever_arm: tuple[float, float, float] | None
-    crs: str | None
-    flight_height: float | None
-    attenuation: float | None
-    attenuation_error: float | None
-    visibility: float | None
-    wavelength: float | None
-    energy: Path | str | None
-    where: Condition | str | None
-    drop_flags: str | None
-    classes: tuple[int, ...] | None
-    bbox: tuple[float, float, float, float] | None
-    polygon: Path | str | None
-    points: Literal["echoes", "returns"]
-    columns: str | None
-    names: Literal["wavebatch", "asprs", "riegl", "pdal", "opals"]
-    format: Literal["laz", "las"]
-    point_format: int | None
-    las_version: Literal["1.4", "1.3", "keep"]
-    no_data: Literal["-9999", "nan"]
-    strict: bool
-    keep_packets: bool
-    jobs: int
-    scheduler: str | None
-    memory: int | None
-    block_size: int | None
-    overwrite: bool
-    resume: bool
-
-
 Strips = Iterable[Path | str] | Path | str
 
 
-def run(
-    strips: Strips,
-    output: Path | str,
-    *,
-    on_event: Callable[[dict[str, Any]], None] | None = None,
-    **options: Unpack[RunKeywords],
-) -> BatchResult:
+_P = ParamSpec("_P")
+
+
+def _takes(
+    options: Callable[_P, RunOptions],
+) -> Callable[[Callable[..., BatchResult]], Callable[Concatenate[Strips, _P], BatchResult]]:
+    """A function of strips gets the keywords of RunOptions: for type checkers, help() and editors that run the code."""
+
+    def sign(function: Callable[..., BatchResult]) -> Callable[Concatenate[Strips, _P], BatchResult]:
+        first = inspect.signature(function).parameters["strips"]
+        output, *others = inspect.signature(options).parameters.values()
+        shown = [first, output.replace(default=output.empty), *(one.replace(kind=one.KEYWORD_ONLY) for one in others)]
+        function.__signature__ = inspect.Signature(shown, return_annotation=BatchResult)  # type: ignore[attr-defined]
+        before, mark, after = (function.__doc__ or "").partition("    **options\n")
+        lines = "".join(f"    {line}\n" for line in describe_options().split("\n"))
+        function.__doc__ = before + lines + after[after.find("\n\n") + 1 :] if mark else before
+        return function
+
+    return sign
+
+
+@_takes(RunOptions)
+def run(strips: Strips, output: Path | str, **options: Any) -> BatchResult:
     """Write a point cloud and a report for every strip; what `wavebatch run` does.
 
     The keywords are the options of the command, with `_` for `-`; `help(wavebatch.run)` lists them.
@@ -112,22 +82,8 @@ def run(
     ConfigError
         For wrong options, before anything starts.
     """
-    return run_batch(*plan_run(strips, RunOptions(output, **options)), on_event)
-
-
-def _sign(function: Callable) -> None:
-    """Give `run` the keywords of RunOptions, for help() and editors that run the code."""
-    given = inspect.signature(function).parameters
-    keywords = inspect.signature(RunOptions).parameters
-    shown = [given["strips"], given["output"], given["on_event"]]
-    shown += [one.replace(kind=one.KEYWORD_ONLY) for one in list(keywords.values())[1:]]
-    function.__signature__ = inspect.Signature(shown, return_annotation=BatchResult)  # type: ignore[attr-defined]
-    before, mark, after = (function.__doc__ or "").partition("    **options\n")
-    lines = "".join(f"    {line}\n" for line in describe_options().split("\n"))
-    function.__doc__ = before + lines + after[after.find("\n\n") + 1 :] if mark else before
-
-
-_sign(run)
+    asked = RunOptions(output, **options)
+    return run_batch(*plan_run(strips, replace(asked, on_event=None)), asked.on_event)
 
 
 def plan_run(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from wavebatch.core.order import EvenSample
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader
 from wavebatch.files.figure_file import has_matplotlib, open_svg, plain_text
@@ -23,11 +24,10 @@ from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.systems.shown import full_width, sample_pulse
-from wavebatch.tools.even_sample import EvenSample
+from wavebatch.tools.cells import Raster, Tally, choose_grid, compute_cells, find_shown, robust_limits
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, draw_cells
 from wavebatch.tools.plots.draw_waveform import HEAD, LEGEND, draw_small_waveforms, sheet_size
 from wavebatch.tools.plots.waveform import WaveformView, build_views
-from wavebatch.tools.rasters.cells import Raster, Tally, choose_grid, compute_cells, find_shown, robust_limits
 from wavebatch.tools.sheets.sheet import Note, Picture, Sheet
 
 if TYPE_CHECKING:

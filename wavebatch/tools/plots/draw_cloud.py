@@ -17,12 +17,12 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import EvenSample
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.las.header import CLASS_NAMES
-from wavebatch.tools.even_sample import EvenSample
-from wavebatch.tools.rasters.cells import Clouds, Raster, Tally, name_paths, shown_limits
+from wavebatch.tools.cells import Clouds, Raster, Tally, name_paths, shown_limits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

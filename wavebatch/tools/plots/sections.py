@@ -20,8 +20,9 @@ from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.las.crs import CrsWords
+from wavebatch.tools import cells
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
-from wavebatch.tools.rasters import cells
+from wavebatch.tools.slice_output import UNIT, SegmentFiles, is_segments
 from wavebatch.tools.voxels.grid import VoxelFile
 
 MOST_POINTS = 200_000
@@ -37,8 +38,16 @@ _CHOSEN_BINS = 60
 """Bins of a profile, about, if their size is not given."""
 
 
-def open_heights(paths: Sequence[Path], column: str | None, chosen: PointFilter) -> cells.Clouds | VoxelFile:
-    """Clouds or one file of voxels, whose rows have the height as second value."""
+_PIECE = 100_000
+"""Shares of segments in bins that are computed at a time."""
+
+
+def open_heights(
+    paths: Sequence[Path], column: str | None, chosen: PointFilter
+) -> cells.Clouds | VoxelFile | SegmentFiles:
+    """Clouds or one file of voxels, whose rows have the height as second value; segments have those of both ends."""
+    if is_segments(paths[0]):
+        return SegmentFiles(paths, column)
     voxels = [path for path in paths if path.suffix.lower() == ".npz"]
     if voxels and len(paths) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
@@ -129,7 +138,9 @@ def cut_section(
                    outside, shown, voxel, crs)  # fmt: skip
 
 
-def _find_crs(clouds: cells.Clouds | VoxelFile) -> CrsWords:
+def _find_crs(clouds: cells.Clouds | VoxelFile | SegmentFiles) -> CrsWords:
+    if isinstance(clouds, SegmentFiles):
+        return CrsWords()
     return CrsWords(clouds.crs) if isinstance(clouds, VoxelFile) else cells.check_crs(clouds.paths)
 
 
@@ -204,7 +215,9 @@ def measure_profile(
     size: float | None = None,
     each: bool = False,
 ) -> Profile:
-    """The number of points, or the sum or mean of the column, per height.
+    """The number of points or segments, or the sum or mean of the column, per height.
+
+    A segment is not a point: it counts in every bin that it crosses, by the share of its height that lies there.
 
     size: height of a bin, by default about a sixtieth of all. each: one series per cloud instead of one for all. Far
     outliers in height are left out and counted. Raises InputError without any value.
@@ -214,7 +227,7 @@ def measure_profile(
     cells.check_statistic(column, statistic, clouds.facts, paths[0])
 
     def pick(_: int, rows: np.ndarray) -> np.ndarray:
-        height = rows["values"][:, 1:]
+        height = rows["values"][:, 1:].reshape(-1, 1)
         return height[np.isfinite(height[:, 0])]
 
     total, sample, box = cells.sample_points(clouds, pick)
@@ -225,18 +238,43 @@ def measure_profile(
     series = len(paths) if each else 1
     sums, numbers, outside = np.zeros((series, len(edges) - 1)), np.zeros((series, len(edges) - 1)), 0
     for cloud, rows, _ in clouds.read():
-        at = np.searchsorted(edges, rows["values"][:, 1], side="right") - 1
-        good = (at >= 0) & (at < len(edges) - 1)
+        value, row = rows["values"][:, 0], cloud if each else 0
+        low, high = rows["values"][:, 1:].min(axis=1), rows["values"][:, 1:].max(axis=1)
+        at = np.searchsorted(edges, low, side="right") - 1
+        good = (at < len(edges) - 1) & ~(high < edges[0])  # not a number is outside
         outside += int(np.count_nonzero(~good))
-        row = cloud if each else 0
-        numbers[row] += np.bincount(at[good], minlength=len(edges) - 1)
-        sums[row] += np.bincount(at[good], rows["values"][:, 0][good], minlength=len(edges) - 1)
+        if rows["values"].shape[1] == 2:
+            numbers[row] += np.bincount(at[good], minlength=len(edges) - 1)
+            sums[row] += np.bincount(at[good], value[good], minlength=len(edges) - 1)
+            continue
+        step = _PIECE // len(edges) + 1
+        for part in (slice(start, start + step) for start in range(0, len(rows), step)):
+            share = share_heights(rows["values"][part, 1:], edges)
+            numbers[row] += share.sum(axis=0)
+            sums[row] += value[part] @ share
     with np.errstate(invalid="ignore", divide="ignore"):
         values: Any = {"count": numbers, "sum": sums, "mean": np.where(numbers > 0, sums / numbers, np.nan)}[statistic]
     names = cells.name_paths(paths)
-    names = names if each or len(paths) == 1 else (f"{len(paths)} clouds",)
-    return Profile(clouds.facts, statistic, names, edges, values, outside, total, crs.upright_unit,
-                   crs.upright)  # fmt: skip
+    kind, unit = "clouds", crs.upright_unit
+    more = {"upright": crs.upright}
+    if isinstance(clouds, SegmentFiles):
+        kind, unit, more = "files", UNIT, {"noun": "segments"}
+    names = names if each or len(paths) == 1 else (f"{len(paths)} {kind}",)
+    return Profile(clouds.facts, statistic, names, edges, values, outside, total, unit, **more)
+
+
+def share_heights(ends: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Share of the height of each segment in each bin, f8 (n, b).
+
+    ends: heights of both ends, f8 (n, 2). Bins hold their lower edge; a level segment lies in one bin.
+    """
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    span = high - low
+    level = span < 1e-9 * max(float(np.abs(edges).max()), 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        below = np.clip((edges - low[:, None]) / span[:, None], 0.0, 1.0)
+    below[level] = low[level, None] < edges
+    return np.diff(below, axis=1)
 
 
 def place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:

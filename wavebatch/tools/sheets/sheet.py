@@ -146,6 +146,17 @@ def format_value(value: Any, form: str = "", unknown: str = "-") -> str:
     return str(value)
 
 
+def list_facts(record: Any) -> Iterator[Fact]:
+    """The fields of a dataclass that say in their Key how they are shown, and are known."""
+    from wavebatch.files.toml_file import list_entries
+
+    for one in list_entries(type(record)):
+        value = getattr(record, one.field)
+        if one.key.shown and value is not None and math.isfinite(value):
+            name, _, words = one.key.shown.partition(": ")
+            yield Fact(name, words.format(value))
+
+
 def sum_table(rows: Iterable[tuple[str, int, str, bool]]) -> Table:
     """A table of sums: name, number, its parts in words, and whether they add up to it; one that does not is marked."""
     marks = {True: "adds up", False: Cell("does not add up", 1, note="counts are wrong; please report it")}

@@ -1,16 +1,53 @@
-"""What a survey found, as a sheet: `wavebatch survey` prints it, and it is on the pages of `survey` and `run`."""
+"""What a survey or a calibration found, as sheets: commands print them, and they are on the pages of `--html`.
+
+`survey --angles` also gives the lookup table of a sensor: which echo width means which incidence angle, and how sure
+that is, as .csv or drawn. The widths go through the functions of stage attribute.incidence_angle, so that the table is
+what a run writes for surfaces that fill the beam.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from wavebatch.core.units import FWHM_PER_SIGMA, count, format_measure
+import numpy as np
+
+from wavebatch import __version__
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.frozen import frozen
+from wavebatch.core.system import swath_columns
+from wavebatch.core.units import FWHM_PER_SIGMA, count, format_measure, format_relative
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.disk.publish import check_target
+from wavebatch.files.figure_file import check_picture, open_picture, plain_text, set_head
+from wavebatch.files.text_file import write_text
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
+from wavebatch.stages.attribute.incidence_angle import added_variance
 from wavebatch.surveying import Survey
+from wavebatch.surveying.angle_limits import REFERENCE_ERROR
 from wavebatch.surveying.systems.shown import name_model
-from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Picture, Sheet, Table
+from wavebatch.tools.sheets.sheet import (
+    Cell,
+    Code,
+    Fact,
+    Later,
+    Note,
+    Part,
+    Picture,
+    Sheet,
+    Table,
+    format_csv,
+    list_facts,
+)
+
+if TYPE_CHECKING:
+    from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
+    from wavebatch.surveying.calibration import Calibration, TargetResult
 
 NOISE_KINDS = {
     "quiet": "quiet samples",
@@ -32,7 +69,7 @@ def survey_sheet(survey: Survey, document: Mapping[str, Any]) -> Sheet:
     decisions = Table(("decisions", "part of the chain", "reason"), rows)
     chosen = [decisions] if rows else [Note("The survey did not choose the chain: the user gave it.")]
     facts = [*_list_strip(survey, document), *_list_noise(survey), *_list_pulse(survey, document), *_list_scene(survey)]
-    return Sheet("Survey", [*facts, Later(partial(_draw, survey)), Sheet("Decisions", chosen)])
+    return Sheet("Survey", [*facts, Later(partial(_draw_survey, survey)), Sheet("Decisions", chosen)])
 
 
 def list_doubts(document: Mapping[str, Any]) -> list[Note]:
@@ -121,14 +158,13 @@ def _list_scene(survey: Survey) -> Iterator[Part]:
     shares = [f"{100 * share:.2f} % {kind}" for kind, share in kinds.items() if share is not None]
     if shares and figures.echoes_per_waveform is not None:
         yield Fact("waveforms", f"{', '.join(shares)}; {figures.echoes_per_waveform:.3f} echoes each")
-    if figures.amplitude_99 is not None:
-        yield Fact("amplitudes", f"99 % below {figures.amplitude_99:.1f} DN")
+    yield from list_facts(figures)
     if figures.system_width_share is not None:
         share = 100 * figures.system_width_share
         yield Fact("widths", f"{share:.1f} % of the clear echoes have the width of the system pulse")
 
 
-def _draw(survey: Survey) -> Iterator[Picture]:
+def _draw_survey(survey: Survey) -> Iterator[Picture]:
     """The pulses, and what the waveforms hold."""
     from wavebatch.tools.plots.charts import chart_pulse, draw_counts
 
@@ -159,7 +195,7 @@ def write_survey_page(
 def _page_parts(
     survey: Survey, document: Mapping[str, Any], strips: Sequence[Path], reading: Mapping[str, Any]
 ) -> Iterator[Part]:
-    from wavebatch.surveying.auto_chain import choose_chain
+    from wavebatch.surveying.choose_chain import choose_chain
     from wavebatch.tools.plots.charts import draw_waveforms
 
     yield from list_doubts(document)
@@ -178,3 +214,244 @@ def _page_parts(
     paths = (Fact(f"strip {n + 1}", path) for n, path in enumerate(strips))
     chain_text = Sheet("Chain that the strip needs", [Code(document["chain"])])
     yield Sheet("Provenance", [Fact("wavebatch", document["version"]), *paths, chain_text])
+
+
+UNIT = "1/(m2 DN ns)"
+
+MOST_PAIRS = 60
+"""Pairs that are drawn; more would be too small to read."""
+
+
+def calibration_sheet(flight: FlightCalibration) -> Sheet:
+    """The sheet of a calibration of one strip or of several, without its notes, which are warnings."""
+    found = flight.calibration
+    drawn = Later(partial(_draw_calibration, flight))
+    return Sheet("Calibration", [*_list_facts(found), *_list_tables(flight), drawn])
+
+
+def write_calibrate_page(target: Path, flight: FlightCalibration) -> None:
+    """Write the page of a calibration of one strip or of several."""
+    from wavebatch.surveying.calibrating.calibration_file import format_calibration
+    from wavebatch.tools.sheets.page import write_page
+
+    found = flight.calibration
+    days = [Fact("day of the flight", found.flight or "not in the strip"), Fact("calibrated on", found.date)]
+    provenance = Sheet("Provenance", [Fact("wavebatch", __version__), *days, Code(format_calibration(found))])
+    parts = [*(Note(words, "warning") for words in found.notes), *calibration_sheet(flight).parts, provenance]
+    write_page(target, f"wavebatch calibrate: {found.strip or 'strips'}", parts)
+
+
+def _list_facts(found: Calibration) -> Iterator[Fact]:
+    constant = format_relative(found.constant, found.relative_error)
+    yield Fact("constant", f"{constant} +- {100 * found.relative_error:.1f} % {UNIT}")
+    yield Fact("attenuation", f"{found.attenuation:g} dB/km one way")
+    yield Fact("divergence", "not given" if found.divergence is None else f"{found.divergence:g} mrad")
+    if found.swath:
+        most, square, fourth, odd = found.swath
+        left, right = (100 * math.expm1(-square - fourth - side * odd) for side in (-1, 1))
+        sides = f"{left:+.1f} % light to the left and {right:+.1f} % to the right"
+        yield Fact("scan angle", f"{sides}, at {math.degrees(most):.1f} deg against straight down")
+    yield Fact("conditions", found.conditions)
+
+
+def _list_tables(flight: FlightCalibration) -> Iterator[Table]:
+    found = flight.calibration
+    tilted = any(one.incidence_deg is not None for one in found.targets)  # a column of reflectances has no angle
+    rows = [(one.label, one.reflectance, one.echoes, _constant(one.constant, one.relative_error or one.spread),
+             one.spread, *[_incidence(one)] * tilted,
+             "used" if one.constant is not None else one.refused or "refused") for one in found.targets]  # fmt: skip
+    head = ("target", "reflectance", "echoes", "constant", "spread", *["incidence deg"] * tilted, "")
+    yield Table(head, rows, ("", ".4g", "", "", ".1%", *[""] * tilted, ""), sortable=True)
+    rows = [(f"digitizer {one.digitizer}, scanner channel {one.scanner}", one.echoes or "by overlap",
+             _constant(one.constant, one.relative_error), one.relative_error,
+             *((one.spread, one.shot_energy) if one.echoes else (None, None))) for one in found.channels]  # fmt: skip
+    yield Table(("channel", "echoes", "constant", "error", "spread", "without fit errors"), rows, ".1%")
+    rows = [(one.strip, f"{one.digitizer}/{one.scanner}", _constant(one.constant, one.relative_error),
+             one.relative_error, one.drift, one.drift_error, one.ties) for one in found.strips]  # fmt: skip
+    head = ("strip", "digitizer/channel", "constant", "error", "drift", "drift error", "tie cells")
+    yield Table(head, rows, ("", "", "", ".1%", "+.2%", ".2%", ""), sortable=True)
+    rows = [(f"{one.a} over {one.b}", one.cells, one.ratio - 1, one.after - 1, one.spread, one.height)
+            for one in flight.pairs]  # fmt: skip
+    head = ("overlap", "cells", "light", "calibrated", "spread", "height m")
+    yield Table(head, rows, ("", "", "+.2%", "+.2%", ".2%", "+.3f"), sortable=True)
+
+
+def _constant(value: float | None, relative_error: float | None) -> Cell:
+    """A constant with as many digits as its error allows."""
+    return Cell("-", "") if value is None else Cell(format_relative(value, relative_error or 0.0), value)
+
+
+def _incidence(target: TargetResult) -> Cell:
+    if target.incidence_deg is None:
+        return Cell("-", "")
+    error = "" if target.incidence_error_deg is None else f" +- {target.incidence_error_deg:.1f}"
+    return Cell(f"{target.incidence_deg:.1f}{error}", target.incidence_deg)
+
+
+def _draw_calibration(flight: FlightCalibration) -> Iterator[Picture]:
+    """Constants of the targets, light by scan angle, drifts of the strips, and what is left in overlaps."""
+    from wavebatch.tools.plots.charts import draw_values
+
+    found = flight.calibration
+    used = [(one.label, one.constant, one.constant * (one.relative_error or one.spread or 0.0))
+            for one in found.targets if one.constant is not None]  # fmt: skip
+    if used:
+        names, constants, errors = zip(*used, strict=True)
+        yield from draw_values(names, constants, errors, title="Constant of each target with its error", label=UNIT)
+    if found.swath:
+        angles = np.linspace(-found.swath[0], found.swath[0], 13)
+        light = 100 * np.exp(-swath_columns(angles, found.swath[0]) @ found.swath[1:])
+        names = [f"{angle:.1f}" for angle in np.degrees(angles)]
+        title = f"Light from {names[0]} (left of the flight) to {names[-1]} deg"
+        yield from draw_values(names, light, np.zeros(13), title=title, label="% of straight down")
+    if found.strips:
+        names = [f"{one.strip} {one.digitizer}/{one.scanner}" for one in found.strips]
+        drifts, errors = zip(*((100 * one.drift, 100 * one.drift_error) for one in found.strips), strict=True)
+        yield from draw_values(names, drifts, errors, title="Drift of each strip with its error", label="%")
+    some = flight.pairs[:MOST_PAIRS]
+    if some:
+        light, spread = zip(*((100 * (one.after - 1), 100 * one.spread) for one in some), strict=True)
+        names = [f"{one.a} / {one.b}" for one in some]
+        yield from draw_values(names, light, spread, title="Calibrated light of the first over the second", label="%")
+
+
+ANGLES = np.arange(0.0, 81.0)
+"""Angles of the table [deg]."""
+
+DRAWN = (1.0, 0.25, 4.0)
+"""Amplitudes over that of the table for which a picture has errors."""
+
+_DRAWS = 2000
+"""Measured widths, evenly drawn from their law, from which the error of an angle is computed."""
+
+_WIDEST, _FINE = 40.0, 20_000
+"""Largest width that is tried [system widths], and number of widths."""
+
+
+@frozen(eq=False)
+class AngleTable:
+    """Widths by angle at one distance and amplitude; NaN where no width means the angle."""
+
+    distance: float
+    """Sensor to echo [m]."""
+    divergence: float
+    """Full angle of the beam between the 1/e^2 points [mrad]."""
+    amplitude: float
+    """Of the echoes whose errors are given [DN]."""
+    angle: np.ndarray
+    """f8 (a,) [deg]."""
+    spread: np.ndarray
+    """What the surface adds to the pulse, as a standard deviation, f8 (a,) [ns]."""
+    width: np.ndarray
+    """Column echo_width, f8 (a,) [ns]."""
+    error: np.ndarray
+    """Root mean square error of the angle that a run gives one echo of a surface with this angle, f8 (a,) [deg]."""
+
+
+def tabulate_angles(
+    system: SystemPulse, spacing: float, distance: float, divergence: float, amplitude: float
+) -> AngleTable:
+    """The table of a system; amplitude: of the echoes for whose noise errors are given [DN]."""
+    beam = 1e-3 * divergence
+    spread = spread_of_angle(np.radians(ANGLES), distance, divergence=beam)
+    tried = np.linspace(0.3, _WIDEST, _FINE) * system.sigma_ref
+    variance, _ = _add_variance(system, spacing, tried, np.zeros(_FINE))
+    sigma = np.interp(spread**2, variance, tried, left=np.nan, right=np.nan)
+    bound = np.array([bound_time(max(amplitude, 1e-3), max(one, 1e-6), system.noise.std, spacing)
+                      for one in np.nan_to_num(sigma, nan=1.0)])  # fmt: skip
+    variance, variance_err = _add_variance(system, spacing, sigma, bound)
+    error = _expect_error(variance, variance_err, distance, beam)
+    width = FWHM_PER_SIGMA * sigma
+    return AngleTable(distance, divergence, amplitude, ANGLES, spread, width, np.where(np.isnan(sigma), np.nan, error))
+
+
+def _expect_error(variance: np.ndarray, variance_err: np.ndarray, distance: float, beam: float) -> np.ndarray:
+    """Root mean square error of the angles of many echoes of each surface [deg].
+
+    The error column of a run belongs to one measured width: over the widths it jumps near 0, where half of the echoes
+    are read as 0. What a surface gives on average does not.
+    """
+    from scipy.special import erfinv  # every survey comes by this module
+
+    normal = np.sqrt(2.0) * erfinv(np.arange(-_DRAWS + 1, _DRAWS, 2) / _DRAWS)
+    measured = variance[:, None] + variance_err[:, None] * normal
+    angle = angle_of_spread(np.sqrt(np.maximum(measured, 0.0)), distance, beam)
+    return np.degrees(np.sqrt(np.mean((angle - np.radians(ANGLES)[:, None]) ** 2, axis=1)))
+
+
+def _add_variance(
+    system: SystemPulse, spacing: float, sigma: np.ndarray, sigma_err: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variance that a surface added to echoes of these widths, as the stage computes it [ns2]."""
+    block = WaveformBlock.from_samples(np.zeros((1, 2), np.uint8), bits=8, spacing=spacing)
+    zero = np.zeros(len(sigma))
+    echoes = EchoTable.build(zero.astype(int), zero, zero + 1.0, sigma, sigma_err=sigma_err)
+    return added_variance(block, system, echoes, "system", REFERENCE_ERROR)
+
+
+def check_angles(target: Path, *, overwrite: bool) -> None:
+    """Raises ConfigError or InputError if the table cannot be written there."""
+    if target.suffix.lower() == ".csv":
+        check_target(target, overwrite=overwrite)
+    else:
+        check_picture(target, overwrite=overwrite)
+
+
+def write_angles(
+    target: Path,
+    system: SystemPulse,
+    *,
+    spacing: float,
+    distance: float | None,
+    amplitude: float,
+    strip: str = "",
+    overwrite: bool = False,
+) -> None:
+    """Writes the table of a strip as .csv, or draws it; strip: its name, for the title.
+
+    Raises ConfigError where the beam is not known, InputError where the sensor's position is not known or no width of
+    this system means an angle.
+    """
+    if not system.radiometry.divergence:
+        raise ConfigError(f"--angles {target}: the beam is not known; give --divergence")
+    if distance is None:
+        raise InputError(f"--angles {target}: the distance of the sensor is not known, so no width means an angle")
+    if math.isinf(system.widths.error or 0.0):
+        raise InputError(f"--angles {target}: the strip does not show which width a surface has that faces the sensor")
+    beam = system.radiometry.divergence
+    tables = [tabulate_angles(system, spacing, distance, beam, part * amplitude) for part in DRAWN]
+    if target.suffix.lower() == ".csv":
+        write_text(target, format_angles(tables[0]), overwrite=overwrite)
+    else:
+        draw_angles(tables, target, strip=strip, overwrite=overwrite)
+
+
+def format_angles(found: AngleTable) -> str:
+    """The table as CSV; empty cells are no data."""
+    head = ("angle_deg", "spread_ns", "echo_width_ns", "angle_err_deg", "distance_m", "divergence_mrad",
+            "amplitude_DN")  # fmt: skip
+    same = map(float, (found.distance, found.divergence, found.amplitude))
+    columns = (found.angle, found.spread, found.width, found.error, *(np.full(len(found.angle), one) for one in same))
+    return format_csv(head, zip(*columns, strict=True), digits=6)
+
+
+def draw_angles(tables: Sequence[AngleTable], target: Path, *, strip: str = "", overwrite: bool = False) -> None:
+    """Writes a picture of the angles, and of their errors for echoes of each table's amplitude.
+
+    Raises as figure_file.open_picture does.
+    """
+    from wavebatch.tools.plots.draw_cloud import SERIES
+
+    found = tables[0]
+    with open_picture(target, (7.0, 6.0), overwrite=overwrite) as figure:
+        axes, errors = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+        axes.plot(found.width, found.angle, color=SERIES[0], linewidth=1.5)
+        axes.set(ylim=(0, 90), ylabel="incidence angle [deg]")
+        for one, color in zip(tables, SERIES, strict=False):
+            errors.plot(one.width, one.error, color=color, linewidth=1.2, label=f"echoes of {one.amplitude:.0f} DN")
+        errors.set_yscale("log")
+        errors.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        errors.set(xlabel="echo_width [ns]", ylabel="rms error [deg]")
+        parts = [plain_text(strip), f"{found.distance:.0f} m, {found.divergence:g} mrad"]
+        set_head(figure, [part for part in parts if part], size=10.5)
+        errors.legend(loc="upper right")

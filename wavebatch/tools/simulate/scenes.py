@@ -563,9 +563,9 @@ class Simulated:
             return self
         a, b = np.searchsorted(self.truth.waveform, [start, stop])
         truth = self.truth.take(np.arange(a, b))
-        rays = SceneRays(**{field.name: getattr(self.rays, field.name)[start:stop] for field in fields(SceneRays)})
+        rays = {one.name: getattr(self.rays, one.name)[start:stop] for one in fields(SceneRays)}
         truth = replace(truth, waveform=truth.waveform - np.int32(start))
-        return Simulated(self.block.rows(slice(start, stop)), truth, rays)
+        return Simulated(self.block.rows(slice(start, stop)), truth, SceneRays(**rays))
 
 
 def simulate_block(

@@ -34,7 +34,7 @@ from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.packets import StripFacts
 from wavebatch.kernels.geometry import voxels as kernel
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
-from wavebatch.tools.rasters.cells import Tally
+from wavebatch.tools.cells import Tally
 from wavebatch.tools.voxels.rays import Floor, LightRule, Rays, measure_lengths
 
 LIGHT_UNIT = 2.0**-30

@@ -1,6 +1,6 @@
 import numpy as np
 
-from wavebatch.tools.even_sample import EvenSample
+from wavebatch.core.order import EvenSample
 
 
 def test_an_even_sample_is_every_nth_row_however_they_come(rng):

@@ -20,6 +20,7 @@ import scipy  # parts of it load when they are first asked for
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import EvenSample
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
@@ -28,7 +29,6 @@ from wavebatch.files.disk.temp_store import Spool, count_buckets, spread_times
 from wavebatch.files.las.header import CLASS_NAMES
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
-from wavebatch.tools.even_sample import EvenSample
 from wavebatch.tools.return_stats import pulses_told_apart
 from wavebatch.tools.simulate.strip import TruthReader
 

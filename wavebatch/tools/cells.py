@@ -19,12 +19,12 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import EvenSample
 from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader, check_alike
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.files.las.crs import CrsWords, describe_crs
-from wavebatch.tools.even_sample import EvenSample
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""

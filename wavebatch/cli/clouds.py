@@ -1,6 +1,7 @@
-"""`wavebatch stats`: return numbers, separations and flags of point clouds.
+"""`wavebatch stats`: return numbers, separations and flags of clouds; `wavebatch grid`: their columns as a GeoTIFF.
 
-Reads options and writes the text, the CSV table and the JSON document; counting is in `wavebatch.tools.return_stats`.
+Reads options and writes text, CSV and JSON; counting is in `wavebatch.tools.return_stats`, rasters are made in
+`wavebatch.tools.raster`, which needs rasterio (extra `gis`).
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import print_json, print_sheet, talk
+from wavebatch.cli.messages import answer, print_json, print_sheet, talk, tell
+from wavebatch.cli.plot import choose_points, find_clouds
+from wavebatch.cli.program.command import complete_columns
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C, count
@@ -23,8 +26,10 @@ from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
+from wavebatch.files.toml_file import describe_record
 from wavebatch.tools import return_stats as returns
-from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv
+from wavebatch.tools.raster import ForestOptions, GridOptions, GridResult, write_grid
+from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv, list_facts
 
 EXIT_UNREADABLE = 1
 """A cloud could not be read; the others were counted."""
@@ -111,6 +116,7 @@ def _sheet(found: returns.ReturnStats) -> Sheet:
         pulses = count(found.several, "pulse")
         words = f"{found.depth:.3f} m, mean height of the first above the last return of {pulses}"
         parts.append(Fact("first to last", words))
+    parts += list_facts(found)
     parts += [Fact(f"  {name}", number) for name, number in (found.flags or {}).items() if number]
     parts += [Note(words, "warning") for words in found.warnings]
     number = range(1, max((max(area.by_count) for area in found.areas), default=0) + 1)
@@ -141,7 +147,7 @@ def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_coun
     ends = ["", *(f"_{pair.replace('-', '_').rstrip('_')}" for pair in returns.RANKS)]
     for end, one in zip(ends, [part if is_area else part.separations["all"], *_rank_pairs(part)], strict=True):
         found |= {f"pairs{end}": one.pairs, f"mean_m{end}": one.mean, f"least_m{end}": one.least}
-    found |= {"pulses_with_several": part.several, "first_above_last_m": part.depth}
+    found |= describe_record(part)
     # Distances are collected per cloud only: a histogram per area would need too much memory.
     zones = {} if is_area else part.dead_zones
     for end, name in zip(ends, ("all", *returns.RANKS), strict=True):
@@ -164,3 +170,101 @@ def _rank_pairs(part: returns.PulseStats) -> list[returns.Separation]:
 def _plain(found: returns.ReturnStats) -> dict[str, Any]:
     areas = [{**asdict(area), "returns_per_pulse": area.returns_per_pulse} for area in found.areas]
     return {**asdict(found), "areas": areas, "returns_per_pulse": found.returns_per_pulse}
+
+
+FEW_CELLS = 1_000_000
+"""Cells of a raster up to which it may be nearly empty without a warning."""
+
+
+@click.command()
+@shared.clouds_argument
+@shared.declared("recursive")
+@click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete_columns,
+              help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
+@shared.options_of(GridOptions, "statistic", "size")
+@click.option("--forest", is_flag=True, help="Metrics of voxels that voxelize --forest made, in place of columns: "
+              "cover, heights of light, leaf area index and density, with errors.")
+@shared.options_of(ForestOptions)
+@shared.output_option("Raster to write: .tif.", "X.tif")
+@shared.bbox_option("Write")
+@shared.selection_options
+@shared.options_of(GridOptions, "crs", "no_data")
+@shared.common_options("overwrite", "json")
+def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
+    """Write columns of CLOUDs as a GeoTIFF, of clouds of any size.
+
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. The raster is tiled,
+    compressed and has the CRS of the clouds, a no-data value, and name and unit of every band; it has at most 10^11
+    cells. Memory does not grow; large clouds need room in TMPDIR. Needs rasterio: pip install rasterio.
+
+    With --forest the bands are cover (the part of the light that plants catch), light_height_25, 50, 75 and 95 (the
+    height below which plants caught 25 % of their light, ...), leaf_area_index, and leaf_area_density of each layer;
+    cover_err and the like are standard deviations. Leaves and wood count alike. The last band, no_data_reason, says why
+    a cell has no data: 1 fewer than 10 rays, 2 no light on the ground.
+
+    Exit code: 0 done, 1 a cloud cannot be read or the raster cannot be written, 2 wrong usage.
+
+    Examples:
+      # two bands for GIS
+      wavebatch grid clouds/ --column amplitude --column echo_width --statistic median --size 1 -o x.tif
+      # points per square metre
+      wavebatch grid clouds/ --statistic density --size 5 -o density.tif
+      # without points of noise
+      wavebatch grid clouds/ --column z --statistic max --where 'classification != 7' -o top.tif
+    """  # fmt: skip
+    from wavebatch.files.geotiff_file import check_raster
+
+    paths = find_clouds(clouds, options)
+    check_raster(output, overwrite=options["overwrite"])
+    forest = shared.from_options(ForestOptions, options) if options["forest"] else None
+    how = shared.from_options(GridOptions, options, columns=columns, chosen=choose_points(options), forest=forest)
+    found = write_grid(paths, output, how, overwrite=options["overwrite"])
+    layout = found.layout
+    if layout.crs is None:
+        talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")
+    if found.unnamed:
+        some = f"{found.unnamed[0]}" + f" and {len(found.unnamed) - 1} more" * (len(found.unnamed) > 1)
+        talk(f"warning: {some}: without a CRS; taken to be in that of the other clouds; say so with --crs")
+    cells = layout.columns * layout.rows
+    if found.filled < cells / 1000 and cells > FEW_CELLS:
+        share = f"{100 * found.filled / cells:.1g} % of the cells have a value"
+        talk(f"warning: {output}: only {share}: if clouds lie far apart, make a raster of each")
+    tell(f"{output}: {_summarise(found, columns)}")
+    statistic = None if forest else options["statistic"]
+    answer({"output": str(output), "clouds": [str(path) for path in paths], "statistic": statistic,
+            **_describe(found, columns)})  # fmt: skip
+
+
+def _summarise(found: GridResult, columns: Sequence[str]) -> str:
+    layout = found.layout
+    used = found.points - found.left_out - found.outside
+    if found.reasons:
+        known, few, dark = found.reasons
+        return (
+            f"{count(found.points, 'voxel')}, {found.outside} outside; {layout.columns} x {layout.rows} cells of "
+            f"{layout.size:g} {layout.unit}: {known} with metrics, {few} with fewer than 10 rays, "
+            f"{dark} without light on the ground"
+        )
+    parts = [f"{name or 'points'} {values} values, {used - values} without data"
+             for name, values in zip(columns or ("",), found.values, strict=True)]  # fmt: skip
+    return (
+        f"{count(found.points, 'point')}, {found.left_out} left out, {found.outside} outside; "
+        f"{'; '.join(parts)}; {layout.columns} x {layout.rows} cells of {layout.size:g} {layout.unit}, {found.filled} "
+        "with a value"
+    )
+
+
+def _describe(found: GridResult, columns: Sequence[str]) -> dict[str, Any]:
+    """The raster and the counts as plain values."""
+    layout = found.layout
+    used = sum(found.reasons) or found.points - found.left_out - found.outside
+    if found.reasons:
+        columns = [""] * len(found.bands)
+    bands = [{"column": name or None, "description": band.description, "unit": band.unit, "values": values,
+              "no_data": used - values}
+             for name, band, values in zip(columns or ("",), found.bands, found.values, strict=True)]  # fmt: skip
+    east, south = layout.west + layout.columns * layout.size, layout.north - layout.rows * layout.size
+    cells = {"columns": layout.columns, "rows": layout.rows, "size": layout.size, "filled": found.filled}
+    return {"points": found.points, "left_out": found.left_out, "outside": found.outside, "bands": bands, **cells,
+            "bounds": [layout.west, south, east, layout.north], "unit": layout.unit, "crs": layout.crs,
+            "no_data_value": layout.no_data}  # fmt: skip

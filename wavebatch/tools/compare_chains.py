@@ -15,6 +15,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
+from wavebatch.core.order import EvenSample
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.packets import MAX_SAMPLES
@@ -24,13 +25,11 @@ from wavebatch.stages.chain_file import list_profiles
 from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying import Survey
-from wavebatch.surveying.auto_chain import widest_chain
-from wavebatch.surveying.choose_chain import Request
+from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.tools import pairing
 from wavebatch.tools.api.strip import AUTO, load_chain
-from wavebatch.tools.compare import pairing
-from wavebatch.tools.even_sample import EvenSample
 
 
 @frozen

@@ -5,15 +5,14 @@ line, pulse and time on one axis: windows open at other heights for every pulse,
 the relief would be lost. Lines of an oscillating mirror run to and fro, and some begin late: pulses of equal scan angle
 have the same column.
 
-`wavebatch plot profile` measures how much of them lies at each height. A segment is not a point: it counts in every bin
-that it crosses, by the share of its height that lies there; a level segment counts in one.
+`wavebatch plot profile` reads them to measure how much of them lies at each height.
 """
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +26,8 @@ from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.figure_file import open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.geojson import GeoJsonCrs
-from wavebatch.tools.plots.sections import Profile, place_heights
-from wavebatch.tools.rasters.cells import Tally, check_statistic, name_paths
-from wavebatch.tools.slices.segments import ScanLine, Segment, Slice, align_times, find_main_axis
+from wavebatch.tools.cells import Tally
+from wavebatch.tools.scan_slices import ScanLine, Segment, Slice, align_times, find_main_axis
 
 MOST_VALUES = 200_000_000
 """Most values of a cube (800 MB): it is built in memory."""
@@ -420,8 +418,6 @@ _COLUMNS = {
 REMEDY = "make it again with `wavebatch slice`"
 """What to do about a damaged file."""
 
-_PIECE = 100_000
-
 
 def is_segments(path: Path) -> bool:
     """Whether a file is one of segments, by its name."""
@@ -455,58 +451,28 @@ def read_segments(path: Path, column: str | None) -> tuple[np.ndarray, np.ndarra
     return values[:, :2], values[:, 2]
 
 
-def profile_segments(
-    paths: Sequence[Path], column: str | None, statistic: str, *, size: float | None = None, each: bool = False
-) -> Profile:
-    """The number of segments, or the sum or mean of a column, per height.
-
-    Arguments and errors as `sections.measure_profile`; sums and means weight a segment by the share of its height
-    in a bin.
+class SegmentFiles:
+    """Segments of several files, read as `cells.Clouds` are: the values of a row are that of the column, and the
+    heights of both ends. Raises InputError for a file that cannot be read or holds no segments, ConfigError for another
+    column.
     """
-    check_statistic(column, statistic)
-    files = [read_segments(path, column) for path in paths]
-    heights = np.concatenate([ends for ends, _ in files])
-    if not len(heights):
-        raise InputError(f"{paths[0]}: holds no segment: nothing to draw")
-    edges = place_heights(heights.ravel(), float(heights.min()), float(heights.max()), size, 0.0)
-    series = len(paths) if each else 1
-    sums, numbers = np.zeros((series, len(edges) - 1)), np.zeros((series, len(edges) - 1))
-    for number, (ends, values) in enumerate(files):
-        for start in range(0, len(ends), _PIECE // len(edges) + 1):
-            part = slice(start, start + _PIECE // len(edges) + 1)
-            share = share_heights(ends[part], edges)
-            numbers[number if each else 0] += share.sum(axis=0)
-            sums[number if each else 0] += values[part] @ share
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(numbers > 0, sums / numbers, np.nan)
-    unit, meaning = _COLUMNS[column] if column else ("-", "")
-    names = name_paths(paths)
-    outside = int(np.count_nonzero((heights.max(axis=1) < edges[0]) | (heights.min(axis=1) >= edges[-1])))
-    return Profile(
-        facts=ColumnFacts(column or "segments", unit, meaning, 0.0),
-        statistic=statistic,
-        names=names if each or len(paths) == 1 else (f"{len(paths)} files",),
-        edges=edges,
-        values={"count": numbers, "sum": sums, "mean": mean}[statistic],
-        outside=outside,
-        total=Tally(len(heights), 0, 0, len(heights)),
-        unit=UNIT,
-        noun="segments",
-    )
 
+    def __init__(self, paths: Sequence[Path], column: str | None) -> None:
+        self.paths = tuple(paths)
+        self._files = [read_segments(path, column) for path in paths]
+        unit, meaning = _COLUMNS[column] if column else ("-", "")
+        self.facts = ColumnFacts(column or "segments", unit, meaning, 0.0)
 
-def share_heights(ends: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Share of the height of each segment in each bin, f8 (n, b).
+    def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
+        """As Clouds.read."""
+        for number, (ends, values) in enumerate(self._files):
+            rows = np.zeros(len(ends), [("values", "<f8", (3,))])
+            rows["values"][:, 0], rows["values"][:, 1:] = values, ends
+            yield number, rows, Tally(len(rows), 0, 0, len(rows))
 
-    ends: heights of both ends, f8 (n, 2). Bins hold their lower edge; a level segment lies in one bin.
-    """
-    low, high = ends.min(axis=1), ends.max(axis=1)
-    span = high - low
-    level = span < 1e-9 * max(float(np.abs(edges).max()), 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        below = np.clip((edges - low[:, None]) / span[:, None], 0.0, 1.0)
-    below[level] = low[level, None] < edges
-    return np.diff(below, axis=1)
+    def complain(self, tally: Tally) -> InputError:
+        """The error that says why nothing can be drawn."""
+        return InputError(f"{self.paths[0]}: holds no segment: nothing to draw")
 
 
 def check_alone(paths: Sequence[Path], options: dict) -> None:
