@@ -106,6 +106,7 @@ def test_lists_of_windows_and_a_console_of_an_old_code_page(elsewhere, tiny_stri
         assert done.returncode == 1 and len(done.stderr.splitlines()) == 1 and b"Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_names_with_drive_letters_are_names_of_files(elsewhere, tiny_strip, tmp_path):
     """A colon is no separator anywhere: `C:\\data\\a.las` reaches the system whole."""
     (tmp_path / "C:").mkdir()

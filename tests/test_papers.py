@@ -34,6 +34,7 @@ def test_there_is_one_for_every_paper():
     assert all(f"{name}.py" in told for name in SCRIPTS)
 
 
+@pytest.mark.quick_cases("s1*", "s2*")
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_papers_run(name, load):
     tables = [table for table in load(name).measure(300, 1) if not isinstance(table, str)]
@@ -264,6 +265,7 @@ def test_long_tables_are_folded_unless_a_figure_is_not_accepted(load):
     assert wrong.startswith("<details open><summary>t: 20 figures, 1 not accepted<")
 
 
+@pytest.mark.quick_cases("draw_cases", "draw_peak")
 @pytest.mark.parametrize(
     "name", ["draw_cases", "draw_coefficients", "draw_fan", "draw_noise", "draw_peak", "draw_record"]
 )

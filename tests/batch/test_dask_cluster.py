@@ -112,6 +112,7 @@ def run(*arguments):
     return done.exit_code, done.stderr
 
 
+@pytest.mark.slow
 def test_a_cluster_writes_the_same_bytes(dask, strips, tmp_path, monkeypatch):
     monkeypatch.chdir(strips.parent)
     relative = os.path.relpath(strips)
@@ -168,6 +169,7 @@ def _spool_as_ever():
     return temp_store.made
 
 
+@pytest.mark.quick_cases("tcp://127.0.0.1:9", "nonsense", "a:b")
 @pytest.mark.parametrize(
     "address", ["tcp://127.0.0.1:9", "nonsense", "foo://127.0.0.1:9", "tcp://none.invalid:8786", "tcp://", "a:b"]
 )

@@ -117,6 +117,7 @@ def test_a_stopped_process_does_not_keep_this_one_from_ending(tmp_path, function
     assert not workers._workers
 
 
+@pytest.mark.slow
 def test_calls_that_nobody_has_taken_are_given_up_when_all_processes_are_dead():
     with Workers(2) as workers:
         futures = [workers.submit(die_while_sending) for _ in range(6)]

@@ -100,7 +100,7 @@ main()
 """
 
 
-@pytest.mark.quick_cases("1")
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_run_that_reaches_its_limit_of_processor_time_leaves_nothing(strip, tmp_path, jobs):
     """The parent process counts in vain until its limit; the limit holds for each process."""

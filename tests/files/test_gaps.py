@@ -281,6 +281,7 @@ def test_decomposers_find_the_same_echoes_as_without_a_gap(whole, tmp_path, name
         assert np.nanquantile(change, 0.5) < usual and np.nanquantile(change, 0.9) < large
 
 
+@pytest.mark.slow
 def test_recordings_of_different_level_have_their_own_baseline(whole, tmp_path):
     for shift in (0, 7):
         plain, block, system, found = two_levels(whole, tmp_path, shift)

@@ -6,7 +6,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry.facets import LINE_ERROR, fit_facet
+from wavebatch.kernels.geometry.planes import LINE_ERROR, fit_facet
 
 DOWN = np.array([[0.0, 0.0, -1.0]])
 

@@ -10,7 +10,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
-from wavebatch.kernels.signal.square_differences import (
+from wavebatch.kernels.signal.filters import (
     find_minima,
     keep_prominent,
     pad_samples,

@@ -108,7 +108,7 @@ def test_the_widest_chain_computes_what_accurate_does():
     assert widest_chain().steps[2].effective() == load_profile("accurate").steps[2].effective()
 
 
-@pytest.mark.quick_cases("flat", "forest")
+@pytest.mark.quick_cases("forest")
 @pytest.mark.parametrize(
     ("scene", "grows"),
     [

@@ -22,7 +22,7 @@ from wavebatch.surveying.calibrating.calibration_file import format_calibration,
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.matching import setting
 from wavebatch.surveying.matching.setting import NO_CHANGE, keep_places, weigh_change
-from wavebatch.surveying.matching.strip_conditions import judge_fading
+from wavebatch.surveying.matching.strip_match import judge_fading
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -521,6 +521,7 @@ def test_the_assumed_chance_of_a_change_says_how_much_error_holds_it(spread):
     assert all(weigh_change(0.5, 0.04, 0.5, chance=chance).chance > 0.9 for chance in (0.05, 0.3, 0.6))
 
 
+@pytest.mark.slow
 def test_a_chance_of_zero_in_the_file_takes_the_check_away(tmp_path, calibrated):
     text = (calibrated / "cal.toml").read_text()
     assert "\nchange_chance = 0.3" in text
@@ -594,6 +595,7 @@ def test_a_target_that_is_listed_twice_does_not_halve_the_error(tmp_path, calibr
     assert done.exit_code == 2 and "targets 1 and 2 are one target: its reflectance would count twice" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_strip_whose_times_show_no_day_is_said_to_count_as_of_the_same_day(tmp_path, calibrated):
     write_strip(tmp_path / "s.las", GROUND, replace(SENSOR, time=START + 90 * 86400), 10_000, seed=87)
     content = bytearray((tmp_path / "s.las").read_bytes())

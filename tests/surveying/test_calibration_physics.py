@@ -375,7 +375,7 @@ def test_a_vendors_column_of_reflectances_is_an_anchor(tmp_path, vendor):
     assert f" {row.spread:.1%} " in done.stderr and "incidence" not in done.stderr
 
 
-@pytest.mark.quick_cases("1.0")
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [0.0, 0.5, 1.0])
 def test_air_that_a_vendors_column_still_holds_is_taken_off(tmp_path, monkeypatch, held):
     """Constants by such a column were 7 to 15 % off, with an error of 3 %."""

@@ -281,7 +281,7 @@ def roof_strips(a, width=9.0):
     return lambda x, y: (y >= a) & (y < a + width)
 
 
-@pytest.mark.quick_cases("64-71")
+@pytest.mark.slow
 @pytest.mark.parametrize(("samples", "seed"), [(64, 71), (90, 72)])
 def test_footprints_that_reach_over_an_edge_to_what_no_packet_holds_have_no_reflectance(tmp_path, samples, seed):
     """Roofs 25 m above ground, packets of 5 m: a tenth of the echoes at their edges was a quarter too dark."""

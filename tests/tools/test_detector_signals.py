@@ -7,7 +7,7 @@ from plot_tools import PULSE, make_chain, simulate
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.kernels.fit.pulse_shape import PulseShape
-from wavebatch.kernels.signal.square_differences import find_minima, keep_prominent
+from wavebatch.kernels.signal.filters import find_minima, keep_prominent
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.noise import pooled
 from wavebatch.tools.plots.waveform import build_views, choose_step, list_signals, see_block

@@ -160,6 +160,7 @@ def forest_strip(tmp_path):
     return fly(tmp_path / "p.las", rng, grow(rng, 4.0, crowns=None, density=0.1), 4.0, pulses=1.0)
 
 
+@pytest.mark.slow
 def test_strips_of_a_forest_become_one_raster_with_two_commands(tmp_path):
     """Each strip sees half of the plot; voxels in a folder are clouds, which grid reads as one."""
     pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")

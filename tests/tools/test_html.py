@@ -14,8 +14,8 @@ from commands import run_command
 from html_tools import Page
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.surveying.calibrating.adjust_flight import PairOverlap
 from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
-from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
 from wavebatch.surveying.calibration import Calibration, StripConstant, TargetResult
 from wavebatch.tools.plots.charts import chart, draw_histogram, draw_values, merge_bins
 from wavebatch.tools.sheets import page

@@ -238,6 +238,7 @@ def test_errors_of_shares_cover_the_truth(tmp_path, clumps, density):
     assert 0.6 < np.mean(np.abs(off) < 1) < 0.8 and len(off) > 600 and abs(np.mean(off)) < 0.25
 
 
+@pytest.mark.slow
 def test_a_wrong_ratio_is_within_the_errors(tmp_path):
     """Two kinds of soil: the ratio is that of one of them, and its error says how much the other differs."""
     rng = np.random.default_rng(4)

@@ -31,7 +31,10 @@ HEADINGS = (CHAIN, READING, SENSOR, AIR, WHICH, OUTPUT, SPEED, RUNNING)
 EXCLUSIVE = (
     ("chain", "profile", "tolerance"), ("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"),
     ("scheduler", "memory"), ("attenuation", "visibility"),
-    ("attenuation", "wavelength"), ("trajectory", "flight_height"), ("forest", "statistic"),
+    ("attenuation", "wavelength"), ("trajectory", "flight_height"), ("forest", "statistic"), ("forest", "columns"),
+    ("strip", "truth"), ("strip", "where"), ("sheet", "show"), ("sheet", "table"),
+    *((one, other) for one in ("flags", "where", "most", "random") for other in ("packets", "point_numbers", "times")),
+    *(("random", one) for one in ("flags", "where", "most")),
 )  # fmt: skip
 """Options that exclude each other. One in wavebatch.toml replaces those that come from a weaker source."""
 
@@ -39,6 +42,7 @@ NEEDS = {
     "lever_arm": ("trajectory",), "crs": ("trajectory",), "wavelength": ("visibility",),
     "attenuation_error": ("attenuation", "visibility"), "seed": ("random",),
     "leaf_projection": ("forest",), "layer": ("forest",),
+    "limit": ("strip",), "system": ("strip",), "force": ("strip",),
 }  # fmt: skip
 """Options that are of no use without one of others."""
 
@@ -50,28 +54,32 @@ ELSEWHERE = ("output", "recursive", "jobs", "scheduler", "memory", "block_size",
 """Options that do not change a cloud."""
 
 
-def check_together(given: Mapping[str, Any], known: Collection[str] | None = None) -> None:
+def check_together(
+    given: Mapping[str, Any], known: Collection[str], spelled: Callable[[str], str] = typed
+) -> None:
     """Raise ConfigError for two options that exclude each other, and for one without the option that it needs.
 
     Parameters
     ----------
     given : mapping
         Its keys are the names of the options that the user gave.
-    known : collection of str, optional
+    known : collection of str
         Names of the options that there are: another command may have one without those that it needs in `run`.
+    spelled : callable
+        Gives an option as it is typed from its name.
     """
     for rivals in EXCLUSIVE:
-        names = [typed(name) for name in rivals if name in given]
+        names = [spelled(name) for name in rivals if name in given]
         if len(names) > 1:
             raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
     if "system" in given and given.get("survey") == "flight":
         raise ConfigError("--system and --survey flight exclude each other; give one of them")
     for name, needed in NEEDS.items():
-        if known is not None and not set(known) & set(needed):
+        if not set(known) & set(needed):
             continue
         if name in given and not any(one in given for one in needed):
-            others = " or ".join(map(typed, needed))
-            raise ConfigError(f"{typed(name)} is of no use without {others}; give that too, or leave it out")
+            others = " or ".join(map(spelled, needed))
+            raise ConfigError(f"{spelled(name)} is of no use without {others}; give that too, or leave it out")
 
 
 @frozen
@@ -212,7 +220,7 @@ class RunOptions:
 
     def check(self) -> None:
         """Raise ConfigError for options that exclude or need each other, and for values that they do not take."""
-        check_together(self.given())
+        check_together(self.given(), OPTIONS)
         check_options(self)
         if self.scheduler is not None and not self.scheduler.strip():
             raise ConfigError("--scheduler: the address is empty; leave it out to work on this machine")

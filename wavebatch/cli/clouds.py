@@ -20,7 +20,7 @@ from wavebatch.cli.messages import answer, print_json, print_sheet, talk, tell
 from wavebatch.cli.plot import choose_points, find_clouds
 from wavebatch.cli.program.command import complete_columns
 from wavebatch.core.condition import Condition
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C, count
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
@@ -214,8 +214,6 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     """  # fmt: skip
     from wavebatch.files.geotiff_file import check_raster
 
-    if options["forest"] and columns:
-        raise ConfigError("--forest and --column exclude each other; give one of them")
     paths = find_clouds(clouds, options)
     check_raster(output, overwrite=options["overwrite"])
     forest = shared.from_options(ForestOptions, options) if options["forest"] else None

@@ -87,7 +87,7 @@ def compare(
     shared.check_html(html_file)
     if output is not None:
         check_target(output, overwrite=overwrite)
-    result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
+    result = _match(a, b, strip, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
     if output is not None:
         write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
@@ -110,9 +110,6 @@ def compare(
 
 
 def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
-    for name in ("system", "force", "limit"):
-        if options[name] not in (None, False):
-            raise click.UsageError(f"--{name} is for chains; give --strip STRIP too")
     if (b is None) == (truth is None):
         raise click.UsageError("give either B or --truth FILE.npz")
     for side in (a, b):
@@ -131,17 +128,13 @@ def _is_chain(side: Path) -> bool:
     return side.suffix.lower() == ".toml" or (not side.is_file() and not find_contender(str(side)).is_cloud)
 
 
-def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: dict) -> Matchup:
+def _match(a: Path, b: Path | None, strip: Path, options: dict) -> Matchup:
     from wavebatch.core.errors import nearest
     from wavebatch.surveying.choose_chain import COSTS
     from wavebatch.surveying.system_file import load_survey
     from wavebatch.tools.api.strip import AUTO
     from wavebatch.tools.compare.chains import find_contender, match_sides
 
-    if truth is not None:
-        raise click.UsageError("--truth is for a cloud; `wavebatch bench` compares chains with a truth")
-    if options["where"] is not None:
-        raise click.UsageError("--where is for two clouds; leave --strip out")
     saved = None if options["system"] is None else load_survey(options["system"])
     sides = [None if side is None else find_contender(str(side)) for side in (a, b)]
     for side in sides:

@@ -308,9 +308,10 @@ def _protected(command: Callable) -> Callable:
     @functools.wraps(command)
     def call(*args: Any, **options: Any) -> Any:
         context = click.get_current_context()
-        sources = {name: context.get_parameter_source(name) for name in context.params}
-        given = {name for name, source in sources.items() if source is not ParameterSource.DEFAULT}
-        check_together({name: context.params[name] for name in given}, context.params)
+        known = {one.name: one for one in context.command.params if isinstance(one, click.Option)}
+        given = {name: value for name, value in context.params.items()
+                 if name in known and context.get_parameter_source(name) is not ParameterSource.DEFAULT}  # fmt: skip
+        check_together(given, known, lambda name: max(known[name].opts, key=len) if name in known else typed(name))
         inputs: list[Any] = list(context.meta.get(READ, ()))
         outputs: dict[str, Any] = {}
         if LOG in context.meta:

@@ -362,16 +362,6 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     from wavebatch.files.cloud.point_filter import PointFilter
     from wavebatch.tools.plots.waveform import Wanted
 
-    named = any(options[name] for name in ("packets", "point_numbers", "times"))
-    for option in ("flags", "where"):
-        if options[option] and (named or options["random"]):
-            raise ConfigError(f"--{option} chooses the waveforms; leave out --packet, --point, --gps-time and --random")
-    if options["random"] and named:
-        raise ConfigError("--random chooses the waveforms; leave out --packet, --point and --gps-time")
-    if options["most"] and (named or options["random"]):
-        raise ConfigError("--most is for --flags, --where and the default; leave it out, or leave out the numbers")
-    if options["sheet"] and (options["show"] or options["table"]):
-        raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
     tabular = output.suffix.lower() == ".csv"
     for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
         if options[name]:

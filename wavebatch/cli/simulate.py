@@ -6,7 +6,7 @@ they fill (see `from_options`), so that a renamed field needs a renamed option h
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import counting, print_summary
 from wavebatch.cli.program.command import complete_scenes
+from wavebatch.core.schema import declared_options
 from wavebatch.core.units import count
 from wavebatch.tools.simulate import (
     CANOPIES,
@@ -32,11 +33,6 @@ from wavebatch.tools.simulate import (
 from wavebatch.tools.simulate.render import Recording
 from wavebatch.tools.simulate.returns import EQUAL, Radar, SynthesisOptions, SynthesisSummary, synthesize_strip
 
-_RECORDING = ("n_samples", "spacing", "baseline", "noise_std", "rho", "noise_gain", "saturation")
-"""Options that change the recording of the scene."""
-
-_LIGHT = ("height", "power", "aperture", "divergence", "efficiency", "attenuation")
-_RECEIVER = ("dead_zone", "threshold", "most")
 _SEEN = 0.001
 """Share of the energy that is worth a note where it is not of echoes."""
 
@@ -48,10 +44,6 @@ _SCENE_LINES = "\n\n".join(
 
 _output = shared.output_option("Strip to write: .las or .laz.")
 
-def _changes(kind: type, *names: str) -> Callable:
-    """Options that are not given unless the user gives them."""
-    return shared.options_of(kind, *names, default=None)
-
 
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
 @click.argument("scene", shell_complete=complete_scenes)
@@ -59,7 +51,7 @@ def _changes(kind: type, *names: str) -> Callable:
 @shared.output_option("Write the true echoes to this .npz file.", "FILE", "--truth", required=False)
 @click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Number of pulses.")
 @shared.seed_option("Seed of the random numbers; pulse k of a scene and a seed is always the same.")
-@_changes(Recording, "bits", *_RECORDING)
+@shared.options_of(Recording, default=None)
 @click.option("--pulse", type=click.Choice(list(PULSES)), help="Shape of the system pulse.  [default: gaussian]")
 @click.option("--sigma", type=float, help="Standard deviation of the pulse's main lobe [ns].  [default: the scene's]")
 @click.option("--kappa", type=float, help="Skew of the main lobe.  [default: 0]")
@@ -67,7 +59,7 @@ def _changes(kind: type, *names: str) -> Callable:
 @shared.options_of(StripOptions)
 @click.option("--sensor", type=click.Choice(["waveform", "discrete"]), default="waveform", show_default=True,
               help="waveform: record every waveform; discrete: record only returns, by a receiver with a dead zone.")
-@_changes(DiscreteReceiver, *_RECEIVER)
+@shared.options_of(DiscreteReceiver, default=None)
 @shared.common_options("overwrite", "json")
 def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | None, **options: Any) -> None:
     """Simulate a full-waveform strip of a SCENE with known echoes.
@@ -85,7 +77,7 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
     """  # fmt: skip
     receiver = _build_receiver(truth, options)
     found = find_scene(scene)
-    given = shared.given_options(options, ("bits", *_RECORDING))
+    given = shared.given_options(options, declared_options(Recording))  # the others are those of the scene
     shape = {name: options[name] for name in ("pulse", "sigma", "kappa", "ringing")}
     pulse = shape_pulse(found.recording.pulse, **shape)
     shaped = replace(found, recording=replace(found.recording, pulse=pulse, **given))
@@ -116,7 +108,7 @@ def _build_receiver(truth: Path | None, options: dict[str, Any]) -> DiscreteRece
         if not options["internal"]:
             raise click.UsageError("--external is about packets; --sensor discrete writes none")
         return shared.from_options(DiscreteReceiver, options)
-    if shared.given_options(options, _RECEIVER):
+    if shared.given_options(options, declared_options(DiscreteReceiver)):
         raise click.UsageError("--dead-zone, --threshold and --most-returns need --sensor discrete")
     return None
 
@@ -128,7 +120,7 @@ def _build_receiver(truth: Path | None, options: dict[str, Any]) -> DiscreteRece
                    "noise")
 @shared.seed_option("Seed of the noise and of the first sample's time.")
 @shared.options_of(SynthesisOptions, "internal")
-@_changes(Radar, *_LIGHT)
+@shared.options_of(Radar, default=None)
 @shared.common_options("overwrite", "json")
 def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     """Model waveforms from the discrete returns of CLOUD: one Gaussian per return, from its range and intensity.
@@ -155,7 +147,7 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
 def _build_radar(options: dict[str, Any]) -> Radar | None:
     """The figures of the lidar equation; None if intensities are peaks."""
     if options["intensity"] == "peak":
-        if shared.given_options(options, (*_LIGHT, "shares")):
+        if shared.given_options(options, (*declared_options(Radar), "shares")):
             raise click.UsageError("the options of the lidar equation and --shares need --intensity reflectance")
         return None
     if options["height"] is None:

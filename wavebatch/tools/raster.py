@@ -27,6 +27,7 @@ from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
 from wavebatch.files.las.read_points import read_checked_header
+from wavebatch.kernels.physics.gap_probability import ASSUMED_ERROR
 from wavebatch.tools.cells import (
     LARGEST_SIZE,
     Box,
@@ -38,7 +39,6 @@ from wavebatch.tools.cells import (
     compute_tiles,
     is_in_bounds,
 )
-from wavebatch.tools.voxels.rays import ASSUMED_ERROR
 
 COLUMNS = ("x", "y", "height", "light", "path", "share", "ground", "free_path", "attenuation", "attenuation_error")
 """Columns of voxels that are used."""

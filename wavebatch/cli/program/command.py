@@ -108,10 +108,10 @@ def read_settings(command: click.Command, title: str, context: click.Context, ar
 
 def drop_rivals(context: click.Context) -> None:
     """Put settings aside that exclude an option that counts more: of the command line, or of a variable."""
-    options = {one.name: one for one in context.command.params}
+    options = _list_options(context.command)
     for rivals in EXCLUSIVE:
         given = {name: _ORDER.index(source) for name in rivals
-                 if (source := context.get_parameter_source(name)) in _ORDER}  # fmt: skip
+                 if name in options and (source := context.get_parameter_source(name)) in _ORDER}  # fmt: skip
         for name in [name for name, place in given.items() if place > min(given.values())]:
             (context.default_map or {}).pop(name, None)
             default = options[name].get_default(context)

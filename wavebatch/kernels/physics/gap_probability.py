@@ -31,6 +31,9 @@ to s^2 (simulated: 3 to 10 % for reflectances that vary by a fifth), and pulses 
 second kind of soil, by as much as they differ.
 """
 
+ASSUMED_ERROR = float(np.log(2.0))
+"""Standard deviation of the logarithm of a ratio that the strip does not show: leaves and soils of .15 to .5."""
+
 _MOST_UNLIKE = np.log(4.0)
 """Pulses whose light differs by more have hardly any: they tell nothing about reflectances."""
 

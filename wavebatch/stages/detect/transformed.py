@@ -21,16 +21,6 @@ from wavebatch.kernels.signal import filters
 from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
 from wavebatch.kernels.signal.runs import list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
-from wavebatch.kernels.signal.square_differences import (
-    COLUMNS_AT_A_TIME,
-    Minima,
-    find_minima,
-    keep_prominent,
-    pad_samples,
-    slide_energy,
-    slide_taps,
-    square_differences,
-)
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import Searched, candidate_table, signal_above
 from wavebatch.stages.pulse_tables import ReferenceKind, reference_pulse
@@ -133,7 +123,7 @@ def _deconvolve(
     given, signal = reference_pulse(system, block.spacing, reference, reach, pulse), signal_above(block, noise)
     profile = deconvolve_richardson_lucy(signal, given.taps, BACKGROUND * noise.std, iterations)
     wide = 2 * spike_reach(system.sigma_ref / block.spacing) + 1
-    sums = slide_taps(pad_samples(profile.astype(np.float64), wide // 2), np.ones(wide))
+    sums = filters.slide_taps(filters.pad_samples(profile.astype(np.float64), wide // 2), np.ones(wide))
     rule, least = f"spikes whose sum is above {threshold:g} std", threshold / np.sqrt(np.sum(given.taps**2)) * noise.std
     return Searched("deconvolved [DN]", rule, profile, least, signal, first=given.peak - given.middle,
                     second=sums, second_label=f"sum of {wide} samples")  # fmt: skip
@@ -216,7 +206,7 @@ Peaks = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _in_parts(
-    signal: np.ndarray, std: np.ndarray, detect: Callable[..., Peaks], most: int = COLUMNS_AT_A_TIME
+    signal: np.ndarray, std: np.ndarray, detect: Callable[..., Peaks], most: int = filters.COLUMNS_AT_A_TIME
 ) -> Peaks:
     """Candidates of the columns of signal (s, n), `most` at a time, so that arrays stay in the cache."""
     found: list[Peaks] = [(np.empty(0, np.int64), np.empty(0), np.empty(0))]
@@ -236,7 +226,7 @@ def _correlate(
     given, signal = reference_pulse(system, block.spacing, reference, reach, pulse), signal_above(block, noise)
     energy = float(np.sum(given.taps**2))
     rule = f"maxima above {threshold:g} std, coefficient at least {similarity:g}"
-    values = slide_taps(pad_samples(signal, given.middle), given.taps)
+    values = filters.slide_taps(filters.pad_samples(signal, given.middle), given.taps)
     least = threshold * np.sqrt(energy) * noise.std
     return Searched("correlation [DN]", rule, values, least, signal, energy, given.peak - given.middle)
 
@@ -275,10 +265,10 @@ def correlation(
     energy = float(np.sum(given.taps**2))
 
     def detect(signal: np.ndarray, std: np.ndarray) -> Peaks:
-        padded = pad_samples(signal, given.middle)
-        correlations = slide_taps(padded, given.taps)
+        padded = filters.pad_samples(signal, given.middle)
+        correlations = filters.slide_taps(padded, given.taps)
         waveform, sample = find_peaks(correlations, np.float32(threshold * np.sqrt(energy)) * std)
-        squares = slide_energy(padded, len(given.taps))[sample, waveform]
+        squares = filters.slide_energy(padded, len(given.taps))[sample, waveform]
         value = correlations[sample, waveform]
         alike = value >= similarity * np.sqrt(np.maximum(squares, 0) * np.float32(energy))
         waveform, sample = waveform[alike], sample[alike]
@@ -295,7 +285,7 @@ def _compare(
     """What `asdf` searches in parts."""
     given, signal = reference_pulse(system, block.spacing, reference, reach, pulse), signal_above(block, noise)
     height = signal.max(axis=0)
-    difference, _ = square_differences(signal, given.taps, height)
+    difference, _ = filters.square_differences(signal, given.taps, height)
     if rule == "paper":
         least = fraction * np.ptp(difference, axis=0)
         words = f"minima as deep as {fraction:g} of the range (bars)"
@@ -349,15 +339,15 @@ def asdf(
 
     def detect(signal: np.ndarray, std: np.ndarray) -> Peaks:
         height = signal.max(axis=0)
-        difference, correlations = square_differences(signal, given.taps, height)
+        difference, correlations = filters.square_differences(signal, given.taps, height)
         values = np.ascontiguousarray(difference.T)
         if rule == "paper":
-            minima = find_minima(values)
+            minima = filters.find_minima(values)
             least = np.float32(fraction) * (difference.max(axis=0) - difference.min(axis=0))
         else:
-            minima = find_minima(values, np.ascontiguousarray((correlations > gain * std).T))
+            minima = filters.find_minima(values, np.ascontiguousarray((correlations > gain * std).T))
             least = 2 * gain * std * np.maximum(height, 0)
-        kept = minima.take(keep_prominent(minima, least))
+        kept = minima.take(filters.keep_prominent(minima, least))
         shift, peaked = _refine(values, correlations, kept, interpolation == "log")
         time = kept.row - (len(given.taps) - 1) + given.peak + shift
         amplitude = correlations[kept.row, kept.waveform] / np.sum(given.taps**2)
@@ -394,7 +384,9 @@ def parabola_bias(width: float) -> float:
     return float(np.sqrt(np.mean((parabola_shift(*near) - phase) ** 2)))
 
 
-def _refine(values: np.ndarray, correlations: np.ndarray, minima: Minima, log: bool) -> tuple[np.ndarray, np.ndarray]:
+def _refine(
+    values: np.ndarray, correlations: np.ndarray, minima: filters.Minima, log: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Distance from minima of values (n, rows) to the peak [samples]; whether the correlation (rows, n) peaks there."""
     waveform, row = minima.waveform, minima.row
     shift = parabola_shift(*(values[waveform, row + d] for d in (-1, 0, 1)))

@@ -18,6 +18,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.system import angle_across, angle_to_vertical
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying.calibrating.adjust_flight import TIE, VIEW, hash_squares
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, EchoSource, open_source
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.targets import (
@@ -26,7 +27,6 @@ from wavebatch.surveying.calibrating.targets import (
     describe_channel,
     measure_ranging,
 )
-from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, hash_squares
 from wavebatch.surveying.calibration import Calibration, ChannelConstant
 from wavebatch.surveying.matching.setting import SCANNERS, see_channels
 from wavebatch.surveying.matching.strip_energies import StripEnergies

@@ -1,6 +1,6 @@
 """Reference targets: areas of known reflectance, read from GeoJSON or CSV.
 
-`wavebatch calibrate` reads them; `target_constants` asks which echoes lie inside, and how far.
+`wavebatch calibrate` reads them; `targets` asks which echoes lie inside, and how far.
 """
 
 from __future__ import annotations

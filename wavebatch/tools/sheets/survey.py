@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch import __version__
 from wavebatch.core.echoes import EchoTable
@@ -372,7 +371,9 @@ def _expect_error(variance: np.ndarray, variance_err: np.ndarray, distance: floa
     The error column of a run belongs to one measured width: over the widths it jumps near 0, where half of the echoes
     are read as 0. What a surface gives on average does not.
     """
-    normal = np.sqrt(2.0) * scipy.special.erfinv(np.arange(-_DRAWS + 1, _DRAWS, 2) / _DRAWS)
+    from scipy.special import erfinv  # every survey comes by this module
+
+    normal = np.sqrt(2.0) * erfinv(np.arange(-_DRAWS + 1, _DRAWS, 2) / _DRAWS)
     measured = variance[:, None] + variance_err[:, None] * normal
     angle = angle_of_spread(np.sqrt(np.maximum(measured, 0.0)), distance, beam)
     return np.degrees(np.sqrt(np.mean((angle - np.radians(ANGLES)[:, None]) ** 2, axis=1)))

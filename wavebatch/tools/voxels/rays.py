@@ -39,7 +39,7 @@ from wavebatch.files.strip.scanner import expand
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, along_ray, find_rays, group_times, on_ray
 from wavebatch.kernels.geometry.planes import fit_planes
 from wavebatch.kernels.physics import radiometry
-from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
+from wavebatch.kernels.physics.gap_probability import ASSUMED_ERROR, estimate_canopy_ratio
 from wavebatch.kernels.signal import deconvolve
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121, widen
 from wavebatch.stages.detect.candidates import signal_above
@@ -679,9 +679,6 @@ def _measure_sections(
 
 LEAST_CANOPY = 0.01
 """Share of the light from the canopy below which its ratio to the ground does not matter."""
-
-ASSUMED_ERROR = float(np.log(2.0))
-"""Standard deviation of the logarithm of a ratio that the strip does not show: leaves and soils of .15 to .5."""
 
 WEAKEST = 0.05
 """Quantile of the light in packets that is stated as the most that a gap between packets hides."""
