@@ -29,7 +29,7 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.incidence_angle import added_variance
 from wavebatch.surveying import Survey
-from wavebatch.surveying.angle_limits import REFERENCE_ERROR
+from wavebatch.surveying.flat_ground import REFERENCE_ERROR
 from wavebatch.surveying.systems.shown import name_model
 from wavebatch.tools.sheets.sheet import (
     Cell,
