@@ -29,7 +29,7 @@ from wavebatch.stages.detect.transformed import wavelet
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block
-from wavebatch.tools.compare.chains import measure_fit
+from wavebatch.tools.compare_chains import measure_fit
 from wavebatch.tools.simulate import find_scene, simulate_block
 
 PAPER_COUNTS = {"a": 1, "b": 2, "c": 1, "d": 2, "e": 3}

@@ -11,7 +11,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.stages.chain_file import load_chain_file
 from wavebatch.surveying import Survey
-from wavebatch.surveying.auto_chain import chain_text, decide
+from wavebatch.surveying.choose_chain import chain_text, decide
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems.figures import Figures, describe_figures
 from wavebatch.tools.sheets.sheet import list_lines

@@ -36,7 +36,7 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.noise import pooled, tail
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample
-from wavebatch.tools.compare.chains import measure_fit
+from wavebatch.tools.compare_chains import measure_fit
 from wavebatch.tools.plots.waveform import build_views
 from wavebatch.tools.scan_slices import _shape
 from wavebatch.tools.simulate import StripOptions, simulate_strip

@@ -4,8 +4,8 @@ import naive_geometry
 import numpy as np
 import pytest
 
+from wavebatch.kernels.geometry.normals import cut_tiles, is_inside, sort_into_tiles
 from wavebatch.kernels.geometry.slice_lines import find_lines
-from wavebatch.kernels.geometry.tiles import cut_tiles, is_inside, sort_into_tiles
 
 
 def slice_of(rng, kind):

@@ -6,7 +6,17 @@ import pytest
 from scipy.spatial import cKDTree
 
 from wavebatch.core.units import MAD_TO_STD
-from wavebatch.kernels.geometry.normals import MOST_PER_CELL, Gap, Surroundings, find_edges, measure_normals, thin_out
+from wavebatch.kernels.geometry.normals import (
+    MOST_PER_CELL,
+    Gap,
+    Surroundings,
+    cut_tiles,
+    find_edges,
+    is_inside,
+    measure_normals,
+    sort_into_tiles,
+    thin_out,
+)
 from wavebatch.kernels.geometry.planes import (
     DOUBTFUL,
     LEAST_SPREAD,
@@ -20,7 +30,6 @@ from wavebatch.kernels.geometry.planes import (
     measure_angles,
     misfit_of_angles,
 )
-from wavebatch.kernels.geometry.tiles import cut_tiles, is_inside, sort_into_tiles
 
 SETTINGS = {"radius": 1.5, "min_points": 8, "max_error": 5.0}
 

@@ -14,7 +14,7 @@ from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import parse_chain
-from wavebatch.tools.compare.chains import measure_fit
+from wavebatch.tools.compare_chains import measure_fit
 
 LEARNED = ((1.0, 0.0, 2.0), (0.3, 3.0, 2.4), (0.02, 9.0, 2.0))
 TEXT = "\n".join(f'[[chain]]\nstage = "{name}"' for name in ("noise.pooled", "detect.maximum", "decompose.skewed"))

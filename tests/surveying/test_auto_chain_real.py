@@ -7,8 +7,7 @@ import pytest
 
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import choose_chain, read_sample
 
 AFTER_PULSE = (9.0, 12.0)
 """Where the RIEGL's after-pulse lies behind an echo [ns]; it has 4 % of its amplitude."""

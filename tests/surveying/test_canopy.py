@@ -7,7 +7,7 @@ from helpers_scenes import CANOPY_NOISE, CANOPY_SIGMA, grow_canopy
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.surveying import survey_block
-from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.systems.known_systems import compare_pulses
 
 

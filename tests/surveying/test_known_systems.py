@@ -13,8 +13,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems import known_systems as module

@@ -8,8 +8,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.measuring.trial import Trial, limit_surveys
 from wavebatch.surveying.systems.known_systems import draw_pulse, find_source
 

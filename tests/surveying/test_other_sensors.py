@@ -16,7 +16,7 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey, survey_block, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.measuring import choose_pulse
 from wavebatch.surveying.measuring.choose_pulse import settle
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, load_survey, parse_survey

@@ -9,8 +9,7 @@ from writer_tools import data_file
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.systems import known_systems as module
 from wavebatch.surveying.systems.doubt import MOST_DOUBTED, MOST_DOUBTED_KNOWN
 from wavebatch.surveying.systems.known_systems import find_source

@@ -9,8 +9,7 @@ from helpers_scenes import make_block, make_scene
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import join_digitizers, survey_block, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.measuring.noise_and_width import FIRST_LOOK
 from wavebatch.tools.simulate import PulseModel, find_pulse
 

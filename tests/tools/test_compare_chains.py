@@ -19,8 +19,8 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.decompose.models import fitted_pulse, rebuild_waveforms
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample
-from wavebatch.tools.compare import chains
-from wavebatch.tools.compare.chains import (
+from wavebatch.tools import compare_chains as chains
+from wavebatch.tools.compare_chains import (
     ChainRun,
     Contender,
     FitQuality,
@@ -29,7 +29,7 @@ from wavebatch.tools.compare.chains import (
     match_sides,
     measure_fit,
 )
-from wavebatch.tools.compare.pairing import compare_clouds
+from wavebatch.tools.pairing import compare_clouds
 
 
 def make_chain(detector, decomposer, **parameters):

@@ -17,8 +17,8 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.disk import temp_store
 from wavebatch.kernels.fit.bounds import crlb
-from wavebatch.tools.compare import pairing
-from wavebatch.tools.compare.pairing import SPEED, Differences, compare_clouds, compare_truth, measure_lag
+from wavebatch.tools import pairing
+from wavebatch.tools.pairing import SPEED, Differences, compare_clouds, compare_truth, measure_lag
 from wavebatch.tools.sheets.compare import HEAD, format_comparison
 from wavebatch.tools.simulate import StripOptions, TruthReader, simulate_strip
 

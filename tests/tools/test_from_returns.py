@@ -19,7 +19,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.group_returns import fit_rays, group_pulses
 from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section, transmit
 from wavebatch.surveying.inspect_strip import check_file
-from wavebatch.tools.compare.pairing import compare_clouds
+from wavebatch.tools.pairing import compare_clouds
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, StripOptions, returns, simulate_returns
 from wavebatch.tools.simulate.returns import Radar, SynthesisOptions, synthesize_strip
 

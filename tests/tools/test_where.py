@@ -12,7 +12,7 @@ from wavebatch.core.condition import parse_condition
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.tools.compare.pairing import compare_clouds
+from wavebatch.tools.pairing import compare_clouds
 from wavebatch.tools.plots.draw_cloud import count_values
 from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip

@@ -32,8 +32,16 @@ from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.core.process import Seconds
 from wavebatch.files.disk.temp_store import RowStore, Spool
 from wavebatch.files.las.header import field_names
-from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, thin_out
-from wavebatch.kernels.geometry.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
+from wavebatch.kernels.geometry.normals import (
+    FINENESS,
+    Gap,
+    Surroundings,
+    Tiles,
+    cut_tiles,
+    is_inside,
+    sort_into_tiles,
+    thin_out,
+)
 from wavebatch.stages.chain import Chain, Step
 
 TILE_POINTS = 150_000

@@ -1,6 +1,7 @@
 """`wavebatch compare`: two clouds, two chains, or one of them with the vendor's returns or the truth.
 
-Reads options and checks thresholds; figures come from `wavebatch.tools.compare`, their sheet from `tools.sheets`.
+Reads options and checks thresholds; figures come from `wavebatch.tools.pairing` and `compare_chains`, their
+sheet from `tools.sheets`.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from wavebatch.cli.messages import print_result, talk, tell
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.text_file import write_text
-from wavebatch.tools.compare.pairing import Comparison, compare_clouds, compare_truth
+from wavebatch.tools.pairing import Comparison, compare_clouds, compare_truth
 from wavebatch.tools.sheets.compare import comparison_sheet, format_comparison, write_compare_page
 
 if TYPE_CHECKING:
-    from wavebatch.tools.compare.chains import Matchup
+    from wavebatch.tools.compare_chains import Matchup
 
 EXIT_VIOLATED = 1
 """A threshold was not met."""
@@ -123,7 +124,7 @@ def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comp
 
 
 def _is_chain(side: Path) -> bool:
-    from wavebatch.tools.compare.chains import find_contender
+    from wavebatch.tools.compare_chains import find_contender
 
     return side.suffix.lower() == ".toml" or (not side.is_file() and not find_contender(str(side)).is_cloud)
 
@@ -133,7 +134,7 @@ def _match(a: Path, b: Path | None, strip: Path, options: dict) -> Matchup:
     from wavebatch.surveying.choose_chain import COSTS
     from wavebatch.surveying.system_file import load_survey
     from wavebatch.tools.api.strip import AUTO
-    from wavebatch.tools.compare.chains import find_contender, match_sides
+    from wavebatch.tools.compare_chains import find_contender, match_sides
 
     saved = None if options["system"] is None else load_survey(options["system"])
     sides = [None if side is None else find_contender(str(side)) for side in (a, b)]

@@ -70,7 +70,7 @@ def survey(
     from wavebatch.core.errors import ConfigError
     from wavebatch.files.disk.publish import check_target
     from wavebatch.files.text_file import write_text
-    from wavebatch.surveying.auto_chain import chain_text
+    from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
     from wavebatch.tools.sheets.sheet import Sheet
     from wavebatch.tools.sheets.survey import list_doubts, survey_sheet, write_survey_page
@@ -179,7 +179,7 @@ def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Pat
 
 
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
-    from wavebatch.surveying.auto_chain import chain_text
+    from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import SYSTEM_SCHEMA, describe_system
     from wavebatch.surveying.systems.doubt import doubt_survey
     from wavebatch.surveying.systems.figures import describe_figures

@@ -6,10 +6,10 @@ How a strip is surveyed:
    `noise_and_width` finds noise, baseline, pulse width and saturation, and `learn_pulse` the pulse's shape; `residuals`
    finds the noise again from what fits leave, `misfit` what the pulse does not explain.
 2. `survey` runs these and decides which parts of a chain the scene needs. `system_file` saves the result.
-3. `auto_chain` turns the decisions into a chain; `predict_error` tries the shipped chains for `--tolerance`;
-   `choose_chain` is the entry point for both: it gives each strip its pulse and its chain.
+3. `choose_chain` turns the decisions into a chain, and gives each strip its pulse and its chain; `predict_error` tries
+   the shipped chains for `--tolerance`.
 4. `sensor` finds where the sensor was. With that and the beam's divergence, `flat_ground` measures how wide the echoes
-   of level ground are, and `angle_limits` predicts how well widths measure angles.
+   of level ground are, and predicts how well widths measure angles.
 
 `calibration` and the folder `calibrating` use and make calibrations; `inspect_strip` serves
 `wavebatch check`.

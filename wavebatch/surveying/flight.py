@@ -26,8 +26,7 @@ from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.surveying.auto_chain import decide
-from wavebatch.surveying.choose_chain import sample_size
+from wavebatch.surveying.choose_chain import decide, sample_size
 from wavebatch.surveying.inspect_strip import doubt_files
 from wavebatch.surveying.measuring.noise_and_width import (
     FAR_OFF,

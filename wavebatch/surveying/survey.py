@@ -19,7 +19,6 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.hidden_neighbours import measure_hidden
 from wavebatch.surveying.measuring.choose_pulse import MISFITS, Tried, choose_pulse, settle
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
@@ -45,6 +44,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening
+from wavebatch.surveying.predict_error import measure_hidden
 from wavebatch.surveying.systems.doubt import share_repeated, share_unexplained
 from wavebatch.surveying.systems.figures import Figures, Level
 from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known

@@ -16,8 +16,7 @@ from wavebatch.kernels.signal.runs import find_stretches
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.surveying import Survey, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import sample_size
+from wavebatch.surveying.choose_chain import choose_chain, sample_size
 
 ROWS = 8192
 """Waveforms that a chain gets at a time."""

@@ -24,9 +24,8 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scanner import StripScan
 from wavebatch.kernels.physics.radiometry import usual_attenuation
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.choose_chain import ChainChoice, Request
+from wavebatch.surveying.choose_chain import ChainChoice, Request, widest_chain
 from wavebatch.surveying.matching.setting import SCANNERS, Setting, measure_setting
 from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
 from wavebatch.surveying.prepare import Positions, prepare

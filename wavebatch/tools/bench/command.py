@@ -46,7 +46,7 @@ from wavebatch.files.strip.scanner import expand
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import effective, load_chain_file, load_profile
 from wavebatch.surveying import SAMPLE, Survey, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.survey import pool_blocks
 from wavebatch.tools.api.strip import AUTO
 from wavebatch.tools.bench import accuracy

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from wavebatch import __version__
 from wavebatch.core.units import count
-from wavebatch.tools.compare.pairing import Comparison
+from wavebatch.tools.pairing import Comparison
 from wavebatch.tools.sheets.sheet import Fact, Later, Note, Part, Picture, Sheet, Table, format_csv, sum_table
 
 if TYPE_CHECKING:
-    from wavebatch.tools.compare.chains import Matchup
+    from wavebatch.tools.compare_chains import Matchup
 
 _UNITS = {"time": "time ns", "echo_time": "echo_time ns", "amplitude": "amplitude DN", "echo_width": "width ns"}
 _SPREAD = ("number", "median", "mean", "rms", "nmad")

@@ -29,7 +29,7 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.incidence_angle import added_variance
 from wavebatch.surveying import Survey
-from wavebatch.surveying.angle_limits import REFERENCE_ERROR
+from wavebatch.surveying.flat_ground import REFERENCE_ERROR
 from wavebatch.surveying.systems.shown import name_model
 from wavebatch.tools.sheets.sheet import (
     Cell,
@@ -195,7 +195,7 @@ def write_survey_page(
 def _page_parts(
     survey: Survey, document: Mapping[str, Any], strips: Sequence[Path], reading: Mapping[str, Any]
 ) -> Iterator[Part]:
-    from wavebatch.surveying.auto_chain import choose_chain
+    from wavebatch.surveying.choose_chain import choose_chain
     from wavebatch.tools.plots.charts import draw_waveforms
 
     yield from list_doubts(document)

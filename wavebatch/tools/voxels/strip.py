@@ -29,9 +29,8 @@ from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
-from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.choose_chain import Request
+from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
