@@ -27,8 +27,8 @@ INSIDE = {
         {"serve", "worker_check"}, {"processes"}, {"dask_cluster"},
     ],
     "surveying": [
-        {"measuring"}, {"flat_ground", "predict_error"}, {"survey", "sensor"}, {"system_file"}, {"outgoing"},
-        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"prepare"},
+        {"measuring"}, {"predict_error"}, {"survey", "sensor"}, {"system_file"}, {"outgoing"},
+        {"choose_chain", "inspect_strip", "calibration"}, {"flat_ground", "flight"}, {"prepare"},
     ],
 }
 """The same within packages whose modules do one thing after another."""

@@ -47,6 +47,8 @@ def test_a_missing_wdp_is_named(tmp_path):
     path = make_raw(internal=False).write(tmp_path / "a.las")
     path.with_suffix(".wdp").unlink()
     assert "put a.wdp next to the strip" in refused(path, "packets are missing")
+    path.with_suffix(".wdp").mkdir()
+    refused(path, "packets are missing: a.wdp is no file")
 
 
 def test_upper_case_wdp_is_found(tmp_path):

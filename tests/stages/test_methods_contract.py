@@ -78,7 +78,7 @@ def test_parts_of_a_block_do_not_show(mixed, monkeypatch):
     block, system = mixed
     names = ("detect.asdf", "detect.correlation", "detect.richardson_lucy")
     whole = [call(name, {}, block, system) for name in names]
-    monkeypatch.setattr(transformed, "COLUMNS_AT_A_TIME", 7)
+    monkeypatch.setattr(transformed.filters, "COLUMNS_AT_A_TIME", 7)
     monkeypatch.setattr(transformed, "AT_A_TIME", 7)
     for name, table in zip(names, whole, strict=True):
         assert_same(call(name, {}, block, system), table)

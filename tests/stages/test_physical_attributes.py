@@ -22,8 +22,8 @@ from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.stages.pulse_tables import describe_fitted, pulse_shape, shape_limits
 from wavebatch.surveying import survey_block
-from wavebatch.surveying.angle_limits import SLOPE, predict_angles
 from wavebatch.surveying.calibration import with_physics
+from wavebatch.surveying.flat_ground import SLOPE, predict_angles
 from wavebatch.tools.simulate.render import AIR_SPEED
 from wavebatch.tools.simulate.scenes import find_scene, simulate_pulses
 

@@ -14,7 +14,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angles_of_variance
 from wavebatch.stages.attribute.incidence_angle import added_variance
-from wavebatch.surveying.angle_limits import REFERENCE_ERROR, SLOPE, predict_angles
+from wavebatch.surveying.flat_ground import REFERENCE_ERROR, SLOPE, predict_angles
 from wavebatch.tools.sheets.survey import ANGLES, format_angles, tabulate_angles
 
 GAUSSIAN = SystemPulse(sigma_ref=2.0, noise=ReceiverNoise(baseline=12.0, std=1.0), widths=LevelWidths(scatter=0.01))

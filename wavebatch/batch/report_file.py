@@ -30,8 +30,8 @@ from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
 from wavebatch.stages.decompose.loops import loop_model
-from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
+from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets
 from wavebatch.surveying.sensor import SensorSource
 from wavebatch.surveying.system_file import format_survey

@@ -37,9 +37,8 @@ from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.kernels.geometry.normals import find_edges
 from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
 from wavebatch.stages.chain import Chain, Solved, Step
-from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.choose_chain import ChainChoice, try_chain, without_columns
-from wavebatch.surveying.flat_ground import choose_radius, measure_slope
+from wavebatch.surveying.flat_ground import angle_parameters, choose_radius, measure_slope, sample_reference
 from wavebatch.surveying.prepare import prepare
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, judge_scale, refuse_units
 

@@ -18,18 +18,7 @@ from wavebatch.cli.messages import counting, print_summary
 from wavebatch.cli.program.command import complete_scenes
 from wavebatch.core.schema import declared_options
 from wavebatch.core.units import count
-from wavebatch.tools.simulate import (
-    CANOPIES,
-    OTHER_NAMES,
-    PULSES,
-    SCENES,
-    DiscreteReceiver,
-    StripOptions,
-    find_scene,
-    shape_pulse,
-    simulate_returns,
-    simulate_strip,
-)
+from wavebatch.tools import simulate as simulation
 from wavebatch.tools.simulate.render import Recording
 from wavebatch.tools.simulate.returns import EQUAL, Radar, SynthesisOptions, SynthesisSummary, synthesize_strip
 
@@ -37,9 +26,9 @@ _SEEN = 0.001
 """Share of the energy that is worth a note where it is not of echoes."""
 
 _SCENE_LINES = "\n\n".join(
-    [f"{name}: {scene.meaning}." for name, scene in SCENES.items()]
-    + [f"{name}: another name of {scene}." for name, scene in OTHER_NAMES.items()]
-    + [f"canopy.{name}: {meaning}." for name, (meaning, _) in CANOPIES.items()]
+    [f"{name}: {scene.meaning}." for name, scene in simulation.SCENES.items()]
+    + [f"{name}: another name of {scene}." for name, scene in simulation.OTHER_NAMES.items()]
+    + [f"canopy.{name}: {meaning}." for name, (meaning, _) in simulation.CANOPIES.items()]
 )
 
 _output = shared.output_option("Strip to write: .las or .laz.")
@@ -52,14 +41,15 @@ _output = shared.output_option("Strip to write: .las or .laz.")
 @click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Number of pulses.")
 @shared.seed_option("Seed of the random numbers; pulse k of a scene and a seed is always the same.")
 @shared.options_of(Recording, default=None)
-@click.option("--pulse", type=click.Choice(list(PULSES)), help="Shape of the system pulse.  [default: gaussian]")
+@click.option("--pulse", type=click.Choice(list(simulation.PULSES)),
+              help="Shape of the system pulse.  [default: gaussian]")
 @click.option("--sigma", type=float, help="Standard deviation of the pulse's main lobe [ns].  [default: the scene's]")
 @click.option("--kappa", type=float, help="Skew of the main lobe.  [default: 0]")
 @click.option("--ringing", default=0.0, help="Share of the amplitude in lobes 4 and 8 sigma after the peak.")
-@shared.options_of(StripOptions)
+@shared.options_of(simulation.StripOptions)
 @click.option("--sensor", type=click.Choice(["waveform", "discrete"]), default="waveform", show_default=True,
               help="waveform: record every waveform; discrete: record only returns, by a receiver with a dead zone.")
-@shared.options_of(DiscreteReceiver, default=None)
+@shared.options_of(simulation.DiscreteReceiver, default=None)
 @shared.common_options("overwrite", "json")
 def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | None, **options: Any) -> None:
     """Simulate a full-waveform strip of a SCENE with known echoes.
@@ -76,39 +66,39 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
       wavebatch simulate forest -o forest.laz --pulses 50000 --truth truth.npz
     """  # fmt: skip
     receiver = _build_receiver(truth, options)
-    found = find_scene(scene)
+    found = simulation.find_scene(scene)
     given = shared.given_options(options, declared_options(Recording))  # the others are those of the scene
     shape = {name: options[name] for name in ("pulse", "sigma", "kappa", "ringing")}
-    pulse = shape_pulse(found.recording.pulse, **shape)
+    pulse = simulation.shape_pulse(found.recording.pulse, **shape)
     shaped = replace(found, recording=replace(found.recording, pulse=pulse, **given))
     bar = counting("pulses", options["quiet"], pulses)
     common = {
         "pulses": pulses,
         "seed": seed,
-        "options": shared.from_options(StripOptions, options),
+        "options": shared.from_options(simulation.StripOptions, options),
         "overwrite": options["overwrite"],
         "progress": bar.update,
     }
     with bar:
         if receiver:
-            summary = simulate_returns(shaped, output, receiver=receiver, **common)
+            summary = simulation.simulate_returns(shaped, output, receiver=receiver, **common)
             rest = f"{summary.empty} without any"
         else:
-            summary = simulate_strip(shaped, output, truth=truth, **common)
+            summary = simulation.simulate_strip(shaped, output, truth=truth, **common)
             rest = f"{count(summary.packets, 'packet')} with {count(summary.echoes, 'echo')}"
     points = f"{count(summary.points, 'point')} of {count(summary.pulses, 'pulse')}"
     print_summary(summary, [f"{output}: {points}, {rest}"])
 
 
-def _build_receiver(truth: Path | None, options: dict[str, Any]) -> DiscreteReceiver | None:
+def _build_receiver(truth: Path | None, options: dict[str, Any]) -> simulation.DiscreteReceiver | None:
     """The discrete receiver of the options; None for a sensor that records waveforms."""
     if options["sensor"] == "discrete":
         if truth:
             raise click.UsageError("--truth holds the echoes of waveforms; simulate them with --sensor waveform")
         if not options["internal"]:
             raise click.UsageError("--external is about packets; --sensor discrete writes none")
-        return shared.from_options(DiscreteReceiver, options)
-    if shared.given_options(options, declared_options(DiscreteReceiver)):
+        return shared.from_options(simulation.DiscreteReceiver, options)
+    if shared.given_options(options, declared_options(simulation.DiscreteReceiver)):
         raise click.UsageError("--dead-zone, --threshold and --most-returns need --sensor discrete")
     return None
 

@@ -9,7 +9,7 @@ How a strip is surveyed:
 3. `choose_chain` turns the decisions into a chain, and gives each strip its pulse and its chain; `predict_error` tries
    the shipped chains for `--tolerance`.
 4. `sensor` finds where the sensor was. With that and the beam's divergence, `flat_ground` measures how wide the echoes
-   of level ground are, and `angle_limits` predicts how well widths measure angles.
+   of level ground are, and predicts how well widths measure angles.
 
 `calibration` and the folder `calibrating` use and make calibrations; `inspect_strip` serves
 `wavebatch check`.

@@ -170,6 +170,8 @@ def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerle
         )
     elif external:
         name = path.with_suffix(".wdz" if COMPRESSED in compression.values() else ".wdp").name
+        if path.with_name(name).exists():
+            raise InputError(f"{path}: its packets are missing: {name} is no file; put them there")
         raise InputError(f"{path}: its packets are missing: put {name} next to the strip")
     else:
         return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp next to the strip",))

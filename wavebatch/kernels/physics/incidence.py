@@ -1,4 +1,4 @@
-"""Incidence angles from widths of echoes: the stage attribute.incidence_angle and `surveying.angle_limits` call it.
+"""Incidence angles from widths of echoes: the stage attribute.incidence_angle and `surveying.flat_ground` call it.
 
 A plane under a Gaussian beam adds a Gaussian of standard deviation w tan(alpha) / c, w = R beta / 2: range and beam
 enter only by this product, so that one table of measured width by spread serves every echo (docs/algorithms.md 1.4).

@@ -135,7 +135,7 @@ SEAM_ROWS, SEAM_SPAN, SEAM_REACH = 20, 20.0, 3
 SEAM_SHARE, USUAL_SHARE = 0.95, 0.5
 """Share of them in which the sample is the mean of its neighbours, and how often that is so elsewhere, at most."""
 
-LEAST_RECORDING, MOST_SEAM_VALUES = 12, 1 << 20
+LEAST_RECORDING, MOST_SEAM_VALUES = 12, 1 << 18
 """Samples of a recording at least, and samples of all waveforms in which a seam is looked for."""
 
 

@@ -368,7 +368,9 @@ def _leave_signal_out(
     s, n = signal.shape
     above = np.where(quiet, signal - level, np.float32(0))
     # Smoothed counts are multiples of 1/4: without a dither of it one of the limits is nearer than the other.
-    dither = (DITHER[0] * np.arange(s, dtype=np.float32)[:, None] + DITHER[1] * np.arange(n, dtype=np.float32)) % 1
+    down, across = (np.arange(size) * float(step) % 1 for step, size in zip(DITHER, (s, n), strict=True))
+    dither = down[:, None].astype(np.float32) + across.astype(np.float32)
+    dither -= dither >= 1
     smoothed = smooth_121(above) + np.float32(0.25) * (dither - np.float32(0.5))
     limit, reach, number = np.float32(HIGH * std), -(-lags // 6), quiet.sum(axis=0)
     calm = ~(quiet & (np.abs(smoothed) > limit)).any(axis=0) & (number > 0)

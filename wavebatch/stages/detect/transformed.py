@@ -206,10 +206,11 @@ Peaks = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _in_parts(
-    signal: np.ndarray, std: np.ndarray, detect: Callable[..., Peaks], most: int = filters.COLUMNS_AT_A_TIME
+    signal: np.ndarray, std: np.ndarray, detect: Callable[..., Peaks], most: int | None = None
 ) -> Peaks:
     """Candidates of the columns of signal (s, n), `most` at a time, so that arrays stay in the cache."""
     found: list[Peaks] = [(np.empty(0, np.int64), np.empty(0), np.empty(0))]
+    most = most or filters.COLUMNS_AT_A_TIME
     for begin in range(0, signal.shape[1], most):
         part = slice(begin, begin + most)
         waveform, time, amplitude = detect(np.ascontiguousarray(signal[:, part]), std[part])

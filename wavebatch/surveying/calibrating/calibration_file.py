@@ -16,16 +16,8 @@ from pathlib import Path
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
+from wavebatch.files import toml_file
 from wavebatch.files.text_file import read_text
-from wavebatch.files.toml_file import (
-    TomlTable,
-    describe_record,
-    format_toml,
-    list_comments,
-    parse_toml,
-    read_record,
-    shorten,
-)
 from wavebatch.surveying.calibration import Calibration
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
@@ -42,7 +34,7 @@ _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of 
 
 def format_calibration(found: Calibration) -> str:
     """Return the TOML text of a calibration; `parse_calibration` gives the same constants again."""
-    table = describe_record(found)
+    table = toml_file.describe_record(found)
     rows = {key: table.pop(key, None) for key in ("channel", "flight_strip")}
     document = {
         "schema": CALIBRATION_SCHEMA,
@@ -57,7 +49,8 @@ def format_calibration(found: Calibration) -> str:
         "target": [asdict(row) for row in found.targets] or None,
         "fingerprint": {key: item for key, item in found.fingerprint.items() if not isinstance(item, Mapping)} or None,
     }
-    return format_toml(document, heading=_HEADING, comments=list_comments(Calibration, "") | {_SECTION: _MEANING})
+    comments = toml_file.list_comments(Calibration, "") | {_SECTION: _MEANING}
+    return toml_file.format_toml(document, heading=_HEADING, comments=comments)
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -84,19 +77,19 @@ def parse_calibration(text: str, name: str) -> Calibration:
     ConfigError
         When a key is unknown, missing or out of its range, or where section_constant does not fit the others.
     """
-    table = parse_toml(text, name)
+    table = toml_file.parse_toml(text, name)
     table.check_kind("calibration")
     table.check_schema(CALIBRATION_SCHEMA)
     swath = _read_swath(table.table("scan_angle")) if "scan_angle" in table.values else ()
     fingerprint = dict(table.table("fingerprint", {}).values)
     others = ("schema", "version", _SECTION, "scan_angle", "target", "fingerprint")
-    found = replace(read_record(Calibration, table, also=others), swath=swath, fingerprint=fingerprint)
+    found = replace(toml_file.read_record(Calibration, table, also=others), swath=swath, fingerprint=fingerprint)
     if found.flight:
         flight = found.flight
         with contextlib.suppress(ValueError):
             flight = datetime.date.fromisoformat(flight).isoformat()
         if not _DAY.fullmatch(flight):
-            raise ConfigError(f"{name}: flight must be a day such as 2026-05-31, it is {shorten(flight)}")
+            raise ConfigError(f"{name}: flight must be a day such as 2026-05-31, it is {toml_file.shorten(flight)}")
         found = replace(found, flight=flight)
     known: set[tuple[int, int]] = set()
     for number, row in enumerate(found.channels, 1):
@@ -110,7 +103,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     return found
 
 
-def _read_swath(table: TomlTable) -> tuple[float, ...]:
+def _read_swath(table: toml_file.TomlTable) -> tuple[float, ...]:
     table.check_keys(_SWATH)
     even = {key: limits for key, limits in _SWATH.items() if key != "odd"}
     most, *terms = (table.number(key, low, high) for key, (low, high) in even.items())

@@ -26,8 +26,8 @@ from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.attribute.radiometry import AIR_DOUBT
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.angle_limits import sample_reference
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
+from wavebatch.surveying.flat_ground import sample_reference
 from wavebatch.surveying.matching import setting as settings
 from wavebatch.surveying.sensor import FOOT, SensorSource
 

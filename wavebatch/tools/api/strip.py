@@ -16,8 +16,8 @@ from wavebatch.files.strip.scanner import StripScan
 from wavebatch.stages import chain_file
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import survey_blocks
-from wavebatch.surveying.angle_limits import survey_angles
 from wavebatch.surveying.choose_chain import choose_chain, decide, read_sample
+from wavebatch.surveying.flat_ground import survey_angles
 from wavebatch.surveying.outgoing import compare_outgoing
 from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.systems.saved_check import with_look

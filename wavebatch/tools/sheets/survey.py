@@ -29,21 +29,10 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.incidence_angle import added_variance
 from wavebatch.surveying import Survey
-from wavebatch.surveying.angle_limits import REFERENCE_ERROR
+from wavebatch.surveying.flat_ground import REFERENCE_ERROR
 from wavebatch.surveying.systems.shown import name_model
-from wavebatch.tools.sheets.sheet import (
-    Cell,
-    Code,
-    Fact,
-    Later,
-    Note,
-    Part,
-    Picture,
-    Sheet,
-    Table,
-    format_csv,
-    list_facts,
-)
+from wavebatch.tools.sheets import sheet as sheets
+from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Picture, Sheet, Table, list_facts
 
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
@@ -432,7 +421,7 @@ def format_angles(found: AngleTable) -> str:
             "amplitude_DN")  # fmt: skip
     same = map(float, (found.distance, found.divergence, found.amplitude))
     columns = (found.angle, found.spread, found.width, found.error, *(np.full(len(found.angle), one) for one in same))
-    return format_csv(head, zip(*columns, strict=True), digits=6)
+    return sheets.format_csv(head, zip(*columns, strict=True), digits=6)
 
 
 def draw_angles(tables: Sequence[AngleTable], target: Path, *, strip: str = "", overwrite: bool = False) -> None:
