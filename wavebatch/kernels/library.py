@@ -226,7 +226,7 @@ class Samples(NamedTuple):
         counts, baseline, std, missing = self
         kind = 0 if counts.dtype == np.float32 else counts.dtype.itemsize
         block = Block(
-            counts.ctypes.data, counts.shape[1], kind, place(baseline, np.float32), baseline.ndim - 1,
+            address(counts), counts.shape[1], kind, place(baseline, np.float32), baseline.ndim - 1,
             place(std, np.float32), None if missing is None else place(missing, np.bool_),
         )  # fmt: skip
         block.arrays = self  # they must live as long as the structure
@@ -277,7 +277,7 @@ def call(name: str, *arguments: Any) -> int:
         There is not enough for its largest waveform or window.
     """
     given = [
-        ctypes.c_void_p(part.ctypes.data) if isinstance(part, np.ndarray)
+        ctypes.c_void_p(address(part)) if isinstance(part, np.ndarray)
         else ctypes.byref(part) if isinstance(part, ctypes.Structure) else part
         for part in arguments
     ]  # fmt: skip
@@ -291,4 +291,11 @@ def place(array: np.ndarray, dtype: type) -> int:
     """Address of a contiguous array of this type, for a structure whose owner keeps the array."""
     if array.dtype != dtype or not array.flags.c_contiguous:
         raise ValueError(f"expected a contiguous array of {np.dtype(dtype)}, got {array.dtype}")
-    return array.ctypes.data
+    return address(array)
+
+
+def address(array: np.ndarray) -> int:
+    """Address of an array's first value; `array.ctypes.data` takes twice as long, and a survey asks 10,000 times."""
+    if array.size and array.flags.carray:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
+    return array.ctypes.data  # of what cannot be written, or is empty

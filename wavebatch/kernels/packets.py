@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.library import CJudged, CPoints, CRules, call, place
+from wavebatch.kernels.library import CJudged, CPoints, CRules, address, call, place
 
 FIELDS = {"index": "u1", "offset": "<u8", "size": "<u4", "location": "<f4", "x": "<f4", "y": "<f4", "z": "<f4"}
 
@@ -87,9 +87,9 @@ def judge_packets(fields: dict[str, np.ndarray], rules: PacketRules, geometry: G
         raise ValueError("rules must have 256 rows, and samples of at least 1 byte")
     kinds = (np.uint8, np.int32, np.uint64, np.bool_, np.bool_)
     out = tuple(np.empty(n, kind) for kind in kinds)
-    points = CPoints(n, stride, *(fields[name].ctypes.data for name in FIELDS))
+    points = CPoints(n, stride, *(address(fields[name]) for name in FIELDS))
     call("judge_packets", points, CRules(*tables, rules.least, rules.end, *geometry),
-         CJudged(*(column.ctypes.data for column in out)))  # fmt: skip
+         CJudged(*map(address, out)))  # fmt: skip
     return out
 
 

@@ -46,7 +46,7 @@ def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clust
     while done < c:
         echoes = np.empty((room, 4)), np.empty((room, 4)), np.empty((room, 2)), np.empty(room, bool)
         columns = (number, converged, misfit, cost, *echoes)
-        out = library.Echoes(room, *(column.ctypes.data for column in columns))
+        out = library.Echoes(room, *map(library.address, columns))
         found = ctypes.c_int64()
         reached = call("decompose_clusters", *problem, ctypes.c_int64(done), out, ctypes.byref(found))
         parts.append([column[: found.value] for column in echoes])

@@ -122,10 +122,10 @@ def keep_echoes(
         raise ValueError("a cluster lies in no waveform")
     columns = {name: np.empty(m, kind) for name, kind in _COLUMNS.items()}
     kept = call(
-        "keep_echoes", library.CClusters(n, waveform.ctypes.data),
-        library.Echoes(m, *(column.ctypes.data for column in fits)), whole.as_structure(fits[4][:, 2]),
-        library.CKeeping(std.ctypes.data, factors.ctypes.data, spacing, length - 1, significance),
-        library.CKept(*(column.ctypes.data for column in columns.values())),
+        "keep_echoes", library.CClusters(n, library.address(waveform)),
+        library.Echoes(m, *map(library.address, fits)), whole.as_structure(fits[4][:, 2]),
+        library.CKeeping(library.address(std), library.address(factors), spacing, length - 1, significance),
+        library.CKept(*map(library.address, columns.values())),
     )  # fmt: skip
     found = {name: column[:kept] for name, column in columns.items()}
     return found, found.pop("row")

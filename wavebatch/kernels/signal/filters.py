@@ -198,7 +198,7 @@ def find_maxima(
     room, done, parts = 2 * n + samples.counts.shape[1], 0, []
     while done < n:
         columns = np.empty(room, np.int64), np.empty(room), np.empty(room), np.empty(room)
-        out, found = library.CCandidates(room, *(column.ctypes.data for column in columns)), ctypes.c_int64()
+        out, found = library.CCandidates(room, *map(library.address, columns)), ctypes.c_int64()
         sizes = ctypes.c_int64(n), detector, ctypes.c_int64(done)
         done = call("find_maxima", samples.as_block(), *sizes, out, ctypes.byref(found))
         parts.append([column[: found.value] for column in columns])
