@@ -61,8 +61,11 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
         reason, remedy = "most of the noise below count 0", "raise the level of the digitizer in the next flight"
     if reason:
         code, guess = "pulse-guess", f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
-        if (known and not few) or unseen or hidden:
+        if unseen or hidden:
             code, guess = "noise-guess", f"noise is a guess, of {system.noise.std:.3g} DN"
+        elif known and not few:
+            values = f"{system.noise.std:.3g} DN and {100 * system.misfit:.2g} %"
+            code, guess = "noise-guess", f"noise and the misfit are guesses, of {values}"
         yield StripWarning(
             code, f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
             f"{remedy}",
