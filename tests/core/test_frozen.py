@@ -126,3 +126,35 @@ def test_wrong_arguments_are_named(values, named, text):
 def test_a_class_checks_its_values():
     with pytest.raises(ValueError, match="last is negative"):
         Checked(1, last=-1)
+
+
+def test_other_classes_may_be_made_of_it():
+    @dataclass(frozen=True)
+    class Plain(Point):
+        more: int = 0
+
+    class Own(Point):
+        def __init__(self, width: int) -> None:
+            super().__init__(width)
+
+    one = Own(3)
+    object.__setattr__(one, "seen", 1)
+    assert Plain(1, more=2) == Plain(1, more=2) and list(inspect.signature(Own).parameters) == ["width"]
+    assert copy.copy(one).seen == 1 and copy.copy(one).x == 3
+    with pytest.raises(TypeError, match="cannot inherit non-frozen"):
+        dataclass(type("Loose", (Point,), {}))
+    with pytest.raises(TypeError, match="use dataclass"):
+
+        @frozen
+        class Hidden:
+            x: int = field(default=0, init=False)
+
+
+def test_values_have_an_order_where_it_is_asked_for():
+    @frozen(order=True)
+    class Size:
+        x: int
+
+    assert Size(1) < Size(2) and Size(2) > Size(1) and Size(1) <= Size(1) and Size(2) >= Size(2)
+    with pytest.raises(TypeError):
+        assert Size(1) < 2

@@ -42,7 +42,7 @@ WARNINGS = {
     "empty": "no points, no waveforms or no echoes",
     "nothing-selected": "the selection leaves no point",
     "pulse-guess": "the survey knows the pulse too little: widths, errors and the number of echoes depend on it",
-    "noise-guess": "the survey knows the noise too little: errors and the number of echoes depend on it",
+    "noise-guess": "the survey knows noise or misfit too little: errors and the number of echoes depend on it",
     "forced-system": "the survey of --system contradicts the strip",
     "false-echoes": "the chain that was asked for does not fit the pulse: many of its echoes are false",
     "failed-fits": "far more fits than usual did not converge, or ended at a bound",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from dataclasses import MISSING, FrozenInstanceError, dataclass, field
+from dataclasses import MISSING, FrozenInstanceError, dataclass, field, fields
 from typing import Any, dataclass_transform
 
 
@@ -35,7 +35,16 @@ def frozen(kind: type | None = None, /, *, eq: bool = True, order: bool = False)
     for name, method in {**_METHODS, **(_EQUALITY if eq else {}), **(_ORDER if order else {})}.items():
         if getattr(kind, name, None) is getattr(object, name, None):
             setattr(kind, name, method)
-    return dataclass(init=False, repr=False, eq=False, slots=True)(kind)
+    bases = [vars(base)["__dataclass_params__"] for base in kind.__mro__[1:] if "__dataclass_params__" in vars(base)]
+    bases = [base for base in bases if base.frozen]
+    for base in bases:
+        base.frozen = False  # `dataclass` would write the methods that this class has, or refuse it
+    made: Any = dataclass(init=False, repr=False, eq=False, slots=True)(kind)
+    for one in (*bases, made.__dataclass_params__):
+        one.frozen = True
+    if len(fields(made)) < len(made.__dataclass_fields__) or not all(one.init and one.repr for one in fields(made)):
+        raise TypeError(f"{kind.__name__} has a field that is not of its objects, or that is hidden: use dataclass")
+    return made
 
 
 def _init(self: Any, *values: Any, **named: Any) -> None:
@@ -78,6 +87,10 @@ def _is_less(self: Any, other: object) -> bool:
     return _values(self) < _values(other) if type(other) is type(self) else NotImplemented
 
 
+def _is_no_more(self: Any, other: object) -> bool:
+    return _values(self) <= _values(other) if type(other) is type(self) else NotImplemented
+
+
 def _hash(self: Any) -> int:
     return hash(_values(self))
 
@@ -90,6 +103,8 @@ class _Signature:
     """What `inspect.signature` and help() show of a class."""
 
     def __get__(self, one: object, kind: Any) -> inspect.Signature:
+        if kind.__init__ is not _init:
+            raise AttributeError("__signature__")  # that of its own __init__
         parameters = []
         for name, known in kind.__dataclass_fields__.items():
             where = inspect.Parameter.KEYWORD_ONLY if known.kw_only else inspect.Parameter.POSITIONAL_OR_KEYWORD
@@ -99,13 +114,14 @@ class _Signature:
         return inspect.Signature(parameters)
 
 
-def _set_state(self: Any, state: tuple[None, dict[str, Any]]) -> None:
-    """Fill an object that is copied or unpickled."""
-    for name, value in state[1].items():
-        object.__setattr__(self, name, value)
+def _set_state(self: Any, state: Any) -> None:
+    """Fill an object that is copied or unpickled, from what `object` saves: attributes, those in slots, or both."""
+    for values in state if isinstance(state, tuple) else (state,):
+        for name, value in (values or {}).items():
+            object.__setattr__(self, name, value)
 
 
 _METHODS = {"__init__": _init, "__repr__": _repr, "__setattr__": _refuse, "__delattr__": _refuse,
             "__setstate__": _set_state, "__signature__": _Signature()}  # fmt: skip
 _EQUALITY = {"__eq__": _is_equal, "__hash__": _hash}
-_ORDER = {"__lt__": _is_less}
+_ORDER = {"__lt__": _is_less, "__le__": _is_no_more}
