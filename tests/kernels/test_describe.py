@@ -108,8 +108,9 @@ def test_widths_cost_what_the_loop_says(scatter, rng):
     known = error < 0.15
     widths = ratio, error, known, (0.01, 0.02, 0.04, 0.06), 1 + 0.02 * 2.0 ** np.arange(9), 0.01
     np.testing.assert_allclose(describe_widths(*widths), naive.describe_widths(*widths), atol=1e-4)
-    with pytest.raises(ValueError, match="errors above 0"):
-        describe_widths(ratio, 0 * error, *widths[2:])
+    for wrong in ({1: 0 * error}, {0: ratio * np.nan}, {2: known[1:]}, {3: ()}, {4: np.array([1.0])}):
+        with pytest.raises(ValueError):
+            describe_widths(*(wrong.get(place, value) for place, value in enumerate(widths)))
 
 
 def test_echoes_that_are_not_sorted_are_refused():

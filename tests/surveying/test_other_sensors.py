@@ -219,25 +219,55 @@ def test_tails_far_below_a_thousandth_are_known_where_echoes_are_so_high():
     assert judge(block, time)[2] > 0.85
 
 
-def test_no_misfit_is_looked_for_below_none(monkeypatch):
-    """Its neighbours may describe shorter, but by less than one error: then it is none, not one beyond the largest."""
-    cost = {0: 0, 1: -5, 2: -12, 3: -13, 4: 0, 6: 0, 8: 40}
-    scatter = np.resize([1.0, -1.0], 100)
-    looked = []
+def search_misfit(monkeypatch, cost, loud, change):
+    """Misfit and doubt where a misfit at a place costs so much, and the places that were looked at."""
+    scatter, looked = np.resize([1.0, -1.0], 100), []
 
     def explain_between(block, system, found, place):
         return SimpleNamespace(place=place, echoes=range(100 + place))
 
     def describe(block, system, explained, changes):
         looked.append(explained.place)
-        return [np.full(100, cost[explained.place] / 100) + (5.0 if explained.place == 3 else 0.3) * scatter]
+        return [np.full(100, cost[explained.place] / 100) + (5.0 if explained.place == loud else 0.3) * scatter]
 
     monkeypatch.setattr(choose_pulse, "describe_waveforms", describe)
     monkeypatch.setattr(choose_pulse, "_explain_between", explain_between)
     block = record(gaussian, 5, n=100)[0]
-    misfit, doubt = choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0, 0.0)
+    return *choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0, change), looked
+
+
+def test_no_misfit_is_looked_for_below_none(monkeypatch):
+    """Its neighbours may describe shorter, but by less than one error: then it is none, not one beyond the largest."""
+    cost = {0: 0, 1: -5, 2: -12, 3: -13, 4: 0, 6: 0, 8: 40}
+    misfit, doubt, looked = search_misfit(monkeypatch, cost, 3, 0.0)
     assert misfit == 0.0 and doubt == pytest.approx(4 / 103)
     assert set(looked) <= set(cost)
+
+
+def test_none_is_taken_only_where_it_was_looked_at(monkeypatch):
+    """From a change of 1 % on it begins above; what is looked at last may make the least of these as good as any."""
+    cost = {0: 900, 1: 700, 2: 500, 3: 40, 4: 40, 5: -5, 6: 0, 7: 20, 8: 60}
+    misfit, _, looked = search_misfit(monkeypatch, cost, 5, 0.01)
+    assert choose_pulse.MISFITS[2] < misfit <= choose_pulse.MISFITS[3] and 2 in looked
+
+
+@pytest.mark.parametrize(
+    ("errors", "echoes", "known", "taken"),
+    [
+        (2.0, 100, False, False), (4.0, 100, False, True),  # as many echoes: SURE
+        (2.0, 90, False, True), (1.0, 90, False, False),  # fewer, in place of a learned pulse: HINT
+        (2.0, 90, True, False),  # in place of a known one
+        (4.0, 110, True, False), (5.0, 110, True, True),  # more: both
+    ],
+)  # fmt: skip
+def test_a_pulse_with_more_echoes_must_describe_shorter_by_more(errors, echoes, known, taken):
+    """Two pulses as simple: the second is described shorter by so many standard errors."""
+    spread = 0.5 * np.resize([1.0, -1.0], 400)
+    first = choose_pulse.Candidate("first", SystemPulse(2.0), 0.0, 50 + 0 * spread, 100, known, 2, 0.0)
+    length = first.length - errors * 0.5 / np.sqrt(400) + spread
+    second = choose_pulse.Candidate("second", SystemPulse(2.2), 0.0, length, echoes, True, 3, 0.0)
+    assert second.name == choose_pulse._decide([first, second]).best.name or not taken
+    assert taken or choose_pulse._decide([first, second]).best.name == "first"
 
 
 def test_the_misfit_is_at_least_what_the_pulse_misses_of_the_stack():

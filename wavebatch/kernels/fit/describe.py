@@ -136,10 +136,13 @@ def describe_widths(
     ----------
     docs/algorithms.md R2.
     """
-    if not (len(ratio) == len(error) == len(known)) or not len(wider) or not (error > 0).all():
-        raise ValueError("widths, errors and marks must be as many, errors above 0, and laws at least one")
     columns = [np.ascontiguousarray(column, np.float64) for column in (ratio, error, scatters, wider)]
     (ratio, error, scatter, ends), cost = columns, np.zeros(len(ratio))
+    finite = all(np.isfinite(column).all() for column in columns)
+    if not (len(ratio) == len(error) == len(known)) or not len(scatter) or not len(ends) or not finite:
+        raise ValueError("widths, errors and marks must be as many and finite, scatters and laws at least one")
+    if not (error > 0).all() or not (ends > 1).all():
+        raise ValueError("the errors of widths must be above 0, and the laws end above 1")
     call(
         "describe_widths", ctypes.c_int64(len(ratio)), ratio, error, np.ascontiguousarray(known, np.bool_),
         ctypes.c_int64(len(scatter)), scatter, ctypes.c_int64(len(ends)), ends, ctypes.c_double(anywhere), cost,

@@ -384,6 +384,8 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float, chang
         first = next(place for place, errors in zip(sorted(lengths), longer, strict=True) if errors <= 1)
         if first:
             best, longer = look(first - 1)
+    while longer[0] <= 1 and min(lengths) > 0:  # what was looked at last may be the shortest
+        best, longer = look(min(lengths) - 1)
     places = sorted(lengths)
     numbers = [len(found[place].echoes) for place, errors in zip(places, longer, strict=True) if errors <= 1]
     doubt = (max(numbers) - min(numbers)) / max(len(found[best].echoes), 1)
