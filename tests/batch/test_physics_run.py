@@ -156,12 +156,12 @@ def test_heights_of_another_kind_are_told(tmp_path, tiny_strip):
 
 
 @pytest.mark.slow
-def test_verbose_says_where_the_sensor_was(tmp_path, tiny_strip, calibration):
-    done = run(tiny_strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", calibration, "-v")
+def test_verbose_says_where_the_sensor_was(tmp_path, wide_strip, calibration):
+    done = run(wide_strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", calibration, "-v")
     (line,) = [line for line in done.stderr.splitlines() if "sensor from direction vectors: " in line]
     for words in ("m above the points", "60.0 m/s", "heading 90 degrees", "smooth to", "ranges to"):
         assert words in line
-    assert "sensor from" not in run(tiny_strip, "-o", tmp_path / "bare", "--profile", "fast", "-v").stderr
+    assert "sensor from" not in run(wide_strip, "-o", tmp_path / "bare", "--profile", "fast", "-v").stderr
 
 
 def test_resume_makes_it_anew_when_the_calibration_changes(tmp_path, tiny_strip):
