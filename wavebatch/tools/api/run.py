@@ -56,7 +56,9 @@ def _takes(
 
 
 @_takes(RunOptions)
-def run(strips: Strips, output: Path | str, **options: Any) -> BatchResult:
+def run(
+    strips: Strips, output: Path | str, *, on_event: Callable[[dict[str, Any]], None] | None = None, **options: Any
+) -> BatchResult:
     """Write a point cloud and a report for every strip; what `wavebatch run` does.
 
     The keywords are the options of the command, with `_` for `-`; `help(wavebatch.run)` lists them.
@@ -82,8 +84,7 @@ def run(strips: Strips, output: Path | str, **options: Any) -> BatchResult:
     ConfigError
         For wrong options, before anything starts.
     """
-    asked = RunOptions(output, **options)
-    return run_batch(*plan_run(strips, replace(asked, on_event=None)), asked.on_event)
+    return run_batch(*plan_run(strips, RunOptions(output, **options)), on_event)
 
 
 def plan_run(

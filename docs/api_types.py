@@ -1,0 +1,21 @@
+"""What the reader of Python for the site is told: classes of `frozen` are dataclasses (`extensions` in mkdocs.yml)."""
+
+from __future__ import annotations
+
+from griffe import Class, ExprName, Extension
+
+
+class Dataclass(ExprName):
+    """The decorator that the reader knows."""
+
+    canonical_path = "dataclasses.dataclass"
+
+
+class FrozenClasses(Extension):
+    """Gives classes of `wavebatch.core.frozen` the constructor of a dataclass."""
+
+    def on_class_members(self, *, cls: Class, **_: object) -> None:
+        """Look at the decorators of a class that was read."""
+        for one in cls.decorators:
+            if getattr(one.value, "canonical_path", "") == "wavebatch.core.frozen.frozen":
+                one.value = Dataclass("dataclass")
