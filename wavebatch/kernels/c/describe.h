@@ -32,7 +32,7 @@ static int furnish(Desk *d, int64_t rows, int64_t vectors) {
     const size_t row = vectors * sizeof(lanes), n = rows;
     d->vectors = vectors;
     return enlarge(&d->x, row) && enlarge(&d->weight, row) && enlarge(&d->rest, row) && enlarge(&d->rows, n * row)
-        && enlarge(&d->modes, 6 * row) && enlarge(&d->gram, n * n * sizeof(double)) && enlarge(&d->matrix, n * n * sizeof(double))
+        && enlarge(&d->modes, (6 + 2 * CHANGED) * row) && enlarge(&d->gram, n * n * sizeof(double)) && enlarge(&d->matrix, n * n * sizeof(double))
         && enlarge(&d->pivot, n * sizeof(double)) && enlarge(&d->column, n * sizeof(double));
 }
 
@@ -62,16 +62,21 @@ static double lay_out(const Described *w, int64_t i, Desk *d) {
     return sum;
 }
 
-/* What the two samples before do not predict, in place. */
+/* What the two samples before do not predict, in place. From the end, so that what is still needed is not yet changed. */
 static void innovate(const Described *w, lanes *row, int64_t vectors) {
-    float *y = (float *)row;
+    const float *y = (float *)row;
     const float one = w->ahead[0], two = w->ahead[1], scale = 1 / sqrt(w->left_over);
-    float before = 0, last = 0;
-    for (int64_t t = 0; t < vectors * LANES; t++) {
-        float here = y[t];
-        y[t] = (here - one * last - two * before) * scale;
-        before = last; last = here;
+    lanes last, before;
+    for (int64_t v = vectors - 1; v > 0; v--) {
+        memcpy(&last, y + v * LANES - 1, sizeof(lanes));
+        memcpy(&before, y + v * LANES - 2, sizeof(lanes));
+        row[v] = (row[v] - last * one - before * two) * scale;
     }
+    float shifted[LANES + 2] = {0, 0};
+    memcpy(shifted + 2, y, sizeof(lanes));
+    memcpy(&last, shifted + 1, sizeof(lanes));
+    memcpy(&before, shifted, sizeof(lanes));
+    row[0] = (row[0] - last * one - before * two) * scale;
 }
 
 static double dot(const lanes *a, const lanes *b, int64_t vectors) {
@@ -136,15 +141,15 @@ static double shared_volume(const Described *w, Desk *d, int64_t first, int64_t 
     return sum;
 }
 
-/* Takes a change of an echo's shape off what is left, as far as it is likely, and returns what it costs. The two
-   directions are the next after those of the fit, as in `hermite_moments`. */
-static double change_shape(const Described *w, Desk *d, int64_t echo, double *heights, double *energies) {
-    int64_t from;
-    const int64_t vectors = find_vectors(w, echo, 1, &from);
-    const lanes *x = d->x + from, *weight = d->weight + from;
-    lanes *rest = d->rest + from;
+typedef struct { int64_t from, vectors; lanes *rows; double energy[2]; } Bend;
+
+/* Two directions in which an echo's shape may change, the next after those of the fit as in `hermite_moments`, as they
+   are seen in innovations of the noise; and their energies. */
+static void find_bend(const Described *w, Desk *d, int64_t echo, Bend *bend) {
+    const int64_t vectors = bend->vectors = find_vectors(w, echo, 1, &bend->from);
+    const lanes *x = d->x + bend->from, *weight = d->weight + bend->from;
     const float time = w->time[echo], inverse = 1 / w->width[echo];
-    double cost = 0, energy = 0;
+    double energy = 0;
     draw_echo(w, echo, x, vectors, d->modes);
     for (int64_t v = 0; v < vectors; v++) {
         lanes z = least_of(most_of((x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
@@ -161,14 +166,26 @@ static double change_shape(const Described *w, Desk *d, int64_t echo, double *he
         if (!r) energy = norm;
         for (int64_t v = 0; v < vectors; v++) row[v] *= (float)(1 / fmax(norm, 1e-9));
     }
-    for (int64_t r = 3; r < 5; r++) {
-        lanes *row = d->modes + r * vectors;
-        for (int64_t v = 0; v < vectors; v++) row[v] *= weight[v] * (float)(energy * w->amplitude[echo]);
+    for (int64_t r = 0; r < 2; r++) {
+        lanes *row = bend->rows + r * vectors;
+        for (int64_t v = 0; v < vectors; v++) row[v] = d->modes[(3 + r) * vectors + v] * (weight[v] * (float)(energy * w->amplitude[echo]));
         innovate(w, row, vectors);
-        double own = dot(row, row, vectors), height = dot(row, rest, vectors) / (own + 1 / (w->change * w->change));
-        if (heights) { heights[r - 3] = height; energies[r - 3] = own; continue; }
-        for (int64_t v = 0; v < vectors; v++) rest[v] -= row[v] * (float)height;
-        cost += 0.5 * (height / w->change) * (height / w->change) + 0.5 * log_double(1 + w->change * w->change * own);
+        bend->energy[r] = dot(row, row, vectors);
+    }
+}
+
+/* Height of a direction in what is left, where a change of the pulse from shot to shot makes so much likely. */
+static double find_height(const Bend *bend, int64_t r, const lanes *rest, double change) {
+    return dot(bend->rows + r * bend->vectors, rest + bend->from, bend->vectors) / (bend->energy[r] + 1 / (change * change));
+}
+
+/* Takes a change of an echo's shape off what is left, as far as it is likely, and returns what it costs. */
+static double change_shape(const Bend *bend, double change, lanes *rest) {
+    double cost = 0;
+    for (int64_t r = 0; r < 2; r++) {
+        const double height = find_height(bend, r, rest, change);
+        for (int64_t v = 0; v < bend->vectors; v++) rest[bend->from + v] -= bend->rows[r * bend->vectors + v] * (float)height;
+        cost += 0.5 * (height / change) * (height / change) + 0.5 * log_double(1 + change * change * bend->energy[r]);
     }
     return cost;
 }
@@ -199,19 +216,25 @@ static double measure_rest(const Described *w, int64_t i, const float *rest) {
    (number, n); and the volume that echoes share, (n). */
 EXPORT int64_t describe_waveforms(const Described *w, int64_t number, const double *changes, double *length, double *volume) {
     Desk d = {0};
-    Described tried = *w;
+    Bend bends[CHANGED];
     const int64_t vectors = VECTORS(w->length);
-    int good = furnish(&d, 3 * TOGETHER, vectors);
+    int good = furnish(&d, 3 * TOGETHER, vectors), most = 0;
+    for (int64_t c = 0; c < number; c++) most = changes[c] > 0 ? CHANGED : most;
     for (int64_t i = 0; i < w->n && good; i++) {
         const int64_t first = w->first[i], end = w->first[i + 1];
+        const double sum = lay_out(w, i, &d);
+        lanes *rest = d.modes + 5 * vectors;
+        int64_t bent = 0, echo = -1;
+        innovate(w, d.rest, vectors);
+        for (; bent < most && (echo = next_strongest(w, first, end, echo)) >= 0; bent++) {
+            bends[bent].rows = d.modes + (6 + 2 * bent) * vectors;
+            find_bend(w, &d, echo, bends + bent);
+        }
         for (int64_t c = 0; c < number; c++) {
-            double sum = lay_out(w, i, &d);
-            innovate(w, d.rest, vectors);
-            tried.change = changes[c];
-            int64_t echo = -1;
-            for (int64_t j = 0; changes[c] > 0 && j < CHANGED && (echo = next_strongest(w, first, end, echo)) >= 0; j++)
-                sum += change_shape(&tried, &d, echo, NULL, NULL);
-            length[c * w->n + i] = sum + measure_rest(w, i, (const float *)d.rest);
+            double cost = sum;
+            memcpy(rest, d.rest, vectors * sizeof(lanes));
+            for (int64_t j = 0; changes[c] > 0 && j < bent; j++) cost += change_shape(bends + j, changes[c], rest);
+            length[c * w->n + i] = cost + measure_rest(w, i, (const float *)rest);
         }
         volume[i] = 0;
         for (int64_t j = first; j < end; j += TOGETHER) volume[i] += shared_volume(w, &d, j, end - j < TOGETHER ? end - j : TOGETHER);
@@ -224,6 +247,7 @@ EXPORT int64_t describe_waveforms(const Described *w, int64_t number, const doub
    the variance of each, (n, 2); 0 where there is no echo. */
 EXPORT int64_t measure_changes(const Described *w, double *heights, double *energies) {
     Desk d = {0};
+    Bend bend;
     int good = furnish(&d, 1, VECTORS(w->length));
     memset(heights, 0, 2 * w->n * sizeof(double));
     memset(energies, 0, 2 * w->n * sizeof(double));
@@ -232,7 +256,12 @@ EXPORT int64_t measure_changes(const Described *w, double *heights, double *ener
         if (echo < 0) continue;
         lay_out(w, i, &d);
         innovate(w, d.rest, d.vectors);
-        change_shape(w, &d, echo, heights + 2 * i, energies + 2 * i);
+        bend.rows = d.modes + 5 * d.vectors;
+        find_bend(w, &d, echo, &bend);
+        for (int64_t r = 0; r < 2; r++) {
+            heights[2 * i + r] = find_height(&bend, r, d.rest, w->change);
+            energies[2 * i + r] = bend.energy[r];
+        }
     }
     clear_desk(&d);
     return good ? 0 : -1;
