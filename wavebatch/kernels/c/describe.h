@@ -269,52 +269,62 @@ EXPORT int64_t measure_changes(const Described *w, double *heights, double *ener
 
 enum { LEARNED = 15 };                         /* rounds after which shares of laws hardly move */
 
-/* Share of normal values below z, exact to 1e-7 (Abramowitz and Stegun 26.2.17). */
-static double normal_below(double z) {
-    if (fabs(z) > 6) return z > 0;
-    const double t = 1 / (1 + 0.2316419 * fabs(z));
-    const double series = t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))));
-    const double above = exp_double(-0.5 * z * z) * ROOT_2PI_INVERSE * series;
-    return z > 0 ? 1 - above : above;
+/* Shares of normal values below z, exact to 2e-7 (Abramowitz and Stegun 26.2.17). */
+INLINE lanes normal_below(lanes z) {
+    const lanes size = least_of(most_of(z, -z), ALL(6)), t = 1 / (1 + 0.2316419f * size);
+    const lanes series = t * (0.319381530f + t * (-0.356563782f + t * (1.781477937f + t * (-1.821255978f + t * 1.330274429f))));
+    const lanes above = exp_lanes(size * size * -0.5f) * series * (float)ROOT_2PI_INVERSE;
+    return pick(z > 0, 1 - above, above);
 }
 
-/* Density of a width by each law through its error: the pulse's own width, and uniform ones from there up to `wider`. */
-static void weigh_laws(double ratio, double error, int64_t laws, const double *wider, double *density) {
-    const double z = (ratio - 1) / error, below = normal_below(z);
-    density[0] = exp_double(-0.5 * fmin(z * z, 1400)) * ROOT_2PI_INVERSE / error;
-    for (int64_t k = 1; k < laws; k++) density[k] = (below - normal_below((ratio - wider[k - 1]) / error)) / (wider[k - 1] - 1);
+/* Density of a width by each law through its error: the pulse's own width, and uniform ones from there up to the ends;
+   spans: one over what those cover, 0 for the first and for what fills up. */
+static void weigh_laws(double ratio, double error, int64_t vectors, const lanes *ends, const lanes *spans, lanes *density) {
+    const float inverse = 1 / error, z = (ratio - 1) / error, beyond = ratio - 1;
+    const float below = normal_below(ALL(z))[0];
+    for (int64_t v = 0; v < vectors; v++) density[v] = (below - normal_below((beyond - ends[v]) * inverse)) * spans[v];
+    density[0][0] = exp_lanes(ALL(-0.5f * fminf(z * z, 160)))[0] * (float)ROOT_2PI_INVERSE * inverse;
+}
+
+/* Density of a width by the sum of laws of these shares. */
+INLINE float add_laws(const lanes *density, const lanes *share, int64_t vectors) {
+    lanes sum = density[0] * share[0];
+    for (int64_t v = 1; v < vectors; v++) sum += density[v] * share[v];
+    return sum_lanes(sum);
 }
 
 /* Cost of each of n widths [nats] by the sum of laws that makes the known ones likeliest, with the scatter beyond their
    errors that serves best; a share `anywhere` of them lies anywhere up to the widest. */
 EXPORT int64_t describe_widths(int64_t n, const double *ratio, const double *error, const uint8_t *known, int64_t scatters,
                                const double *scatter, int64_t uniform, const double *wider, double anywhere, double *cost) {
-    const int64_t laws = uniform + 1;
-    double *density = malloc((n * laws + n + 2 * laws + 1) * sizeof(double)), least = INFINITY;
-    if (!density) return -1;
-    double *tried = density + n * laws, *share = tried + n, *next = share + laws;
+    const int64_t laws = uniform + 1, vectors = VECTORS(laws);
+    lanes *density = calloc((n + 4) * vectors, sizeof(lanes)), *share = density + n * vectors, *next = share + vectors;
+    lanes *ends = next + vectors, *spans = ends + vectors;
+    double *tried = malloc((n + 1) * sizeof(double)), least = INFINITY;
+    if (!density || !tried) { free(density); free(tried); return -1; }
+    for (int64_t k = 1; k < laws; k++) {
+        ends[k / LANES][k % LANES] = wider[k - 1] - 1;
+        spans[k / LANES][k % LANES] = 1 / (wider[k - 1] - 1);
+    }
     for (int64_t s = 0; s < scatters; s++) {
         double sum = 0, number = 0;
         for (int64_t i = 0; i < n; i++) {
-            weigh_laws(ratio[i], sqrt(error[i] * error[i] + scatter[s] * scatter[s]), laws, wider, density + i * laws);
+            weigh_laws(ratio[i], sqrt(error[i] * error[i] + scatter[s] * scatter[s]), vectors, ends, spans, density + i * vectors);
             number += known[i];
         }
-        for (int64_t k = 0; k < laws; k++) share[k] = 1.0 / laws;
+        for (int64_t k = 0; k < laws; k++) share[k / LANES][k % LANES] = 1.0 / laws;
         for (int round = 0; round < LEARNED; round++) {
-            for (int64_t k = 0; k < laws; k++) next[k] = 0;
+            memset(next, 0, vectors * sizeof(lanes));
             for (int64_t i = 0; i < n; i++) {
                 if (!known[i]) continue;
-                const double *own = density + i * laws;
-                double whole = 0;
-                for (int64_t k = 0; k < laws; k++) whole += own[k] * share[k];
-                whole = 1 / fmax(whole, 1e-300);
-                for (int64_t k = 0; k < laws; k++) next[k] += own[k] * share[k] * whole;
+                const lanes *own = density + i * vectors;
+                const float whole = 1 / fmaxf(add_laws(own, share, vectors), 1e-30f);
+                for (int64_t v = 0; v < vectors; v++) next[v] += own[v] * whole;
             }
-            for (int64_t k = 0; k < laws; k++) share[k] = (next[k] + 0.5) / (number + 0.5 * laws);
+            for (int64_t v = 0; v < vectors; v++) share[v] = (next[v] * share[v] + 0.5f) * (float)(1 / (number + 0.5 * laws));
         }
         for (int64_t i = 0; i < n; i++) {
-            double whole = 0;
-            for (int64_t k = 0; k < laws; k++) whole += density[i * laws + k] * share[k];
+            const double whole = add_laws(density + i * vectors, share, vectors);
             tried[i] = -log_double((1 - anywhere) * whole + anywhere / wider[uniform - 1]);
             if (known[i]) sum += tried[i];
         }
@@ -324,7 +334,7 @@ EXPORT int64_t describe_widths(int64_t n, const double *ratio, const double *err
         }
     }
     for (int64_t i = 0; i < n; i++) cost[i] -= log_double(error[i] / ROOT_2PI_INVERSE);
-    free(density);
+    free(density); free(tried);
     return 0;
 }
 
