@@ -183,7 +183,6 @@ def choose_pulse(
     """
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
     part = thin_block(block, 2 * number)
-    part = part.rows(np.arange(min(len(part), 2 * number)))
     small = len(part) < SMALL
     learn, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
     few = thin_block(held, FEWEST)

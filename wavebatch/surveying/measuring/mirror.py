@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -70,34 +70,27 @@ def look_in_mirror(
         Of the echoes that have this energy, by the detector that is worse off.
     """
     block = block.rows(np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1)))
-    # Chains find candidates by either detector, and the smoothing of one is broader than a narrow pulse.
-    looks = [_look(block, system, detect, levels) for detect in (matched_filter, maximum)]
-    for level, *counts in zip(levels, *looks, strict=True):
-        found = [min(one) for one in zip(*(one[:2] for one in counts), strict=True)]
-        false = [max(one) for one in zip(*(one[2:] for one in counts), strict=True)]
-        yield level, Mirror(found[0], false[0], found[1], false[1])
-
-
-def _look(
-    block: WaveformBlock, system: SystemPulse, detect: Callable[..., EchoTable], levels: Sequence[float]
-) -> Iterator[tuple[int, int, int, int]]:
-    """Main echoes, echoes, and false ones beside main ones and in quiet, of each level."""
-    explained = explain(block, system, detect)
-    mirrored = (block.samples - 2 * explained.sums.left).astype(np.float32)
-    echoes, other = explained.echoes, explain(replace(block, samples=mirrored), system, detect).echoes
+    explained = explain(block, system)
+    echoes = explained.echoes
+    mirrored = replace(block, samples=(block.samples - 2 * explained.sums.left).astype(np.float32))
     width = system.sigma_ref * FWHM_PER_SIGMA
-    alone = np.ones(len(other), bool)
-    alone[match_echoes(other, echoes, SAME * width).found] = False
-    rest = other.take(np.flatnonzero(alone))
     top = np.zeros(len(block), np.float32)
     np.maximum.at(top, echoes.waveform, echoes.amplitude)
     strong = (echoes.amplitude == top[echoes.waveform]) & (echoes.amplitude > STRONG * system.noise.std)
     mains = echoes.take(np.flatnonzero(strong))
+    false = []
+    # Chains find candidates by either detector, and the smoothing of one is broader than a narrow pulse.
+    for detect in (matched_filter, maximum):
+        other = explain(mirrored, system, detect).echoes
+        alone = np.ones(len(other), bool)
+        alone[match_echoes(other, echoes, SAME * width).found] = False
+        rest = other.take(np.flatnonzero(alone))
+        beside, quiet = ~_lie_far(rest, mains, ZONE * width), _lie_far(rest, echoes, ZONE * width)
+        false.append((_measure_energy(rest, system, block.spacing), beside, quiet))
+    energy = _measure_energy(echoes, system, block.spacing)
     for level in levels:
-        found = np.count_nonzero(_measure_energy(echoes, system, block.spacing) >= level)
-        false = rest.take(np.flatnonzero(_measure_energy(rest, system, block.spacing) >= level))
-        beside = _count_near(false, mains, ZONE * width)
-        yield len(mains), int(found), beside, len(false) - _count_near(false, echoes, ZONE * width)
+        beside, quiet = (max(int(np.count_nonzero(one[i][one[0] >= level])) for one in false) for i in (1, 2))
+        yield level, Mirror(len(mains), beside, int(np.count_nonzero(energy >= level)), quiet)
 
 
 def _measure_energy(echoes: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:
@@ -105,13 +98,13 @@ def _measure_energy(echoes: EchoTable, system: SystemPulse, spacing: float) -> n
     return echoes.amplitude * np.sqrt(echoes.sigma / spacing * SQRT_PI) / system.noise.std
 
 
-def _count_near(rest: EchoTable, echoes: EchoTable, reach: float) -> int:
-    """How many echoes of the mirror lie within reach of any of these."""
+def _lie_far(rest: EchoTable, echoes: EchoTable, reach: float) -> np.ndarray:
+    """Which echoes of the mirror lie beyond reach of all of these (m,)."""
     if not len(rest) or not len(echoes):
-        return 0
+        return np.ones(len(rest), bool)
     span = float(max(rest.time.max(), echoes.time.max()) + 4 * reach)
     place = np.sort(echoes.waveform * span + echoes.time)
     at = rest.waveform * span + rest.time
     after = np.searchsorted(place, at)
     nearest = np.minimum(np.abs(place[np.minimum(after, len(place) - 1)] - at), np.abs(place[after - 1] - at))
-    return int(np.count_nonzero(nearest <= reach))
+    return nearest > reach

@@ -127,14 +127,15 @@ def measure_again(block: WaveformBlock, system: SystemPulse, gain: float) -> Sys
 
 
 def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
-    """About `number` waveforms spread over the block, at least as many where it has them."""
-    return block.rows(slice(None, None, max(len(block) // number, 1)))
+    """At most `number` waveforms spread evenly over the block."""
+    if number >= len(block):
+        return block
+    return block.rows(np.arange(number) * len(block) // number)
 
 
 def thin_samples(block: WaveformBlock, number: int) -> WaveformBlock:
-    """Waveforms spread over the block, of `number` samples at most, or LEAST_LOOK of them."""
-    most = max(number // block.samples.shape[1], LEAST_LOOK)
-    return block.rows(slice(None, None, -(-len(block) // most)))
+    """Waveforms spread evenly over the block, of `number` samples at most, or LEAST_LOOK of them."""
+    return thin_block(block, max(number // block.samples.shape[1], LEAST_LOOK))
 
 
 def _reach(width: float) -> int:
