@@ -73,6 +73,9 @@ MISFITS = 0.0005 * 2.0 ** np.arange(9)
 """Misfits of the chosen pulse that are tried: half a noise at 1,000 noises up to an eighth of the pulse, beyond which
 it is no pulse of this strip."""
 
+ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, "all echoes": {}}
+"""Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
+
 FALSE_QUIET = 0.0075
 """Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
 threshold than these add: echoes of 4 to 6 noises are some 2 % of a scene's."""
@@ -197,7 +200,14 @@ def choose_pulse(
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
     tried = {one.name: one.system for one in hopeful} | dict(_learn(learn, begin))
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
-    return _decide(_try_changes(held, found))
+    choice = _decide(_try_changes(held, found))
+    best = choice.best
+    if small or best.name not in ROUNDS:
+        return choice
+    # From all of them, now that it is chosen.
+    explained = explain(part, _bear(best.system, best.change), **ROUNDS[best.name])
+    system = learn_jointly(part, best.system, explained, best.change, last=True)
+    return replace(choice, best=replace(best, system=system))
 
 
 def _same_pulse(one: SystemPulse, other: SystemPulse) -> bool:
@@ -211,8 +221,7 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
         every = explain(block, _bear(system, begin.change), width_prior=0.0)
         own = find_own_width(every, shape_limits(system, block.spacing).ref)
         yield "gaussian of all echoes", replace(system, sigma_ref=system.sigma_ref * own)
-    rounds: tuple[tuple[str, dict[str, Any]], ...] = (("one echo per cluster", {"max_echoes": 1}), ("all echoes", {}))
-    for name, options in rounds:
+    for name, options in ROUNDS.items():
         for last in (False, True):
             explained = explain(block, _bear(system, begin.change), **options)
             if count_telling(explained) < ENOUGH_TO_LEARN:
