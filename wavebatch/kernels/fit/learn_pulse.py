@@ -75,14 +75,15 @@ def stack_pulse(
     after: float,
     std: float = 0.0,
     first: np.ndarray | int = 0,
+    step: float = STEP,
 ) -> Stack:
     """Median of signal (m, s) over amplitude, by lag from `before` samples before each centre to `after` behind it.
 
-    first: sample at which each row of the signal begins, int or int (m,).
+    first: sample at which each row of the signal begins, int or int (m,); step: of the lag [samples], at least.
     std: error of a sample that counts have without any noise; where they are rounded more coarsely than they scatter,
     the values of a bin may all be equal without being exact.
     """
-    step = float(np.clip(IN_BIN / max(len(amplitude), 1), STEP, 1.0))
+    step = float(np.clip(IN_BIN / max(len(amplitude), 1), step, max(step, 1.0)))
     least = max(std / float(np.median(amplitude)), 1e-6) if len(amplitude) else 1e-6
     lag = np.reshape(first, (-1, 1)) + np.arange(signal.shape[1]) - time[:, None]
     used = (lag >= -before) & (lag <= after) & np.isfinite(signal)

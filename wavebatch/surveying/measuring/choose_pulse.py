@@ -159,7 +159,11 @@ class Choice:
 
 
 def choose_pulse(
-    block: WaveformBlock, starts: Mapping[str, SystemPulse], given: Mapping[str, SystemPulse] | None = None
+    block: WaveformBlock,
+    starts: Mapping[str, SystemPulse],
+    given: Mapping[str, SystemPulse] | None = None,
+    *,
+    learn: bool = True,
 ) -> Choice:
     """Choose the pulse that describes waveforms in the fewest words.
 
@@ -172,6 +176,8 @@ def choose_pulse(
         per cluster, so that false echoes do not eat the pulse's tail, then with as many as it needs.
     given : mapping of SystemPulse by name
         Pulses known from elsewhere: shipped ones, the strip's outgoing pulse.
+    learn : bool
+        Whether a pulse is to be learned from all echoes too.
 
     Returns
     -------
@@ -187,7 +193,7 @@ def choose_pulse(
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
     part = thin_block(block, 2 * number)
     small = len(part) < SMALL
-    learn, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
+    taught, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
     few = thin_block(held, FEWEST)
     given = given or {}
     every: dict[str, SystemPulse] = {}
@@ -198,7 +204,7 @@ def choose_pulse(
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
-    tried = {one.name: one.system for one in hopeful} | dict(_learn(learn, begin))
+    tried = {one.name: one.system for one in hopeful} | (dict(_learn(taught, begin)) if learn else {})
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
     choice = _decide(_try_changes(held, found))
     best = choice.best

@@ -36,8 +36,8 @@ deviation: a fifth of what the second difference of a Gaussian pulse is there.""
 EARLY, LATE = 0.02, 0.15
 """The same far before and after the core, over its value: before a pulse there is hardly anything."""
 
-STEP = 0.2
-"""Steps of the lag at which the core is drawn [samples]."""
+STEP, TAIL_STEP = 0.1, 0.5
+"""Steps of the lag at which the core and the tail of a pulse are drawn [widths, of a pulse of 2 samples at least]."""
 
 LEAST_CHANGE = 0.003
 """Least misfit that is expected of the strongest echoes, so that a few do not decide alone."""
@@ -91,7 +91,7 @@ def learn_jointly(
     missed = [float(np.mean(_miss(fit, stack) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
-    misfit = misfit_of(_miss(best, stack)[core], STEP, width)
+    misfit = misfit_of(_miss(best, stack)[core], float(stack.lag[1] - stack.lag[0]), width)
     system = replace(system, kappa=0.0, components=(), ringing=0.0, misfit=misfit)
     if len(best.components) == 1:
         return replace(system, sigma_ref=float(best.components[0, 2]) * spacing)
@@ -137,7 +137,8 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     matrix += 1e-9 * np.trace(matrix) / len(delay) * np.eye(len(matrix))
     inverse = solve(matrix, np.eye(len(matrix)))
     weight = np.einsum("ij,j->i", inverse, right)
-    lag = np.r_[np.arange(-6 * width, 8 * width, STEP), np.arange(8 * width, min(AFTER * width, 0.8 * s), 1.0)]
+    step, end = max(width, 2.0), min(AFTER * width, 0.8 * s)
+    lag = np.r_[np.arange(-6 * width, 8 * width, STEP * step), np.arange(8 * width, end, TAIL_STEP * step)]
     rows = exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2) / sigma
     value = np.einsum("lk,k->l", rows, weight[:-1])
     error = np.sqrt(np.maximum(np.einsum("lk,kj,lj->l", rows, inverse[:-1, :-1], rows), 0.0))

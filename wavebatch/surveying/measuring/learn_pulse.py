@@ -10,7 +10,15 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
-from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
+from wavebatch.kernels.fit.learn_pulse import (
+    MOST_COMPONENTS,
+    STEP,
+    PulseFit,
+    Stack,
+    fit_gaussians,
+    fit_skewed,
+    stack_pulse,
+)
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
@@ -131,7 +139,8 @@ def _learn(
     """The pulse of echoes whose signal (m, k), without baseline and other echoes, is given from the sample `first`."""
     width = system.sigma_ref / block.spacing
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
-    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
+    step = STEP * max(width / 2, 1.0)
+    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first, step)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = REACHED * system.noise.std / strongest
     small = len(block) < SMALL
