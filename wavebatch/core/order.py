@@ -116,9 +116,12 @@ def group_medians(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np
     count = np.bincount(group)
     start = np.cumsum(count) - count
     some = count > 0
+    small = group.astype(np.uint16) if len(count) <= 1 << 16 else group  # numbers so small are sorted by their digits
 
     def middle(values: np.ndarray) -> np.ndarray:
-        ordered, middles = values[np.lexsort((values, group))], np.zeros(len(count), values.dtype)
+        order = np.argsort(values)
+        ordered = values[order[np.argsort(small[order], kind="stable")]]
+        middles = np.zeros(len(count), values.dtype)
         low, high = (start + (count - 1) // 2)[some], (start + count // 2)[some]
         middles[some] = (ordered[low] + ordered[high]) * values.dtype.type(0.5)
         return middles
