@@ -32,7 +32,7 @@ from wavebatch.surveying.measuring.judge import (
     replace_rows,
 )
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, spread_rows, thin_block
 
 STRICT = 0.92
 """Least width of an echo where a pulse is judged, over the pulse's: nothing reflects narrower, and widths scatter by up
@@ -40,6 +40,9 @@ to 4 %."""
 
 SAMPLES, MOST, LEAST = 60_000, 384, 96
 """Samples that candidates are judged on, as many waveforms at most, and as many at least where they are long."""
+
+MORE = 4
+"""Times as many waveforms on which candidates are judged where another one costs the same as the best."""
 
 SMALL = 120
 """Waveforms below which halves are too few to learn a pulse from: the judge then sees what it was learned from."""
@@ -101,8 +104,8 @@ class Candidate:
     """Of the pulse, as far as they had to be learned: 2 for one that is known, so that a plain Gaussian goes first."""
     seen: float
     """Change of the shape that the median of the strongest echoes shows."""
-    as_likely: tuple[int, ...] = ()
-    """Echoes with other changes of the shape that cost the same."""
+    as_likely: tuple[float, ...] = ()
+    """Echoes with other changes of the shape that cost the same, over its own."""
 
     @property
     def missed(self) -> float:
@@ -146,6 +149,8 @@ class Choice:
     """Share by which the number of echoes differs between candidates that cost the same."""
     spread: float
     """Share by which their widths differ from that of the best one."""
+    tied: bool
+    """Whether another candidate costs the same."""
 
     def describe(self) -> tuple[Tried, ...]:
         """Return the candidates for people, the best first."""
@@ -191,8 +196,9 @@ def choose_pulse(
     must be proven. By HINT one is taken in place of a learned pulse that needs more echoes or misses the stacked ones.
     """
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
-    part = thin_block(block, 2 * number)
-    small = len(part) < SMALL
+    rows = spread_rows(len(block), 2 * number)
+    small = len(rows) < SMALL
+    part = block.rows(rows)
     taught, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
     few = thin_block(held, FEWEST)
     given = given or {}
@@ -206,7 +212,12 @@ def choose_pulse(
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
     tried = {one.name: one.system for one in hopeful} | (dict(_learn(taught, begin)) if learn else {})
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
-    choice = _decide(_try_changes(held, found))
+    found = _try_changes(held, found)
+    choice = _decide(found)
+    if choice.tied and len(rows) < len(block):
+        others = np.delete(np.arange(len(block)), rows[::2])
+        more = block.rows(others[spread_rows(len(others), MORE * number)])
+        choice = _decide([_judge_again(more, one) for one in found])
     best = choice.best
     if small or best.name not in ROUNDS:
         return choice
@@ -255,6 +266,10 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
     )
 
 
+def _judge_again(block: WaveformBlock, one: Candidate) -> Candidate:
+    return replace(_judge(block, one.name, one.system, one.change, known=one.known), as_likely=one.as_likely)
+
+
 def _try_changes(block: WaveformBlock, found: list[Candidate]) -> list[Candidate]:
     """Candidates, each with the change of its shape that serves it better: that of the best one, or as it was."""
     best = min(found, key=lambda one: one.typical)
@@ -285,7 +300,8 @@ def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
     tried = [one for one in tried if one.change <= STEP_OF_CHANGES * one.seen]
     best = min(tried, key=lambda one: one.typical)
     found = next(one for one in tried if one.exceeds(best) < HINT)
-    return replace(found, as_likely=tuple(one.echoes for one in tried if one.exceeds(best) < SURE))
+    as_likely = tuple(one.echoes / max(found.echoes, 1) for one in tried if one.exceeds(best) < SURE)
+    return replace(found, as_likely=as_likely)
 
 
 def _decide(found: list[Candidate]) -> Choice:
@@ -306,10 +322,11 @@ def _decide(found: list[Candidate]) -> Choice:
         if best.exceeds(one) > _bound_errors(one, best):
             best = one
     tied = [one for one in ordered if one.exceeds(best) < SURE]
-    echoes, widths = [*best.as_likely, *(one.echoes for one in tied)], [one.system.sigma_ref for one in tied]
-    doubt = (max(echoes) - min(echoes)) / max(best.echoes, 1)
+    echoes = [*best.as_likely, *(one.echoes / max(best.echoes, 1) for one in tied)]
+    doubt = max(echoes) - min(echoes)
+    widths = [one.system.sigma_ref for one in tied]
     spread = max(abs(width / best.system.sigma_ref - 1) for width in widths)
-    return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt, spread)
+    return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt, spread, len(tied) > 1)
 
 
 def _bound_errors(shorter: Candidate, longer: Candidate) -> float:

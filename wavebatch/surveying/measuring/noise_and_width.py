@@ -128,9 +128,13 @@ def measure_again(block: WaveformBlock, system: SystemPulse, gain: float) -> Sys
 
 def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
     """At most `number` waveforms spread evenly over the block."""
-    if number >= len(block):
-        return block
-    return block.rows(np.arange(number) * len(block) // number)
+    return block if number >= len(block) else block.rows(spread_rows(len(block), number))
+
+
+def spread_rows(n: int, number: int) -> np.ndarray:
+    """At most `number` of n rows, spread evenly."""
+    number = min(number, n)
+    return np.arange(number) * n // max(number, 1)
 
 
 def thin_samples(block: WaveformBlock, number: int) -> WaveformBlock:
