@@ -150,7 +150,7 @@ class Choice:
     spread: float
     """Share by which their widths differ from that of the best one."""
     tied: bool
-    """Whether another candidate costs the same."""
+    """Whether another candidate, or another change of its shape, costs the same."""
 
     def describe(self) -> tuple[Tried, ...]:
         """Return the candidates for people, the best first."""
@@ -217,7 +217,8 @@ def choose_pulse(
     if choice.tied and len(rows) < len(block):
         others = np.delete(np.arange(len(block)), rows[::2])
         more = block.rows(others[spread_rows(len(others), MORE * number)])
-        choice = _decide([_judge_again(more, one) for one in found])
+        found = [_judge(more, one.name, one.system, one.change, known=one.known) for one in found]
+        choice = _decide(_try_changes(more, found))
     best = choice.best
     if small or best.name not in ROUNDS:
         return choice
@@ -264,10 +265,6 @@ def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, 
         name, system, change, length, len(explained.echoes), known, 2 if known else gaussians,
         measure_change(borne, explained),
     )
-
-
-def _judge_again(block: WaveformBlock, one: Candidate) -> Candidate:
-    return replace(_judge(block, one.name, one.system, one.change, known=one.known), as_likely=one.as_likely)
 
 
 def _try_changes(block: WaveformBlock, found: list[Candidate]) -> list[Candidate]:
@@ -326,12 +323,14 @@ def _decide(found: list[Candidate]) -> Choice:
     doubt = max(echoes) - min(echoes)
     widths = [one.system.sigma_ref for one in tied]
     spread = max(abs(width / best.system.sigma_ref - 1) for width in widths)
-    return Choice(best, tuple(sorted(found, key=lambda one: one.typical)), doubt, spread, len(tied) > 1)
+    in_order = tuple(sorted(found, key=lambda one: one.typical))
+    return Choice(best, in_order, doubt, spread, max(len(tied), len(best.as_likely)) > 1)
 
 
 def _bound_errors(shorter: Candidate, longer: Candidate) -> float:
     """Standard errors by which a candidate must describe shorter to be taken in place of the other."""
-    doubtful = shorter.echoes <= FEWER * longer.echoes or longer.missed > max(COVERED * longer.change, shorter.missed)
+    doubtful = AS_FEW * shorter.echoes <= longer.echoes and longer.gaussians > 1
+    doubtful |= longer.missed > max(COVERED * longer.change, shorter.missed) or shorter.echoes <= FEWER * longer.echoes
     if doubtful and not longer.known:
         return HINT
     return SURE + HINT if longer.echoes <= FEWER * shorter.echoes else SURE

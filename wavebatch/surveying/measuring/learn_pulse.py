@@ -12,7 +12,6 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.learn_pulse import (
     MOST_COMPONENTS,
-    STEP,
     PulseFit,
     Stack,
     fit_gaussians,
@@ -139,8 +138,7 @@ def _learn(
     """The pulse of echoes whose signal (m, k), without baseline and other echoes, is given from the sample `first`."""
     width = system.sigma_ref / block.spacing
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
-    step = STEP * max(width / 2, 1.0)
-    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first, step)
+    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first, width)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = REACHED * system.noise.std / strongest
     small = len(block) < SMALL
