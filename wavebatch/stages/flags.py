@@ -27,6 +27,10 @@ TAIL_FACTOR, FAR_TAIL_FACTOR = 1.5, 2.0
 counts beyond BESIDE, where no component of the pulse reaches: it is measured in steps of a width, and ringing is higher
 between them."""
 
+KNOWN = 3.0
+"""Errors of its amplitude that an echo must be higher than such a tail: less is the tail and noise. One in a thousand
+strong echoes shows so much."""
+
 CORE, CORE_STD = 4.0, 0.34
 """Distance up to which the misfit of an echo adds to the errors of others [system widths], and standard deviation of
 what it leaves, over it: the misfit is 1.4 times the 0.8 quantile of the best of six places, 2.9 for normal values."""
@@ -111,7 +115,9 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
     if system.tail_misfit:
         for row, other, lag in list_neighbours(table):
             factor = np.where(np.abs(lag) < BESIDE * system.sigma_ref, TAIL_FACTOR, FAR_TAIL_FACTOR)
-            faint[row] |= table.amplitude[row] < factor * _tail_share(system, lag) * table.amplitude[other]
+            tail = _tail_share(system, lag) * table.amplitude[other]
+            noise = np.where(tail > 0, KNOWN * np.nan_to_num(table.amplitude_err[row]), 0)
+            faint[row] |= table.amplitude[row] < np.maximum(factor * tail, tail + noise)
     return table.take(np.flatnonzero(~faint)) if faint.any() else table
 
 
@@ -202,13 +208,16 @@ def find_unexplained(table: EchoTable, system: SystemPulse, spacing: float) -> n
 def _tail_share(system: SystemPulse, lag: np.ndarray) -> np.ndarray:
     """Share of an echo (k,) that its tail leaves unexplained at these lags [ns].
 
-    It was measured in steps of the pulse's width: a line between two lags side by side; elsewhere nothing is left.
+    It was measured in steps of the pulse's width: a line between two lags at most two steps apart, as a step on a flank
+    may not be told from neighbours; elsewhere nothing is left.
     """
     if not system.tail_misfit:
         return np.zeros(len(lag))
     lags, shares = np.array(system.tail_misfit).T
     near = np.abs(lag[:, None] - lags).min(axis=1) <= 0.6 * system.sigma_ref
-    return np.where(near, np.interp(lag, lags, shares), 0.0)
+    after = np.searchsorted(lags, lag)
+    between = np.diff(lags, prepend=-np.inf, append=np.inf)[after] < 2.5 * system.sigma_ref
+    return np.where(near | between, np.interp(lag, lags, shares), 0.0)
 
 
 def list_neighbours(table: EchoTable) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

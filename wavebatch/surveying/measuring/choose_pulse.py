@@ -212,13 +212,12 @@ def choose_pulse(
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
     tried = {one.name: one.system for one in hopeful} | (dict(_learn(taught, begin)) if learn else {})
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
-    found = _try_changes(held, found)
-    choice = _decide(found)
+    choice = _decide(_try_changes(held, found))
     if choice.tied and len(rows) < len(block):
         others = np.delete(np.arange(len(block)), rows[::2])
         more = block.rows(others[spread_rows(len(others), MORE * number)])
-        found = [_judge(more, one.name, one.system, one.change, known=one.known) for one in found]
-        choice = _decide(_try_changes(more, found))
+        found = [_judge(more, one.name, one.system, one.change, known=one.known) for one in choice.tried]
+        choice = _decide(_try_changes(more, found) if len(choice.best.as_likely) > 1 else found)
     best = choice.best
     if small or best.name not in ROUNDS:
         return choice
