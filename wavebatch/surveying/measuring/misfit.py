@@ -31,9 +31,6 @@ NORMAL_BELOW = 0.0228, 0.1587
 TAIL_BEFORE, TAIL_AFTER = 15, 40
 """Widths of the pulse before and after an echo in which its tail is measured."""
 
-SLICE = 0.25
-"""Widths about a lag in which its tail is measured: in wider ones the slope of the tail is scatter."""
-
 BESIDE, NOT_ABSORBED = 10, 3
 """Widths of the pulse beside an echo up to which what is left is measured, and from which."""
 
@@ -184,7 +181,7 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     expected = system.noise.std / np.median(echoes.amplitude) / np.sqrt(energy)
     profile = []
     for place in range(-TAIL_BEFORE, TAIL_AFTER):
-        here = left[(np.abs(lag - place) < SLICE) & np.isfinite(residual)]
+        here = left[(lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)]
         if abs(place) < 3 or len(here) < ENOUGH_TO_LEARN:
             continue
         # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
