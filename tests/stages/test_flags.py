@@ -97,7 +97,7 @@ def test_echoes_that_an_error_of_the_pulse_explains_are_dropped_as_by_a_loop(tab
     faint = rng.random(len(table)) < 0.4
     table = replace(table, amplitude=np.where(faint, 0.02 * table.amplitude, table.amplitude).astype(np.float32))
     learned = SystemPulse(2.0, components=((0.1, 6.0, 1.0),), tail_misfit=((-2.0, 0.01), (0.0, 0.02), (2.0, 0.05)))
-    gaussian = SystemPulse(2.0, tail_misfit=((-4.0, 0.05), (-2.0, 0.05)))
+    gaussian = SystemPulse(2.0, tail_misfit=((-6.0, 0.05), (-2.0, 0.05)))
     for system, top in ((learned, np.inf), (learned, 300.0), (gaussian, 300.0)):
         lags, shares = np.array(system.tail_misfit).T
         dropped = set()
@@ -105,9 +105,11 @@ def test_echoes_that_an_error_of_the_pulse_explains_are_dropped_as_by_a_loop(tab
             share = 0.02 if system.components and abs(lag) <= max(4 * 2.0, 6.0 + 3 * 1.0) else 0.0
             if system.components and table.amplitude[j] >= top:
                 share = max(share, 0.005)
-            if np.abs(lag - lags).min() <= 0.6 * 2.0:
-                share = max(share, 1.5 * np.interp(lag, lags, shares))
-            if table.amplitude[i] < share * table.amplitude[j]:
+            least = share * table.amplitude[j]
+            if np.abs(lag - lags).min() <= 0.6 * 2.0 or lags[0] < lag < lags[-1]:
+                tail = np.interp(lag, lags, shares) * table.amplitude[j]
+                least = max(least, 1.5 * tail, tail + 2 * table.amplitude_err[i])
+            if table.amplitude[i] < least:
                 dropped.add(i)
         kept = drop_unproven(table, system, top)
         left = [i for i in range(len(table)) if i not in dropped]
