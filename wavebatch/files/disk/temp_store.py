@@ -484,9 +484,9 @@ _MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 divided by the golden ratio: multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
 
 
-def count_buckets(rows: int, held: int | None = None) -> int:
-    """Return how many buckets of at most `held` rows (None: BUCKET_ROWS) are needed, at most MOST_BUCKETS."""
-    return min(-(-max(rows, 1) // (held or BUCKET_ROWS)), MOST_BUCKETS)
+def count_buckets(rows: int, held: int = BUCKET_ROWS) -> int:
+    """Return how many buckets of at most `held` rows are needed, at most MOST_BUCKETS."""
+    return min(-(-max(rows, 1) // held), MOST_BUCKETS)
 
 
 def spread_times(gps_time: np.ndarray, number: int) -> np.ndarray:
