@@ -9,10 +9,17 @@ from __future__ import annotations
 
 import functools
 import inspect
+from collections.abc import Callable
 from dataclasses import MISSING, FrozenInstanceError, dataclass, field, fields
-from typing import Any, dataclass_transform
+from typing import Any, TypeVar, dataclass_transform, overload
+
+Kind = TypeVar("Kind")
 
 
+@overload
+def frozen(kind: type[Kind], /) -> type[Kind]: ...
+@overload
+def frozen(*, eq: bool = True, order: bool = False) -> Callable[[type[Kind]], type[Kind]]: ...
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def frozen(kind: type | None = None, /, *, eq: bool = True, order: bool = False) -> Any:
     """Make a frozen dataclass with slots; `fields`, `replace`, `asdict`, pickling and copying work as for any other.
