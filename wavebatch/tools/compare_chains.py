@@ -272,6 +272,7 @@ class _Found(Solved):
         rows = self.rows(block)
         rows["ray"] = rows["xyz"] = 0.0
         rows["xyz"][:, 2] = -pairing.SPEED * self.echoes.time
+        rows["echo_time"] = np.nan  # the distances are these times: they would be compared twice
         return rows
 
     def vendor_rows(self, block: WaveformBlock) -> np.ndarray:
