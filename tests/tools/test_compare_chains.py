@@ -157,7 +157,7 @@ def test_the_vendors_returns_as_a_cloud_has_them(mixed):
         for one in (alone.between, alone.vendor["a"]):
             # A cloud's positions are rounded to its scale: a pair at the very tolerance may be one there only.
             assert abs(one.matched - cloud.matched) <= 2
-            assert one.differences["time"].nmad < 1e-9 < one.differences["echo_time"].nmad
+            assert one.differences["time"].nmad < 0.1 * one.differences["echo_time"].nmad
             assert one.matched + one.missed == cloud.matched + cloud.missed == alone.returns
             assert one.matched + one.extra == cloud.matched + cloud.extra
         assert alone.between.b == str(mixed / "s.las")

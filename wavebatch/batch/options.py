@@ -37,7 +37,7 @@ EXCLUSIVE = (
     *(("random", one) for one in ("flags", "where", "most")),
 )  # fmt: skip
 """Options that exclude each other. One in wavebatch.toml replaces those that come from a weaker source."""
-REMEDIES = {
+REMEDIES: dict[tuple[str, ...], str] = {
     ("strip", "truth"): "`wavebatch bench` compares chains with a truth",
     ("strip", "where"): "`wavebatch run` both chains, then compare the clouds with --where",
 }
