@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from wavebatch.surveying.measuring.judge import (
 )
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
+from wavebatch.surveying.systems.survey_result import Tried
 
 STRICT = 0.92
 """Least width of an echo where a pulse is judged, over the pulse's: nothing reflects narrower, and widths scatter by up
@@ -115,22 +116,6 @@ class Candidate:
         """Standard errors by which descriptions are longer than with another candidate."""
         more = self.length - other.length
         return count_errors(np.clip(more, *np.quantile(more, (0.02, 0.98))))
-
-
-class Tried(NamedTuple):
-    """A candidate in a line of `survey -v`."""
-
-    name: str
-    fwhm_ns: float
-    gaussians: int
-    """Of its sum; 1 also for a skewed pulse."""
-    change: float
-    """Of the shape, from shot to shot, as a share of the amplitude."""
-    nats: float
-    """That describe a waveform; and standard errors by which they are more than with the chosen pulse."""
-    longer_by: float
-    echoes_per_waveform: float
-    chosen: bool
 
 
 @frozen(eq=False)

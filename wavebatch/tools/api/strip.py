@@ -19,8 +19,8 @@ from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, decide, read_sample
 from wavebatch.surveying.flat_ground import survey_angles
 from wavebatch.surveying.outgoing import compare_outgoing
-from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.systems.saved_check import with_look
+from wavebatch.surveying.systems.survey_result import Survey
 
 AUTO = "auto"
 """In place of a chain's name: the survey of each strip chooses the chain."""
