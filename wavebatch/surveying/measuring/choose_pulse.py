@@ -32,7 +32,7 @@ from wavebatch.surveying.measuring.judge import (
     replace_rows,
 )
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, thin_block
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, HALVED, thin_block
 from wavebatch.surveying.systems.survey_result import Tried
 
 STRICT = 0.92
@@ -41,9 +41,6 @@ to 4 %."""
 
 SAMPLES, MOST, LEAST = 60_000, 384, 96
 """Samples that candidates are judged on, as many waveforms at most, and as many at least where they are long."""
-
-SMALL = 120
-"""Waveforms below which halves are too few to learn a pulse from: the judge then sees what it was learned from."""
 
 CHANGES, STEP_OF_CHANGES = (0.0, 0.003, 0.01, 0.03), 3.4
 """Changes of the pulse from shot to shot that are tried, as shares of the amplitude: in steps of a factor 3.4 at most,
@@ -169,7 +166,7 @@ def choose_pulse(
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
     part = thin_block(block, 2 * number)
     part = part.rows(np.arange(min(len(part), 2 * number)))
-    small = len(part) < SMALL
+    small = len(part) < HALVED
     learn, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
     few = thin_block(held, FEWEST)
     given = given or {}
