@@ -20,7 +20,7 @@ from wavebatch.core.schema import Range, check_options, declared_options, option
 if TYPE_CHECKING:
     from wavebatch.core.condition import Condition
     from wavebatch.stages.chain import Chain
-    from wavebatch.surveying.survey import Survey
+    from wavebatch.surveying.systems.survey_result import Survey
 
 CHAIN, READING, SENSOR, AIR = "Chain and pulse", "Reading", "Position of the sensor", "Air and light"
 WHICH, OUTPUT, SPEED, RUNNING = "Which points", "Output", "Speed and memory", "How it runs"

@@ -24,10 +24,10 @@ from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import list_profiles
 from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying import Survey
 from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools import pairing
 from wavebatch.tools.api.strip import AUTO, load_chain
 
