@@ -115,6 +115,11 @@ class WaveformBlock:
         """Number of waveforms."""
         return len(self.samples)
 
+    def __repr__(self) -> str:
+        """One line: how many waveforms of how many samples."""
+        n, s = self.samples.shape
+        return f"<WaveformBlock: {n} waveforms of {s} samples of {self.spacing:g} ns, digitizer {self.digitizer.index}>"
+
     @property
     def spacing(self) -> float:
         """Time between two samples [ns]."""
@@ -347,6 +352,11 @@ class SystemPulse:
         """Checks the one value that everything divides by."""
         if not self.sigma_ref > 0:
             raise ValueError(f"sigma_ref must be positive, got {self.sigma_ref}")
+
+    def __repr__(self) -> str:
+        """One line: kind and width of the pulse, and the noise."""
+        kind = f"{len(self.components)} Gaussians" if self.components else f"a Gaussian of skew {self.kappa:g}"
+        return f"<SystemPulse: {kind}, s_ref {self.sigma_ref:.4f} ns, noise {self.noise.std:.3f} DN>"
 
     def of(self, block: WaveformBlock) -> SystemPulse:
         """The system of the block's digitizer: its pulse and noise, and the radiometry of the whole strip."""

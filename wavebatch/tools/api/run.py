@@ -27,8 +27,8 @@ from wavebatch.surveying.calibrating.calibration_file import load_calibration
 from wavebatch.surveying.calibration import check_attenuation, needs_sensor
 from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
-from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
+from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools.api.strip import AUTO, load_chain
 
 Strips = Iterable[Path | str] | Path | str

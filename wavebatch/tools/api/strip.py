@@ -15,12 +15,10 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scanner import StripScan
 from wavebatch.stages import chain_file
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, decide, read_sample
 from wavebatch.surveying.flat_ground import survey_angles
-from wavebatch.surveying.outgoing import compare_outgoing
-from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.systems.saved_check import with_look
+from wavebatch.surveying.systems.survey_result import Survey
 
 AUTO = "auto"
 """In place of a chain's name: the survey of each strip chooses the chain."""
@@ -207,6 +205,9 @@ def survey(
     InputError
         Where the strip cannot be read or holds no waveform.
     """
+    from wavebatch.surveying.outgoing import compare_outgoing  # a run with a saved system needs neither
+    from wavebatch.surveying.survey import survey_blocks
+
     if not isinstance(strip, Strip):
         with open_strip(strip) as opened:
             return survey(opened, waveforms=waveforms, divergence=divergence, find_divergence=find_divergence)
