@@ -27,7 +27,7 @@ INSIDE = {
         {"serve", "worker_check"}, {"processes"}, {"dask_cluster"},
     ],
     "surveying": [
-        {"measuring"}, {"predict_error"}, {"survey", "sensor"}, {"system_file"}, {"outgoing"},
+        {"measuring"}, {"look", "predict_error"}, {"survey", "sensor"}, {"system_file"}, {"outgoing"},
         {"choose_chain", "inspect_strip", "calibration"}, {"flat_ground", "flight"}, {"prepare"},
     ],
 }

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from wavebatch.core.waveforms import Digitizer, Noise, ReturnTable, SystemPulse, WaveformBlock
     from wavebatch.files.cloud.cloud_reader import read_cloud
     from wavebatch.stages.chain import Chain, Range, Step, stage
-    from wavebatch.surveying.survey import Decision, Survey
+    from wavebatch.surveying.systems.survey_result import Decision, Survey
     from wavebatch.tools.api import Strip, auto_chain, load_chain, open_strip, run, survey
 
 __version__ = "0.1.0"
@@ -39,7 +39,7 @@ _MODULES = {
     "files.cloud.cloud_reader": ("read_cloud",),
     "stages.chain": ("Chain", "Range", "Step", "stage"),
     "batch.options": ("RunOptions",),
-    "surveying.survey": ("Decision", "Survey"),
+    "surveying.systems.survey_result": ("Decision", "Survey"),
     "tools.api": ("Strip", "auto_chain", "load_chain", "open_strip", "run", "survey"),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}

@@ -97,6 +97,7 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed, monkeypatch):
     )  # fmt: skip
     assert between.exact_count == exact / len(block)
     assert (between.counts_a, between.counts_b) == tuple(dict(sorted(one.items())) for one in counts)
+    assert "echo_time" not in between.differences  # would be the same figures
     spread = between.differences["time"]
     assert spread.median == pytest.approx(np.median(differences), abs=1e-9)
     assert spread.rms == pytest.approx(np.sqrt(np.mean(np.square(differences))), rel=1e-9)
@@ -156,6 +157,7 @@ def test_the_vendors_returns_as_a_cloud_has_them(mixed):
         for one in (alone.between, alone.vendor["a"]):
             # A cloud's positions are rounded to its scale: a pair at the very tolerance may be one there only.
             assert abs(one.matched - cloud.matched) <= 2
+            assert one.differences["time"].nmad < 0.1 * one.differences["echo_time"].nmad
             assert one.matched + one.missed == cloud.matched + cloud.missed == alone.returns
             assert one.matched + one.extra == cloud.matched + cloud.extra
         assert alone.between.b == str(mixed / "s.las")

@@ -34,12 +34,12 @@ from wavebatch.kernels.geometry.planes import in_two_lines
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
 from wavebatch.stages.attribute.incidence_angle import added_variance
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying import Decision, Part, Survey
 from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.systems.survey_result import Decision, Part, Survey
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

@@ -37,9 +37,9 @@ from wavebatch.surveying.choose_chain import Request, choose_chain, decide, read
 from wavebatch.surveying.flat_ground import survey_angles
 from wavebatch.surveying.outgoing import compare_outgoing
 from wavebatch.surveying.sensor import SensorRequest
-from wavebatch.surveying.survey import Survey
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
 from wavebatch.surveying.systems.saved_check import with_look
+from wavebatch.surveying.systems.survey_result import Survey
 
 AUTO = "auto"
 """In place of a chain's name: the survey of each strip chooses the chain."""

@@ -24,10 +24,10 @@ from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import list_profiles
 from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying import Survey
 from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools import pairing
 from wavebatch.tools.api import AUTO, load_chain
 
@@ -272,6 +272,7 @@ class _Found(Solved):
         rows = self.rows(block)
         rows["ray"] = rows["xyz"] = 0.0
         rows["xyz"][:, 2] = -pairing.SPEED * self.echoes.time
+        rows["echo_time"] = np.nan  # the distances are these times: they would be compared twice
         return rows
 
     def vendor_rows(self, block: WaveformBlock) -> np.ndarray:

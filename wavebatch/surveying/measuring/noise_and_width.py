@@ -43,6 +43,9 @@ SMALL = 256
 """Waveforms below which a stack of echoes cannot show that a pulse is simple: a tail of 6 % drowns in its errors, and
 adds a fifth to the echoes. What pulse such a strip has is decided by all of its waveforms."""
 
+HALVED = 120
+"""Waveforms below which halves are too few to learn a pulse from: the judge then sees what it was learned from."""
+
 ENOUGH_TO_LEARN = 20
 """Isolated echoes from which a pulse can be learned (R2): at SNR 20 their stack is known to a hundredth of its peak, a
 Gaussian misses the pulses of real sensors by two to six."""

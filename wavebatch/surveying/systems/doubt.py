@@ -12,9 +12,8 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.elementary import log
 from wavebatch.stages.flags import find_unexplained, list_neighbours
-from wavebatch.surveying.measuring.choose_pulse import SMALL
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.noise_and_width import FEW
+from wavebatch.surveying.measuring.noise_and_width import FEW, HALVED
 from wavebatch.surveying.measuring.residuals import hides_noise
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import find_source
@@ -48,7 +47,7 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
     # So few that the judge sees what the pulse was learned from: many Gaussians explain any waveforms, and a shipped
     # pulse may be that of another sensor. Of more waveforms the judge knows the width, or that it does not.
     unsure = figures.width_in_doubt is None or figures.width_in_doubt > MOST_SPREAD
-    few = alone < FEW and (waveforms < SMALL or (unsure and not (known or system.components)))
+    few = alone < FEW and (waveforms < HALVED or (unsure and not (known or system.components)))
     if few:
         reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
     measured = system.noise.by_kind
@@ -64,8 +63,9 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
         if unseen or hidden:
             code, guess = "noise-guess", f"noise is a guess, of {system.noise.std:.3g} DN"
         elif known and not few:
-            values = f"{system.noise.std:.3g} DN and {100 * system.misfit:.2g} %"
-            code, guess = "noise-guess", f"noise and the misfit are guesses, of {values}"
+            misfit = f"{100 * system.misfit:.2g} %" if system.misfit else "none found"
+            noise = f"noise, {system.noise.std:.3g} DN"
+            code, guess = "noise-guess", f"{noise}, and the pulse's misfit, {misfit}, are guesses"
         yield StripWarning(
             code, f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
             f"{remedy}",

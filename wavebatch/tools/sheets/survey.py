@@ -28,9 +28,8 @@ from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.incidence_angle import added_variance
-from wavebatch.surveying import Survey
 from wavebatch.surveying.flat_ground import REFERENCE_ERROR
-from wavebatch.surveying.systems.shown import name_model
+from wavebatch.surveying.systems.survey_result import Survey, name_model
 from wavebatch.tools.sheets import sheet as sheets
 from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Picture, Sheet, Table, list_facts
 
