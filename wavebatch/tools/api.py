@@ -30,12 +30,10 @@ from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.stages import chain_file
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
-from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.calibrating.calibration_file import load_calibration
 from wavebatch.surveying.calibration import check_attenuation, needs_sensor
 from wavebatch.surveying.choose_chain import Request, choose_chain, decide, read_sample, widest
 from wavebatch.surveying.flat_ground import survey_angles
-from wavebatch.surveying.outgoing import compare_outgoing
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
 from wavebatch.surveying.systems.saved_check import with_look
@@ -226,6 +224,9 @@ def survey(
     InputError
         Where the strip cannot be read or holds no waveform.
     """
+    from wavebatch.surveying.outgoing import compare_outgoing  # a run with a saved system needs neither
+    from wavebatch.surveying.survey import survey_blocks
+
     if not isinstance(strip, Strip):
         with open_strip(strip) as opened:
             return survey(opened, waveforms=waveforms, divergence=divergence, find_divergence=find_divergence)
