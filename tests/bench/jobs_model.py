@@ -31,7 +31,7 @@ from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import UNIT_POINTS
 from wavebatch.files.strip.scanner import PART_UNITS
-from wavebatch.tools.api.run import plan_run
+from wavebatch.tools.api import plan_run
 from wavebatch.tools.bench.command import Worker
 from wavebatch.tools.bench.report import write_texts
 
@@ -46,7 +46,7 @@ PULSES, SMALL_PULSES = 600_000, 1_000
 """Of the simulated strip, more than ten units; and of the strips that show what a strip costs, however small."""
 SMALL_STRIPS = 20
 """Strips of a batch that measures what each costs the process that writes."""
-_IMPORTS = "import resource, wavebatch.tools.api.run, wavebatch.cli.run; r = resource.getrusage(resource.RUSAGE_SELF)"
+_IMPORTS = "import resource, wavebatch.tools.api, wavebatch.cli.run; r = resource.getrusage(resource.RUSAGE_SELF)"
 
 
 @dataclass(frozen=True, slots=True)

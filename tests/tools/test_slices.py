@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from commands import run_command
 from strips import cut_strip
 
-from wavebatch.cli.slice import slice_
+from wavebatch.cli.geometry import slice_
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader, StripScan

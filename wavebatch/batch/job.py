@@ -1,6 +1,6 @@
 """A strip to process and how: what the command line and the public API ask for, and the workers get.
 
-`tools.api.run` builds a StripJob per strip; `unit` does what it asks for.
+`tools.api` builds a StripJob per strip; `unit` does what it asks for.
 Before you change it: a job travels to other processes, and all of it that decides the output is in `describe_job` of
 `report_file`, or --resume would keep clouds that are not what is asked for.
 """

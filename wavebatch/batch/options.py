@@ -1,6 +1,6 @@
 """The options of a run: one declaration each, for the command, the Python function and the documentation.
 
-`cli.options` makes click's options of the fields of RunOptions, `tools.api.run` the keywords of `wavebatch.run`. Before
+`cli.options` makes click's options of the fields of RunOptions, `tools.api` the keywords of `wavebatch.run`. Before
 you change it: this module is imported for `--help`, so it imports nothing that takes time.
 """
 

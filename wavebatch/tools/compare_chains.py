@@ -29,7 +29,7 @@ from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools import pairing
-from wavebatch.tools.api.strip import AUTO, load_chain
+from wavebatch.tools.api import AUTO, load_chain
 
 
 @frozen
