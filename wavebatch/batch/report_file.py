@@ -29,7 +29,7 @@ from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
-from wavebatch.stages.decompose.loops import loop_model
+from wavebatch.stages.decompose.fit import loop_model
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets

@@ -32,7 +32,7 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.geometry.normals import Surroundings, grow_tree, measure_normals, thin_out
 from wavebatch.kernels.geometry.planes import in_two_lines
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
-from wavebatch.stages.attribute.incidence_angle import added_variance
+from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR

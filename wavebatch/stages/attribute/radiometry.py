@@ -6,7 +6,7 @@ quantities have stages of their own: amplitudes as they would be at one range co
 calibration. Source: docs/algorithms.md 5.
 
 What an echo returns, its distance, energy and backscatter with their errors (`measure_light`), is also what the
-calibration, the reference of level ground in `surveying`, `basic` and `incidence_angle` use. Before you change it:
+calibration, the reference of level ground in `surveying` and `basic` use. Before you change it:
 calibration and run must measure the energy of an echo in the same way (`echo_light`).
 
 Reflectance is that of surfaces that fill the beam, so it needs the angle at which the surface was struck. It comes

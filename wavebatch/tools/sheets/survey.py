@@ -27,7 +27,7 @@ from wavebatch.files.figure_file import check_picture, open_picture, plain_text,
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
-from wavebatch.stages.attribute.incidence_angle import added_variance
+from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.surveying.flat_ground import REFERENCE_ERROR
 from wavebatch.surveying.systems.survey_result import Survey, name_model
 from wavebatch.tools.sheets import sheet as sheets
