@@ -28,7 +28,7 @@ from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN, C, fo
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.header import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.geometry.normals import Surroundings, grow_tree, measure_normals, thin_out
 from wavebatch.kernels.geometry.planes import in_two_lines
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle

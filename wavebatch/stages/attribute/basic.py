@@ -17,8 +17,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.no_data import SUFFIX, NoData, explain_no_data
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, LEAST_PULSE_WIDTH, SQRT_2PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.hermite import residual_moments
-from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, residual_moments
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.geometry.group_returns import match_returns
 from wavebatch.kernels.geometry.normals import measure_normals

@@ -14,8 +14,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.fit.closed_form import estimate_starts, fit_closed_form, start_errors
+from wavebatch.kernels.fit.closed_form import bound_time, estimate_starts, fit_closed_form, start_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.kernels.signal.signal import smooth_121
 from wavebatch.stages.chain import Chain, Range, Step, stage

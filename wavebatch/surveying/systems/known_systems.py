@@ -29,7 +29,7 @@ from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
 from wavebatch.surveying.measuring.residuals import subtract_echoes
 from wavebatch.surveying.measuring.trial import TRIAL
-from wavebatch.surveying.systems.system_table import read_system
+from wavebatch.surveying.systems.figures import read_system
 
 LEAST_ECHOES = 8
 """Strong single echoes below which no pulse is taken: eight that all agree are chance once in 256 times."""

@@ -25,7 +25,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture, open_picture, plain_text, set_head
 from wavebatch.files.text_file import write_text
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.surveying.flat_ground import REFERENCE_ERROR
