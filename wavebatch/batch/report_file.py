@@ -35,7 +35,7 @@ from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, pred
 from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets
 from wavebatch.surveying.sensor import SensorSource
 from wavebatch.surveying.system_file import format_survey
-from wavebatch.surveying.systems.doubt import doubt_survey
+from wavebatch.surveying.systems.known_systems import doubt_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 MOST_REPORT = 64 << 20

@@ -40,9 +40,15 @@ from wavebatch.surveying.measuring.noise_and_width import (
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening
 from wavebatch.surveying.predict_error import measure_hidden
-from wavebatch.surveying.systems.doubt import share_repeated, share_unexplained
 from wavebatch.surveying.systems.figures import Figures
-from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known
+from wavebatch.surveying.systems.known_systems import (
+    find_lone,
+    find_ringing,
+    guess_width,
+    list_known,
+    share_repeated,
+    share_unexplained,
+)
 from wavebatch.surveying.systems.skew import measure_skew
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 
