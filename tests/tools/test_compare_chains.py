@@ -19,7 +19,6 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.decompose.models import fitted_pulse, rebuild_waveforms
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample
-from wavebatch.tools import compare_chains as chains
 from wavebatch.tools.compare_chains import (
     ChainRun,
     Contender,
@@ -76,7 +75,7 @@ def pair_naively(a, b, tolerance):
     return pairs
 
 
-def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed, monkeypatch):
+def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed):
     sides = find_contender("fast"), find_contender("accurate")
     result = match_sides(mixed / "s.las", *sides)
     with StripReader(mixed / "s.las") as reader, reader.scan() as scan:
@@ -105,8 +104,7 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed, monkeypatch):
     assert spread.nmad == pytest.approx(nmad, rel=1e-6)
     assert between.gain == pytest.approx(len(a) / len(b) - 1)
     assert result.returns == len(block.returns)
-    monkeypatch.setattr(chains, "_BLOCK", 97)
-    parts = match_sides(mixed / "s.las", *sides)
+    parts = match_sides(mixed / "s.las", *sides, block_size=97)
     assert parts.between.differences["time"].rms == pytest.approx(spread.rms, rel=1e-12)
     assert parts.vendor["b"].missed_by == result.vendor["b"].missed_by
     assert parts.fit["a"]["multi"].median == result.fit["a"]["multi"].median

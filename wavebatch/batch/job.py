@@ -53,6 +53,8 @@ class StripJob:
     """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
     chosen: PointFilter = PointFilter()
     """What is written."""
+    unit_points: int | None = None
+    """Of a unit, which one process works on; the cloud does not depend on it."""
 
     def extend(self, chain: Chain) -> Chain:
         """Return the chain with the physical stages that trajectory, calibration and divergence allow, and those of the
@@ -99,7 +101,8 @@ class StripJob:
 
     def open(self) -> StripReader:
         """Open the strip; raises InputError where it cannot be read."""
-        return StripReader(self.path, direction=self.options.direction, headerless=self.options.headerless)
+        direction, headerless = self.options.direction, self.options.headerless
+        return StripReader(self.path, direction=direction, headerless=headerless, unit_points=self.unit_points)
 
 
 def list_column_names(wanted: str | None) -> tuple[str, ...]:
