@@ -20,8 +20,7 @@ from writer_tools import data_file
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import InputError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.systems.known_systems import Trial, find_source, known_systems, limit_surveys

@@ -23,9 +23,8 @@ from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.order import even_places
-from wavebatch.core.system import LevelWidths
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN, C, format_measure
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.fit.closed_form import bound_time

@@ -24,9 +24,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain_no_data
-from wavebatch.core.system import angle_to_vertical
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_2PI
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock, angle_to_vertical
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.physics import radiometry
 from wavebatch.stages.chain import Range, stage

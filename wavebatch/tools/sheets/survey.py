@@ -19,9 +19,8 @@ from wavebatch import __version__
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.system import swath_columns
 from wavebatch.core.units import FWHM_PER_SIGMA, count, format_measure, format_relative
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock, swath_columns
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture, open_picture, plain_text, set_head
 from wavebatch.files.text_file import write_text
