@@ -9,7 +9,6 @@ import time
 import pytest
 from batch_tools import is_alive, read_outputs
 
-from wavebatch.batch.workers import serve
 from wavebatch.tools.simulate import simulate_strip
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
@@ -174,17 +173,6 @@ def test_a_worker_that_is_stopped_as_soon_as_our_code_runs_in_it_dies_with_its_p
         os.kill(worker, signal.SIGSTOP)
         process.send_signal(signal.SIGKILL)
     _wait_until_gone([worker])
-
-
-def test_a_worker_asks_for_the_death_signal_before_all_else(monkeypatch):
-    done = []
-    monkeypatch.setattr(serve, "_wake_when_parent_dies", lambda: done.append("death signal"))
-    monkeypatch.setattr(serve.signal, "signal", lambda *_: done.append("ignores Ctrl-C"))
-    monkeypatch.setattr(serve, "keep_freed_memory", lambda: done.append("memory"))
-    monkeypatch.setattr(serve.multiprocessing, "parent_process", lambda: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        serve.serve_calls(None)
-    assert done == ["death signal", "ignores Ctrl-C", "memory"]
 
 
 _SHOT = """

@@ -17,13 +17,13 @@ SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0))
 
 
 @pytest.fixture(autouse=True)
-def own_stages(monkeypatch):
+def own_stages():
     """Stages and columns that a test registers are gone after it."""
-    monkeypatch.setattr(chain_module, "STAGES", dict(STAGES))
-    known = set(COLUMNS)
+    known = [(table, set(table)) for table in (STAGES, COLUMNS)]
     yield
-    for name in COLUMNS.keys() - known:
-        del COLUMNS[name]
+    for table, names in known:
+        for name in table.keys() - names:
+            del table[name]
 
 
 def block(n=3):

@@ -174,6 +174,15 @@ def test_digitizers_that_record_otherwise_get_a_pulse_and_noise_of_their_own():
     assert survey.waveforms == 2112 and survey.figures.single_share > 0.98
 
 
+def test_a_digitizer_with_few_echoes_asks_of_weak_echoes_what_its_own_noise_does():
+    """The main one's noise is a ten-thousandth of its echoes; the other's is a two-hundredth."""
+    main = digitized(record(gaussian, 8, n=1500, amplitude=(5000, 20000), dtype="u2")[0], 1)
+    few = digitized(record(gaussian, 9, n=12, amplitude=(150, 600), noise=3.0, dtype="u2")[0], 2, gain=0.1)
+    system = survey_blocks([main, few]).system
+    assert set(system.digitizers) == {2} and system.of(few).sigma_ref == system.sigma_ref
+    assert system.faint_share < 0.01 < 0.013 < system.of(few).faint_share <= 0.02
+
+
 @pytest.mark.slow
 def test_digitizers_that_record_alike_share_what_is_learned():
     """As scanners do that write one descriptor per length of a waveform."""

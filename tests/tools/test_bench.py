@@ -362,13 +362,12 @@ def GaussianDecomposition(y, thres):
 def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     (tmp_path / "gdecomp.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(peers, "PATIENCE", 10.0)
     scene = replace(find_scene("flat"), recording=Recording(bits=16))
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()
     samples[7, 40], samples[20, 40] = 950, 850
     system = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.04))
-    result = peers.run_peer("gdecomp", replace(block, samples=samples), system)
+    result = peers.run_peer("gdecomp", replace(block, samples=samples), system, patience=10.0)
     assert result.failures == 2 and result.waveforms == 38
     assert sorted(set(range(40)) - set(result.found.waveform.tolist())) == [7, 20]
     group = make_group(scene, 0, block, truth, Survey(SystemPulse(2.0), 40))
@@ -630,12 +629,12 @@ def test_all_methods_stand_in_one_table(timed_here):
 
 
 @pytest.mark.slow
-def test_every_method_goes_through_the_stiff_cases(monkeypatch):
-    monkeypatch.setattr("bench.stability.GROUPS", 1)
+def test_every_method_goes_through_the_stiff_cases():
     few = ("detect.asdf", "detect.wavelet", "decompose.residual_loop", "decompose.reference")
     methods = {name: list_methods()[name] for name in few}
     shown = {"accurate": load_profile("accurate"), **methods}
-    rows = measure_stability(lambda survey: shown, 50, 300, 3, cases=list_cases(["H10", "H2"]), methods=methods)
+    cases = list_cases(["H10", "H2"])
+    rows = measure_stability(lambda survey: shown, 50, 300, 3, cases=cases, methods=methods, groups=1)
     assert len(rows) == 4 * len(shown)
     for row in rows:
         assert row["is_method"] == (row["chain"] != "accurate")

@@ -22,7 +22,7 @@ from wavebatch.surveying.measuring.learn_pulse import (
     learn_pulse,
 )
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import limit_faint, measure_beside, measure_tail
+from wavebatch.surveying.measuring.misfit import MOST_FAINT, PEAK, limit_faint, measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
@@ -200,7 +200,10 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> 
     if not learn or (own.figures.isolated_echoes or 0.0) >= FEW:
         return own.system
     measured = measure_gaussian(block, system.sigma_ref / block.spacing)
-    return replace(system, noise=measured.noise, saturation=measured.saturation)
+    other = replace(system, noise=measured.noise, saturation=measured.saturation)
+    # The main one's pulse, but what echoes must exceed beside strong ones follows from this one's noise too.
+    echoes = decompose_sample(block, other)
+    return limit_faint(replace(other, faint_share=MOST_FAINT), system.faint_share / PEAK, echoes)
 
 
 def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
