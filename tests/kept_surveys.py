@@ -44,12 +44,11 @@ def keep(function):
 
 def install(config):
     """Keep what is measured on a sample wherever a strip is prepared."""
-    from wavebatch.surveying import choose_chain, flight
-    from wavebatch.tools.api import strip
+    from wavebatch.surveying import flight, predict_error, survey
 
     if _FOLDER not in os.environ:  # the first process of the session; the others inherit the variable
         os.environ[_FOLDER] = tempfile.mkdtemp(prefix="wavebatch-tests-")
         config.add_cleanup(lambda: shutil.rmtree(os.environ.pop(_FOLDER), ignore_errors=True))
-    for module in choose_chain, flight, strip:
+    for module in survey, flight:
         module.survey_blocks = keep(module.survey_blocks)
-    choose_chain.predict_errors = keep(choose_chain.predict_errors)
+    predict_error.predict_errors = keep(predict_error.predict_errors)

@@ -145,8 +145,12 @@ def test_a_prompt_shows_a_few_lines(strips):
     with wb.open_strip(strips[0]) as strip:
         survey = wb.survey(strip)
         chain = wb.auto_chain(survey)
-        echoes = chain.run(next(strip.blocks()), survey.system)
+        block = next(strip.blocks())
+        echoes = chain.run(block, survey.system)
+        assert len(repr(strip.facts)) < 2000 and "point_format=" in repr(strip.facts)
     for value, words in (
+        (block, (f"{len(block)} waveforms of {block.samples.shape[1]} samples",)),
+        (survey.system, ("Gaussian", f"{survey.system.noise.std:.3f} DN")),
         (survey, (f"{survey.waveforms} waveforms", f"{survey.system.noise.std:.3f} DN", "Gaussian")),
         (chain, ("noise.pooled", "detect.maximum")),
         (echoes, (f"{len(echoes)} echoes", "amplitude", "range_err")),

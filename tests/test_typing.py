@@ -37,6 +37,10 @@ wb.run("a.las", "out", names="rigl")
 wb.open_strip("a.las", direction=1)
 with wb.open_strip("a.las") as strip: strip.block()
 wb.survey("a.las").sytem
+with wb.open_strip("a.las") as strip: next(strip.blocks()).sampels
+wb.load_chain("fast").run(next(wb.open_strip("a.las").blocks()), wb.survey("a.las").system).amplitud
+wb.Digitizer(index="x", bits=8, n_samples=3, spacing=1.0, gain=1.0, offset=0.0)
+wb.survey("a.las").system.noise.std = 3
 """
 
 

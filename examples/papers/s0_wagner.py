@@ -20,12 +20,12 @@ from table import Table, main, scatter
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C, MAD_TO_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 from wavebatch.stages.attribute.basic import position
 from wavebatch.stages.attribute.radiometry import cross_section
 from wavebatch.stages.decompose.fit import gaussian
-from wavebatch.stages.detect.maximum import TWICE_SMOOTHED_GAIN, maximum
+from wavebatch.stages.detect.direct import TWICE_SMOOTHED_GAIN, maximum
 from wavebatch.stages.detect.transformed import asdf
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.simulate import simulate_block

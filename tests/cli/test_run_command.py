@@ -154,13 +154,14 @@ def test_help_imports_neither_numpy_nor_laspy():
 
 
 PAGES = "wavebatch.tools.sheets.page wavebatch.tools.plots matplotlib"
+SURVEYS = "wavebatch.surveying.survey wavebatch.surveying.flight wavebatch.surveying.predict_error"
 
 
 @pytest.mark.parametrize(
     "command, unused",
     [
         ("info STRIP", "laspy scipy wavebatch.stages wavebatch.surveying.survey"),
-        ("run STRIP -o OUT --system SYSTEM", f"laspy pyproj requests urllib3 numpy.ma scipy dask {PAGES}"),
+        ("run STRIP -o OUT --system SYSTEM", f"{SURVEYS} laspy pyproj requests urllib3 numpy.ma scipy dask {PAGES}"),
         ("survey STRIP", f"laspy pyproj {PAGES}"),
     ],
 )

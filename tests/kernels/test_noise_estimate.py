@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from wavebatch import surveying
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import estimate_noise
 from wavebatch.stages.chain import STAGES
 from wavebatch.surveying.measuring.residuals import hides_noise
-from wavebatch.tools.api.strip import load_chain
+from wavebatch.tools.api import load_chain
 from wavebatch.tools.simulate import Recording, simulate_block
 
 

@@ -6,15 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.learn_pulse import fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.signal.runs import lobe_edges
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.decompose.models import reference
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
 
 SIGMA = 2.0

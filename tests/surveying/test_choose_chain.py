@@ -97,7 +97,7 @@ def test_a_saved_survey_is_used_as_it_is_and_the_report_says_whose_it_is(strips,
 
 def test_no_survey_is_made_where_one_is_given(strips, saved, tmp_path, monkeypatch):
     monkeypatch.setattr(kept_surveys, "active", False)
-    monkeypatch.setattr("wavebatch.surveying.survey.survey_block", lambda *a, **k: pytest.fail("surveyed"))
+    monkeypatch.setattr("wavebatch.surveying.survey.survey_blocks", lambda *a, **k: pytest.fail("surveyed"))
     assert _run(strips / "flat.las", "-o", tmp_path, "-q", "--system", saved, "--debug").exit_code == 0
 
 

@@ -9,7 +9,8 @@ from strips import cut_strip
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
-from wavebatch.surveying.flight import hold_strip, read_flight, read_samples, survey_flight, surveys_agree
+from wavebatch.surveying.flight import hold_strip, read_samples, survey_flight
+from wavebatch.surveying.look import read_flight, surveys_agree
 from wavebatch.surveying.system_file import format_survey, parse_survey
 from wavebatch.tools.simulate import PulseModel, find_pulse, simulate_strip
 

@@ -31,9 +31,9 @@ from wavebatch.core.frozen import frozen
 from wavebatch.files.disk.publish import protecting, refuse_input, remove_stale, reporting
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.library import load as load_kernels
-from wavebatch.surveying import Survey
-from wavebatch.surveying.flight import read_flight, read_samples, survey_flight, surveys_agree
+from wavebatch.surveying.look import read_flight, surveys_agree
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, load_survey, parse_survey
+from wavebatch.surveying.systems.survey_result import Survey
 
 if TYPE_CHECKING:
     from wavebatch.batch.workers.dask_cluster import Cluster
@@ -175,6 +175,8 @@ def _survey_flight(
     on_event: Callable[[dict[str, Any]], None] | None,
 ) -> SavedSurvey | None:
     """Survey all strips together and keep the result; None where no strip can be read: each fails in its turn."""
+    from wavebatch.surveying.flight import read_samples, survey_flight
+
     first = jobs[0].options
     paths = [job.path for job in jobs]
     samples = read_samples(paths, direction=first.direction, headerless=first.headerless, spread=workers.map)

@@ -115,8 +115,8 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     from wavebatch.files.disk.raw_bytes import take_fingerprint
     from wavebatch.surveying.inspect_strip import doubt_files
     from wavebatch.surveying.system_file import SavedSurvey
-    from wavebatch.tools.api.strip import open_strip
-    from wavebatch.tools.api.strip import survey as survey_strip
+    from wavebatch.tools.api import open_strip
+    from wavebatch.tools.api import survey as survey_strip
 
     with open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
         found = survey_strip(
@@ -181,8 +181,8 @@ def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Pat
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
     from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import SYSTEM_SCHEMA, describe_system
-    from wavebatch.surveying.systems.doubt import doubt_survey
     from wavebatch.surveying.systems.figures import describe_figures
+    from wavebatch.surveying.systems.known_systems import doubt_survey
 
     doubts = doubt_survey(saved.survey.system, saved.survey.figures, saved.survey.waveforms)
     return {

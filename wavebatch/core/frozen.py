@@ -9,10 +9,17 @@ from __future__ import annotations
 
 import functools
 import inspect
+from collections.abc import Callable
 from dataclasses import MISSING, FrozenInstanceError, dataclass, field, fields
-from typing import Any, dataclass_transform
+from typing import Any, TypeVar, dataclass_transform, overload
+
+T = TypeVar("T")
 
 
+@overload
+def frozen(kind: type[T], /) -> type[T]: ...
+@overload
+def frozen(*, eq: bool = True, order: bool = False) -> Callable[[type[T]], type[T]]: ...
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def frozen(kind: type | None = None, /, *, eq: bool = True, order: bool = False) -> Any:
     """Make a frozen dataclass with slots; `fields`, `replace`, `asdict`, pickling and copying work as for any other.
@@ -70,13 +77,18 @@ def _init(self: Any, *values: Any, **named: Any) -> None:
         self.__post_init__()
 
 
+_SHOWN = 100
+"""Characters of a field that a prompt shows: the whole of one long array or table hides all others."""
+
+
 def _values(self: Any) -> tuple[Any, ...]:
     return tuple(getattr(self, name) for name, one in self.__dataclass_fields__.items() if one.compare)
 
 
 def _repr(self: Any) -> str:
-    shown = ", ".join(f"{name}={getattr(self, name)!r}" for name in self.__dataclass_fields__)
-    return f"{type(self).__qualname__}({shown})"
+    texts = {name: " ".join(repr(getattr(self, name)).split()) for name in self.__dataclass_fields__}
+    shown = (f"{name}={text if len(text) <= _SHOWN else text[: _SHOWN - 3] + '...'}" for name, text in texts.items())
+    return f"{type(self).__qualname__}({', '.join(shown)})"
 
 
 def _is_equal(self: Any, other: object) -> bool:

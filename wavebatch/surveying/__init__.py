@@ -5,7 +5,8 @@ How a strip is surveyed:
 1. In the folder `measuring`, `lone_echoes` fits the echoes that are alone in their waveform. From them,
    `noise_and_width` finds noise, baseline, pulse width and saturation, and `learn_pulse` the pulse's shape; `residuals`
    finds the noise again from what fits leave, `misfit` what the pulse does not explain.
-2. `survey` runs these and decides which parts of a chain the scene needs. `system_file` saves the result.
+2. `survey` runs these and decides which parts of a chain the scene needs. Its result is in `systems/survey_result`;
+   `system_file` saves it. `look` is the short survey by which strips are compared with a result.
 3. `choose_chain` turns the decisions into a chain, and gives each strip its pulse and its chain; `predict_error` tries
    the shipped chains for `--tolerance`.
 4. `sensor` finds where the sensor was. With that and the beam's divergence, `flat_ground` measures how wide the echoes
@@ -19,9 +20,9 @@ from __future__ import annotations
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from wavebatch.surveying.survey import SAMPLE, Decision, Part, Survey, join_digitizers, survey_block, survey_blocks
+    from wavebatch.surveying.survey import Decision, Survey, join_digitizers, survey_block, survey_blocks
 
-__all__ = ["SAMPLE", "Decision", "Part", "Survey", "join_digitizers", "survey_block", "survey_blocks"]
+__all__ = ["Decision", "Survey", "join_digitizers", "survey_block", "survey_blocks"]
 
 
 def __getattr__(name: str) -> object:

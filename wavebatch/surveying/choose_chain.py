@@ -23,11 +23,14 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import format_step, load_profile, parse_chain
-from wavebatch.surveying import SAMPLE, Decision, Part, Survey, join_digitizers, survey_blocks
-from wavebatch.surveying.outgoing import compare_outgoing
-from wavebatch.surveying.predict_error import WAVEFORMS, Prediction, leave_out_false, predict_errors
+from wavebatch.surveying.look import join_digitizers
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.surveying.systems.figures import describe_figures
+from wavebatch.surveying.systems.survey_result import Decision, Part, Survey
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from wavebatch.surveying.predict_error import Prediction
 
 LOST = 0.005
 """Largest share of overlapping echoes, among the waveforms with echoes, at which growth is turned off.
@@ -147,6 +150,9 @@ def widest_chain() -> Chain:
     return choose_chain(Survey(SystemPulse(sigma_ref=1.0), 0))
 
 
+SAMPLE = 8192
+"""Waveforms that a survey looks at."""
+
 SAMPLE_SAMPLES = 1 << 21
 """Most samples that a survey reads: 8192 waveforms of 256 samples."""
 
@@ -258,6 +264,9 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
     """
     sample = read_sample(reader, scan) if request.system is None or request.tolerance is not None else []
     if request.system is None:
+        from wavebatch.surveying.outgoing import compare_outgoing  # these and what they import: 10 ms
+        from wavebatch.surveying.survey import survey_blocks
+
         found = compare_outgoing(survey_blocks(sample), reader.facts.path)
     else:
         found = request.system.survey
@@ -270,6 +279,8 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
 
 
 def _choose_by_tolerance(block: WaveformBlock | None, found: Survey, tolerance: float, strip: str) -> ChainChoice:
+    from wavebatch.surveying.predict_error import leave_out_false, predict_errors
+
     chains = {name: load_profile(name) for name in COSTS}
     if block is None:
         return ChainChoice(chains[COSTS[0]], found)
@@ -315,6 +326,8 @@ def try_chain(reader: StripReader, scan: StripScan, choice: ChainChoice, request
     system = choice.survey.system
     if request.describe(choice.chain) is not None or (len(system.components) < 2 and not system.kappa):
         return choice
+    from wavebatch.surveying.predict_error import WAVEFORMS, leave_out_false, predict_errors
+
     sample = read_sample(reader, scan, WAVEFORMS)
     if not sample:
         return choice

@@ -17,29 +17,19 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core import interrupts
-from wavebatch.core.echoes import EchoTable
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import quantile
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.choose_chain import decide, sample_size
 from wavebatch.surveying.inspect_strip import doubt_files
-from wavebatch.surveying.measuring.noise_and_width import (
-    FAR_OFF,
-    FEW,
-    FIRST_WIDTH,
-    find_edge,
-    measure_gaussian,
-    measure_quiet,
-)
-from wavebatch.surveying.survey import Survey, compare_levels, describe_level, pool_blocks, survey_blocks
+from wavebatch.surveying.look import compare_echoes, compare_looks, kind_of, look_at, read_flight
+from wavebatch.surveying.measuring.noise_and_width import FIRST_WIDTH
+from wavebatch.surveying.survey import survey_blocks
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.figures import Kind, Look
-from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, take_strongest, with_pulse
+from wavebatch.surveying.systems.survey_result import Survey
 
 LEAST_SHARE = 64
 """Waveforms that each strip gives to the survey, however many strips there are."""
@@ -54,32 +44,6 @@ CANDIDATES = 32
 
 ROUNDS = 3
 """Times, at most, that strips are pooled and compared with the result."""
-
-NARROWER = 0.06
-"""How much narrower than those of the flight the echoes of a strip may be, as a share of the width: find_edge gives it
-to 1 to 3 %."""
-
-WIDER, STEADY = 0.10, 0.5
-"""How much wider they may be, where more than this share of them have nearly one width. Slopes and forest widen echoes
-by any amount, but never most of them by the same."""
-
-OTHER_NOISE = 1.5
-"""Ratio of the noise of two strips from which they are of two sensors: that of one sensor grows with the light of the
-scene, on strips of one RIEGL from .62 to .89 DN."""
-
-SAME_WIDTH = 0.06
-"""How far from the edge a width may be to count as the same, as a share of it."""
-
-SHAPE = 0.008
-"""How much worse than in the flight the common pulse may fit the better quarter of a strip's strong echoes, as a share
-of the amplitude. A Gaussian misses the echoes of the shipped sensors by 0.02 to 0.06."""
-
-ALIKE_PULSES, PULSE_ERROR = 0.02, 0.3
-"""Difference of two pulses (`compare_pulses`) up to which surveys of single strips agree, and what is added to it, over
-the root of the number of isolated echoes: pulses of two simulated strips with 200 of them differ by 0.03."""
-
-ALIKE_NOISE, ALIKE_LEVEL = 1.15, 0.5
-"""The same for the ratio of the noise, and for the difference of the level over the noise."""
 
 Spread = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]
 """Calls a function with every item and gives the results in order, like `map`."""
@@ -276,91 +240,9 @@ def _hold(sample: StripSample, system: SystemPulse, whole: Look | None, kinds: M
     """A strip compared with what the flight records."""
     kind, look = _compare_kinds(sample.blocks, kinds), look_at(sample.blocks, system)
     # Counts of other bits or another gain say nothing; times do.
-    pulse = "" if look is None or whole is None else (_compare_pulses if kind else compare_looks)(look, whole, system)
+    pulse = "" if look is None or whole is None else (compare_echoes if kind else compare_looks)(look, whole, system)
     reason = "; ".join(filter(None, (pulse, kind)))
     return Held(sample.path, sample.fingerprint, sample.waveforms, None if kind else look, reason, sample.facts)
-
-
-def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None:
-    """Measure what waveforms record, without learning a pulse.
-
-    Parameters
-    ----------
-    blocks : iterable of WaveformBlock
-        Of any descriptors; only those of the main digitizer are used.
-    system : SystemPulse
-        Of the flight: its pulse is tried on the strong echoes.
-
-    Returns
-    -------
-    Look or None
-        None without waveforms of the main digitizer.
-    """
-    kinds: dict[Kind, list[WaveformBlock]] = {}
-    for block in blocks:
-        if block.digitizer.index not in system.digitizers:
-            kinds.setdefault(_kind(block), []).append(block)
-    if not kinds:
-        return None
-    block = pool_blocks(max(kinds.values(), key=lambda group: sum(map(len, group))))
-    plain, lone, width = _find_width(block, system.sigma_ref)
-    level = describe_level(block, plain)
-    quiet = plain.noise.by_kind.get("quiet", 0.0)
-    if quiet:
-        # The mean square of all quiet samples holds weak echoes too: 2.2 DN in a RIEGL strip, 1.6 in a part of it.
-        level = replace(level, std=max(quiet, QUANTISATION_STD))
-    if not width:
-        return Look(level, 0.0, 0.0, 0.0)
-    steady = float(np.mean(np.abs(np.log(lone.sigma / width)) < SAME_WIDTH))
-    strong = take_strongest(lone)
-    noise = level.std / strong.amplitude.astype(np.float64)
-    left = quantile(fit_alone(block, with_pulse(plain, system), strong)[0] ** 2 - noise**2, 0.25)
-    return Look(level, width, steady, float(np.sqrt(max(left, 0.0))))
-
-
-def _find_width(block: WaveformBlock, expected: float) -> tuple[SystemPulse, EchoTable, float]:
-    """A Gaussian and the noise, the lone echoes, and the width of the narrowest that repeat [ns]; 0: too few.
-
-    With the width of the flight this takes half as long as to measure one; where the echoes contradict it, it is done.
-    """
-    plain = measure_quiet(block, expected / block.spacing)
-    for measured in False, True:
-        if measured:
-            plain = measure_gaussian(block, expected / block.spacing)
-        lone = find_lone(block, plain, most=len(block))
-        width = find_edge(lone.sigma) if len(lone) >= FEW else 0.0
-        if abs(width / plain.sigma_ref - 1.0) <= FAR_OFF:
-            break
-    return plain, lone, width
-
-
-def compare_looks(own: Look, whole: Look, system: SystemPulse, wider: float = WIDER) -> str:
-    """Return why a strip does not belong to the flight, the pulse first; empty where it does.
-
-    wider: how much wider than the flight's most echoes may be, as a share of the width.
-    """
-    level = compare_levels(own.level, [whole.level], system.noise.std, OTHER_NOISE)
-    level = level.strip().replace("the others", "the flight")
-    return "; ".join(filter(None, (_compare_pulses(own, whole, system, wider), level)))
-
-
-def _compare_pulses(own: Look, whole: Look, system: SystemPulse, wider: float = WIDER) -> str:
-    """Why the echoes of a strip are not of the flight's sensor; empty where they may be."""
-    if own.width and whole.width:
-        ratio = own.width / whole.width
-        if ratio < 1 - NARROWER or (ratio > 1 + wider and own.steady > STEADY):
-            slope = "; steep slopes widen echoes as well" if ratio > 1 else ""
-            widths = f"{own.width:.2f} ns wide (Gaussian sigma), those of the flight {whole.width:.2f} ns{slope}"
-            return f"its echoes are {widths}"
-        if own.misfit > whole.misfit + SHAPE:
-            misfits = f"by {100 * own.misfit:.1f} % of the amplitude, those of the flight by {100 * whole.misfit:.1f} %"
-            return f"the flight's pulse misses its strong echoes {misfits}"
-    return ""
-
-
-def _kind(block: WaveformBlock) -> Kind:
-    digitizer = block.digitizer
-    return Kind(float(digitizer.bits), digitizer.spacing, digitizer.gain, digitizer.offset)
 
 
 def _agree_on_kinds(samples: Sequence[StripSample]) -> dict[int, Kind]:
@@ -369,7 +251,7 @@ def _agree_on_kinds(samples: Sequence[StripSample]) -> dict[int, Kind]:
     for sample in samples:
         counts: Counter[tuple[int, Kind]] = Counter()
         for block in sample.blocks:
-            counts[block.digitizer.index, _kind(block)] += len(block)
+            counts[block.digitizer.index, kind_of(block)] += len(block)
         for (index, kind), number in counts.items():
             votes.setdefault(index, {}).setdefault(kind, []).append(number)
     return {
@@ -381,7 +263,7 @@ def _agree_on_kinds(samples: Sequence[StripSample]) -> dict[int, Kind]:
 def _compare_kinds(blocks: Iterable[WaveformBlock], kinds: Mapping[int, Kind]) -> str:
     """Why a strip's descriptors do not fit those of the flight; empty where they do."""
     for block in blocks:
-        index, kind = block.digitizer.index, _kind(block)
+        index, kind = block.digitizer.index, kind_of(block)
         if index not in kinds and kind in kinds.values():
             continue
         other = kinds.get(index) or next(iter(kinds.values()))
@@ -417,47 +299,3 @@ def _find_group(samples: list[StripSample], spread: Spread) -> list[StripSample]
         if sum(sample.waveforms for sample in group) > sum(sample.waveforms for sample in best):
             best = group
     return best or samples
-
-
-def list_kinds(blocks: Iterable[WaveformBlock]) -> dict[int, Kind]:
-    """Return how the samples of each descriptor of blocks were made, by its index."""
-    return {block.digitizer.index: _kind(block) for block in blocks}
-
-
-def read_flight(survey: Survey) -> tuple[Look, dict[int, Kind]]:
-    """Return what a surveyed flight records, and its descriptors; raises ConfigError for a survey of no flight."""
-    look, kinds = survey.figures.look, survey.figures.kinds
-    if look is None or not kinds:
-        raise ConfigError("holds no survey of a flight; `wavebatch run --survey flight --overwrite` makes one")
-    return look, dict(sorted(kinds.items()))
-
-
-def surveys_agree(surveys: Sequence[Survey]) -> bool:
-    """Return whether surveys of single strips agree so well that one survey of all of them would serve.
-
-    Parameters
-    ----------
-    surveys : sequence of Survey
-
-    Returns
-    -------
-    bool
-        False for fewer than two, and where one has too few echoes for a pulse.
-    """
-    if len(surveys) < 2 or any((survey.figures.isolated_echoes or 0) < FEW for survey in surveys):
-        return False
-    first, *others = surveys
-    return all(_agree(first, other) for other in others)
-
-
-def _agree(a: Survey, b: Survey) -> bool:
-    if (a.figures.spacing_ns, a.figures.bits) != (b.figures.spacing_ns, b.figures.bits):
-        return False
-    noise = min(a.system.noise.std, b.system.noise.std)
-    echoes = min(a.figures.isolated_echoes or 0.0, b.figures.isolated_echoes or 0.0)
-    return (
-        max(a.system.noise.std, b.system.noise.std) < ALIKE_NOISE * noise
-        and abs(a.system.noise.baseline - b.system.noise.baseline) < ALIKE_LEVEL * noise
-        and a.system.digitizers.keys() == b.system.digitizers.keys()
-        and compare_pulses(a.system, b.system) < ALIKE_PULSES + PULSE_ERROR / np.sqrt(echoes)
-    )

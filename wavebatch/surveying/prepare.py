@@ -18,7 +18,6 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.calibration import Calibration, needs_sensor
 from wavebatch.surveying.choose_chain import ChainChoice, Request, make_choice
-from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.matching.strip_energies import StripEnergies, take_energies
 from wavebatch.surveying.matching.strip_match import match_strip
 from wavebatch.surveying.measuring.return_scatter import measure_returns
@@ -133,6 +132,8 @@ def _hold(reader: StripReader, scan: StripScan, request: Request) -> tuple[str, 
     if request.system is None:
         return "", ""
     if request.flight:
+        from wavebatch.surveying.flight import hold_strip  # and with it the survey
+
         return hold_strip(reader, scan, request.system.survey), ""
     return "", check_saved(reader, scan, request.system.survey, force=request.force)
 

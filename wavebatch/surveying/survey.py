@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import field, replace
-from enum import StrEnum
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.core.frozen import frozen
-from wavebatch.core.system import Defects, LevelWidths
-from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NORMAL_MEDIAN
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import log
-from wavebatch.kernels.signal.noise import find_levels
-from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
+from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
+from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.measuring.choose_pulse import MISFITS, Tried, choose_pulse, settle
+from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
+from wavebatch.surveying.measuring.choose_pulse import MISFITS, choose_pulse, settle
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
     find_isolated,
@@ -27,14 +22,13 @@ from wavebatch.surveying.measuring.learn_pulse import (
     learn_pulse,
 )
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import limit_faint, measure_beside, measure_tail
+from wavebatch.surveying.measuring.misfit import MOST_FAINT, PEAK, limit_faint, measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,
     RESIDUAL_LOOK,
     SMALL,
-    find_saturation,
     list_widths,
     measure_again,
     measure_gaussian,
@@ -45,71 +39,22 @@ from wavebatch.surveying.measuring.noise_and_width import (
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening
 from wavebatch.surveying.predict_error import measure_hidden
-from wavebatch.surveying.systems.doubt import share_repeated, share_unexplained
-from wavebatch.surveying.systems.figures import Figures, Level
-from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known
-from wavebatch.surveying.systems.shown import Shown
+from wavebatch.surveying.systems.figures import Figures
+from wavebatch.surveying.systems.known_systems import (
+    find_lone,
+    find_ringing,
+    guess_width,
+    list_known,
+    share_repeated,
+    share_unexplained,
+)
 from wavebatch.surveying.systems.skew import measure_skew
-
-SAMPLE = 8192
-"""Waveforms that a survey looks at."""
-
-
-LEAST_QUIET_SAMPLES = 4
-"""Samples before the strongest echo from which a waveform has a level."""
-
-LEAST_LEVELS = 5
-"""Waveforms of a descriptor from which on its level is compared with that of others."""
-
+from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 
 NARROWER = 0.85
 """Width of the chosen pulse, over that of isolated echoes, below which quiet samples are looked for once more if there
 were none: those next to signal are not quiet, by widths of the pulse. Without isolated echoes they were found with a
 guess of it."""
-
-STRANGE, STRANGE_NOISE = 6.0, 1.3
-"""Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
-
-COUNTED = 256
-"""Samples of a waveform that count where the main digitizer is chosen."""
-
-
-class Part(StrEnum):
-    """Parts of a chain that a survey decides on; the values stand in files and reports."""
-
-    PULSE = "learned pulse"
-    SKEW = "skewed pulse"
-    GROWTH = "growth of fits"
-    PRIOR = "width prior"
-    CENSORED = "censored fit"
-    WEIGHTS = "signal-dependent weights"
-    WIDTH = "echo width"
-    ANGLE = "incidence angle"
-    INVERTED = "inverted waveforms"
-    """Only where they are."""
-
-
-@frozen
-class Decision:
-    """Whether the strip needs a part of the chain, and why."""
-
-    part: str
-    """A Part; any text where a file of another version has it."""
-    needed: bool
-    reason: str
-
-
-@frozen
-class Survey(Shown):
-    """What a sample of a strip says of sensor and scene."""
-
-    system: SystemPulse
-    waveforms: int
-    figures: Figures = field(default_factory=Figures)
-    decisions: tuple[Decision, ...] = ()
-    candidates: tuple[Tried, ...] = field(default=(), compare=False)
-    """Pulses that were tried, that which describes waveforms best first; empty for a survey from a file."""
-
 
 def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
     """Survey of a strip from blocks sampled over it.
@@ -162,48 +107,6 @@ def _survey_joined(joined: list[WaveformBlock], *, learn: bool) -> Survey:
     return _add_digitizers(found, plain, main, others, strangers, learn=learn)
 
 
-def join_digitizers(blocks: Iterable[WaveformBlock]) -> list[WaveformBlock]:
-    """The samples of each descriptor as one block; the largest first.
-
-    Waveforms of several lengths are filled up to the longest, with the fill marked as missing. Samples of long
-    waveforms count up to 256 each: it takes many waveforms to learn a pulse.
-    """
-    groups: dict[int, list[WaveformBlock]] = {}
-    for block in blocks:
-        if len(block):
-            groups.setdefault(block.digitizer.index, []).append(block)
-    joined = [pool_blocks(group) for _, group in sorted(groups.items())]
-    return sorted(joined, key=_weigh, reverse=True)
-
-
-def pool_blocks(group: list[WaveformBlock]) -> WaveformBlock:
-    """Waveforms of blocks (of one kind of digitizer) as one block, without geometry; short ones are filled up."""
-    length = max(block.samples.shape[1] for block in group)
-    digitizer = replace(max(group, key=_weigh).digitizer, n_samples=length)
-    samples = np.concatenate([_fill_up(block.samples, length) for block in group])
-    missing = np.concatenate([_missing(block, length) for block in group])
-    pooled = WaveformBlock.from_samples(samples, spacing=digitizer.spacing, bits=digitizer.bits)
-    return replace(pooled, digitizer=digitizer, missing=missing if missing.any() else None)
-
-
-def _fill_up(samples: np.ndarray, length: int) -> np.ndarray:
-    """Samples (n, s) with columns added up to `length`, each the waveform's least count, which is no signal."""
-    lack = length - samples.shape[1]
-    return samples if not lack else np.hstack([samples, np.repeat(samples.min(axis=1)[:, None], lack, axis=1)])
-
-
-def _missing(block: WaveformBlock, length: int) -> np.ndarray:
-    """Samples of a block that were not recorded, once it is filled up to `length`: bool (n, length)."""
-    missing = np.ones((len(block), length), bool)
-    missing[:, : block.samples.shape[1]] = False if block.missing is None else block.missing
-    return missing
-
-
-def _weigh(block: WaveformBlock) -> int:
-    """Samples of a block that count for a survey."""
-    return min(block.samples.shape[1], COUNTED) * len(block)
-
-
 def _group_descriptors(joined: list[WaveformBlock]) -> list[tuple[WaveformBlock, list[WaveformBlock]]]:
     """Descriptors that differ in length only, pooled, with the blocks they were pooled from; the largest first."""
     kinds: dict[tuple[float, ...], list[WaveformBlock]] = {}
@@ -211,7 +114,7 @@ def _group_descriptors(joined: list[WaveformBlock]) -> list[tuple[WaveformBlock,
         digitizer = block.digitizer
         kinds.setdefault((digitizer.bits, digitizer.spacing, digitizer.gain, digitizer.offset), []).append(block)
     groups = [(pool_blocks(members), members) for members in kinds.values()]
-    return sorted(groups, key=lambda group: _weigh(group[0]), reverse=True)
+    return sorted(groups, key=lambda group: weigh(group[0]), reverse=True)
 
 
 def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int, str]:
@@ -241,50 +144,6 @@ def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int
         if reason:
             strangers[index] = reason
     return strangers
-
-
-def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
-    """Level and noise of one descriptor, from each waveform's own quiet samples."""
-    signal = transpose_samples(block.samples)
-    reach = int(np.ceil(3 * plain.sigma_ref / block.spacing))
-    _, quiet, _ = find_levels(signal, plain.noise.std, reach)
-    if block.missing is not None:
-        quiet &= ~block.missing.T
-    # Only what comes before the first signal: long packets have more echoes, and what lies between them is no level.
-    quiet = accumulate(np.logical_and, quiet)
-    level, number = quiet_mean(signal, quiet)
-    used = number >= LEAST_QUIET_SAMPLES
-    # From differences of neighbours: a variance about the mean of so few correlated samples depends on their number.
-    pairs = quiet[1:] & quiet[:-1]
-    step = np.where(pairs, signal[1:] - signal[:-1], np.float32(0))
-    freedom = max(int(np.count_nonzero(pairs)), 1)
-    unlike = 2 * max(1 - (plain.noise.correlation[0] if plain.noise.correlation else 0.0), 0.1)
-    std = float(np.sqrt(np.sum(step * step, dtype=np.float64) / (unlike * freedom)))
-    mean, spread = (float(np.mean(level[used])), float(np.std(level[used]))) if used.any() else (0.0, 0.0)
-    clip = find_saturation(block.samples, block.digitizer.max_count)
-    return Level(int(used.sum()), mean, spread, max(std, QUANTISATION_STD), freedom, clip)
-
-
-def compare_levels(own: Level, rest: list[Level], noise: float, most: float = STRANGE_NOISE) -> str:
-    """Why a descriptor is a stranger among the rest, or empty; most: ratio of two noises of one sensor."""
-    rest = [level for level in rest if level.waveforms]
-    if own.waveforms < LEAST_LEVELS or not rest:
-        return ""
-    weights = np.array([level.waveforms for level in rest], np.float64)
-    mean = float(np.average([level.mean for level in rest], weights=weights))
-    spread = float(np.sqrt(np.average([level.spread**2 for level in rest], weights=weights)))
-    error = float(np.hypot(own.spread, 0.5 * noise) / np.sqrt(own.waveforms) + spread / np.sqrt(weights.sum()))
-    if abs(own.mean - mean) > max(STRANGE * error, 0.5 * noise):
-        return f"its level is {own.mean:.2f} DN, that of the others {mean:.2f} "
-    std = float(np.sqrt(np.average([level.std**2 for level in rest], weights=weights)))
-    ratio = own.std / std
-    # Quiet samples of one waveform are correlated: a tenth of them count.
-    if abs(log(ratio)) > max(log(most), STRANGE / np.sqrt(0.2 * own.samples)):
-        return f"its noise is {own.std:.2f} DN, that of the others {std:.2f}"
-    clips = {level.clip for level in rest if level.clip is not None}
-    if own.clip is not None and clips and own.clip < min(clips):
-        return f"it is clipped at {own.clip:.0f} DN, the others at {min(clips):.0f}"
-    return ""
 
 
 def _add_digitizers(
@@ -341,7 +200,10 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> 
     if not learn or (own.figures.isolated_echoes or 0.0) >= FEW:
         return own.system
     measured = measure_gaussian(block, system.sigma_ref / block.spacing)
-    return replace(system, noise=measured.noise, saturation=measured.saturation)
+    other = replace(system, noise=measured.noise, saturation=measured.saturation)
+    # The main one's pulse, but what echoes must exceed beside strong ones follows from this one's noise too.
+    echoes = decompose_sample(block, other)
+    return limit_faint(replace(other, faint_share=MOST_FAINT), system.faint_share / PEAK, echoes)
 
 
 def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +32,8 @@ from wavebatch.surveying.measuring.judge import (
     replace_rows,
 )
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, spread_rows, thin_block
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, HALVED, spread_rows, thin_block
+from wavebatch.surveying.systems.survey_result import Tried
 
 STRICT = 0.92
 """Least width of an echo where a pulse is judged, over the pulse's: nothing reflects narrower, and widths scatter by up
@@ -43,9 +44,6 @@ SAMPLES, MOST, LEAST = 60_000, 384, 96
 
 MORE = 4
 """Times as many waveforms on which candidates are judged where another one costs the same as the best."""
-
-SMALL = 120
-"""Waveforms below which halves are too few to learn a pulse from: the judge then sees what it was learned from."""
 
 CHANGES, STEP_OF_CHANGES = (0.0, 0.003, 0.01, 0.03), 3.4
 """Changes of the pulse from shot to shot that are tried, as shares of the amplitude: in steps of a factor 3.4 at most,
@@ -126,22 +124,6 @@ class Candidate:
         return count_errors(np.clip(more, *np.quantile(more, (0.02, 0.98))))
 
 
-class Tried(NamedTuple):
-    """A candidate in a line of `survey -v`."""
-
-    name: str
-    fwhm_ns: float
-    gaussians: int
-    """Of its sum; 1 also for a skewed pulse."""
-    change: float
-    """Of the shape, from shot to shot, as a share of the amplitude."""
-    nats: float
-    """That describe a waveform; and standard errors by which they are more than with the chosen pulse."""
-    longer_by: float
-    echoes_per_waveform: float
-    chosen: bool
-
-
 @frozen(eq=False)
 class Choice:
     """The candidate that was taken, and those that lost."""
@@ -200,7 +182,7 @@ def choose_pulse(
     """
     number = int(np.clip(SAMPLES // block.samples.shape[1], LEAST, MOST))
     rows = spread_rows(len(block), 2 * number)
-    small = len(rows) < SMALL
+    small = len(rows) < HALVED
     part = block.rows(rows)
     taught, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
     few = thin_block(held, FEWEST)

@@ -12,9 +12,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.order import median
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.signal.noise import PooledNoise, estimate_noise, keep_longest
@@ -42,6 +41,9 @@ FEW = 20
 SMALL = 256
 """Waveforms below which a stack of echoes cannot show that a pulse is simple: a tail of 6 % drowns in its errors, and
 adds a fifth to the echoes. What pulse such a strip has is decided by all of its waveforms."""
+
+HALVED = 120
+"""Waveforms below which halves are too few to learn a pulse from: the judge then sees what it was learned from."""
 
 ENOUGH_TO_LEARN = 20
 """Isolated echoes from which a pulse can be learned (R2): at SNR 20 their stack is known to a hundredth of its peak, a

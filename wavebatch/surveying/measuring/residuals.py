@@ -12,9 +12,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.order import group_medians
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.describe import render_pulses
 from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
@@ -22,7 +21,7 @@ from wavebatch.kernels.signal.floor import MOST_LEAST, floor_share
 from wavebatch.kernels.signal.noise import DRIFT, residual_noise
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.detect.maximum import matched_filter
+from wavebatch.stages.detect.direct import matched_filter
 from wavebatch.stages.flags import use_noise_errors
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits

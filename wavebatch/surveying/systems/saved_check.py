@@ -13,16 +13,10 @@ from dataclasses import replace
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.surveying import Survey
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.flight import (
-    STEADY,
-    Look,
-    compare_looks,
-    list_kinds,
-    look_at,
-    read_flight,
-)
+from wavebatch.surveying.look import STEADY, compare_looks, list_kinds, look_at, read_flight
+from wavebatch.surveying.systems.figures import Look
+from wavebatch.surveying.systems.survey_result import Survey
 
 HELD = 1024
 """Waveforms of the strip that are compared with the survey."""

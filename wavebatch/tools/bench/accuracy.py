@@ -21,7 +21,8 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.runs import lobe_edges
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 from wavebatch.stages.score import ISOLATED, QUANTITIES, find_isolated_echoes, list_pairs, match_echoes
-from wavebatch.surveying import Survey, survey_block
+from wavebatch.surveying import survey_block
+from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools.simulate import Scene, simulate_blocks
 from wavebatch.tools.simulate.render import PulseModel, Recording, main_lobe, paint_echoes, spread_lobes
 

@@ -45,10 +45,11 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scanner import expand
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import effective, load_chain_file, load_profile
-from wavebatch.surveying import SAMPLE, Survey, survey_blocks
-from wavebatch.surveying.choose_chain import choose_chain
-from wavebatch.surveying.survey import pool_blocks
-from wavebatch.tools.api.strip import AUTO
+from wavebatch.surveying import survey_blocks
+from wavebatch.surveying.choose_chain import SAMPLE, choose_chain
+from wavebatch.surveying.look import pool_blocks
+from wavebatch.surveying.systems.survey_result import Survey
+from wavebatch.tools.api import AUTO
 from wavebatch.tools.bench import accuracy
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene, simulate_blocks, simulate_strip
 from wavebatch.tools.simulate.scenes import Drawn

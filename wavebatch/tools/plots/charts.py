@@ -23,7 +23,7 @@ from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.models import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.systems.shown import full_width, sample_pulse
+from wavebatch.surveying.systems.survey_result import full_width, sample_pulse
 from wavebatch.tools.cells import Raster, Tally, choose_grid, compute_cells, find_shown, robust_limits
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, draw_cells
 from wavebatch.tools.plots.draw_waveform import HEAD, LEGEND, draw_small_waveforms, sheet_size

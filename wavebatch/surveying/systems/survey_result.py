@@ -1,28 +1,80 @@
-"""How a prompt and a notebook show a survey: a few lines, and the same as HTML with a picture of the pulse.
+"""What a survey says of sensor and scene, and how a prompt and a notebook show it.
 
-`Survey` inherits it. The picture needs no matplotlib, so that a notebook shows it everywhere.
+`survey` makes it, `system_file` saves and reads it; runs with a saved survey need no more of a survey than this. The
+picture of the pulse needs no matplotlib, so that a notebook shows it everywhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import field
+from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.surveying.systems.figures import Figures
 
 WIDE, HIGH, MARGIN = 320, 140, 16
 """Size of the picture, and the strip below it for the times [pixels]."""
 
 
-class Shown:
-    """Text and HTML of a survey."""
+class Part(StrEnum):
+    """Parts of a chain that a survey decides on; the values stand in files and reports."""
 
-    __slots__ = ()
+    PULSE = "learned pulse"
+    SKEW = "skewed pulse"
+    GROWTH = "growth of fits"
+    PRIOR = "width prior"
+    CENSORED = "censored fit"
+    WEIGHTS = "signal-dependent weights"
+    WIDTH = "echo width"
+    ANGLE = "incidence angle"
+    INVERTED = "inverted waveforms"
+    """Only where they are."""
+
+
+@frozen
+class Decision:
+    """Whether the strip needs a part of the chain, and why."""
+
+    part: str
+    """A Part; any text where a file of another version has it."""
+    needed: bool
+    reason: str
+
+
+class Tried(NamedTuple):
+    """A pulse that was tried, in a line of `survey -v`."""
+
+    name: str
+    fwhm_ns: float
+    gaussians: int
+    """Of its sum; 1 also for a skewed pulse."""
+    change: float
+    """Of the shape, from shot to shot, as a share of the amplitude."""
+    nats: float
+    """That describe a waveform; and standard errors by which they are more than with the chosen pulse."""
+    longer_by: float
+    echoes_per_waveform: float
+    chosen: bool
+
+
+@frozen
+class Survey:
+    """What a sample of a strip says of sensor and scene."""
+
+    system: SystemPulse
+    waveforms: int
+    figures: Figures = field(default_factory=Figures)
+    decisions: tuple[Decision, ...] = ()
+    candidates: tuple[Tried, ...] = field(default=(), compare=False)
+    """Pulses that were tried, that which describes waveforms best first; empty for a survey from a file."""
 
     def __repr__(self) -> str:
         lines = (f"  {name:14}{text}" for name, text in _describe(self))
@@ -33,11 +85,11 @@ class Shown:
         from html import escape  # 10 ms
 
         rows = "".join(f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in _describe(self))
-        system, spacing = self.system, self.figures.spacing_ns or 1.0  # type: ignore[attr-defined]
+        system, spacing = self.system, self.figures.spacing_ns or 1.0
         return f'<div style="display:flex;gap:1em"><table>{rows}</table>{_draw(*sample_pulse(system, spacing))}</div>'
 
 
-def _describe(survey: Any) -> Iterator[tuple[str, str]]:
+def _describe(survey: Survey) -> Iterator[tuple[str, str]]:
     """Name and text of each line."""
     system, figures = survey.system, survey.figures
     yield "surveyed", f"{survey.waveforms} waveforms"

@@ -1,0 +1,283 @@
+"""What a strip records, without a learned pulse, and whether two records are of one sensor.
+
+`flight` compares the strips of a flight so, `saved_check` a strip with a saved survey, `survey` the descriptors of one
+strip. Before you change it: nothing may depend on the order in which blocks are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.order import quantile
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
+from wavebatch.kernels.signal.noise import find_levels
+from wavebatch.kernels.signal.signal import accumulate, quiet_mean, transpose_samples
+from wavebatch.surveying.measuring.noise_and_width import (
+    FAR_OFF,
+    FEW,
+    find_edge,
+    find_saturation,
+    measure_gaussian,
+    measure_quiet,
+)
+from wavebatch.surveying.systems.figures import Kind, Level, Look
+from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, take_strongest, with_pulse
+from wavebatch.surveying.systems.survey_result import Survey
+
+COUNTED = 256
+"""Samples of a waveform that count where the main digitizer is chosen."""
+
+LEAST_QUIET_SAMPLES = 4
+"""Samples before the strongest echo from which a waveform has a level."""
+
+LEAST_LEVELS = 5
+"""Waveforms of a descriptor from which on its level is compared with that of others."""
+
+STRANGE, STRANGE_NOISE = 6.0, 1.3
+"""Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
+
+NARROWER = 0.06
+"""How much narrower than those of the flight the echoes of a strip may be, as a share of the width: find_edge gives it
+to 1 to 3 %."""
+
+WIDER, STEADY = 0.10, 0.5
+"""How much wider they may be, where more than this share of them have nearly one width. Slopes and forest widen echoes
+by any amount, but never most of them by the same."""
+
+OTHER_NOISE = 1.5
+"""Ratio of the noise of two strips from which they are of two sensors: that of one sensor grows with the light of the
+scene, on strips of one RIEGL from .62 to .89 DN."""
+
+SAME_WIDTH = 0.06
+"""How far from the edge a width may be to count as the same, as a share of it."""
+
+SHAPE = 0.008
+"""How much worse than in the flight the common pulse may fit the better quarter of a strip's strong echoes, as a share
+of the amplitude. A Gaussian misses the echoes of the shipped sensors by 0.02 to 0.06."""
+
+ALIKE_PULSES, PULSE_ERROR = 0.02, 0.3
+"""Difference of two pulses (`compare_pulses`) up to which surveys of single strips agree, and what is added to it, over
+the root of the number of isolated echoes: pulses of two simulated strips with 200 of them differ by 0.03."""
+
+ALIKE_NOISE, ALIKE_LEVEL = 1.15, 0.5
+"""The same for the ratio of the noise, and for the difference of the level over the noise."""
+
+
+def join_digitizers(blocks: Iterable[WaveformBlock]) -> list[WaveformBlock]:
+    """The samples of each descriptor as one block; the largest first.
+
+    Waveforms of several lengths are filled up to the longest, with the fill marked as missing. Samples of long
+    waveforms count up to 256 each: it takes many waveforms to learn a pulse.
+    """
+    groups: dict[int, list[WaveformBlock]] = {}
+    for block in blocks:
+        if len(block):
+            groups.setdefault(block.digitizer.index, []).append(block)
+    joined = [pool_blocks(group) for _, group in sorted(groups.items())]
+    return sorted(joined, key=weigh, reverse=True)
+
+
+def pool_blocks(group: list[WaveformBlock]) -> WaveformBlock:
+    """Waveforms of blocks (of one kind of digitizer) as one block, without geometry; short ones are filled up."""
+    length = max(block.samples.shape[1] for block in group)
+    digitizer = replace(max(group, key=weigh).digitizer, n_samples=length)
+    samples = np.concatenate([_fill_up(block.samples, length) for block in group])
+    missing = np.concatenate([_missing(block, length) for block in group])
+    pooled = WaveformBlock.from_samples(samples, spacing=digitizer.spacing, bits=digitizer.bits)
+    return replace(pooled, digitizer=digitizer, missing=missing if missing.any() else None)
+
+
+def _fill_up(samples: np.ndarray, length: int) -> np.ndarray:
+    """Samples (n, s) with columns added up to `length`, each the waveform's least count, which is no signal."""
+    lack = length - samples.shape[1]
+    return samples if not lack else np.hstack([samples, np.repeat(samples.min(axis=1)[:, None], lack, axis=1)])
+
+
+def _missing(block: WaveformBlock, length: int) -> np.ndarray:
+    """Samples of a block that were not recorded, once it is filled up to `length`: bool (n, length)."""
+    missing = np.ones((len(block), length), bool)
+    missing[:, : block.samples.shape[1]] = False if block.missing is None else block.missing
+    return missing
+
+
+def weigh(block: WaveformBlock) -> int:
+    """Samples of a block that count for a survey."""
+    return min(block.samples.shape[1], COUNTED) * len(block)
+
+
+def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
+    """Level and noise of one descriptor, from each waveform's own quiet samples."""
+    signal = transpose_samples(block.samples)
+    reach = int(np.ceil(3 * plain.sigma_ref / block.spacing))
+    _, quiet, _ = find_levels(signal, plain.noise.std, reach)
+    if block.missing is not None:
+        quiet &= ~block.missing.T
+    # Only what comes before the first signal: long packets have more echoes, and what lies between them is no level.
+    quiet = accumulate(np.logical_and, quiet)
+    level, number = quiet_mean(signal, quiet)
+    used = number >= LEAST_QUIET_SAMPLES
+    # From differences of neighbours: a variance about the mean of so few correlated samples depends on their number.
+    pairs = quiet[1:] & quiet[:-1]
+    step = np.where(pairs, signal[1:] - signal[:-1], np.float32(0))
+    freedom = max(int(np.count_nonzero(pairs)), 1)
+    unlike = 2 * max(1 - (plain.noise.correlation[0] if plain.noise.correlation else 0.0), 0.1)
+    std = float(np.sqrt(np.sum(step * step, dtype=np.float64) / (unlike * freedom)))
+    mean, spread = (float(np.mean(level[used])), float(np.std(level[used]))) if used.any() else (0.0, 0.0)
+    clip = find_saturation(block.samples, block.digitizer.max_count)
+    return Level(int(used.sum()), mean, spread, max(std, QUANTISATION_STD), freedom, clip)
+
+
+def compare_levels(own: Level, rest: list[Level], noise: float, most: float = STRANGE_NOISE) -> str:
+    """Why a descriptor is a stranger among the rest, or empty; most: ratio of two noises of one sensor."""
+    rest = [level for level in rest if level.waveforms]
+    if own.waveforms < LEAST_LEVELS or not rest:
+        return ""
+    weights = np.array([level.waveforms for level in rest], np.float64)
+    mean = float(np.average([level.mean for level in rest], weights=weights))
+    spread = float(np.sqrt(np.average([level.spread**2 for level in rest], weights=weights)))
+    error = float(np.hypot(own.spread, 0.5 * noise) / np.sqrt(own.waveforms) + spread / np.sqrt(weights.sum()))
+    if abs(own.mean - mean) > max(STRANGE * error, 0.5 * noise):
+        return f"its level is {own.mean:.2f} DN, that of the others {mean:.2f} "
+    std = float(np.sqrt(np.average([level.std**2 for level in rest], weights=weights)))
+    ratio = own.std / std
+    # Quiet samples of one waveform are correlated: a tenth of them count.
+    if abs(log(ratio)) > max(log(most), STRANGE / np.sqrt(0.2 * own.samples)):
+        return f"its noise is {own.std:.2f} DN, that of the others {std:.2f}"
+    clips = {level.clip for level in rest if level.clip is not None}
+    if own.clip is not None and clips and own.clip < min(clips):
+        return f"it is clipped at {own.clip:.0f} DN, the others at {min(clips):.0f}"
+    return ""
+
+
+def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None:
+    """Measure what waveforms record, without learning a pulse.
+
+    Parameters
+    ----------
+    blocks : iterable of WaveformBlock
+        Of any descriptors; only those of the main digitizer are used.
+    system : SystemPulse
+        Of the flight: its pulse is tried on the strong echoes.
+
+    Returns
+    -------
+    Look or None
+        None without waveforms of the main digitizer.
+    """
+    kinds: dict[Kind, list[WaveformBlock]] = {}
+    for block in blocks:
+        if block.digitizer.index not in system.digitizers:
+            kinds.setdefault(kind_of(block), []).append(block)
+    if not kinds:
+        return None
+    block = pool_blocks(max(kinds.values(), key=lambda group: sum(map(len, group))))
+    plain, lone, width = _find_width(block, system.sigma_ref)
+    level = describe_level(block, plain)
+    quiet = plain.noise.by_kind.get("quiet", 0.0)
+    if quiet:
+        # The mean square of all quiet samples holds weak echoes too: 2.2 DN in a RIEGL strip, 1.6 in a part of it.
+        level = replace(level, std=max(quiet, QUANTISATION_STD))
+    if not width:
+        return Look(level, 0.0, 0.0, 0.0)
+    steady = float(np.mean(np.abs(np.log(lone.sigma / width)) < SAME_WIDTH))
+    strong = take_strongest(lone)
+    noise = level.std / strong.amplitude.astype(np.float64)
+    left = quantile(fit_alone(block, with_pulse(plain, system), strong)[0] ** 2 - noise**2, 0.25)
+    return Look(level, width, steady, float(np.sqrt(max(left, 0.0))))
+
+
+def _find_width(block: WaveformBlock, expected: float) -> tuple[SystemPulse, EchoTable, float]:
+    """A Gaussian and the noise, the lone echoes, and the width of the narrowest that repeat [ns]; 0: too few.
+
+    With the width of the flight this takes half as long as to measure one; where the echoes contradict it, it is done.
+    """
+    plain = measure_quiet(block, expected / block.spacing)
+    for measured in False, True:
+        if measured:
+            plain = measure_gaussian(block, expected / block.spacing)
+        lone = find_lone(block, plain, most=len(block))
+        width = find_edge(lone.sigma) if len(lone) >= FEW else 0.0
+        if abs(width / plain.sigma_ref - 1.0) <= FAR_OFF:
+            break
+    return plain, lone, width
+
+
+def compare_looks(own: Look, whole: Look, system: SystemPulse, wider: float = WIDER) -> str:
+    """Return why a strip does not belong to the flight, the pulse first; empty where it does.
+
+    wider: how much wider than the flight's most echoes may be, as a share of the width.
+    """
+    level = compare_levels(own.level, [whole.level], system.noise.std, OTHER_NOISE)
+    level = level.strip().replace("the others", "the flight")
+    return "; ".join(filter(None, (compare_echoes(own, whole, system, wider), level)))
+
+
+def compare_echoes(own: Look, whole: Look, system: SystemPulse, wider: float = WIDER) -> str:
+    """Why the echoes of a strip are not of the flight's sensor; empty where they may be."""
+    if own.width and whole.width:
+        ratio = own.width / whole.width
+        if ratio < 1 - NARROWER or (ratio > 1 + wider and own.steady > STEADY):
+            slope = "; steep slopes widen echoes as well" if ratio > 1 else ""
+            widths = f"{own.width:.2f} ns wide (Gaussian sigma), those of the flight {whole.width:.2f} ns{slope}"
+            return f"its echoes are {widths}"
+        if own.misfit > whole.misfit + SHAPE:
+            misfits = f"by {100 * own.misfit:.1f} % of the amplitude, those of the flight by {100 * whole.misfit:.1f} %"
+            return f"the flight's pulse misses its strong echoes {misfits}"
+    return ""
+
+
+def kind_of(block: WaveformBlock) -> Kind:
+    """How the samples of a block were made."""
+    digitizer = block.digitizer
+    return Kind(float(digitizer.bits), digitizer.spacing, digitizer.gain, digitizer.offset)
+
+
+def list_kinds(blocks: Iterable[WaveformBlock]) -> dict[int, Kind]:
+    """Return how the samples of each descriptor of blocks were made, by its index."""
+    return {block.digitizer.index: kind_of(block) for block in blocks}
+
+
+def read_flight(survey: Survey) -> tuple[Look, dict[int, Kind]]:
+    """Return what a surveyed flight records, and its descriptors; raises ConfigError for a survey of no flight."""
+    look, kinds = survey.figures.look, survey.figures.kinds
+    if look is None or not kinds:
+        raise ConfigError("holds no survey of a flight; `wavebatch run --survey flight --overwrite` makes one")
+    return look, dict(sorted(kinds.items()))
+
+
+def surveys_agree(surveys: Sequence[Survey]) -> bool:
+    """Return whether surveys of single strips agree so well that one survey of all of them would serve.
+
+    Parameters
+    ----------
+    surveys : sequence of Survey
+
+    Returns
+    -------
+    bool
+        False for fewer than two, and where one has too few echoes for a pulse.
+    """
+    if len(surveys) < 2 or any((survey.figures.isolated_echoes or 0) < FEW for survey in surveys):
+        return False
+    first, *others = surveys
+    return all(_agree(first, other) for other in others)
+
+
+def _agree(a: Survey, b: Survey) -> bool:
+    if (a.figures.spacing_ns, a.figures.bits) != (b.figures.spacing_ns, b.figures.bits):
+        return False
+    noise = min(a.system.noise.std, b.system.noise.std)
+    echoes = min(a.figures.isolated_echoes or 0.0, b.figures.isolated_echoes or 0.0)
+    return (
+        max(a.system.noise.std, b.system.noise.std) < ALIKE_NOISE * noise
+        and abs(a.system.noise.baseline - b.system.noise.baseline) < ALIKE_LEVEL * noise
+        and a.system.digitizers.keys() == b.system.digitizers.keys()
+        and compare_pulses(a.system, b.system) < ALIKE_PULSES + PULSE_ERROR / np.sqrt(echoes)
+    )
