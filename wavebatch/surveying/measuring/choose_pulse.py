@@ -17,7 +17,7 @@ import numpy as np
 from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.elementary import exp, log
+from wavebatch.kernels.elementary import log
 from wavebatch.stages.pulse_tables import clip_level, shape_limits
 from wavebatch.surveying.measuring.joint_pulse import count_telling, learn_jointly
 from wavebatch.surveying.measuring.judge import (
@@ -73,9 +73,6 @@ start: they had 3 to 5 % of false echoes in place of 1 to 2."""
 MISFITS = 0.0005 * 2.0 ** np.arange(9)
 """Misfits of the chosen pulse that are tried: half a noise at 1,000 noises up to an eighth of the pulse, beyond which
 it is no pulse of this strip."""
-
-NOTHING = 1.0
-"""Mean place among the misfits that are tried up to which there is none: the least ones are as likely as any."""
 
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, "all echoes": {}}
 """Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
@@ -360,12 +357,12 @@ def settle(
 
 
 def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float, change: float) -> tuple[float, float]:
-    """Return the mean of the misfits by how likely their descriptions are, and a doubt.
+    """Return the least misfit whose description is longer than the shortest by at most one standard error, and a doubt.
 
     It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
-    much of it neighbours are not found, and both lengthen the description. One that is longer by z standard errors is
-    as likely as a normal value of z. The doubt is the share by which the number of echoes differs between misfits whose
-    descriptions are longer by at most one.
+    much of it neighbours are not found, and both lengthen the description. Between two misfits that are tried it is
+    found by their standard errors: halves of a strip then agree. The doubt is the share by which the number of echoes
+    differs between misfits whose descriptions are longer by at most one.
     """
     # What clipped echoes hide is no misfit.
     whole = np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1))
@@ -393,15 +390,26 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float, chang
         best, longer = look(min(lengths) - 4, min(lengths) - 2)
     while longer[-1] < SURE and max(lengths) + 4 < len(MISFITS):
         best, longer = look(max(lengths) + 4, max(lengths) + 2)
-    best, longer = look(*(place for place in (best - 1, best + 1) if 0 <= place < len(MISFITS)))
+    if longer[0] > 1:
+        best, longer = look(*(place for place in (best - 1, best + 1) if place < len(MISFITS)))
+        first = next(place for place, errors in zip(sorted(lengths), longer, strict=True) if errors <= 1)
+        if first:
+            best, longer = look(first - 1)
+    while longer[0] <= 1 and min(lengths) > 0:  # what was looked at last may be the shortest
+        best, longer = look(min(lengths) - 1)
     places = sorted(lengths)
-    every = np.arange(places[0], places[-1] + 1)
-    errors = np.interp(every, places, longer)
-    numbers = np.interp(every, places, [len(found[place].echoes) for place in places])[errors <= 1]
-    doubt = float(np.ptp(numbers)) / max(len(found[best].echoes), 1)
-    likely = exp(-0.5 * np.maximum(errors, 0) ** 2)
-    mean = float(np.einsum("k,k->", likely, every) / likely.sum())
-    return (float(MISFITS[0]) * 2.0**mean if mean > NOTHING else 0.0), doubt
+    between = np.linspace(places[0], places[-1], 8 * len(MISFITS))
+    numbers = np.interp(between, places, [len(found[place].echoes) for place in places])
+    as_likely = numbers[np.interp(between, places, longer) <= 1]
+    doubt = float(np.ptp(as_likely)) / max(len(found[best].echoes), 1) if len(as_likely) else 0.0
+    if longer[0] <= 1:
+        return 0.0, doubt
+    first = next(place for place, errors in enumerate(longer) if errors <= 1)
+    before, after = MISFITS[places[first - 1]], MISFITS[places[first]]
+    # Near its least a length is a parabola.
+    over, under = np.sqrt(longer[first - 1]), np.sqrt(max(longer[first], 0.0))
+    share = (over - 1) / (over - under)
+    return float(before * (after / before) ** share), doubt
 
 
 def _explain_between(block: WaveformBlock, system: SystemPulse, found: dict[int, Explained], place: int) -> Explained:

@@ -85,11 +85,12 @@ def look_in_mirror(
         alone = np.ones(len(other), bool)
         alone[match_echoes(other, echoes, SAME * width).found] = False
         rest = other.take(np.flatnonzero(alone))
-        beside, quiet = ~_lie_far(rest, mains, ZONE * width), _lie_far(rest, echoes, ZONE * width)
-        false.append((_measure_energy(rest, system, block.spacing), beside, quiet))
+        energy = _measure_energy(rest, system, block.spacing)
+        alone = _lie_far(rest, echoes, ZONE * width)
+        false.append((energy[~_lie_far(rest, mains, ZONE * width)], energy[alone]))
     energy = _measure_energy(echoes, system, block.spacing)
     for level in levels:
-        beside, quiet = (max(int(np.count_nonzero(one[i][one[0] >= level])) for one in false) for i in (1, 2))
+        beside, quiet = (max(int(np.count_nonzero(one >= level)) for one in kind) for kind in zip(*false, strict=True))
         yield level, Mirror(len(mains), beside, int(np.count_nonzero(energy >= level)), quiet)
 
 
