@@ -250,9 +250,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         plain = len(block) >= SMALL and figures.misfit_gaussians.get(1, np.inf) <= (figures.misfit_goal or 0.0)
         choice = choose_pulse(block, starts, {} if plain else list_known(block, system), learn=not plain)
         # Starts of guessed widths are measured from nothing, and know no defects.
-        system, candidates = replace(choice.best.system, defects=first.defects), choice.describe()
+        system, candidates = replace(choice.best.system, defects=first.defects), choice.tried
         figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change
-        gaussians = (one.typical for one in choice.tried if one.name.startswith("gaussian"))
+        gaussians = (one.nats for one in choice.tried if one.name.startswith("gaussian"))
         figures.gaussian_nats = min(gaussians, default=None)
         part = thin_samples(block, RESIDUAL_LOOK)
         narrower = not first.noise.by_kind["quiet"] and system.sigma_ref < NARROWER * first.sigma_ref

@@ -126,23 +126,14 @@ class Choice:
     """The candidate that was taken, and those that lost."""
 
     best: Candidate
-    tried: tuple[Candidate, ...]
+    tried: tuple[Tried, ...]
+    """The best first."""
     doubt: float
     """Share by which the number of echoes differs between candidates that cost the same."""
     spread: float
     """Share by which their widths differ from that of the best one."""
     tied: bool
     """Whether another candidate, or another change of its shape, costs the same."""
-
-    def describe(self) -> tuple[Tried, ...]:
-        """Return the candidates for people, the best first."""
-        return tuple(
-            Tried(
-                one.name, one.system.sigma_ref * FWHM_PER_SIGMA, max(len(one.system.components), 1), one.change,
-                one.typical, one.exceeds(self.best), one.echoes / len(one.length), one.name == self.best.name,
-            )
-            for one in self.tried
-        )  # fmt: skip
 
 
 def choose_pulse(
@@ -194,12 +185,11 @@ def choose_pulse(
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
     tried = {one.name: one.system for one in hopeful} | (dict(_learn(taught, begin)) if learn else {})
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
-    choice = _decide(_try_changes(held, found))
+    found = _try_changes(held, found)
+    choice = _decide(found)
     if choice.tied and len(rows) < len(block):
         others = np.delete(np.arange(len(block)), rows[::2])
-        more = block.rows(others[spread_rows(len(others), MORE * number)])
-        found = [_judge(more, one.name, one.system, one.change, known=one.known) for one in choice.tried]
-        choice = _decide(_try_changes(more, found) if len(choice.best.as_likely) > 1 else found)
+        choice = _decide_by_more(block.rows(others[spread_rows(len(others), MORE * number)]), found, choice)
     best = choice.best
     if small or best.name not in ROUNDS:
         return choice
@@ -304,8 +294,25 @@ def _decide(found: list[Candidate]) -> Choice:
     doubt = max(echoes) - min(echoes)
     widths = [one.system.sigma_ref for one in tied]
     spread = max(abs(width / best.system.sigma_ref - 1) for width in widths)
-    in_order = tuple(sorted(found, key=lambda one: one.typical))
-    return Choice(best, in_order, doubt, spread, max(len(tied), len(best.as_likely)) > 1)
+    tried = [
+        Tried(
+            one.name, one.system.sigma_ref * FWHM_PER_SIGMA, max(len(one.system.components), 1), one.change,
+            one.typical, one.exceeds(best), one.echoes / len(one.length), one is best,
+        )
+        for one in sorted(found, key=lambda one: one.typical)
+    ]  # fmt: skip
+    return Choice(best, tuple(tried), doubt, spread, max(len(tied), len(best.as_likely)) > 1)
+
+
+def _decide_by_more(block: WaveformBlock, found: list[Candidate], first: Choice) -> Choice:
+    """The choice among the candidates that are not hopeless by other waveforms; the others keep their distance."""
+    left = [one for one in found if one.exceeds(first.best) < HOPELESS]
+    left = [_judge(block, one.name, one.system, one.change, known=one.known) for one in left]
+    choice = _decide(_try_changes(block, left) if len(first.best.as_likely) > 1 else left)
+    again = {one.name: one.typical for one in left}
+    shift = again[first.best.name] - first.best.typical
+    lost = [one._replace(nats=one.nats + shift) for one in first.tried if one.name not in again]
+    return replace(choice, tried=tuple(sorted([*choice.tried, *lost], key=lambda one: one.nats)))
 
 
 def _bound_errors(shorter: Candidate, longer: Candidate) -> float:
