@@ -262,7 +262,8 @@ def test_none_is_taken_only_where_it_was_looked_at(monkeypatch):
 @pytest.mark.parametrize(
     ("errors", "echoes", "known", "taken"),
     [
-        (2.0, 100, False, False), (4.0, 100, False, True),  # as many echoes: SURE
+        (1.0, 100, False, False), (2.0, 100, False, True),  # as many echoes, in place of a learned pulse: HINT
+        (2.0, 103, False, False), (4.0, 103, False, True),  # some more: SURE
         (2.0, 90, False, True), (1.0, 90, False, False),  # fewer, in place of a learned pulse: HINT
         (2.0, 90, True, False),  # in place of a known one
         (4.0, 110, True, False), (5.0, 110, True, True),  # more: both

@@ -60,7 +60,7 @@ def test_a_pulse_that_changes_from_shot_to_shot_leaves_echoes_in_doubt(tmp_path,
     """
     whole = data_file("lvis/lvis1.las")
     path = cut_strip(whole, tmp_path / "cut.las", 50)
-    assert MOST_DOUBTED_KNOWN < _survey(path).figures.echoes_in_doubt < 0.25
+    assert MOST_DOUBTED_KNOWN < _survey(path).figures.echoes_in_doubt < 0.35
     _leave_out(monkeypatch, "nasa-lvis")
     assert _survey(path).figures.echoes_in_doubt > MOST_DOUBTED
     assert _survey(whole).figures.echoes_in_doubt > 0.05, "halves differ in a quarter: unknown echoes are left out"

@@ -246,9 +246,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             guess = guess_width(block, system)
             starts |= {} if guess is None else {"single echoes": guess}
             starts |= {f"gaussian of {width:g} samples": measure_quiet(block, width) for width in list_widths(block)}
-        # Where a Gaussian misses the lone echoes by less than noise shows, there is nothing to learn.
+        # Where a Gaussian misses the lone echoes by less than noise shows, there is nothing to learn but its width.
         plain = len(block) >= SMALL and figures.misfit_gaussians.get(1, np.inf) <= (figures.misfit_goal or 0.0)
-        choice = choose_pulse(block, starts, {} if plain else list_known(block, system), learn=not plain)
+        choice = choose_pulse(block, starts, list_known(block, system), plain=plain)
         # Starts of guessed widths are measured from nothing, and know no defects.
         system, candidates = replace(choice.best.system, defects=first.defects), choice.tried
         figures.description_nats, figures.pulse_change = choice.best.typical, choice.best.change

@@ -42,6 +42,9 @@ to 4 %."""
 SAMPLES, MOST, LEAST = 60_000, 384, 96
 """Samples that candidates are judged on, as many waveforms at most, and as many at least where they are long."""
 
+SAME_WIDTH = 0.05
+"""Difference of two widths of the pulse that is none: more is said to be in doubt."""
+
 MORE = 4
 """Times as many waveforms on which candidates are judged where another one costs the same as the best."""
 
@@ -62,6 +65,11 @@ HINT, FEWER = 1.5, 0.95
 a learned pulse's echoes, or where that is known to miss the stacked echoes by more than the change from shot to shot;
 and beyond SURE, where it needs more echoes than any. Each echo is a claim too; one in twenty is what `run` calls a
 doubt. Chance makes so many errors once in fifteen times."""
+
+LEAST_SAVED = 2.0
+"""Nats per echo that a learned pulse must save in place of one from elsewhere: chi2 of 4, two standard errors of an
+echo. By less no echo tells them apart; and what a strip's scene has in common, which is in its learned pulse and in all
+of its waveforms, saves up to half of it (.3 on RIEGL, 1.1 on LVIS)."""
 
 AS_FEW = 0.98
 """Share of its echoes to which another number of them is the same: a fiftieth of them comes and goes with the noise."""
@@ -141,7 +149,7 @@ def choose_pulse(
     starts: Mapping[str, SystemPulse],
     given: Mapping[str, SystemPulse] | None = None,
     *,
-    learn: bool = True,
+    plain: bool = False,
 ) -> Choice:
     """Choose the pulse that describes waveforms in the fewest words.
 
@@ -154,8 +162,8 @@ def choose_pulse(
         per cluster, so that false echoes do not eat the pulse's tail, then with as many as it needs.
     given : mapping of SystemPulse by name
         Pulses known from elsewhere: shipped ones, the strip's outgoing pulse.
-    learn : bool
-        Whether a pulse is to be learned from all echoes too.
+    plain : bool
+        Whether lone echoes show no more than a Gaussian: nothing else is learned where all echoes have its width too.
 
     Returns
     -------
@@ -183,7 +191,11 @@ def choose_pulse(
     leader = min(looked, key=lambda one: one.typical)
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
-    tried = {one.name: one.system for one in hopeful} | (dict(_learn(taught, begin)) if learn else {})
+    tried = {one.name: one.system for one in hopeful}
+    for name, system in _learn(taught, begin):
+        tried[name] = system
+        if plain and abs(system.sigma_ref / begin.system.sigma_ref - 1) < SAME_WIDTH:
+            break
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
     found = _try_changes(held, found)
     choice = _decide(found)
@@ -281,13 +293,13 @@ def _decide(found: list[Candidate]) -> Choice:
     for number in sorted({one.gaussians for one in found}):
         alike = [one for one in found if one.gaussians == number]
         shortest = min(alike, key=lambda one: (one.typical, one.name))
-        level = [one for one in alike if one.exceeds(shortest) < _bound_errors(shortest, one)]
+        level = [one for one in alike if not _beats(shortest, one)]
         fewest = min(one.echoes for one in level)
         first = min((one for one in level if AS_FEW * one.echoes <= fewest), key=lambda one: (one.typical, one.name))
         ordered += [first, *(one for one in alike if one is not first)]
     best = ordered[0]
     for one in ordered[1:]:
-        if best.exceeds(one) > _bound_errors(one, best):
+        if _beats(one, best):
             best = one
     tied = [one for one in ordered if one.exceeds(best) < SURE]
     echoes = [*best.as_likely, *(one.echoes / max(best.echoes, 1) for one in tied)]
@@ -313,6 +325,14 @@ def _decide_by_more(block: WaveformBlock, found: list[Candidate], first: Choice)
     shift = again[first.best.name] - first.best.typical
     lost = [one._replace(nats=one.nats + shift) for one in first.tried if one.name not in again]
     return replace(choice, tried=tuple(sorted([*choice.tried, *lost], key=lambda one: one.nats)))
+
+
+def _beats(shorter: Candidate, longer: Candidate) -> bool:
+    """Whether a candidate describes so much shorter that it is taken in place of the other."""
+    if longer.known and not shorter.known:
+        saved = (longer.typical - shorter.typical) * len(longer.length) / max(longer.echoes, 1)
+        return saved > LEAST_SAVED and longer.exceeds(shorter) > _bound_errors(shorter, longer)
+    return longer.exceeds(shorter) > _bound_errors(shorter, longer)
 
 
 def _bound_errors(shorter: Candidate, longer: Candidate) -> float:

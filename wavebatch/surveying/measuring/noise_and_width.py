@@ -31,7 +31,7 @@ FAR_OFF = 0.1
 SETTLED = 0.01
 """Change of the width, as a share of it, below which it stays."""
 
-FIRST_LOOK, NOISE_LOOK, RESIDUAL_LOOK, LEAST_LOOK = 80_000, 240_000, 240_000, 256
+FIRST_LOOK, NOISE_LOOK, RESIDUAL_LOOK, LEAST_LOOK = 80_000, 240_000, 480_000, 256
 """Samples from which noise and width to begin with are found, from which noise is found then (to 1 %), and whose
 residuals are looked at; and waveforms that each has at least."""
 
