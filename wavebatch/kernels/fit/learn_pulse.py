@@ -16,9 +16,8 @@ from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.library import CStacked, call, place
 
-STEP, FINE, IN_BIN = 0.2, 0.07, 10.0
-"""Grid of the stack [samples]; coarser where that is less than FINE widths of the pulse, which cannot bend so fast, or
-where fewer echoes would fall into a bin than IN_BIN."""
+STEP, IN_BIN = 0.2, 10.0
+"""Grid of the stack [samples]; coarser where fewer echoes would fall into a bin than IN_BIN."""
 
 MOST_COMPONENTS = 5
 
@@ -76,16 +75,14 @@ def stack_pulse(
     after: float,
     std: float = 0.0,
     first: np.ndarray | int = 0,
-    width: float = 0.0,
 ) -> Stack:
     """Median of signal (m, s) over amplitude, by lag from `before` samples before each centre to `after` behind it.
 
-    first: sample at which each row of the signal begins, int or int (m,); width: of the pulse [samples].
+    first: sample at which each row of the signal begins, int or int (m,).
     std: error of a sample that counts have without any noise; where they are rounded more coarsely than they scatter,
     the values of a bin may all be equal without being exact.
     """
-    step = find_step(width)
-    step = float(np.clip(IN_BIN / max(len(amplitude), 1), step, max(step, 1.0)))
+    step = float(np.clip(IN_BIN / max(len(amplitude), 1), STEP, 1.0))
     least = max(std / float(np.median(amplitude)), 1e-6) if len(amplitude) else 1e-6
     lag = np.reshape(first, (-1, 1)) + np.arange(signal.shape[1]) - time[:, None]
     used = (lag >= -before) & (lag <= after) & np.isfinite(signal)
@@ -119,11 +116,6 @@ class PulseFit(NamedTuple):
     """Root mean square misfit, in amplitudes."""
     datum: float
     """Delay of the strongest component (or the skewed pulse's peak) in the stack [samples]."""
-
-
-def find_step(width: float) -> float:
-    """Return the step of the lag at which a pulse of this width is drawn [samples]."""
-    return max(STEP, FINE * width)
 
 
 def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0) -> list[PulseFit]:

@@ -66,10 +66,11 @@ a learned pulse's echoes, or where that is known to miss the stacked echoes by m
 and beyond SURE, where it needs more echoes than any. Each echo is a claim too; one in twenty is what `run` calls a
 doubt. Chance makes so many errors once in fifteen times."""
 
-LEAST_SAVED = 2.0
-"""Nats per echo that a learned pulse must save in place of one from elsewhere: chi2 of 4, two standard errors of an
-echo. By less no echo tells them apart; and what a strip's scene has in common, which is in its learned pulse and in all
-of its waveforms, saves up to half of it (.3 on RIEGL, 1.1 on LVIS)."""
+LEAST_SAVED, LEAST_OF_KNOWN = 0.5, 2.0
+"""Nats per echo that other pulses must save in place of a Gaussian, and learned ones in place of one from elsewhere:
+chi2 of 1 and 4, one and two standard errors of an echo. What a strip's scene has in common is in a pulse that is
+learned from it and in all of its waveforms, and saves some (.2 in a canopy, .3 on RIEGL, 1.1 on LVIS), however many
+tell it."""
 
 AS_FEW = 0.98
 """Share of its echoes to which another number of them is the same: a fiftieth of them comes and goes with the noise."""
@@ -82,6 +83,7 @@ MISFITS = 0.0005 * 2.0 ** np.arange(9)
 """Misfits of the chosen pulse that are tried: half a noise at 1,000 noises up to an eighth of the pulse, beyond which
 it is no pulse of this strip."""
 
+OF_ALL = "gaussian of all echoes"
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, "all echoes": {}}
 """Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
 
@@ -141,7 +143,7 @@ class Choice:
     spread: float
     """Share by which their widths differ from that of the best one."""
     tied: bool
-    """Whether another candidate, or another change of its shape, costs the same."""
+    """Whether another pulse, or one that needs another number of echoes, costs the same."""
 
 
 def choose_pulse(
@@ -202,13 +204,24 @@ def choose_pulse(
     if choice.tied and len(rows) < len(block):
         others = np.delete(np.arange(len(block)), rows[::2])
         choice = _decide_by_more(block.rows(others[spread_rows(len(others), MORE * number)]), found, choice)
-    best = choice.best
-    if small or best.name not in ROUNDS:
-        return choice
-    # From all of them, now that it is chosen.
-    explained = explain(part, _bear(best.system, best.change), **ROUNDS[best.name])
-    system = learn_jointly(part, best.system, explained, best.change, last=True)
-    return replace(choice, best=replace(best, system=system))
+    return choice if small else replace(choice, best=_learn_from_all(part, choice.best))
+
+
+def _learn_from_all(block: WaveformBlock, best: Candidate) -> Candidate:
+    """The chosen pulse, where it was learned from half of these waveforms, learned from all of them."""
+    if best.name == OF_ALL:
+        return replace(best, system=_find_gaussian(block, best.system, best.change))
+    if best.name not in ROUNDS:
+        return best
+    explained = explain(block, _bear(best.system, best.change), **ROUNDS[best.name])
+    return replace(best, system=learn_jointly(block, best.system, explained, best.change, last=True))
+
+
+def _find_gaussian(block: WaveformBlock, system: SystemPulse, change: float) -> SystemPulse:
+    """A Gaussian of the width that strong echoes of a block repeat, decomposed with another one."""
+    explained = explain(block, _bear(system, change), width_prior=0.0)
+    own = find_own_width(explained, shape_limits(system, block.spacing).ref)
+    return replace(system, sigma_ref=system.sigma_ref * own)
 
 
 def _same_pulse(one: SystemPulse, other: SystemPulse) -> bool:
@@ -219,9 +232,7 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
     """Pulses learned from one echo per cluster and from all echoes, two rounds each; before them a Gaussian."""
     system = begin.system
     if not (system.components or system.kappa):
-        every = explain(block, _bear(system, begin.change), width_prior=0.0)
-        own = find_own_width(every, shape_limits(system, block.spacing).ref)
-        yield "gaussian of all echoes", replace(system, sigma_ref=system.sigma_ref * own)
+        yield OF_ALL, _find_gaussian(block, system, begin.change)
     for name, options in ROUNDS.items():
         for last in (False, True):
             explained = explain(block, _bear(system, begin.change), **options)
@@ -313,7 +324,8 @@ def _decide(found: list[Candidate]) -> Choice:
         )
         for one in sorted(found, key=lambda one: one.typical)
     ]  # fmt: skip
-    return Choice(best, tuple(tried), doubt, spread, max(len(tied), len(best.as_likely)) > 1)
+    other = any(one.gaussians != best.gaussians for one in tied) or spread > SAME_WIDTH or doubt > 1 - AS_FEW
+    return Choice(best, tuple(tried), doubt, spread, other)
 
 
 def _decide_by_more(block: WaveformBlock, found: list[Candidate], first: Choice) -> Choice:
@@ -329,10 +341,10 @@ def _decide_by_more(block: WaveformBlock, found: list[Candidate], first: Choice)
 
 def _beats(shorter: Candidate, longer: Candidate) -> bool:
     """Whether a candidate describes so much shorter that it is taken in place of the other."""
-    if longer.known and not shorter.known:
-        saved = (longer.typical - shorter.typical) * len(longer.length) / max(longer.echoes, 1)
-        return saved > LEAST_SAVED and longer.exceeds(shorter) > _bound_errors(shorter, longer)
-    return longer.exceeds(shorter) > _bound_errors(shorter, longer)
+    least = LEAST_SAVED if longer.gaussians == 1 < shorter.gaussians else 0.0
+    least = LEAST_OF_KNOWN if longer.known and not shorter.known else least
+    saved = (longer.typical - shorter.typical) * len(longer.length) / max(longer.echoes, 1)
+    return saved > least and longer.exceeds(shorter) > _bound_errors(shorter, longer)
 
 
 def _bound_errors(shorter: Candidate, longer: Candidate) -> float:

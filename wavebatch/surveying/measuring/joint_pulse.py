@@ -18,7 +18,6 @@ from wavebatch.kernels.fit.learn_pulse import (
     MOST_COMPONENTS,
     PulseFit,
     Stack,
-    find_step,
     fit_gaussians,
     refine_gaussians,
 )
@@ -43,8 +42,9 @@ deviation: a fifth of what the second difference of a Gaussian pulse is there.""
 EARLY, LATE = 0.02, 0.15
 """The same far before and after the core, over its value: before a pulse there is hardly anything."""
 
-TAIL_STEP = 5.0
-"""Steps of the lag at which the tail is drawn, over those of the core."""
+STEP, FINEST, TAIL_STEP = 0.07, 0.2, 5.0
+"""Steps of the lag at which the core is drawn, [widths] and at least [samples]: no pulse bends faster; and those in the
+tail over them."""
 
 LEAST_CHANGE = 0.003
 """Least misfit that is expected of the strongest echoes, so that a few do not decide alone."""
@@ -98,7 +98,7 @@ def learn_jointly(
     missed = [float(np.mean(_miss(fit, stack) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
-    misfit = misfit_of(_miss(best, stack)[core], find_step(system.sigma_ref / spacing), width)
+    misfit = misfit_of(_miss(best, stack)[core], max(FINEST, STEP * system.sigma_ref / spacing), width)
     system = replace(system, kappa=0.0, components=(), ringing=0.0, misfit=misfit)
     if len(best.components) == 1:
         return replace(system, sigma_ref=float(best.components[0, 2]) * spacing)
@@ -144,7 +144,7 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     matrix += 1e-9 * np.trace(matrix) / len(delay) * np.eye(len(matrix))
     inverse = solve(matrix, np.eye(len(matrix)))
     weight = np.einsum("ij,j->i", inverse, right)
-    step, end = find_step(width), min(AFTER * width, 0.8 * s)
+    step, end = max(FINEST, STEP * width), min(AFTER * width, 0.8 * s)
     lag = np.r_[np.arange(-6 * width, 8 * width, step), np.arange(8 * width, end, TAIL_STEP * step)]
     rows = exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2) / sigma
     value = np.einsum("lk,k->l", rows, weight[:-1])

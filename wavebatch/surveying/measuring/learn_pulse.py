@@ -138,7 +138,7 @@ def _learn(
     """The pulse of echoes whose signal (m, k), without baseline and other echoes, is given from the sample `first`."""
     width = system.sigma_ref / block.spacing
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
-    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first, width)
+    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = REACHED * system.noise.std / strongest
     small = len(block) < SMALL
