@@ -11,7 +11,7 @@ import wavebatch as wb
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip
 from wavebatch.core.order import group_medians
 from wavebatch.surveying.calibrating.adjust_flight import TIE, Anchors, Ties, adjust_constants, measure_ties
-from wavebatch.surveying.calibrating.calibration_file import load_calibration
+from wavebatch.surveying.calibrating.calibration_files import load_calibration
 
 GAINS = {("a", 1): 1.0, ("b", 1): 1.08, ("c", 1): 0.95, ("c", 2): 0.4275}
 """Of each strip and channel: strips drift, and channel 2 has 0.45 of the gain of channel 1."""
