@@ -18,8 +18,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
-from wavebatch.kernels.fit.cluster import Settings, Solution, choose
-from wavebatch.kernels.fit.decompose import decompose_clusters
+from wavebatch.kernels.fit.decompose import Settings, Solution, choose, decompose_clusters
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.kernels.fit.render import render_echoes, render_skewed, skewed_pulse
 from wavebatch.stages.chain import Range, Step, stage

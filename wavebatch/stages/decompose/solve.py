@@ -14,8 +14,14 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings, Solution, cluster_candidates
-from wavebatch.kernels.fit.decompose import decompose_clusters
+from wavebatch.kernels.fit.decompose import (
+    Candidates,
+    Clusters,
+    Settings,
+    Solution,
+    cluster_candidates,
+    decompose_clusters,
+)
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.fit.whole_pulse import keep_echoes
 from wavebatch.kernels.library import Samples
