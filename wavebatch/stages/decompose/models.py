@@ -31,7 +31,7 @@ from wavebatch.stages.decompose.solve import (
     fit_gaussian,
     make_settings,
 )
-from wavebatch.stages.detect.candidates import samples_of
+from wavebatch.stages.detect.direct import samples_of
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, reference_pulse, shape_limits
 
 POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
