@@ -20,8 +20,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.kernels.signal.signal import find_peaks
 from wavebatch.stages.chain_file import parse_chain
-from wavebatch.stages.decompose.fit import gaussian
-from wavebatch.stages.decompose.loops import residual_loop
+from wavebatch.stages.decompose.fit import gaussian, residual_loop
 from wavebatch.stages.decompose.models import render_table, skewed
 from wavebatch.stages.detect.candidates import signal_above
 from wavebatch.stages.detect.direct import maximum

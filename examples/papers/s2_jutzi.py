@@ -20,7 +20,7 @@ from table import Table, main, scatter
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings
 from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
 from wavebatch.stages.decompose.fit import gauss_newton

@@ -16,11 +16,11 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSI
 PROFILE = ["--profile", "fast"]
 
 
-@pytest.fixture(scope="module")
-def strips(tmp_path_factory):
-    """Three strips, the last with two units."""
+@pytest.fixture(scope="module", params=[300, pytest.param(56_000, marks=pytest.mark.slow)])
+def strips(request, tmp_path_factory):
+    """Three strips, the last with one unit or two."""
     folder = tmp_path_factory.mktemp("strips")
-    for name, pulses in (("a", 300), ("b", 300), ("c", 56_000)):
+    for name, pulses in (("a", 300), ("b", 300), ("c", request.param)):
         simulate_strip("flat", folder / f"{name}.las", pulses=pulses, seed=1)
     return folder
 
@@ -93,7 +93,7 @@ def _is_tracker(pid):
         return False
 
 
-@pytest.mark.quick_cases("event1")
+@pytest.mark.quick_cases("300-event1")
 @pytest.mark.parametrize("event", [REPORTED, DRAWN_UP])
 def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips, undisturbed, tmp_path, event):
     out = tmp_path / "out"
@@ -103,7 +103,7 @@ def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips,
     assert read_outputs(out) == undisturbed
 
 
-@pytest.mark.slow
+@pytest.mark.quick_cases("300-15")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path, number):
     out = tmp_path / "out"
@@ -115,7 +115,7 @@ def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path
         assert path.with_name(path.name.replace(".report.json", ".laz")).exists()
 
 
-@pytest.mark.quick_cases("True")
+@pytest.mark.quick_cases("300-True")
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
 @pytest.mark.parametrize("stopped", [False, True])
 def test_workers_die_with_their_parent(strips, tmp_path, stopped):
@@ -201,7 +201,6 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
 def test_a_strip_at_which_a_worker_dies_is_tried_once_more_and_only_then_fails(strips, undisturbed, tmp_path):
     script = tmp_path / "shot.py"
     out = tmp_path / "out"

@@ -8,7 +8,7 @@ import laspy
 import numpy as np
 from click.testing import CliRunner
 
-from wavebatch.cli.simulate import simulate
+from wavebatch.cli.strips import simulate
 from wavebatch.tools.simulate import SCENES, TruthReader
 
 

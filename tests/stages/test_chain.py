@@ -8,8 +8,7 @@ import pytest
 
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.stages import chain as chain_module
 from wavebatch.stages.chain import KINDS, STAGES, Chain, Range, Step, stage
 from wavebatch.stages.chain_file import list_profiles, load_profile

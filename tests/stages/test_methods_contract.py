@@ -6,8 +6,7 @@ from contract_tools import SYSTEMS, assert_same, check_echoes, inputs, make_bloc
 
 from wavebatch import surveying
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.pulse_tables import error_factors, pulse_shape

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scoring import score
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.score import ErrorStats, find_isolated_echoes, list_pairs, match_echoes
 
 

@@ -8,8 +8,7 @@ import pytest
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.pulse_shape import PulseShape, measure_pulse
 from wavebatch.kernels.signal.noise import find_levels

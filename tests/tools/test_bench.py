@@ -31,9 +31,8 @@ import wavebatch
 from wavebatch.cli.options import parse_length
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse
-from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
+from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey

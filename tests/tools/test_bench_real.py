@@ -20,12 +20,10 @@ from writer_tools import data_file
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import InputError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain
-from wavebatch.surveying.measuring.trial import Trial, limit_surveys
-from wavebatch.surveying.systems.known_systems import find_source, known_systems
+from wavebatch.surveying.systems.known_systems import Trial, find_source, known_systems, limit_surveys
 from wavebatch.tools.simulate import simulate_strip
 
 

@@ -12,8 +12,7 @@ from commands import run_command
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import InputError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.decompose.models import fitted_pulse, rebuild_waveforms

@@ -9,8 +9,7 @@ from commands import run_command
 from forest_scenes import fly, grow
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey, format_survey

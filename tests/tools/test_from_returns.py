@@ -12,7 +12,7 @@ from batch_tools import read_cloud, run_one
 from click.testing import CliRunner
 from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 
-from wavebatch.cli.simulate import synthesize
+from wavebatch.cli.strips import synthesize
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import HALF_C, SQRT_2PI
-from wavebatch.core.waveforms import Digitizer, SystemPulse
+from wavebatch.core.waveforms import Digitizer, ReceiverNoise, SystemPulse
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.writer import FullwaveWriter

@@ -1,7 +1,7 @@
 """Decomposers with other pulse models, for comparison, and the waveform of any fitted echoes.
 
 Chains name the decomposers: generalized Gaussians, the strip's pulse, Gauss-Newton steps without damping, and skewed
-pulses: the log-normal of Wang et al. with a skew per strip or per echo. `plot`, `compare` and `loops` call
+pulses: the log-normal of Wang et al. with a skew per strip or per echo. `plot`, `compare` and the loops of `fit` call
 `rebuild_waveforms` and its parts: the sum of the fitted pulses is what a decomposer's echoes stand for.
 """
 

@@ -1,4 +1,4 @@
-"""The steps that all fitting decomposers share: `fit`, `models` and `loops` call them.
+"""The steps that all fitting decomposers share: `fit` and `models` call them.
 
 Candidates of a detector become clusters in samples, without false ones, grouped where they overlap; settings and fits
 of all clusters follow, and at the end the flagged table in ns.

@@ -21,7 +21,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
-from wavebatch.core.system import angle_across, angle_to_vertical, swath_columns
+from wavebatch.core.waveforms import angle_across, angle_to_vertical, swath_columns
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.files.strip.reader import StripReader

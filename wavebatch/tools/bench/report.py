@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.optional import advise_install
+from wavebatch.core.errors import advise_install
 from wavebatch.files.disk.publish import reporting
 from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
 from wavebatch.files.text_file import write_text
