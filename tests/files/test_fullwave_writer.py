@@ -10,7 +10,7 @@ from writer_tools import BACKENDS, random_points, read_raw, write_strip
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.las.header import ExtraRecord, find_evlrs, read_header
-from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.strip.packets import FullwaveWriter
 
 FORMATS = [(4, "1.3"), (5, "1.3"), (4, "1.4"), (5, "1.4"), (9, "1.4"), (10, "1.4"), (9, "1.5"), (10, "1.5")]
 ONE = (Digitizer(1, 8, 80, 1.0),)

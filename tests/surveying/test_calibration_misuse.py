@@ -19,7 +19,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
-from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibration import Calibration, ChannelConstant
 from wavebatch.surveying.matching import setting

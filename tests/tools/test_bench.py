@@ -36,7 +36,7 @@ from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
-from wavebatch.tools.bench import command, report
+from wavebatch.tools.bench import command
 from wavebatch.tools.bench.accuracy import (
     SURVEY_SCATTER,
     AccuracyTally,
@@ -58,12 +58,12 @@ from wavebatch.tools.bench.command import (
     BenchOptions,
     BenchWorkerDied,
     Worker,
+    format_document,
     list_methods,
     peak_memory,
     run_bench,
     shape_scene,
 )
-from wavebatch.tools.bench.report import format_document
 from wavebatch.tools.simulate import (
     PULSES,
     PulseModel,
@@ -179,7 +179,7 @@ def test_nothing_to_measure():
 
 @pytest.mark.slow
 def test_command_writes_what_it_prints(tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "has_matplotlib", lambda: False)
+    monkeypatch.setattr(command, "has_matplotlib", lambda: False)
     options = "--scene flat --waveforms 800 --pulses 0 --repeat 1 --json"
     chain = tmp_path / "mine.toml"
     chain.write_text(
@@ -198,7 +198,7 @@ def test_command_writes_what_it_prints(tmp_path, monkeypatch):
 
 def test_plot_is_written_where_matplotlib_is(tmp_path, document):
     pytest.importorskip("matplotlib")
-    lines = report.write_outputs(document, "text", tmp_path)
+    lines = command.write_outputs(document, "text", tmp_path)
     assert lines == [f"{tmp_path}: bench.json, bench.txt, bench-flat.png"]
     assert (tmp_path / "bench-flat.png").read_bytes()[:4] == b"\x89PNG"
 

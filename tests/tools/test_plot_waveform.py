@@ -23,7 +23,7 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.surveying import survey_block
-from wavebatch.tools.bench.report import _draw_panel
+from wavebatch.tools.bench.command import _draw_panel
 from wavebatch.tools.compare_chains import ChainRun, measure_fit
 from wavebatch.tools.plots.charts import measure_view_residuals
 from wavebatch.tools.plots.draw_waveform import _draw_panels, draw_waveform_panels, draw_waveform_sheet
