@@ -23,7 +23,7 @@ from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
 from wavebatch.surveying.calibration import Calibration, ChannelConstant
 from wavebatch.surveying.matching import setting
-from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, weigh_change
+from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, weigh_alike, weigh_change
 from wavebatch.surveying.matching.strip_match import compare_setting, judge_fading
 
 pytestmark = pytest.mark.kept_surveys
@@ -342,6 +342,14 @@ def test_light_that_changes_evenly_along_a_strip_is_told_from_its_fields(rng, fa
     assert found.shift == pytest.approx(0.5 * np.log1p(fade), abs=0.06)
     forest = np.where(np.abs(time - 0.4) < 0.2, 0.5 * light, light)
     assert fade or _find_fading(time, forest).chance < 0.5
+
+
+def test_parts_of_one_field_count_as_few(rng):
+    """A slope's error is that of independent parts, and several times as large where halves are of two fields."""
+    alone = [weigh_alike(rng.standard_normal(32)) for _ in range(50)]
+    field = np.repeat([-1.0, 1.0], 16)
+    assert 1.2 < np.median(alone) < 2.5
+    assert weigh_alike(field + 0.1 * rng.standard_normal(32)) > 8
 
 
 @pytest.mark.slow
