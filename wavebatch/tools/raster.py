@@ -385,7 +385,10 @@ def write_grid(
         metrics = Forest(paths, options.size, options.forest)
         options = replace(options, columns=tuple(COLUMNS))
     _check(options)
-    options = replace(options, bbox=_grow(options.bbox, options.size))
+    if options.bbox is not None:  # up to the next borders of cells, so that no cell holds a part of its points only
+        west, south, east, north = (value / options.size for value in options.bbox)
+        borders = math.floor(west), math.floor(south), math.ceil(east), math.ceil(north)
+        options = replace(options, bbox=tuple(border * options.size for border in borders))
     crs, unit, unnamed = _find_crs(paths, options.crs)
     if metrics is not None and unit != "m":
         raise ConfigError(f"{paths[0]}: --forest: voxels are measured in metres, and coordinates are in {unit}; "
@@ -426,14 +429,6 @@ def _check(options: GridOptions) -> None:
     check_options(options)
     if not (math.isnan(options.no_data) or abs(options.no_data) <= float(np.finfo(np.float32).max)):
         raise ConfigError(f"--no-data must be nan or a number that float32 holds, got {options.no_data:g}")
-
-
-def _grow(bounds: Box | None, size: float) -> Box | None:
-    """The bounds up to the next borders of cells, so that no cell holds a part of its points only."""
-    if bounds is None:
-        return None
-    west, south, east, north = (value / size for value in bounds)
-    return math.floor(west) * size, math.floor(south) * size, math.ceil(east) * size, math.ceil(north) * size
 
 
 def _find_crs(paths: Sequence[Path], given: str | None) -> tuple[str | None, str, tuple[Path, ...]]:
