@@ -28,19 +28,12 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import option
 from wavebatch.core.units import MAD_TO_STD, PS_PER_NS, QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
+from wavebatch.files import pulsewaves_file
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.crs import GeoKeys, build_utm
 from wavebatch.files.las.header import GEOTIFF_ID, ExtraRecord, Vlr, read_header
-from wavebatch.files.pulsewaves_file import (
-    OUTGOING,
-    RETURNING,
-    PulseHeader,
-    PulsePiece,
-    PulseReader,
-    Segments,
-    read_pulse_header,
-)
+from wavebatch.files.pulsewaves_file import OUTGOING, RETURNING, PulseHeader, PulsePiece, PulseReader, Segments
 from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.signal.outgoing import OutgoingReference, find_reference, measure_outgoing
@@ -713,7 +706,7 @@ def import_file(
     InputError
         Where the file cannot be read to its end, or the strip cannot be written; nothing is left behind.
     """
-    header = read_pulse_header(path)
+    header = pulsewaves_file.read_pulse_header(path)
     source = {"file": path.name, **take_fingerprint(path, header.waves)}
     account = {"import": source, "options": options.describe(), "version": __version__}
     state = _find_state(target, account)
