@@ -24,7 +24,17 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.kernels.physics.radiometry import transmit
-from wavebatch.tools.simulate import render
+from wavebatch.tools.simulate.render import (
+    AIR_SPEED,
+    GROUND,
+    FlightLine,
+    PulseModel,
+    Recording,
+    SceneRays,
+    paint_echoes,
+    record_counts,
+    trace_rays,
+)
 
 MARGIN = 6.0
 """Distance that echoes keep from the ends of the window, in sigma of the pulse."""
@@ -46,9 +56,9 @@ class Canopy:
     @property
     def duration(self) -> float:
         """Two-way travel time through the stand [ns]."""
-        return self.height / render.AIR_SPEED
+        return self.height / AIR_SPEED
 
-    def draw(self, rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+    def draw(self, rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
         """Echoes of n waveforms, the ground's last."""
         plants = np.where(rng.random(n) < self.cover, rng.poisson(self.density * self.height, n), 0)
         count = plants + 1
@@ -183,7 +193,7 @@ class WithinDepth:
     margin: float = 4.0
     """Distance that echoes keep from the ends of the window, in sigma_ref."""
 
-    def __call__(self, rng: np.random.Generator, count: np.ndarray, recording: render.Recording) -> np.ndarray:
+    def __call__(self, rng: np.random.Generator, count: np.ndarray, recording: Recording) -> np.ndarray:
         low, high = _find_room(recording, self.margin)
         depth = min(self.depth, high - low)
         start = np.repeat(rng.uniform(low, high - depth, len(count)), count)
@@ -198,7 +208,7 @@ class WithGaps:
     high: float
     margin: float = 4.0
 
-    def __call__(self, rng: np.random.Generator, count: np.ndarray, recording: render.Recording) -> np.ndarray:
+    def __call__(self, rng: np.random.Generator, count: np.ndarray, recording: Recording) -> np.ndarray:
         low, high = _find_room(recording, self.margin)
         most = int(count.max(initial=1)) - 1
         top = min(self.high, (high - low) / max(most, 1)) if most * self.low < high - low else self.low
@@ -225,7 +235,7 @@ class WithGaps:
         return gaps
 
 
-def _find_room(recording: render.Recording, margin: float) -> tuple[float, float]:
+def _find_room(recording: Recording, margin: float) -> tuple[float, float]:
     """First and last time at which echoes may lie [ns]."""
     keep = min(margin * recording.pulse.sigma, recording.duration / 3)
     return keep, recording.duration - keep
@@ -243,16 +253,16 @@ def widen_on_slope(
     return wide, amplitude * np.cos(incidence) * sigma / wide
 
 
-Draw = Callable[[np.random.Generator, int, render.Recording], Drawn]
+Draw = Callable[[np.random.Generator, int, Recording], Drawn]
 
 
-def _middle(rng: np.random.Generator, n: int, recording: render.Recording, room: float = 10.0) -> np.ndarray:
+def _middle(rng: np.random.Generator, n: int, recording: Recording, room: float = 10.0) -> np.ndarray:
     """Times (n, 1) at least `room` sigma_ref from both ends, or as far as the window allows."""
     keep = min(room * recording.pulse.sigma, 0.4 * recording.duration)
     return rng.uniform(keep, recording.duration - keep, (n, 1))
 
 
-def draw_near(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_near(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """Two echoes of the system's width 0.5 to 2 sigma apart, amplitude 30 to 150, the second 0.2 to 1 of the first."""
     s = recording.pulse.sigma
     gap = s * rng.uniform(0.5, 2.0, (n, 1))
@@ -262,7 +272,7 @@ def draw_near(rng: np.random.Generator, n: int, recording: render.Recording) -> 
     return tabulate_echoes(np.hstack([start - gap / 2, start + gap / 2]), amplitude, s)
 
 
-def draw_saturated(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_saturated(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo 1.05 to 3.3 times as high as the receiver can record; in a third of the waveforms a weak one before."""
     s = recording.pulse.sigma
     strong = (recording.clip - recording.baseline) / rng.uniform(0.3, 0.95, (n, 1))
@@ -271,13 +281,13 @@ def draw_saturated(rng: np.random.Generator, n: int, recording: render.Recording
     return tabulate_echoes(np.hstack([before, time]), np.hstack([LogUniform(15, 60)(rng, (n, 1)), strong]), s)
 
 
-def draw_huge(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_huge(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo 5 to 500 times as high as the receiver can record: a flat top hides its amplitude."""
     strong = (recording.clip - recording.baseline) * LogUniform(5, 500)(rng, (n, 1))
     return tabulate_echoes(_middle(rng, n, recording), strong, recording.pulse.sigma)
 
 
-def draw_ringing(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_ringing(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One strong echo with lobes of -r at 4 and +r at 8 sigma after it, r = 1 to 5 %: one target only."""
     s = recording.pulse.sigma
     time = _middle(rng, n, recording)
@@ -288,7 +298,7 @@ def draw_ringing(rng: np.random.Generator, n: int, recording: render.Recording) 
     return tabulate_echoes(times, heights, s, ghost=np.array([False, True, True]))
 
 
-def draw_edge(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_edge(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo cut by the start or the end of the window: centre from 0.5 sigma outside to 2 sigma inside."""
     s = recording.pulse.sigma
     inside = s * rng.uniform(-0.5, 2.0, (n, 1))
@@ -296,12 +306,12 @@ def draw_edge(rng: np.random.Generator, n: int, recording: render.Recording) -> 
     return tabulate_echoes(time, LogUniform(20, 200)(rng, (n, 1)), s)
 
 
-def draw_tiny(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_tiny(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo of 2 to 6 counts."""
     return tabulate_echoes(_middle(rng, n, recording), LogUniform(2, 6)(rng, (n, 1)), recording.pulse.sigma)
 
 
-def draw_contrast(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_contrast(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """A strong echo and one of 6 to 12 counts 3.5 to 8 sigma before or after it."""
     s = recording.pulse.sigma
     time = _middle(rng, n, recording)
@@ -310,20 +320,20 @@ def draw_contrast(rng: np.random.Generator, n: int, recording: render.Recording)
     return tabulate_echoes(np.hstack([time, time + gap]), heights, s)
 
 
-def draw_broad(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_broad(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo 2.5 to 4 times as wide as the system pulse: steep ground, dense crown."""
     wide = recording.pulse.sigma * rng.uniform(2.5, 4.0, (n, 1))
     return tabulate_echoes(_middle(rng, n, recording, 12), LogUniform(20, 120)(rng, (n, 1)), wide)
 
 
-def draw_crowd(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_crowd(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """Eight echoes evenly over the window: more than most decomposers fit."""
     s = recording.pulse.sigma
     at = np.linspace(4 * s, recording.duration - 4 * s, 8) + 0.3 * s * rng.standard_normal((n, 8))
     return tabulate_echoes(at, LogUniform(15, 150)(rng, (n, 8)), s)
 
 
-def draw_constant(rng: np.random.Generator, n: int, recording: render.Recording) -> Drawn:
+def draw_constant(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """No echo: all samples 0, at the baseline, or at the receiver's limit."""
     levels = np.array([0.0, round(recording.baseline), recording.clip])[rng.integers(0, 3, n)]
     none = np.empty(0)
@@ -340,7 +350,7 @@ HAZARDS: dict[str, Draw] = {
 """Every hazard by name; scene `stiff` mixes them evenly, scene `stiff.<name>` holds one of them."""
 
 
-def draw_hazards(rng: np.random.Generator, n: int, recording: render.Recording, names: tuple[str, ...]) -> Drawn:
+def draw_hazards(rng: np.random.Generator, n: int, recording: Recording, names: tuple[str, ...]) -> Drawn:
     """Each waveform one of the named hazards, evenly at random."""
     kind = rng.integers(0, len(names), n)
     parts = []
@@ -386,16 +396,16 @@ class Scene:
     light: float = 0.0
     """amplitude sigma range^2 of a white surface that faces the sensor, without attenuation by the air [count ns m2].
     Above 0, amplitudes are those of Lambertian surfaces with GROUND_REFLECTS and ROOFS_REFLECT."""
-    flight: render.FlightLine | None = None
+    flight: FlightLine | None = None
     """None: the default Flight."""
     hazards: tuple[str, ...] = ()
     """Names of hazards that replace all of the above."""
     canopy: Canopy | None = None
     """A stand of plants that replaces counts, amplitude, width and times."""
-    recording: render.Recording = field(default_factory=render.Recording)
+    recording: Recording = field(default_factory=Recording)
     """The receiver."""
 
-    def draw(self, rng: np.random.Generator, n: int, rays: render.SceneRays) -> Drawn:
+    def draw(self, rng: np.random.Generator, n: int, rays: SceneRays) -> Drawn:
         """Echoes of n waveforms along n rays."""
         if self.hazards:
             return draw_hazards(rng, n, self.recording, self.hazards)
@@ -409,7 +419,7 @@ class Scene:
         sigma = self.width(rng, np.repeat(count == 1, count), self.recording.pulse.sigma)
         if self.light:
             # Of surfaces that face their ray, as bright as roofs or as ground.
-            reflectance = np.where(rays.ground[:, 2] > render.GROUND + LEAST_ROOF, ROOFS_REFLECT, GROUND_REFLECTS)
+            reflectance = np.where(rays.ground[:, 2] > GROUND + LEAST_ROOF, ROOFS_REFLECT, GROUND_REFLECTS)
             energy = self.light * reflectance * transmit(rays.distance, AIR_ATTENUATION) / rays.distance**2
             amplitude = energy[waveform] / self.recording.pulse.sigma
         if self.divergence:
@@ -455,8 +465,8 @@ _SCENES = (
         terrain="village",
         divergence=1.1,
         light=1.4e8,
-        flight=render.FlightLine(height=640.0, half_angle=10.0, look_ahead=0.0),
-        recording=render.Recording(n_samples=128, spacing=0.5, pulse=render.PulseModel(sigma=1.5 / FWHM_PER_SIGMA)),
+        flight=FlightLine(height=640.0, half_angle=10.0, look_ahead=0.0),
+        recording=Recording(n_samples=128, spacing=0.5, pulse=PulseModel(sigma=1.5 / FWHM_PER_SIGMA)),
     ),
     Scene(
         "shore",
@@ -482,13 +492,13 @@ _SCENES = (
         width=HalfBroadened(0.02, 4.0 / 1.9),
         times=WithGaps(2.5, 40.0),
         terrain="hills",
-        recording=render.Recording(noise_std=1.2, pulse=render.PulseModel(sigma=1.9)),
+        recording=Recording(noise_std=1.2, pulse=PulseModel(sigma=1.9)),
     ),
     Scene(
         "stiff",
         "every hazard in equal shares: " + ", ".join(HAZARDS) + "; `stiff.near` and so on hold one of them",
         hazards=tuple(HAZARDS),
-        recording=render.Recording(n_samples=96),
+        recording=Recording(n_samples=96),
     ),
 )
 
@@ -516,7 +526,7 @@ def find_scene(name: str | Scene) -> Scene:
         return replace(SCENES["stiff"], name=name, meaning=doc, hazards=(hazard,))
     if head == "canopy" and hazard in CANOPIES:
         meaning, canopy = CANOPIES[hazard]
-        window = render.Recording(n_samples=8 * -(-int(canopy.duration + 48.0) // 8))
+        window = Recording(n_samples=8 * -(-int(canopy.duration + 48.0) // 8))
         return Scene(name, meaning, canopy=canopy, recording=window)
     parts = [*(f"stiff.{known}" for known in HAZARDS), *(f"canopy.{known}" for known in CANOPIES)]
     names = [*SCENES, *OTHER_NAMES, *parts]
@@ -545,7 +555,7 @@ class Simulated:
 
     block: WaveformBlock
     truth: EchoTable
-    rays: render.SceneRays
+    rays: SceneRays
 
     def cut(self, start: int, stop: int) -> Simulated:
         """Pulses [start, stop)."""
@@ -553,13 +563,13 @@ class Simulated:
             return self
         a, b = np.searchsorted(self.truth.waveform, [start, stop])
         truth = self.truth.take(np.arange(a, b))
-        rays = {one.name: getattr(self.rays, one.name)[start:stop] for one in fields(render.SceneRays)}
+        rays = {one.name: getattr(self.rays, one.name)[start:stop] for one in fields(SceneRays)}
         truth = replace(truth, waveform=truth.waveform - np.int32(start))
-        return Simulated(self.block.rows(slice(start, stop)), truth, render.SceneRays(**rays))
+        return Simulated(self.block.rows(slice(start, stop)), truth, SceneRays(**rays))
 
 
 def simulate_block(
-    scene: Scene | str, n: int, rng: np.random.Generator, *, recording: render.Recording | None = None
+    scene: Scene | str, n: int, rng: np.random.Generator, *, recording: Recording | None = None
 ) -> tuple[WaveformBlock, EchoTable]:
     """A block of n waveforms of the scene and the truth: an EchoTable of the echoes in it.
 
@@ -598,7 +608,7 @@ def seed_block(scene: Scene) -> int:
     return min(SEED_BLOCK, SEED_SAMPLES // scene.recording.n_samples)
 
 
-def simulate_seed_block(scene: Scene, seed: int, number: int, flight: render.FlightLine | None = None) -> Simulated:
+def simulate_seed_block(scene: Scene, seed: int, number: int, flight: FlightLine | None = None) -> Simulated:
     """Pulses [k number, k (number + 1)) of the scene with this seed, k from `seed_block`."""
     n = seed_block(scene)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
@@ -606,14 +616,14 @@ def simulate_seed_block(scene: Scene, seed: int, number: int, flight: render.Fli
 
 
 def simulate_pulses(
-    scene: Scene, n: int, rng: np.random.Generator, *, first: int = 0, flight: render.FlightLine | None = None
+    scene: Scene, n: int, rng: np.random.Generator, *, first: int = 0, flight: FlightLine | None = None
 ) -> Simulated:
     """Block, truth and rays of pulses [first, first + n)."""
     recording = scene.recording
-    rays = render.trace_rays(flight or scene.flight or render.FlightLine(), scene.terrain, first + np.arange(n))
+    rays = trace_rays(flight or scene.flight or FlightLine(), scene.terrain, first + np.arange(n))
     drawn = scene.draw(rng, n, rays)
-    signal = render.paint_echoes(recording, n, drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
-    counts = render.record_counts(recording, signal, rng, drawn.constant)
+    signal = paint_echoes(recording, n, drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
+    counts = record_counts(recording, signal, rng, drawn.constant)
     real = slice(None) if drawn.ghost is None else ~drawn.ghost
     truth = EchoTable.build(drawn.waveform[real], drawn.time[real], drawn.amplitude[real], drawn.sigma[real])
     truth = flag_truth(truth, recording)
@@ -633,7 +643,7 @@ def simulate_pulses(
     return Simulated(block, truth, rays)
 
 
-def flag_truth(truth: EchoTable, recording: render.Recording) -> EchoTable:
+def flag_truth(truth: EchoTable, recording: Recording) -> EchoTable:
     """The truth with flags for what makes an echo hard to find: OVERLAPPED, NEAR_EDGE, SATURATED, WEAK."""
     sigma = truth.sigma.astype(np.float64)
     close = np.diff(truth.time) < NEIGHBOUR * np.maximum(sigma[1:], sigma[:-1])
