@@ -25,7 +25,7 @@ from wavebatch.core.process import keep_freed_memory
 from wavebatch.files.disk.temp_store import owning_scratch
 
 if TYPE_CHECKING:
-    from wavebatch.batch.workers.spawned import Call, Worker
+    from wavebatch.batch.workers.spawned import Call, PipedProcess
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
@@ -54,7 +54,7 @@ class Workers:
         """Most calls that may be under way; two per process keep it busy while results are written."""
         keep_freed_memory()
         self._calls: SimpleQueue[Call | None] = SimpleQueue()
-        self._workers: list[Worker] = []
+        self._workers: list[PipedProcess] = []
         self._stack = contextlib.ExitStack()
         self._scratch: Path | None = None
         self._needs_main = False
@@ -72,7 +72,7 @@ class Workers:
         """Return the future result of `function(*arguments)`; both must be picklable."""
         if self.jobs == 1:
             return settle_future(Future(), function, *arguments)
-        from wavebatch.batch.workers.spawned import Call, Worker, end_early, start_early, take_early
+        from wavebatch.batch.workers.spawned import Call, PipedProcess, end_early, start_early, take_early
 
         payload = pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL)
         self._needs_main = self._needs_main or _MAIN in payload
@@ -81,7 +81,7 @@ class Workers:
             with uninterrupted():
                 start_early(self.jobs - len(self._workers), self._needs_main)
                 while len(self._workers) < self.jobs:
-                    self._workers.append(Worker(take_early(), self._calls, self._scratch))
+                    self._workers.append(PipedProcess(take_early(), self._calls, self._scratch))
                 end_early()
         call = Call(payload)
         self._calls.put(call)

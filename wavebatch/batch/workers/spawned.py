@@ -111,7 +111,7 @@ def take_early() -> _Process:
     return _early.pop(0)
 
 
-class Worker:
+class PipedProcess:
     """A process, and the thread that hands it calls and takes its results through a pipe.
 
     One pipe per process: a process that dies in the middle of a result cannot block the results of the others.
