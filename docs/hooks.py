@@ -20,7 +20,7 @@ import click
 import wavebatch
 from wavebatch.batch.options import describe_options
 from wavebatch.cli import COMMANDS, main
-from wavebatch.cli.program.command import group_options
+from wavebatch.cli.command import group_options
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.stages.chain import KINDS, STAGES
 from wavebatch.stages.chain_file import format_step

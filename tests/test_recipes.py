@@ -125,6 +125,28 @@ def test_recipe(folder, title):
         assert "Median" in shown
 
 
+def test_tiles_have_every_point_once_with_all_columns(folder, riegl):
+    """Of two clouds with other offsets; a tile has them in the order of the clouds."""
+    clouds = folder / "flight"
+    assert wavebatch.run(riegl, clouds, profile="fast").failed == 0
+    old = laspy.read(clouds / f"{riegl.stem}.laz")
+    moved = laspy.read(clouds / f"{riegl.stem}.laz")
+    moved.change_scaling(offsets=moved.header.offsets + [7.0, -3.0, 0.5])
+    moved.write(clouds / "moved.laz")
+    _run(folder, f"python examples/gis/tiles.py 15 squares flight/{riegl.stem}.laz flight/moved.laz")
+    tiles = {path.stem: laspy.read(path) for path in (folder / "squares").iterdir()}
+    assert len(tiles) > 5 and sum(map(len, tiles.values())) == 2 * len(old)
+    for name, tile in tiles.items():
+        low = np.array([int(word) for word in name.split("_")])
+        mine = np.all(np.stack([old.x, old.y], axis=1) // 15 * 15 == low, axis=1)
+        assert tile.header.vlrs.get("WktCoordinateSystemVlr")[0].string
+        assert str(list(tile.point_format.extra_dimensions)) == str(list(old.point_format.extra_dimensions))
+        for column in ("x", "y", "z", *old.point_format.dimension_names):
+            if column not in "XYZ":
+                both = np.tile(old[column][mine], 2)
+                np.testing.assert_allclose(tile[column], both, rtol=0, atol=1e-6, err_msg=column)
+
+
 @pytest.mark.parametrize("most", [50_000, 60])
 def test_copc_by_copclib_keeps_points_columns_and_crs(folder, riegl, most):
     """Also with nodes of a few points: readers find each node by way of those above it."""

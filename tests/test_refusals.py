@@ -242,7 +242,7 @@ TOOLS = [
     (f"{COMPARE} strip.las --limit 5", 2, "--limit is of no use without --strip"),
     (f"{COMPARE} strip.las --system x.toml", 2, "--system is of no use without --strip"),
     (f"{CHAINS} fats", 2, "fats: is neither a file nor a shipped chain; did you mean 'fast'?"),
-    (f"{CHAINS} fast --truth truth.npz", 2, "--strip and --truth exclude each other"),
+    (f"{CHAINS} fast --truth truth.npz", 2, "--strip and --truth exclude each other; `wavebatch bench` compares"),
     (f"{CHAINS} fast run/strip.laz --limit 5", 2, "leave --limit out"),
     (f"{CHAINS} run/strip.laz", 2, "without --strip"), (f"{CHAINS} run/strip.laz cloud.laz", 2, "without --strip"),
     (f"{CHAINS} fast none.toml", 2, "none.toml"), (f"{CHAINS} fast none.las", 2, "none.las"),

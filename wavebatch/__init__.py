@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from wavebatch.files.cloud.cloud_reader import read_cloud
     from wavebatch.stages.chain import Chain, Range, Step, stage
     from wavebatch.surveying.systems.survey_result import Decision, Survey
-    from wavebatch.tools.api.run import run
-    from wavebatch.tools.api.strip import Strip, auto_chain, load_chain, open_strip, survey
+    from wavebatch.tools.api import Strip, auto_chain, load_chain, open_strip, run, survey
 
 __version__ = "0.1.0"
 
@@ -41,8 +40,7 @@ _MODULES = {
     "stages.chain": ("Chain", "Range", "Step", "stage"),
     "batch.options": ("RunOptions",),
     "surveying.systems.survey_result": ("Decision", "Survey"),
-    "tools.api.run": ("run",),
-    "tools.api.strip": ("Strip", "auto_chain", "load_chain", "open_strip", "survey"),
+    "tools.api": ("Strip", "auto_chain", "load_chain", "open_strip", "run", "survey"),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 

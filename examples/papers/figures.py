@@ -19,7 +19,7 @@ from wavebatch.core.units import HALF_C
 from wavebatch.files.figure_file import open_picture
 from wavebatch.kernels.physics.incidence import PAPER_TAU, paper_table, pulse_table, spread_of_angle, spread_pulse
 from wavebatch.stages.decompose.fit import gaussian
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.detect.transformed import transform, wavelet
 from wavebatch.tools.simulate.returns import SynthesisOptions, synthesize_strip
 

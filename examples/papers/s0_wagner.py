@@ -25,7 +25,7 @@ from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 from wavebatch.stages.attribute.basic import position
 from wavebatch.stages.attribute.radiometry import cross_section
 from wavebatch.stages.decompose.fit import gaussian
-from wavebatch.stages.detect.maximum import TWICE_SMOOTHED_GAIN, maximum
+from wavebatch.stages.detect.direct import TWICE_SMOOTHED_GAIN, maximum
 from wavebatch.stages.detect.transformed import asdf
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.simulate import simulate_block

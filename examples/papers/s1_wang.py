@@ -24,7 +24,7 @@ from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.loops import residual_loop
 from wavebatch.stages.decompose.models import render_table, skewed
 from wavebatch.stages.detect.candidates import signal_above
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.detect.transformed import wavelet
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.score import match_echoes

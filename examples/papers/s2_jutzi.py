@@ -24,8 +24,7 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings
 from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
 from wavebatch.stages.decompose.fit import gauss_newton
-from wavebatch.stages.detect.classic import sustained_threshold
-from wavebatch.stages.detect.maximum import matched_filter
+from wavebatch.stages.detect.direct import matched_filter, sustained_threshold
 from wavebatch.tools.scan_slices import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.render import GROUND

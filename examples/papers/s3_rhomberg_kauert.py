@@ -28,7 +28,7 @@ from wavebatch.kernels.physics.incidence import (
 )
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.stages.decompose.fit import gaussian
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.tools.simulate.render import record_counts
 
 HEIGHT, DIVERGENCE, LENGTH = 640.0, 1.1e-3, 1.5

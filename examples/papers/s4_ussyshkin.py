@@ -22,7 +22,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse
 from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section, transmit
 from wavebatch.stages.decompose.fit import gaussian
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.tools.return_stats import ReturnStats, count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, simulate_returns
 from wavebatch.tools.simulate.render import paint_echoes

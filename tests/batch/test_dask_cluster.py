@@ -152,20 +152,22 @@ def _spool_everything():
     """Makes a worker spool to disk, and note where."""
     from wavebatch.files.disk import temp_store
 
-    make, temp_store.made, temp_store.kept = temp_store.make_folder, [], temp_store.SPOOL_KEPT
+    make, temp_store.made = temp_store.make_folder, []
 
     def make_folder():
         temp_store.made.append(str(make()))
         return temp_store.Path(temp_store.made[-1])
 
-    temp_store.unwatched, temp_store.make_folder, temp_store.SPOOL_KEPT = make, make_folder, 0
+    temp_store.unwatched, temp_store.make_folder = make, make_folder
+    temp_store.Spool.__init__.__kwdefaults__["kept"] = 0
 
 
 def _spool_as_ever():
     """Takes that back; the folders that were made."""
     from wavebatch.files.disk import temp_store
 
-    temp_store.SPOOL_KEPT, temp_store.make_folder = temp_store.kept, temp_store.unwatched
+    temp_store.make_folder = temp_store.unwatched
+    temp_store.Spool.__init__.__kwdefaults__["kept"] = temp_store.SPOOL_KEPT
     return temp_store.made
 
 

@@ -14,7 +14,6 @@ import pytest
 from commands import run_command
 from strips import descriptor, make_raw, vlr
 
-from wavebatch.batch import neighbour_pass
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.neighbour_pass import ENTRY, SecondPass, process_tile
@@ -24,7 +23,6 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.disk import temp_store
 from wavebatch.kernels.geometry.normals import Gap
 from wavebatch.stages.chain import STAGES, Stage, Step
 from wavebatch.stages.chain_file import parse_chain
@@ -47,10 +45,9 @@ def strips(tmp_path_factory):
     return folder
 
 
-def run_strip(path, folder, *, columns=None, chain=None, batch=None, chosen=None, **options):
+def run_strip(path, folder, *, columns=None, chain=None, batch=None, known=None, **options):
     chain = chain or parse_chain(CHAIN, "test")
-    job = StripJob(Path(path), chain, RunOptions(**options), choose_columns(chain, columns))
-    job = job if chosen is None else replace(job, chosen=chosen)
+    job = StripJob(Path(path), chain, RunOptions(**options), choose_columns(chain, columns), **known or {})
     outcome = run_batch([job], RunOptions(Path(folder), **(batch or {}))).outcomes[0]
     assert outcome.error is None, outcome.error
     return outcome.report
@@ -105,16 +102,6 @@ def test_the_same_bytes_for_any_jobs_and_blocks(strips, clouds, tmp_path, batch)
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_the_same_bytes_for_any_tiles(strips, clouds, tmp_path, monkeypatch):
-    monkeypatch.setattr(neighbour_pass, "TILE_POINTS", 900)
-    monkeypatch.setattr(neighbour_pass, "PART_POINTS", 400)
-    monkeypatch.setattr(neighbour_pass, "SAMPLE", 5000)
-    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 1 << 18)
-    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 1 << 16)
-    run_strip(strips / "urban.las", tmp_path)
-    assert (tmp_path / "urban.laz").read_bytes() == (clouds[0] / "urban.laz").read_bytes()
-
-
 def test_returns_and_other_names(strips, clouds, tmp_path):
     report = run_strip(strips / "urban.las", tmp_path, points="returns", names="pdal", format="las")
     cloud = laspy.read(tmp_path / "urban.las")
@@ -133,14 +120,13 @@ def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: Echo
 
 
 @pytest.mark.parametrize("points", ["echoes", "returns"])
-def test_stages_after_it_see_its_columns_whatever_the_units(strips, clouds, tmp_path, monkeypatch, points):
+def test_stages_after_it_see_its_columns_whatever_the_units(strips, clouds, tmp_path, points):
     """They are ordinary stages, and their columns decide what is written."""
     after = Stage("attribute.energy", "attribute", energy, {}, ("energy",), (COLUMNS[0],))
     chain = parse_chain(CHAIN, "test")
     chain = replace(chain, steps=(*chain.steps, Step(after)))
-    monkeypatch.setattr("wavebatch.files.strip.reader.UNIT_POINTS", 3000)
-    chosen = PointFilter.build(where="energy < 40 and z > 0")
-    report = run_strip(strips / "slope.las", tmp_path, chain=chain, chosen=chosen, points=points)
+    known = {"chosen": PointFilter.build(where="energy < 40 and z > 0"), "unit_points": 3000}
+    report = run_strip(strips / "slope.las", tmp_path, chain=chain, known=known, points=points)
     cloud = laspy.read(tmp_path / "slope.laz")
     angle = np.asarray(cloud[COLUMNS[0]])
     assert len(cloud) > 2000 and (angle < 20).all()
@@ -151,10 +137,9 @@ def test_stages_after_it_see_its_columns_whatever_the_units(strips, clouds, tmp_
         np.testing.assert_array_equal(angle, whole[(whole != -9999) & (whole < 20)])
 
 
-def test_without_its_columns_there_is_no_second_pass(strips, tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.batch.neighbour_pass.SecondPass", None)
+def test_without_its_columns_there_is_no_second_pass(strips, tmp_path):
     report = run_strip(strips / "slope.las", tmp_path, columns="echo_flags")
-    assert not report.no_data
+    assert not report.no_data and not {"tiles", f"{STAGE}, second pass"} & report.timing.keys()
     assert COLUMNS[0] not in laspy.read(tmp_path / "slope.laz").point_format.dimension_names
 
 
@@ -250,7 +235,7 @@ def test_no_rows_one_row_and_rows_without_a_ray(tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_any_tiles_give_the_same_bits_on_any_points(tmp_path, monkeypatch, seed):
+def test_any_tiles_give_the_same_bits_on_any_points(tmp_path, seed):
     rng = np.random.default_rng(seed)
     spread = rng.uniform(0, 60, (2500, 3)) * [1, 1, 0.001]
     dense = rng.uniform(20, 22, (2500, 3)) * [1, 1, 0.001]
@@ -259,44 +244,22 @@ def test_any_tiles_give_the_same_bits_on_any_points(tmp_path, monkeypatch, seed)
     rows = make_rows(rng.permutation(xyz))
     whole = fill([rows], tmp_path, tile_points=10**9)
     assert np.count_nonzero(whole["gap"] == Gap.KNOWN) > 4000
-    monkeypatch.setattr(neighbour_pass, "PART_POINTS", 300)
-    monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)
-    again = fill(np.array_split(rows, 7), tmp_path, tile_points=200)
+    again = fill(np.array_split(rows, 7), tmp_path, tile_points=200, part_points=300, sample=1000)
     assert again.tobytes() == whole.tobytes()
 
 
 @pytest.mark.slow
-def test_very_many_points_in_one_place_take_no_more_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(neighbour_pass, "PART_POINTS", 2000)
-    monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)
-    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 1 << 16)
-    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 1 << 12)
-    monkeypatch.setattr("wavebatch.files.disk.temp_store.RowStore.pieces.__defaults__", (2000,))
-    rng, peaks = np.random.default_rng(3), []
-    for n in (8000, 40_000):
-        parts = [make_rows(rng.normal(0, 0.05, (2000, 3))) for _ in range(n // 2000)]
-        second = SecondPass(Step(STAGES[STAGE]), SCALES, tmp_path / "cloud.laz", tile_points=1000)
-        for rows in parts:
-            second.add(rows, np.zeros(3, np.uint8))
-        del parts
-        tracemalloc.start()
-        take_all(second, n)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-        second.close()
-    assert peaks[1] < 1.3 * peaks[0]
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_strip(tmp_path, monkeypatch):
-    monkeypatch.setattr(neighbour_pass, "SAMPLE", 4000)
-    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 1 << 20)
+@pytest.mark.parametrize("place", ["one place", "a long strip"])
+def test_memory_does_not_grow_with_the_points(tmp_path, place):
     peaks = []
+    sizes = {"tile_points": 10_000, "sample": 4000, "part_points": 20_000, "spooled": 1 << 20}
     for n in (60_000, 240_000):
         rng = np.random.default_rng(3)
-        second = SecondPass(Step(STAGES[STAGE]), SCALES, tmp_path / "cloud.laz", tile_points=10_000)
+        second = SecondPass(Step(STAGES[STAGE]), SCALES, tmp_path / "cloud.laz", **sizes)
         for start in range(0, n, 20_000):
-            xyz = rng.uniform(0, 100, (20_000, 3)) * [1, 1, 0.001] + [start / 200, 0, 0]
+            xyz = rng.normal(0, 0.05, (20_000, 3))
+            if place == "a long strip":
+                xyz = rng.uniform(0, 100, (20_000, 3)) * [1, 1, 0.001] + [start / 200, 0, 0]
             second.add(make_rows(xyz), np.zeros(3, np.uint8))
         tracemalloc.start()
         take_all(second, n)
@@ -307,8 +270,7 @@ def test_memory_does_not_grow_with_the_strip(tmp_path, monkeypatch):
     assert peaks[0] < 150e6
 
 
-def test_the_second_pass_is_not_told_as_units(strips, tmp_path, monkeypatch):
-    monkeypatch.setattr(neighbour_pass, "TILE_POINTS", 2000)
+def test_the_second_pass_is_not_told_as_units(strips, tmp_path):
     chain = parse_chain(CHAIN, "test")
     job = StripJob(strips / "slope.las", chain, columns=choose_columns(chain))
     events = []

@@ -3,5 +3,4 @@
 release       everything of `wavebatch bench`, other decomposers, stiff cases, start-up, memory, jobs, promised figures
 against       this wavebatch and another version take turns on the same strips
 real          echoes injected into the waveforms of real strips: `make bench-real STRIP=...`
-jobs_model    what each part of a run costs in each process, and what many jobs then reach
 """

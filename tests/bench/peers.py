@@ -21,7 +21,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
 from wavebatch.tools.bench.accuracy import AccuracyTally, Group
 from wavebatch.tools.bench.command import BenchWorkerDied, Laps, Worker, make_row

@@ -25,9 +25,9 @@ from commands import run_command
 import wavebatch as wb
 from wavebatch.batch.options import ELSEWHERE, EXCLUSIVE, NEEDS, OPTIONS, RunOptions
 from wavebatch.cli import COMMANDS, main
+from wavebatch.cli import command as program
+from wavebatch.cli.command import GROUPS, ProgramCommand, complete_files, group_options, roff
 from wavebatch.cli.messages import log_is_open
-from wavebatch.cli.program import command as program
-from wavebatch.cli.program.command import GROUPS, ProgramCommand, complete_files, group_options, roff
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import effective, parse_chain
 
@@ -337,7 +337,7 @@ def test_outputs_replace_neither_the_log_nor_the_settings(folder, tmp_path):
 def test_no_command_loads_linear_algebra_before_it_runs():
     """To explain a variable that no command reads, all commands load; SciPy's BLAS may wait for memory for ever."""
     script = (
-        "import sys, click; from wavebatch.cli import main; from wavebatch.cli.program.command import _load_all; "
+        "import sys, click; from wavebatch.cli import main; from wavebatch.cli.command import _load_all; "
         "assert len(dict(_load_all(click.Context(main)))) > 15; print('scipy.linalg' in sys.modules)"
     )
     shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)

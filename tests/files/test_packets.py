@@ -17,9 +17,10 @@ from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, record_
 from writer_tools import data_file
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.strip import packets, scanner
+from wavebatch.files.strip import packets
 from wavebatch.files.strip.packets import PacketFile, PacketPlace
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.scanner import ScanSizes
 
 
 def refused(path, pattern, **options):
@@ -475,7 +476,7 @@ def test_vectors_as_long_as_the_path_are_divided_by_minus_the_location(tmp_path,
 
 
 @pytest.mark.parametrize(("packets", "most_returns", "direction"), [(60, 3, "away"), (300, 2, "toward")])
-def test_returns_of_a_packet_vote_where_heights_say_nothing(tmp_path, monkeypatch, packets, most_returns, direction):
+def test_returns_of_a_packet_vote_where_heights_say_nothing(tmp_path, packets, most_returns, direction):
     """Also where they meet only far apart: no two returns of a packet lie in one unit or window."""
     raw = make_raw(packets, most_returns=most_returns)
     pulse = np.round((raw.points["gps_time"] - 1000) * 1e5).astype(int)
@@ -487,5 +488,4 @@ def test_returns_of_a_packet_vote_where_heights_say_nothing(tmp_path, monkeypatc
         raw.points[("x_t", "y_t", "z_t")[axis]] = vector[:, axis] * (1 if direction == "toward" else -1)
     if direction == "toward":
         raw.points = raw.points[np.argsort(raw.points["bit_fields"], kind="stable")]
-        monkeypatch.setattr(scanner, "WINDOW", 64)
-    assert scan_of(raw.write(tmp_path / "a.las")).vectors.direction == direction
+    assert scan_of(raw.write(tmp_path / "a.las"), sizes=ScanSizes(window=64)).vectors.direction == direction

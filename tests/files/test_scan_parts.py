@@ -9,19 +9,16 @@ import pytest
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.temp_store import Spool
-from wavebatch.files.strip import reader as strip_reader
 from wavebatch.files.strip import scanner
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.scanner import ScanSizes
 from wavebatch.tools.simulate import simulate_strip
 
-UNIT, WINDOW = 700, 200
+UNIT = 700
 
 
-@pytest.fixture(autouse=True)
-def small_units(monkeypatch):
-    monkeypatch.setattr(strip_reader, "UNIT_POINTS", UNIT)
-    monkeypatch.setattr(scanner, "WINDOW", WINDOW)
-    monkeypatch.setattr(scanner, "PART_UNITS", 1)
+def open_strip(path, **sizes):
+    return StripReader(path, unit_points=UNIT, sizes=ScanSizes(**{"window": 200, "part_units": 1, **sizes}))
 
 
 @pytest.fixture(scope="module", params=["las", "laz"])
@@ -33,7 +30,7 @@ def strip(request, tmp_path_factory):
 
 def scan(path, edges=None):
     """The scan of one process, or of one for all units between two edges each, which send it pickled."""
-    with StripReader(path) as reader:
+    with open_strip(path) as reader:
         if edges is None:
             return reader.scan(tolerant=True)
         parts = [reader.scan_units(*run) for run in itertools.pairwise(edges)]
@@ -58,7 +55,7 @@ def contents(found):
 
 
 def check(path):
-    with StripReader(path) as reader:
+    with open_strip(path) as reader:
         units = reader.unit_count()
     with scan(path) as whole:
         expected = contents(whole)
@@ -86,13 +83,13 @@ def test_parts_of_shuffled_points_too(tmp_path, edit_points, distance):
     assert any(check(tmp_path / "b.las")["context"])
 
 
-def test_a_part_of_few_points_before_a_border_is_not_cut_off(monkeypatch, strip):
-    with StripReader(strip) as reader:
+def test_a_part_of_few_points_before_a_border_is_not_cut_off(strip):
+    with open_strip(strip) as reader:
         units = reader.unit_count()
         assert reader.cut_scan(3) == [(0, units // 3), (units // 3, 2 * units // 3), (2 * units // 3, units)]
-        monkeypatch.setattr(scanner, "PART_UNITS", 4)
+    with open_strip(strip, part_units=4) as reader:
         assert len(reader.cut_scan(1000)) == units // 4
-        monkeypatch.setattr(scanner, "WINDOW", UNIT)  # a window of several units
+    with open_strip(strip, window=UNIT) as reader:  # a window of several units
         assert reader.cut_scan(3) == [(0, units)]
 
 
@@ -103,7 +100,7 @@ def test_a_strip_without_points_is_one_part():
 def test_parts_of_a_damaged_strip_fail_with_the_line_of_one_process(strip):
     """Wherever the damage is: the first part that fails names the same points."""
     content = strip.read_bytes()
-    with StripReader(strip) as reader:
+    with open_strip(strip) as reader:
         units, start = reader.unit_count(), reader.facts.header.offset_to_points
     bad = strip.with_name("bad" + strip.suffix)
     if strip.suffix == ".las":

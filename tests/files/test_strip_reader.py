@@ -3,6 +3,7 @@
 import errno
 import os
 import pickle
+import tempfile
 
 import numpy as np
 import pytest
@@ -11,11 +12,9 @@ from writer_tools import data_file, read_raw
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.publish import protecting, refuse_input
-from wavebatch.files.las import read_points
-from wavebatch.files.strip import scanner
 from wavebatch.files.strip.reader import LONG_SAMPLES, StripReader
+from wavebatch.files.strip.scanner import ScanSizes
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 LEICA = "leica-als/simple1_3_full_internal.las"
@@ -102,7 +101,7 @@ def _shuffled(tmp_path, points, order):
 @pytest.mark.quick_cases("reversed-16384", "by return-300", "random-300", "halves-64")
 @pytest.mark.parametrize("window", [16_384, 300, 64])
 @pytest.mark.parametrize("order", ["reversed", "by return", "random", "halves"])
-def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monkeypatch, order, window):
+def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, order, window):
     """Far sharing goes through the disk; the window is made so small that it must."""
     points = read_raw(data_file(RIEGL))
     orders = {
@@ -114,13 +113,10 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
     path = _shuffled(tmp_path, points, orders[order])
     kinds = {1: (16, 60), 2: (16, 120)}
     plain = read_plainly(points[orders[order]], path.with_suffix(".wdp").read_bytes(), kinds)
-    monkeypatch.setattr(scanner, "WINDOW", window)
-    monkeypatch.setattr(scanner, "BINS", 64)
-    monkeypatch.setattr(scanner, "_PER_BUCKET", 500)
-    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 100)
-    assert_same(read_all(path, size=50, unit_points=128), plain)
-    assert_same(read_all(path, size=50, owned_only=False, unit_points=128), plain)
-    with StripReader(path, unit_points=128) as reader, reader.scan() as scan:
+    small = {"unit_points": 128, "sizes": ScanSizes(window=window, bins=64, keys=500, spooled=100)}
+    assert_same(read_all(path, size=50, **small), plain)
+    assert_same(read_all(path, size=50, owned_only=False, **small), plain)
+    with StripReader(path, **small) as reader, reader.scan() as scan:
         assert (scan.packets, scan.with_waveform) == (2375, 2535)
         spans = [members[-1] - members[0] for _, members in plain.values()]
         assert scan.reach == max(spans)
@@ -261,13 +257,13 @@ def test_equal_offsets_of_two_descriptors_are_two_packets(tmp_path):
     assert len(found) == 20
 
 
-def test_too_many_points_on_one_packet_are_broken_wherever_they_are(tmp_path, monkeypatch):
-    for window in (16_384, 64):
-        monkeypatch.setattr(scanner, "WINDOW", window)
-        raw = make_raw(1000, most_returns=1)
-        bad = np.arange(0, 1000, 25)
-        raw.points["wavepacket_offset"][bad] = 60
-        with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
+def test_too_many_points_on_one_packet_are_broken_wherever_they_are(tmp_path):
+    raw = make_raw(1000, most_returns=1)
+    bad = np.arange(0, 1000, 25)
+    raw.points["wavepacket_offset"][bad] = 60
+    raw.write(tmp_path / "a.las")
+    for sizes in (ScanSizes(), ScanSizes(window=64)):
+        with StripReader(tmp_path / "a.las", unit_points=64, sizes=sizes) as reader, reader.scan() as scan:
             assert (scan.broken, scan.with_waveform, scan.packets) == (40, 960, 960)
             flags = np.concatenate([reader.read_unit(n, scan).point_flags for n in range(reader.unit_count())])
             assert np.flatnonzero(flags).tolist() == bad.tolist()
@@ -334,8 +330,7 @@ def test_a_strip_without_points_and_one_without_waveforms(tmp_path):
         assert list(reader.read_blocks(unit, 10, True)) == []
 
 
-def test_facts_scans_and_units_travel_between_processes(tmp_path, monkeypatch):
-    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 0)
+def test_facts_scans_and_units_travel_between_processes(tmp_path):
     raw = make_raw(64, most_returns=1)
     raw.points = np.concatenate([raw.points, raw.points])
     with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
@@ -352,26 +347,18 @@ def test_compressed_points_are_decoded_once(tmp_path, monkeypatch, case):
     def refuse(*args, **options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    calls = []
-
-    def decode(points, rows, decode=read_points.LazPoints._decode):
-        calls.append(len(rows))
-        decode(points, rows)
-
-    monkeypatch.setattr(temp_store, "SPOOL_MEMORY", 1)
-    if case == "beyond the limit":
-        monkeypatch.setattr(scanner, "_KEPT_BYTES", 150 * 57)
+    sizes = ScanSizes(spooled=1, kept_bytes=150 * 57 if case == "beyond the limit" else 1 << 20)
     if case == "no room":
-        monkeypatch.setattr(temp_store.tempfile, "mkdtemp", refuse)
+        monkeypatch.setattr(tempfile, "mkdtemp", refuse)
     raw = make_raw(200, most_returns=1)
     plain, path = raw.write(tmp_path / "a.las"), raw.write(tmp_path / "b.laz")
-    readers = StripReader(plain, unit_points=64), StripReader(path, unit_points=64)
+    readers = StripReader(plain, unit_points=64), StripReader(path, unit_points=64, sizes=sizes)
     with readers[0] as one, readers[1] as two, one.scan() as expected, two.scan() as scan:
-        monkeypatch.setattr(read_points.LazPoints, "_decode", decode)
+        if case == "kept":
+            path.write_bytes(path.read_bytes()[: two.facts.header.offset_to_points].ljust(path.stat().st_size, b"\0"))
         for number in range(one.unit_count()):
             units = one.read_unit(number, expected), two.read_unit(number, scan)
             assert len({unit.points.tobytes() for unit in units}) == 1
-    assert (len(calls) > 0) == (case != "kept")
     count = scan.decoded.count
     assert {"kept": count == 200, "no room": count == 0}.get(case, 0 < count < 200)
 

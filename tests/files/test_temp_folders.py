@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -15,8 +16,14 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk import temp_store
-from wavebatch.files.disk.temp_store import Spool, make_folder, owning_scratch, remove_orphans, use_scratch
+from wavebatch.files.disk.temp_store import (
+    Spool,
+    make_folder,
+    owning_scratch,
+    remove_orphans,
+    scratch_place,
+    use_scratch,
+)
 from wavebatch.tools.simulate import simulate_strip
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="file locks of POSIX systems")
@@ -107,7 +114,7 @@ def test_a_place_given_by_another_process_is_this_thread_s_only(tmp_path):
     found = []
     use_scratch(tmp_path)
     try:
-        thread = threading.Thread(target=lambda: found.append(temp_store.scratch_place()))
+        thread = threading.Thread(target=lambda: found.append(scratch_place()))
         thread.start()
         thread.join()
         assert make_folder().parent == tmp_path and found != [tmp_path]
@@ -118,26 +125,24 @@ def test_a_place_given_by_another_process_is_this_thread_s_only(tmp_path):
 def test_without_a_place_the_spool_says_so(tmp_path, monkeypatch):
     with owning_scratch(tmp_path / "missing") as folder:
         assert folder is None
-    monkeypatch.setattr("wavebatch.files.disk.temp_store.SPOOL_MEMORY", 1)
 
     def refuse(*args, **options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(temp_store.tempfile, "mkdtemp", refuse)
-    spool = Spool(2, np.dtype("<i8"))
+    monkeypatch.setattr(tempfile, "mkdtemp", refuse)
+    spool = Spool(2, np.dtype("<i8"), memory=1)
     with pytest.raises(InputError, match="No space left.*set TMPDIR"):
         spool.append(np.array([0, 1]), np.array([5, 6]))
 
 
 def test_a_spool_that_travels_takes_a_file_or_its_entries_with_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(temp_store, "SPOOL_KEPT", 0)
     use_scratch(tmp_path)
     try:
-        with Spool(2, np.dtype("<i8")) as spool:
+        with Spool(2, np.dtype("<i8"), kept=0) as spool:
             spool.append(np.array([1, 0, 1]), np.array([5, 6, 7]))
             assert spool.read(1).tolist() == [5, 7] and spool.path is None
             with monkeypatch.context() as full:
-                full.setattr(temp_store, "make_folder", lambda: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
+                full.setattr(tempfile, "mkdtemp", lambda **_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
                 assert pickle.loads(pickle.dumps(spool)).read(1).tolist() == [5, 7] and spool.path is None
             copies = [pickle.loads(pickle.dumps(spool)) for _ in range(2)]
             assert {copy.path for copy in copies} == {spool.path} and spool.path.exists()
@@ -151,9 +156,9 @@ def test_a_spool_that_travels_takes_a_file_or_its_entries_with_it(tmp_path, monk
 EVERY_PROCESS = """
 import os, signal
 from wavebatch.batch import strip_task
-from wavebatch.files.disk import temp_store
-from wavebatch.files.strip import reader
-temp_store.SPOOL_MEMORY, reader.UNIT_POINTS = 1, 500
+from wavebatch.files.strip import reader, scanner
+reader.UNIT_POINTS = 500
+object.__setattr__(scanner.SCAN_SIZES, "spooled", 1)
 
 def kill(task, *arguments):
     os.kill(os.getpid(), signal.SIGKILL)

@@ -57,16 +57,6 @@ def test_number_of_buckets():
     assert [count_buckets(rows, 100) for rows in (0, 1, 100, 101, 10**9)] == [1, 1, 1, 2, MOST_BUCKETS]
 
 
-def test_no_room_for_buckets_is_one_line(monkeypatch):
-    def full(*args, **options):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("wavebatch.files.disk.temp_store.make_folder", full)
-    monkeypatch.setattr("wavebatch.files.disk.temp_store.SPOOL_MEMORY", 1)
-    with pytest.raises(InputError, match="No space left on device.*TMPDIR"), Spool(2, ROW) as buckets:
-        buckets.append(spread_times(np.zeros(3), 2), np.zeros(3, ROW))
-
-
 def slow_sums(parts):
     sums = {}
     for key, value in parts:

@@ -10,7 +10,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import estimate_noise
 from wavebatch.stages.chain import STAGES
 from wavebatch.surveying.measuring.residuals import hides_noise
-from wavebatch.tools.api.strip import load_chain
+from wavebatch.tools.api import load_chain
 from wavebatch.tools.simulate import Recording, simulate_block
 
 

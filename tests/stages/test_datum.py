@@ -14,7 +14,7 @@ from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.signal.runs import lobe_edges
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.decompose.models import reference
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
 
 SIGMA = 2.0

@@ -8,7 +8,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.surveying import survey_block
 
 BASELINE, NOISE = 48.0, 4.0

@@ -9,7 +9,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
 
 N, SIGMA, STD = 600, 2.0, float(np.hypot(1, 1 / np.sqrt(12)))

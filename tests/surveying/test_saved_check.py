@@ -13,7 +13,7 @@ from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems.figures import Figures
 from wavebatch.surveying.systems.known_systems import known_systems
 from wavebatch.surveying.systems.saved_check import find_contradiction
-from wavebatch.tools.api.strip import survey
+from wavebatch.tools.api import survey
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 
 SCENES = {

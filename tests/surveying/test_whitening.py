@@ -10,7 +10,7 @@ from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.pulse_tables import noise_factors, pulse_shape
 from wavebatch.stages.score import match_echoes

@@ -18,10 +18,8 @@ import naive
 import numpy as np
 import pytest
 from bench import against, peers
-from bench import jobs_model as jobs
 from bench.against import compare_runs, format_paired, simulate_strips
 from bench.cases import CASES, list_cases, make_scene
-from bench.jobs_model import Parts
 from bench.promises import SPEEDS, format_promises, judge
 from bench.release import SCENES, format_release, measure_cases, read_options
 from bench.stability import FAILURES, count_changes, count_failures, measure_stability
@@ -401,76 +399,10 @@ def test_two_checkouts_take_turns(tmp_path, checkout):
     assert "flat" in (tmp_path / "out" / "against.txt").read_text()
 
 
-@pytest.mark.slow
-def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path, monkeypatch):
-    monkeypatch.setattr(jobs, "UNIT_POINTS", 1000)
-    jobs.main(["--scene", "flat", "--pulses", "3000", "--repeat", "1", "-o", str(tmp_path / "out")])
-    document = json.loads((tmp_path / "out" / "jobs.json").read_text())
-    parts = document["parts"]
-    assert 2900 < parts["waveforms"] <= 3000
-    assert all(parts[name] > 0 for name in ("start", "start_worker", "scan", "survey", "write", "strip"))
-    text = (tmp_path / "out" / "jobs.txt").read_text()
-    assert [line.split()[0] for line in text.splitlines()[11:16]] == ["1", "2", "4", "16", "64"]
-    (warning,) = document["warnings"]  # two units, which is few
-    assert "waveforms are fewer than 10 units" in warning and warning in text
-    assert parts["work"] >= 0 and parts["single"] >= 0
-
-
-@pytest.mark.slow
-def test_a_short_strip_predicts_nothing(tmp_path, monkeypatch):
-    """Of a strip that two jobs cannot share, what a waveform costs is no-data; no cost is negative."""
-    monkeypatch.setattr(jobs.Worker, "call", _call_slow_starter)
-    waveforms = {}
-    for unit in (1000, 1001):
-        monkeypatch.setattr(jobs, "UNIT_POINTS", unit)
-        found = jobs.measure_jobs(tmp_path / "s.las", tmp_path / "t.las", tmp_path, 1, lambda text: None)
-        waveforms[unit] = jobs.format_jobs("s.las", *found), jobs.to_document("s.las", *found)
-    text, document = waveforms[1000]
-    assert document["parts"]["work"] == document["parts"]["tail"] == 0 and set(document["predicted"]) > {"1", "64"}
-    assert "-" not in text.split("Predicted")[1]
-    text, document = waveforms[1001]
-    assert document["predicted"] == {} and document["most_jobs"] is None
-    assert all(document["parts"][name] is None for name in ("single", "work", "write", "tail"))
-    assert "Predicted" not in text and "two jobs: no-data" in text and document["warnings"][0] in text
-    assert "nothing is predicted" in document["warnings"][0]
-
-
-def test_jobs_are_measured_on_enough_waveforms_by_default():
-    assert jobs.PULSES > 1.1 * jobs.MANY_UNITS * jobs.UNIT_POINTS  # some pulses are empty
-
-
 def test_releases_measure_the_scenes_that_they_promise():
     given = read_options(["-o", "out"])
     assert given.scene is None and given.waveforms == BenchOptions().waveforms and given.pulses == BenchOptions().pulses
     assert {scene for scene, *_ in SPEEDS} == set(SCENES)
-
-
-def _call_slow_starter(self, function, *arguments):
-    """Workers that took longer to start when they did nothing than the whole run."""
-    laps = {jobs.measure_worker: 0.5, jobs.time_preparation: (0.1, 0.2), jobs.run_small: 0.01}
-    return laps.get(function, jobs.Lap(1.0, 0.5, 1.0, 2000))
-
-
-def test_a_small_strip_that_fails_is_no_time(tmp_path):
-    broken = tmp_path / "broken.las"
-    broken.write_bytes(b"LASF")
-    with pytest.raises(InputError, match=r"0\.las"):
-        jobs.run_small(broken, tmp_path / "small")
-
-
-def test_the_slowest_part_bounds_many_jobs():
-    """A scan that jobs share, a survey; one process that writes; many strips hide scan and survey."""
-    parts = Parts(1_000_000, start=0.25, start_worker=0.5, scan=0.6, survey=0.4, single=10e-6, work=10e-6, write=0.5e-6,
-                  strip=0.0, tail=0.0)  # fmt: skip
-    assert parts.predict(1) == pytest.approx(0.25 + 1 + 10)
-    assert parts.predict(2) == pytest.approx(0.5 + 0.3 + 0.4 + 5)
-    assert parts.predict(64) == pytest.approx(0.5 + 0.6 / 5 + 0.4 + 0.5)  # four units for each, of twenty
-    assert parts.predict(1, 100) == pytest.approx(0.25 + 1100)
-    assert parts.predict(10, 100) == pytest.approx(0.5 + 110 + 1)
-    assert parts.predict(64, 100) == pytest.approx(0.5 + 50 + 1)
-    assert parts.most == pytest.approx(22)
-    assert replace(parts, strip=1.0).predict(64, 100) == pytest.approx(0.5 + 150 + 1)
-    assert replace(parts, tail=0.4).predict(2) == pytest.approx(0.5 + 0.3 + 0.4 + 5 + 0.2)
 
 
 @pytest.mark.slow

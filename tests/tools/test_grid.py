@@ -9,8 +9,7 @@ from commands import run_command
 
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
-from wavebatch.tools import cells as module
-from wavebatch.tools.cells import STATISTICS, compute_cells
+from wavebatch.tools.cells import STATISTICS, compute_cells, grid_values
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # inside rasterio
 
@@ -79,10 +78,7 @@ def rasterio():
 
 
 @pytest.mark.parametrize("statistic", ["median", "mean", "max", "count"])
-@pytest.mark.parametrize("held", [2_000_000, 64])
-def test_cells_are_those_of_a_plain_count(rasterio, rng, tmp_path, monkeypatch, statistic, held):
-    monkeypatch.setattr(module, "HELD", held)  # 64: buckets that do not fit, tile by tile in groups of cells
-    monkeypatch.setattr(module, "MOST_BUCKETS", 2 if held == 64 else 4096)
+def test_cells_are_those_of_a_plain_count(rasterio, rng, tmp_path, statistic):
     x, y, height = _cloud(tmp_path / "a.las", rng)
     result = _run(tmp_path / "a.las", "--column", "height", "--column", "gps_time", "--statistic", statistic,
                   "--size", 2, "-o", tmp_path / "x.tif")  # fmt: skip
@@ -104,12 +100,14 @@ def test_cells_are_those_of_a_plain_count(rasterio, rng, tmp_path, monkeypatch, 
     assert np.isfinite(raster).sum() == len(filled)
 
 
-def test_more_buckets_than_tiles_are_fine(rasterio, rng, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "HELD", 100)
-    _, _, height = _cloud(tmp_path / "a.las", rng)
-    _run(tmp_path / "a.las", "--column", "height", "--statistic", "max", "--size", 5000, "-o", tmp_path / "x.tif")
-    with rasterio.open(tmp_path / "x.tif") as found:
-        assert found.read(1, masked=True).max() == np.nanmax(height).astype(np.float32)
+@pytest.mark.parametrize(("held", "size"), [(64, 0.5), (64, 5000.0), (3000, 0.5)])
+def test_tiles_do_not_depend_on_the_points_in_memory(rng, tmp_path, held, size):
+    """64: more buckets than tiles, and buckets that do not fit, tile by tile in groups of cells."""
+    _cloud(tmp_path / "a.las", rng)
+    for statistic in ("median", "mean", "max", "count"):
+        whole, parts = (grid_values([tmp_path / "a.las"], "height", statistic, size=size, held=most).values
+                        for most in (2_000_000, held))  # fmt: skip
+        np.testing.assert_array_equal(parts, whole)
 
 
 def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rasterio, rng, tmp_path):

@@ -18,7 +18,6 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.files.strip import reader as io_strip
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.stages.chain import STAGES
@@ -138,13 +137,12 @@ def test_clipped_samples_count_only_where_the_fit_lies_below():
     assert view.echoes.flags[0] & EchoFlag.SATURATED
 
 
-def test_views_of_a_strip_are_what_a_run_gives(tiny_strip, monkeypatch):
+def test_views_of_a_strip_are_what_a_run_gives(tiny_strip):
     chain = load_profile("balanced")
     wanted = Wanted(packets=((5, 8), (300, 301), (6, 7)), points=(0, 400), times=())
     found = {}
-    for points in (io_strip.UNIT_POINTS, 37):
-        monkeypatch.setattr(io_strip, "UNIT_POINTS", points)
-        with StripReader(tiny_strip) as reader, reader.scan() as scan:
+    for points in (50_000, 37):
+        with StripReader(tiny_strip, unit_points=points) as reader, reader.scan() as scan:
             places = find_places(reader, scan, wanted, None)
             found[points] = read_views(reader, scan, places, chain, PULSE)
             blocks = [

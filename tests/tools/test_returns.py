@@ -15,7 +15,6 @@ from click.testing import CliRunner
 from wavebatch.cli.clouds import SHOWN, stats
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.files.las.header import ExtraRecord, LasHeader, build_dtype
@@ -92,7 +91,7 @@ def test_times_that_are_all_alike_are_not_used(tmp_path):
 
 
 @pytest.mark.parametrize("missing", [np.nan, 0.0])
-def test_points_without_a_time_are_not_one_pulse(tmp_path, missing, monkeypatch):
+def test_points_without_a_time_are_not_one_pulse(tmp_path, missing):
     # Ten times the small cloud at times of their own; the pulse of three returns has lost its time in each.
     parts = {name: np.tile(values, 10) for name, values in SMALL.items()}
     parts["time"] = parts["time"] + 10.0 * np.repeat(np.arange(10), 7)
@@ -100,17 +99,15 @@ def test_points_without_a_time_are_not_one_pulse(tmp_path, missing, monkeypatch)
     (found,), _ = count_returns([write_cloud(tmp_path / "a.las", **parts)])
     assert (found.pulses, found.pulses_by) == (40, "gps_time") and found.by_count[3] == pytest.approx(0.25)
     assert found.warnings[0].startswith("points without GPS time (0 or NaN): 30;")
-    monkeypatch.setattr(temp_store, "BUCKET_ROWS", 5)
-    (again,), _ = count_returns([tmp_path / "a.las"])
+    (again,), _ = count_returns([tmp_path / "a.las"], held=5)
     assert again.by_count == found.by_count
 
 
-def test_buckets_and_pieces_change_nothing(tmp_path, monkeypatch):
+def test_buckets_and_pieces_change_nothing(tmp_path):
     receiver = DiscreteReceiver(most=3)
     simulate_returns("canopy.orion-22", tmp_path / "c.laz", pulses=3000, receiver=receiver)
     whole = count_returns([tmp_path / "c.laz"])[1]
-    monkeypatch.setattr(temp_store, "BUCKET_ROWS", 500)
-    parts = count_returns([tmp_path / "c.laz"])[1]
+    parts = count_returns([tmp_path / "c.laz"], held=500)[1]
     assert parts.by_count == whole.by_count and parts.incomplete == whole.incomplete == 0
     assert parts.separations["1-2"].least == whole.separations["1-2"].least
     assert parts.separations["1-2"].mean == pytest.approx(whole.separations["1-2"].mean, rel=1e-12)
@@ -307,11 +304,10 @@ def check_sum(areas, total):
 
 
 @pytest.mark.parametrize("size", [7.5, 40.0, 1000.0])
-@pytest.mark.parametrize("bucket", [400_000, 150])
-def test_cells_as_a_loop_over_pulses_counts_them(tmp_path, monkeypatch, size, bucket):
+@pytest.mark.parametrize("held", [400_000, 150])
+def test_cells_as_a_loop_over_pulses_counts_them(tmp_path, size, held):
     points = make_cloud(tmp_path / "c.las")
-    monkeypatch.setattr(temp_store, "BUCKET_ROWS", bucket)
-    (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(size)])
+    (one,), total = count_returns([tmp_path / "c.las"], divisions=[AreaGrid(size)], held=held)
     naive = count_naively(*points, lambda x, y: (math.floor(x / size) * size, math.floor(y / size) * size))
     check_areas(one.areas, naive, lambda area: (area.x, area.y))
     check_sum(one.areas, one)

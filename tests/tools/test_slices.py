@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from commands import run_command
 from strips import cut_strip
 
-from wavebatch.cli.slice import slice_
+from wavebatch.cli.geometry import slice_
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -34,9 +34,9 @@ def strip(tmp_path_factory):
     return path
 
 
-def read_all(path):
-    with StripReader(path) as reader:
-        return list(read_scan_lines(reader, reader.scan()))
+def read_all(path, unit_points=None, **sizes):
+    with StripReader(path, unit_points=unit_points) as reader:
+        return list(read_scan_lines(reader, reader.scan(), **sizes))
 
 
 def test_scan_lines_are_those_of_the_flight(strip):
@@ -50,10 +50,9 @@ def test_scan_lines_are_those_of_the_flight(strip):
         assert line.time.max() == 79.0
 
 
-def test_lines_do_not_depend_on_units_and_samples_are_those_of_the_strip(strip, monkeypatch):
+def test_lines_do_not_depend_on_units_and_samples_are_those_of_the_strip(strip):
     whole = read_all(strip)
-    monkeypatch.setattr("wavebatch.files.strip.reader.UNIT_POINTS", 700)
-    parts = read_all(strip)
+    parts = read_all(strip, 700)
     assert len(parts) == len(whole)
     for one, other in zip(whole, parts, strict=True):
         for name in ("point", "gps_time", "origin", "direction", "row", "time", "value"):
@@ -65,12 +64,9 @@ def test_lines_do_not_depend_on_units_and_samples_are_those_of_the_strip(strip, 
     assert np.diff(first) == pytest.approx(np.diff(block.samples[0].astype(float)))
 
 
-def test_long_lines_are_cut_and_short_ones_left_out(strip, monkeypatch):
-    monkeypatch.setattr(segments, "MOST_PULSES", 300)
-    found = read_all(strip)
-    assert max(len(line) for line in found) == 300
-    monkeypatch.setattr(segments, "LEAST_PULSES", 250)
-    assert min(len(line) for line in read_all(strip)) >= 250
+def test_long_lines_are_cut_and_short_ones_left_out(strip):
+    assert max(len(line) for line in read_all(strip, most=300)) == 300
+    assert min(len(line) for line in read_all(strip, most=300, least=250)) >= 250
 
 
 def facet_slopes(y):

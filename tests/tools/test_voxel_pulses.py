@@ -82,7 +82,7 @@ def test_split_pulses_are_joined_ones(strips, canopy, whole, tmp_path, ratio):
 
 
 @pytest.mark.slow
-def test_the_strip_may_be_in_any_order_and_cut_anywhere(strips, canopy, tmp_path, monkeypatch):
+def test_the_strip_may_be_in_any_order_and_cut_anywhere(strips, canopy, tmp_path):
     *pulses, _ = canopy
     expected = voxelize(strips[1], tmp_path, profiles=tmp_path / "a.npz")[1]
     made = [(tmp_path / name).read_bytes() for name in ("v.npz", "a.npz")]
@@ -94,9 +94,8 @@ def test_the_strip_may_be_in_any_order_and_cut_anywhere(strips, canopy, tmp_path
         order=lambda n, pulse: np.lexsort((np.random.default_rng(1).random(n), pulse // 100)),
     )  # fmt: skip
     # Packets of most pulses at borders lie in two units.
-    monkeypatch.setattr("wavebatch.files.strip.reader.UNIT_POINTS", 600)
     for strip in (strips[1], mixed):
-        summary, found = voxelize(strip, tmp_path)
+        summary, found = voxelize(strip, tmp_path, unit_points=600)
         assert summary.pulses == N
         # The cells of the ground's map are placed by a sample of the points, which depends on their order.
         assert shares(found, LAYERS) == pytest.approx(shares(expected, LAYERS), rel=0.01)

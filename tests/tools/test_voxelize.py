@@ -303,11 +303,10 @@ def test_followed_up_to_the_highest_return_rays_count_as_if_from_the_sensor(tmp_
 
 
 @pytest.mark.parametrize("most", [8, 100, 1 << 18])
-def test_ceilings_are_those_of_a_slow_search(monkeypatch, most):
-    monkeypatch.setattr("wavebatch.tools.voxels.rays.MOST_CELLS", most)
+def test_ceilings_are_those_of_a_slow_search(most):
     rng = np.random.default_rng(9)
     points = rng.uniform(0, 120, (300, 3)) * [1, 1, 0.3]
-    ceiling = Ceiling(np.array([60.0, 60.0, 0.0]), 1.0)
+    ceiling = Ceiling(np.array([60.0, 60.0, 0.0]), 1.0, most)
     for part in (points[:100], points[100:101], points[101:]):
         ceiling.add(part)
     ceiling.add(np.array([[np.nan, 0, 1], [1e300, 0, 1], [0, 0, np.inf]]))
@@ -361,7 +360,7 @@ def test_light_goes_out_along_the_ray_and_empty_voxels_are_written_on_request(tm
 
 @pytest.mark.quick_cases("v.laz")
 @pytest.mark.parametrize("target", ["v.npz", "v.laz"])
-def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target, monkeypatch):
+def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target):
     strip, _ = forest
     folder = tmp_path / "whole"
     folder.mkdir()
@@ -371,9 +370,6 @@ def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target, m
     for block_size, held in ((97, 1 << 20), (600, 500), (1500, 3)):
         voxelize(strip, tmp_path / target, 0.8, block_size=block_size, held=held, overwrite=True, **options)
         assert (tmp_path / target).read_bytes() == whole
-    monkeypatch.setattr("wavebatch.kernels.geometry.voxels.AT_A_TIME", 700)
-    voxelize(strip, tmp_path / target, 0.8, overwrite=True, **options)
-    assert (tmp_path / target).read_bytes() == whole
 
 
 def test_two_halves_of_a_strip_add_up_to_the_whole(tmp_path):
@@ -562,13 +558,12 @@ def test_light_is_normalised_by_range(tmp_path):
 
 
 @pytest.mark.parametrize("most", [20, 1 << 18])
-def test_the_floor_is_the_ground_below_plants(monkeypatch, most):
-    monkeypatch.setattr("wavebatch.tools.voxels.rays.MOST_CELLS", most)
+def test_the_floor_is_the_ground_below_plants(most):
     rng = np.random.default_rng(5)
     xyz = rng.uniform(0, 60, (6000, 3)) * [1, 1, 0]
     ground = 0.3 * xyz[:, 0] - 0.1 * xyz[:, 1] + 0.05 * rng.standard_normal(6000)
     xyz[:, 2] = ground + np.where(rng.random(6000) < 0.7, rng.uniform(1, 20, 6000), 0)
-    floor = Floor(np.array([30.0, 30.0, 0.0]))
+    floor = Floor(np.array([30.0, 30.0, 0.0]), most)
     for part in (xyz[:2000], xyz[2000:2001], xyz[2001:], np.array([[np.nan, 0, 1], [1e300, 0, 1], [0, 0, np.inf]])):
         floor.add(part)
     floor.finish()

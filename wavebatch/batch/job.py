@@ -1,6 +1,6 @@
 """A strip to process and how: what the command line and the public API ask for, and the workers get.
 
-`tools.api.run` builds a StripJob per strip; `unit` does what it asks for.
+`tools.api` builds a StripJob per strip; `unit` does what it asks for.
 Before you change it: a job travels to other processes, and all of it that decides the output is in `describe_job` of
 `report_file`, or --resume would keep clouds that are not what is asked for.
 """
@@ -53,6 +53,8 @@ class StripJob:
     """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
     chosen: PointFilter = PointFilter()
     """What is written."""
+    unit_points: int | None = None
+    """Of a unit, which one process works on; the cloud does not depend on it."""
 
     def extend(self, chain: Chain) -> Chain:
         """Return the chain with the physical stages that trajectory, calibration and divergence allow, and those of the
@@ -99,7 +101,8 @@ class StripJob:
 
     def open(self) -> StripReader:
         """Open the strip; raises InputError where it cannot be read."""
-        return StripReader(self.path, direction=self.options.direction, headerless=self.options.headerless)
+        direction, headerless = self.options.direction, self.options.headerless
+        return StripReader(self.path, direction=direction, headerless=headerless, unit_points=self.unit_points)
 
 
 def list_column_names(wanted: str | None) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ from wavebatch.core.errors import StageError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.core.process import Seconds
-from wavebatch.files.disk.temp_store import RowStore, Spool
+from wavebatch.files.disk.temp_store import SPOOL_MEMORY, RowStore, Spool
 from wavebatch.files.las.header import field_names
 from wavebatch.kernels.geometry.normals import (
     FINENESS,
@@ -74,6 +74,8 @@ class TileTask:
     entries: Spool
     """Points by tile, including those of its buffer."""
     scales: tuple[float, ...]
+    part_points: int
+    """Most points of a tile that are processed at a time."""
 
     def place(self, xyz: np.ndarray) -> np.ndarray:
         """Return positions [m] without the file's offset, f8 (n, 3), of stored coordinates, i4 (n, 3)."""
@@ -91,15 +93,16 @@ class SecondPass:
         Of the stored positions.
     target : Path
         The cloud; temporary files lie next to it.
-    tile_points : int, optional
-        TILE_POINTS by default; the result does not depend on it.
+    tile_points, sample, part_points, spooled : int
+        What is in memory at a time; the result does not depend on them.
     """
 
     def __init__(
-        self, step: Step, scales: tuple[float, ...], target: Path, *, tile_points: int | None = None
-    ) -> None:
+        self, step: Step, scales: tuple[float, ...], target: Path, *, tile_points: int = TILE_POINTS,
+        sample: int = SAMPLE, part_points: int = PART_POINTS, spooled: int = SPOOL_MEMORY,
+    ) -> None:  # fmt: skip
         self._step, self._scales = step, scales
-        self._tile_points = tile_points or TILE_POINTS
+        self._tile_points, self._most, self._part_points, self._spooled = tile_points, sample, part_points, spooled
         self._rows, self._states = RowStore(target, ENTRY), RowStore(target, np.dtype("u1"))
         self._found = RowStore(target, _found_dtype(step))
         self._entries: Spool | None = None
@@ -117,7 +120,7 @@ class SecondPass:
         self._units.append((slice(entries, entries + len(rows)), slice(states, states + len(kept))))
         self._rows.add(rows)
         self._states.add(kept)
-        while sum(map(len, self._sample)) > SAMPLE:
+        while sum(map(len, self._sample)) > self._most:
             self._sample = [np.concatenate(self._sample)[::2].copy()]
             self._every *= 2
 
@@ -133,7 +136,7 @@ class SecondPass:
         # Tiles much smaller than their buffers would list each point many times.
         tiles = cut_tiles(sample, max(self._tile_points // self._every, 1), 8 * reach)
         self._found.extend(self._rows.count)
-        self._entries = Spool(len(tiles), ENTRY)
+        self._entries = Spool(len(tiles), ENTRY, memory=self._spooled)
         counts, at = np.zeros(len(tiles), np.int64), 0
         for rows in self._rows.pieces():
             rows["row"] = np.arange(at, at + len(rows))
@@ -143,9 +146,10 @@ class SecondPass:
             counts += np.bincount(tile, minlength=len(tiles))
             self._entries.append(tile, rows[able[index]])
             at += len(rows)
-        self._blob = pickle.dumps(TileTask(self._step, tiles, self._entries.seal(), self._scales), PROTOCOL)
+        task = TileTask(self._step, tiles, self._entries.seal(), self._scales, self._part_points)
+        self._blob = pickle.dumps(task, PROTOCOL)
         for number, count in enumerate(counts.tolist()):
-            self._parts.extend((number, part) for part in range(-(-count // PART_POINTS)))
+            self._parts.extend((number, part) for part in range(-(-count // self._part_points)))
         self._tiles_left, self._units_left = len(self._parts), len(self._units)
         return RunReport(timing={"tiles": Seconds.now() - start})
 
@@ -288,7 +292,7 @@ def process_tile(blob: bytes, number: int, part: int) -> Found:
     number : int
         Of the tile.
     part : int
-        Of its PART_POINTS points.
+        Of its points, `part_points` at a time.
 
     Returns
     -------
@@ -300,7 +304,7 @@ def process_tile(blob: bytes, number: int, part: int) -> Found:
     stage = task.step.stage
     if stage.second_pass is None:
         raise StageError(f"{stage.name} has no second pass; please report it as a bug")
-    entries = _read_part(task.entries, number, part)
+    entries = _read_part(task, number, part)
     place = task.place(entries["xyz"])
     own = np.flatnonzero(is_inside(task.tiles, number, place))
     around = _gather(blob, number)
@@ -321,18 +325,18 @@ def _gather(blob: bytes, number: int) -> Surroundings:
     for piece in itertools.chain(task.entries.pieces(number), [None]):
         if piece is not None:
             held.append(piece)
-        if held and (piece is None or sum(map(len, held)) >= PART_POINTS):
+        if held and (piece is None or sum(map(len, held)) >= task.part_points):
             kept = np.concatenate([kept, *held])
             kept = kept[thin_out(task.place(kept["xyz"]), kept["row"], radius)]
             held = []
     return Surroundings(task.place(kept["xyz"]))
 
 
-def _read_part(entries: Spool, number: int, part: int) -> np.ndarray:
-    """Entries of a tile that are its PART_POINTS of that number, in the order of their rows."""
-    low, high, at = part * PART_POINTS, (part + 1) * PART_POINTS, 0
+def _read_part(task: TileTask, number: int, part: int) -> np.ndarray:
+    """Entries of a part of a tile, in the order of their rows."""
+    low, high, at = part * task.part_points, (part + 1) * task.part_points, 0
     found = [np.empty(0, ENTRY)]
-    for piece in entries.pieces(number):
+    for piece in task.entries.pieces(number):
         found.append(piece[max(low - at, 0) : max(high - at, 0)])
         at += len(piece)
         if at >= high:

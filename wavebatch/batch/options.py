@@ -1,6 +1,6 @@
 """The options of a run: one declaration each, for the command, the Python function and the documentation.
 
-`cli.options` makes click's options of the fields of RunOptions, `tools.api.run` the keywords of `wavebatch.run`. Before
+`cli.options` makes click's options of the fields of RunOptions, `tools.api` the keywords of `wavebatch.run`. Before
 you change it: this module is imported for `--help`, so it imports nothing that takes time.
 """
 
@@ -37,6 +37,11 @@ EXCLUSIVE = (
     *(("random", one) for one in ("flags", "where", "most")),
 )  # fmt: skip
 """Options that exclude each other. One in wavebatch.toml replaces those that come from a weaker source."""
+REMEDIES: dict[tuple[str, ...], str] = {
+    ("strip", "truth"): "`wavebatch bench` compares chains with a truth",
+    ("strip", "where"): "`wavebatch run` both chains, then compare the clouds with --where",
+}
+"""What gives the user both of two options that exclude each other."""
 
 NEEDS = {
     "lever_arm": ("trajectory",), "crs": ("trajectory",), "wavelength": ("visibility",),
@@ -71,7 +76,8 @@ def check_together(
     for rivals in EXCLUSIVE:
         names = [spelled(name) for name in rivals if name in given]
         if len(names) > 1:
-            raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
+            remedy = REMEDIES.get(rivals, "give one of them")
+            raise ConfigError(f"{names[0]} and {names[1]} exclude each other; {remedy}")
     if "system" in given and given.get("survey") == "flight":
         raise ConfigError("--system and --survey flight exclude each other; give one of them")
     for name, needed in NEEDS.items():

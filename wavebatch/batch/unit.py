@@ -348,7 +348,7 @@ def solve_unit(
     """
     start = Seconds.now()
     echoes_mode = prepared.job.options.points == "echoes"
-    with StripReader(prepared.facts) as reader:
+    with StripReader(prepared.facts, unit_points=prepared.job.unit_points) as reader:
         unit = reader.read_unit(number, prepared.scan)
         timing["read points"] = Seconds.now() - start
         blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)

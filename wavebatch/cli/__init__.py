@@ -28,8 +28,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "compare": ("wavebatch.cli.compare:compare", "Compare clouds or chains with each other, returns or truth."),
     "stats": ("wavebatch.cli.clouds:stats", "Count return numbers, separations and flags of clouds."),
     "synthesize": ("wavebatch.cli.simulate:synthesize", "Model waveforms from the discrete returns of a cloud."),
-    "slice": ("wavebatch.cli.slice:slice_", "Find straight surface lines in the scan lines of a strip."),
-    "voxelize": ("wavebatch.cli.voxelize:voxelize", "Deconvolve waveforms into the voxels of a 3D grid."),
+    "slice": ("wavebatch.cli.geometry:slice_", "Find straight surface lines in the scan lines of a strip."),
+    "voxelize": ("wavebatch.cli.geometry:voxelize", "Deconvolve waveforms into the voxels of a 3D grid."),
     "plot": ("wavebatch.cli.plot:plot", "Draw waveforms with their fit, histograms and maps."),
     "grid": ("wavebatch.cli.clouds:grid", "Write columns of clouds as a GeoTIFF."),
     "calibrate": ("wavebatch.cli.calibrate:calibrate", "Find the calibration constant from known reflectances."),
@@ -54,7 +54,7 @@ class LazyGroup(NearestGroup):
         if cmd_name not in COMMANDS:
             return None
         module, _, function = COMMANDS[cmd_name][0].partition(":")
-        from wavebatch.cli.program.command import dress
+        from wavebatch.cli.command import dress
 
         with importing():
             home = importlib.import_module(module)
@@ -68,7 +68,7 @@ class LazyGroup(NearestGroup):
 
 def _print_version(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
     if wanted and not context.resilient_parsing:
-        from wavebatch.cli.program.command import describe_version
+        from wavebatch.cli.command import describe_version
 
         click.echo(describe_version())
         context.exit()
@@ -76,8 +76,8 @@ def _print_version(context: click.Context, parameter: click.Parameter, wanted: b
 
 def _write_man_pages(context: click.Context, parameter: click.Parameter, folder: Path | None) -> None:
     if folder is not None and not context.resilient_parsing:
+        from wavebatch.cli.command import write_man_pages
         from wavebatch.cli.messages import report_errors, talk
-        from wavebatch.cli.program.command import write_man_pages
 
         pages = report_errors()(write_man_pages)(main, folder)
         talk(f"{folder}: {len(pages)} manual pages written")

@@ -14,8 +14,8 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
+from wavebatch.cli.command import complete_files
 from wavebatch.cli.messages import answer, counting, tell
-from wavebatch.cli.program.command import complete_files
 from wavebatch.core.units import count
 from wavebatch.tools.export_strip import SUFFIXES as WRITTEN
 from wavebatch.tools.export_strip import ExportSummary, export_strip

@@ -12,8 +12,8 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
+from wavebatch.cli.command import complete_scenes
 from wavebatch.cli.messages import print_result, talk
-from wavebatch.cli.program.command import complete_scenes
 from wavebatch.tools.bench.command import BenchOptions, run_bench
 
 

@@ -77,7 +77,7 @@ def calibrate(
     from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
     from wavebatch.surveying.calibrating.calibration_file import format_calibration
     from wavebatch.surveying.calibrating.target_file import load_targets
-    from wavebatch.tools.api.run import find_request, read_sensor
+    from wavebatch.tools.api import find_request, read_sensor
     from wavebatch.tools.sheets.sheet import list_lines
     from wavebatch.tools.sheets.survey import calibration_sheet, write_calibrate_page
 

@@ -16,9 +16,9 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
+from wavebatch.cli.command import complete_columns
 from wavebatch.cli.messages import answer, print_json, print_sheet, talk, tell
 from wavebatch.cli.plot import choose_points, find_clouds
-from wavebatch.cli.program.command import complete_columns
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C, count

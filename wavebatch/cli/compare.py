@@ -133,7 +133,7 @@ def _match(a: Path, b: Path | None, strip: Path, options: dict) -> Matchup:
     from wavebatch.core.errors import nearest
     from wavebatch.surveying.choose_chain import COSTS
     from wavebatch.surveying.system_file import load_survey
-    from wavebatch.tools.api.strip import AUTO
+    from wavebatch.tools.api import AUTO
     from wavebatch.tools.compare_chains import find_contender, match_sides
 
     saved = None if options["system"] is None else load_survey(options["system"])

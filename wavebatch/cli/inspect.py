@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
+from wavebatch.cli.command import complete_files, complete_stages
 from wavebatch.cli.messages import answer, print_result, print_sheet, print_text, printable, talk
 from wavebatch.cli.options import common_options
-from wavebatch.cli.program.command import complete_files, complete_stages
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.units import count
 from wavebatch.tools.file_facts import describe_file
@@ -81,7 +81,7 @@ def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, A
     """The pulse of a strip by its survey, and the known sensor that it looks like."""
     from wavebatch.core.units import FWHM_PER_SIGMA
     from wavebatch.surveying.systems.known_systems import find_likeness
-    from wavebatch.tools.api.strip import open_strip, survey
+    from wavebatch.tools.api import open_strip, survey
 
     with open_strip(path, direction=direction, headerless=headerless) as strip:
         found = survey(strip)

@@ -20,8 +20,8 @@ import click
 from click.core import ParameterSource
 
 from wavebatch.batch.options import OPTIONS, RunOptions, check_together
+from wavebatch.cli.command import READ, complete_files, complete_flags, complete_profiles, complete_written
 from wavebatch.cli.messages import LEVELS, LOG, begin_log, keep_level, one_line, report_errors, talk, tell
-from wavebatch.cli.program.command import READ, complete_files, complete_flags, complete_profiles, complete_written
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
 from wavebatch.files.disk.publish import protecting, refuse_input

@@ -14,8 +14,8 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
+from wavebatch.cli.command import complete_columns, complete_flags
 from wavebatch.cli.messages import NearestGroup, answer, tell
-from wavebatch.cli.program.command import complete_columns, complete_flags
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import check_target
@@ -408,7 +408,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
     from wavebatch.batch.options import RunOptions
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.surveying.prepare import Positions, prepare
-    from wavebatch.tools.api.run import find_request
+    from wavebatch.tools.api import find_request
     from wavebatch.tools.plots.waveform import add_ranges, find_places, name_chain, read_views
 
     chain, request = find_request(shared.from_options(RunOptions, options))

@@ -239,7 +239,7 @@ def run(**options: Any) -> None:
     try:
         _start_processes(options)
         with importing():
-            from wavebatch.tools.api.run import plan_run
+            from wavebatch.tools.api import plan_run
 
         jobs, batch_options = plan_run(options["strips"], shared.from_options(RunOptions, options), shared.note_input)
         if options["report"] not in (None, "-"):

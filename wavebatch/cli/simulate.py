@@ -14,8 +14,8 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
+from wavebatch.cli.command import complete_scenes
 from wavebatch.cli.messages import counting, print_summary
-from wavebatch.cli.program.command import complete_scenes
 from wavebatch.core.schema import declared_options
 from wavebatch.core.units import count
 from wavebatch.tools import simulate as simulation

@@ -115,8 +115,8 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     from wavebatch.files.disk.raw_bytes import take_fingerprint
     from wavebatch.surveying.inspect_strip import doubt_files
     from wavebatch.surveying.system_file import SavedSurvey
-    from wavebatch.tools.api.strip import open_strip
-    from wavebatch.tools.api.strip import survey as survey_strip
+    from wavebatch.tools.api import open_strip
+    from wavebatch.tools.api import survey as survey_strip
 
     with open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
         found = survey_strip(

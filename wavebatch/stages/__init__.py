@@ -3,4 +3,4 @@
 from wavebatch.stages import noise  # noqa: F401
 from wavebatch.stages.attribute import basic, incidence_angle, radiometry  # noqa: F401
 from wavebatch.stages.decompose import fit, loops, models  # noqa: F401
-from wavebatch.stages.detect import classic, maximum, transformed  # noqa: F401
+from wavebatch.stages.detect import direct, transformed  # noqa: F401

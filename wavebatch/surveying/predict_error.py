@@ -25,7 +25,7 @@ from wavebatch.kernels.signal.noise import whitening_filter
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.decompose.merge import excess_variance
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 from wavebatch.stages.score import match_echoes

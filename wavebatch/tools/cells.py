@@ -315,21 +315,23 @@ number of cells to bands f8 (m, cells)."""
 
 
 def compute_tiles(
-    clouds: Clouds, statistic: Statistic, grid: Grid, points: int, result: Placed, bounds: Box | None = None
+    clouds: Clouds, statistic: Statistic, grid: Grid, points: int, result: Placed, bounds: Box | None = None,
+    *, held: int = HELD,
 ) -> Iterator[tuple[int, int, np.ndarray]]:
     """Row from the north, column and values f8 (bands, TILE, TILE) of every tile with a point; NaN without a value.
 
     There is a band for each column of the clouds, or those that the statistic computes. points: of all clouds, about.
-    result: gets the counts before the first tile comes. bounds: only points within them count.
+    result: gets the counts before the first tile comes. bounds: only points within them count. held: points in memory
+    at a time.
     """
-    number = int(np.clip(-(-points // (HELD // 2)), 1, MOST_BUCKETS))
+    number = int(np.clip(-(-points // (held // 2)), 1, MOST_BUCKETS))
     columns = 1 + len(clouds.other_facts)
     entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (columns,))]))
     try:
         _fill(clouds, bounds, grid, entries, result)
         entries.seal()
         for bucket in range(number):
-            for tile, values in _compute_bucket(entries, bucket, statistic, grid.size**2):
+            for tile, values in _compute_bucket(entries, bucket, statistic, grid.size**2, held):
                 yield *divmod(tile, _across(grid)), values
     finally:
         entries.close()
@@ -369,13 +371,13 @@ def _fill(clouds: Clouds, bounds: Box | None, grid: Grid, entries: Spool, result
 
 
 def _compute_bucket(
-    entries: Spool, bucket: int, statistic: Statistic, area: float
+    entries: Spool, bucket: int, statistic: Statistic, area: float, held: int
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Number and values (bands, TILE, TILE) of every tile of a bucket."""
     total = sum(len(piece) for piece in entries.pieces(bucket))
     if not total:
         return
-    if total <= HELD:
+    if total <= held:
         rows = entries.read(bucket)
         rows = rows[np.argsort(rows["tile"], kind="stable")]
         tiles, first = np.unique(rows["tile"], return_index=True)
@@ -384,15 +386,17 @@ def _compute_bucket(
         return
     tiles = np.unique(np.concatenate([np.unique(piece["tile"]) for piece in entries.pieces(bucket)]))
     for tile in tiles.tolist():
-        yield tile, _compute_dense(entries, bucket, tile, statistic, area)
+        yield tile, _compute_dense(entries, bucket, tile, statistic, area, held)
 
 
-def _compute_dense(entries: Spool, bucket: int, tile: int, statistic: Statistic, area: float) -> np.ndarray:
-    """A tile of a bucket that does not fit in memory: groups of cells, each of about HELD points, one by one."""
+def _compute_dense(
+    entries: Spool, bucket: int, tile: int, statistic: Statistic, area: float, held: int
+) -> np.ndarray:
+    """A tile of a bucket that does not fit in memory: groups of cells, each of about `held` points, one by one."""
     count = np.zeros(TILE * TILE, np.int64)
     for piece in entries.pieces(bucket):
         count += np.bincount(piece["cell"][piece["tile"] == tile], minlength=len(count))
-    group = np.cumsum(count) // HELD
+    group = np.cumsum(count) // held
     values = np.full((TILE, TILE), np.nan)
     for number in np.unique(group[count > 0]).tolist():
         wanted = group == number
@@ -470,11 +474,12 @@ def grid_values(
     *,
     size: float | None = None,
     bounds: Box | None = None,
+    held: int = HELD,
 ) -> Raster:
     """The map of a column of clouds; medians of large clouds need room in TMPDIR.
 
     size: side of a cell [m], by default for about POINTS_PER_CELL points per cell. bounds: west, south, east, north
-    [m], by default all points but far outliers.
+    [m], by default all points but far outliers. held: points in memory at a time.
     Raises InputError if there is nothing to draw, ConfigError for wrong options, more than MOST_CELLS cells, and clouds
     that are far apart or differ in their CRS.
     """
@@ -491,7 +496,7 @@ def grid_values(
         raise InputError(f"{paths[0]}: nothing to draw: no point {where} has a value")
     grid = choose_grid(str(paths[0]), sample, box, size, fixed=bounds is not None)
     values, placed = np.full((grid.rows, grid.columns), np.nan), Placed()
-    for row, column, tile in compute_tiles(clouds, statistic, grid, total.values, placed):
+    for row, column, tile in compute_tiles(clouds, statistic, grid, total.values, placed, held=held):
         part = values[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
         part[:] = tile[0, : part.shape[0], : part.shape[1]]
     values = values[::-1]  # the first row is the southernmost

@@ -29,7 +29,7 @@ from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools import pairing
-from wavebatch.tools.api.strip import AUTO, load_chain
+from wavebatch.tools.api import AUTO, load_chain
 
 
 @frozen
@@ -167,12 +167,13 @@ def match_sides(
     survey: Survey | None = None,
     force: bool = False,
     limit: int | None = None,
+    block_size: int = _BLOCK,
 ) -> Matchup:
     """Compares the echoes of a and b on the waveforms of a strip; without b, a with the vendor's returns.
 
     At least one side is a chain. survey: used instead of a survey of the strip; force: also where the strip contradicts
-    it. limit: use about as many waveforms, spread evenly over the strip, instead of all; not with a cloud. Memory is
-    bounded, as in compare_clouds.
+    it. limit: use about as many waveforms, spread evenly over the strip, instead of all; not with a cloud. block_size:
+    waveforms at a time. Memory is bounded, as in compare_clouds.
     Raises InputError for files that cannot be read, ConfigError for sides that cannot be compared.
     """
     clouds = [side for side in (a, b) if side is not None and side.is_cloud]
@@ -188,9 +189,9 @@ def match_sides(
         chains = {key: side for key, side in (("a", a), ("b", b)) if side is not None and not side.is_cloud}
         system = choice.survey.system
         runs = {key: ChainRun(side.chain or choice.chain, system, tolerance_ns) for key, side in chains.items()}
-        blocks = reader.all_blocks(scan, _BLOCK)
+        blocks = reader.all_blocks(scan, block_size)
         if limit is not None:
-            blocks = reader.sample_blocks(scan, limit, _BLOCK, long_samples=limit * MAX_SAMPLES)
+            blocks = reader.sample_blocks(scan, limit, block_size, long_samples=limit * MAX_SAMPLES)
         if clouds:
             between = _match_cloud(blocks, Path(strip), a, b, runs, tolerance_ns)
         else:
@@ -272,6 +273,7 @@ class _Found(Solved):
         rows = self.rows(block)
         rows["ray"] = rows["xyz"] = 0.0
         rows["xyz"][:, 2] = -pairing.SPEED * self.echoes.time
+        rows["echo_time"] = np.nan  # the distances are these times: they would be compared twice
         return rows
 
     def vendor_rows(self, block: WaveformBlock) -> np.ndarray:

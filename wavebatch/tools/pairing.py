@@ -25,7 +25,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.disk.raw_bytes import Closing
-from wavebatch.files.disk.temp_store import Spool, count_buckets, spread_times
+from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, spread_times
 from wavebatch.files.las.header import CLASS_NAMES
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
@@ -488,17 +488,19 @@ PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
 """A pulse that counts even if neither side has an echo in it."""
 
 
-def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0, chosen: PointFilter = EVERY) -> Comparison:
+def compare_clouds(
+    a: Path, b: Path, *, tolerance_ns: float = 1.0, chosen: PointFilter = EVERY, held: int = BUCKET_ROWS
+) -> Comparison:
     """Compares the echoes of two clouds of one strip; b may be the strip itself, with the vendor's returns.
 
     Echoes of a pulse (equal GPS time) are the same if they are at most `tolerance_ns` apart along the ray, one to one,
     nearest first. If GPS times do not separate pulses, mutual nearest neighbours are the same. Points passed through
-    without an echo are ignored. chosen: only these points are compared, in both clouds. Memory is bounded; large
-    clouds need room in TMPDIR.
+    without an echo are ignored. chosen: only these points are compared, in both clouds. held: rows in memory at a
+    time; large clouds need room in TMPDIR.
     Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance, an unknown column, or
     coordinates without a length.
     """
-    with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns) as task:
+    with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns, held) as task:
         for reader, side in ((first, 0), (second, 1)):
             reader.select(chosen)
             for rows in read_echoes(reader):
@@ -507,12 +509,15 @@ def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0, chosen: Point
     return replace(found, left_out_a=first.left_out, left_out_b=second.left_out)
 
 
-def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float) -> CloudTask:
+def open_task(
+    first: CloudReader, second: CloudReader, tolerance_ns: float, held: int = BUCKET_ROWS
+) -> CloudTask:
     """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
     by_time = pulses_told_apart(first) and pulses_told_apart(second) and _share_times(first, second)
     for reader in (first, second):
         reader.measure_in_metres()
-    task = CloudTask(by_time, check_tolerance(tolerance_ns), max(first.point_count, second.point_count))
+    points = max(first.point_count, second.point_count)
+    task = CloudTask(by_time, check_tolerance(tolerance_ns), count_buckets(points, held))
     if not by_time and task.number > 1:
         # Borders along x, so that all buckets have about the same number of points.
         some = np.concatenate([rows["xyz"][::100, 0] for rows in first.read_pieces()])
@@ -526,16 +531,20 @@ def read_echoes(reader: CloudReader) -> Iterator[np.ndarray]:
         yield rows[(rows["flags"] & np.uint16(PASSED_THROUGH)) == 0]
 
 
-def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5, chosen: PointFilter = EVERY) -> Comparison:
+def compare_truth(
+    a: Path, truth: Path, *, tolerance_ns: float = 1.5, chosen: PointFilter = EVERY, held: int = BUCKET_ROWS
+) -> Comparison:
     """Compares the echoes of a cloud with the truth of its simulated strip; raises as compare_clouds does.
 
-    chosen: only these points of the cloud; the truth is whole, so that true echoes of other points are missed.
+    chosen: only these points of the cloud; the truth is whole, so that true echoes of other points are missed. held:
+    rows in memory at a time.
     """
     with CloudReader(a) as cloud, TruthReader(truth) as reference:
         cloud.select(chosen)
         points = max(cloud.point_count, reference.meta.get("packets", 0))
         names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
-        with CloudTask(True, check_tolerance(tolerance_ns), points, reference.meta) as task:
+        buckets = count_buckets(points, held)
+        with CloudTask(True, check_tolerance(tolerance_ns), buckets, reference.meta) as task:
             for rows in read_echoes(cloud):
                 task.add(0, rows)
             for piece in reference.read_pieces(*names):
@@ -572,9 +581,9 @@ class CloudTask(Closing):
     A context manager, because temporary files hold the rows.
     """
 
-    def __init__(self, by_time: bool, tolerance_ns: float, points: int, meta: dict | None = None) -> None:
+    def __init__(self, by_time: bool, tolerance_ns: float, buckets: int, meta: dict | None = None) -> None:
         self.by_time, self.pairing = by_time, Pairing(tolerance_ns, meta)
-        self.number = count_buckets(points)
+        self.number = buckets
         dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, PACKET_DTYPE)
         self.buckets = [Spool(self.number, dtype) for dtype in dtypes]
         self.borders = np.empty(0)

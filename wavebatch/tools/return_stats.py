@@ -23,7 +23,7 @@ from wavebatch.core.schema import Key
 from wavebatch.core.units import HALF_C
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.disk.temp_store import Spool, count_buckets, spread_keys, tell_pulses_apart, time_keys
+from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, spread_keys, tell_pulses_apart, time_keys
 from wavebatch.files.geojson import Polygon, describe_miss, find_inside
 from wavebatch.files.las.header import read_header
 
@@ -404,6 +404,7 @@ def count_returns(
     *,
     divisions: Sequence[Division] = (),
     chosen: PointFilter = EVERY,
+    held: int = BUCKET_ROWS,
 ) -> tuple[list[ReturnStats], ReturnStats]:
     """Statistics of each cloud and of all together, for points in any order.
 
@@ -411,12 +412,12 @@ def count_returns(
     chosen: count only these points. divisions: count also by areas; a pulse belongs, with all its returns, to the
     area of its first return. skip: called with the InputError of a cloud that cannot be read, which is then left out;
     without it, the error is raised.
-    Memory does not grow with the clouds; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
+    held: rows in memory at a time; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
     """
     each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0
     for path in clouds:
         try:
-            tally = _tally_cloud(Path(path), divisions, chosen)
+            tally = _tally_cloud(Path(path), divisions, chosen, held)
         except InputError as error:
             if skip is None:
                 raise
@@ -438,7 +439,7 @@ def pulses_told_apart(reader: CloudReader) -> bool:
     return rows is None or tell_pulses_apart(rows["gps_time"])
 
 
-def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter) -> _Tally:
+def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter, held: int) -> _Tally:
     with CloudReader(path, RETURN_DTYPE) as reader:
         by_time = pulses_told_apart(reader)  # by all points
         reader.select(chosen)
@@ -452,7 +453,7 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter)
             tally.notes.append(f"coordinates are {reader.unit}: distances and depths are converted to metres")
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
-        number = count_buckets(reader.point_count)
+        number = count_buckets(reader.point_count, held)
         with Spool(number, _ROW) as buckets:
             keys = _Keys(by_time)
             for rows in reader.read_pieces():

@@ -93,10 +93,12 @@ class ScanLine:
         return len(self.point)
 
 
-def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
+def read_scan_lines(
+    reader: StripReader, scan: StripScan, *, least: int = LEAST_PULSES, most: int = MOST_PULSES
+) -> Iterator[ScanLine]:
     """The scan lines of a strip in file order.
 
-    Lines of fewer than LEAST_PULSES pulses are left out, lines of more than MOST_PULSES are cut. Memory is bounded.
+    Lines of fewer than `least` pulses are left out, lines of more than `most` are cut. Memory is bounded.
     Raises InputError if most pulses are in lines that are too short: the file is not in the order of time.
     """
     number = lost = total = 0
@@ -115,25 +117,25 @@ def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
         angle = np.arcsin(np.clip(flat @ axis / length, -1, 1))
         edges = np.append(find_sweeps(angle, pulses.gps_time), len(pulses))
         # Lines that are too long are cut.
-        pieces = [np.arange(a, b, MOST_PULSES) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        pieces = [np.arange(a, b, most) for a, b in zip(edges[:-1], edges[1:], strict=True)]
         edges = np.concatenate([*pieces, edges[-1:]])
         last = unit.number == reader.unit_count() - 1
         for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             if b == len(pulses) and not last:
                 break
             total += b - a
-            if b - a < LEAST_PULSES:
+            if b - a < least:
                 lost += b - a
                 continue
             yield _build_line(number, pulses.take(np.arange(a, b)))
             number += 1
         rest = [pulses.take(np.arange(edges[-2], len(pulses)))]
-    if 0 < total < LEAST_PULSES:
-        need = f"a scan line to find surfaces in needs {LEAST_PULSES}"
+    if 0 < total < least:
+        need = f"a scan line to find surfaces in needs {least}"
         raise InputError(f"{reader.facts.path}: has {total} pulse{'s' * (total > 1)}, {need}")
     if lost > total / 2:
         raise InputError(
-            f"{reader.facts.path}: {lost} of {total} pulses lie in scan lines of fewer than {LEAST_PULSES} pulses; "
+            f"{reader.facts.path}: {lost} of {total} pulses lie in scan lines of fewer than {least} pulses; "
             "slices need pulses in the order of time: sort the strip by GPS time"
         )
 

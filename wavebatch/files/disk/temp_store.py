@@ -128,21 +128,22 @@ def _prefix() -> str:
     return f"wavebatch-{re.sub('[^A-Za-z0-9.]', '_', platform.node())}-"
 
 
-SPOOL_MEMORY = 1 << 24
-"""Bytes of entries in memory before they are written to disk."""
-SPOOL_KEPT = 1 << 20
-"""Bytes of entries with which a spool travels to other processes: more of them read a file."""
+SPOOL_MEMORY, SPOOL_KEPT = 1 << 24, 1 << 20
+"""Bytes of entries that are in memory at a time, and that a spool takes to other processes."""
 
 
 class Spool(Closing):
     """Entries of one dtype in buckets 0..n-1: `append` all, then `read`; sealed it can be pickled. A context manager.
 
     The temporary file holds segments, each sorted by bucket, after a table of where its buckets begin. `close` removes
-    the file; copies in other processes only read it.
+    the file; copies in other processes only read it. memory: bytes of entries before they are written to disk. kept:
+    bytes of entries that travel themselves to other processes; more of them read a file.
     """
 
-    def __init__(self, buckets: int, dtype: np.dtype) -> None:
-        self.buckets = buckets
+    def __init__(
+        self, buckets: int, dtype: np.dtype, *, memory: int = SPOOL_MEMORY, kept: int = SPOOL_KEPT
+    ) -> None:
+        self.buckets, self._most, self._kept = buckets, memory, kept
         self.dtype = np.dtype(dtype)
         self.path: Path | None = None
         """The temporary file; None while all entries are in memory."""
@@ -165,7 +166,7 @@ class Spool(Closing):
         self._pending.append((bucket.astype(np.int64), entries))
         self._held += entries.nbytes + 8 * len(bucket)
         self.count += len(entries)
-        if self._held >= SPOOL_MEMORY:
+        if self._held >= self._most:
             self._flush()
 
     def seal(self) -> Spool:
@@ -182,7 +183,7 @@ class Spool(Closing):
 
     def __getstate__(self) -> dict[str, Any]:
         """Move many entries to a file; without room for it they travel themselves."""
-        if self._memory is not None and self._memory[1].nbytes > SPOOL_KEPT:
+        if self._memory is not None and self._memory[1].nbytes > self._kept:
             with contextlib.suppress(InputError):
                 self._write(self._memory[0], [self._memory[1]])
                 self._memory = None
@@ -483,9 +484,9 @@ _MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 divided by the golden ratio: multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
 
 
-def count_buckets(rows: int, held: int | None = None) -> int:
-    """Return how many buckets of at most `held` rows (None: BUCKET_ROWS) are needed, at most MOST_BUCKETS."""
-    return min(-(-max(rows, 1) // (held or BUCKET_ROWS)), MOST_BUCKETS)
+def count_buckets(rows: int, held: int = BUCKET_ROWS) -> int:
+    """Return how many buckets of at most `held` rows are needed, at most MOST_BUCKETS."""
+    return min(-(-max(rows, 1) // held), MOST_BUCKETS)
 
 
 def spread_times(gps_time: np.ndarray, number: int) -> np.ndarray:

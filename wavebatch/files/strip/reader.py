@@ -27,7 +27,9 @@ from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check
 from wavebatch.files.strip.packets import PacketFile, StripFacts, block_rows, find_facts
 from wavebatch.files.strip.scanner import (
+    SCAN_SIZES,
     ScanPart,
+    ScanSizes,
     StripScan,
     cut_scan,
     expand,
@@ -113,6 +115,8 @@ class StripReader(Closing):
         Accept a .wdp without its 60-byte header.
     unit_points, unit_bytes : int or None
         Most points of a unit, and bytes of their records; None: UNIT_POINTS, UNIT_BYTES.
+    sizes : ScanSizes
+        What a scan holds at a time.
 
     Raises
     ------
@@ -122,7 +126,7 @@ class StripReader(Closing):
 
     def __init__(
         self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False,
-        unit_points: int | None = None, unit_bytes: int | None = None,
+        unit_points: int | None = None, unit_bytes: int | None = None, sizes: ScanSizes = SCAN_SIZES,
     ) -> None:  # fmt: skip
         if direction not in packet_check.OPTIONS:
             raise ConfigError(f"direction {direction!r}: must be one of {', '.join(packet_check.OPTIONS)}")
@@ -131,7 +135,7 @@ class StripReader(Closing):
         else:
             with reading(Path(path)):
                 facts = find_facts(Path(path), direction, headerless)
-        self.facts = facts
+        self.facts, self._sizes = facts, sizes
         most = (unit_bytes or UNIT_BYTES) // facts.header.point_length
         self._unit_points = max(1, min(unit_points or UNIT_POINTS, most))
         self._points = open_points(facts)
@@ -155,7 +159,7 @@ class StripReader(Closing):
         tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
         packets of another strip. parts: of all units, in order, where other processes have passed over the points.
         """
-        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points, parts)
+        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points, parts, self._sizes)
         if not scan.problems and (stranger := self._find_stranger(scan)):
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
             scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
@@ -166,11 +170,11 @@ class StripReader(Closing):
 
     def scan_units(self, first: int, last: int) -> ScanPart:
         """Return what `scan` needs to know of the units [first, last), which are among those of `cut_scan`."""
-        return scan_units(self.facts, self._points, self._packets, self._unit_points, first, last)
+        return scan_units(self.facts, self._points, self._packets, self._unit_points, first, last, self._sizes)
 
     def cut_scan(self, parts: int) -> list[tuple[int, int]]:
         """Return at most so many runs of units that may be scanned one by one, by any processes."""
-        return cut_scan(self.unit_count(), self._unit_points, parts)
+        return cut_scan(self.unit_count(), self._unit_points, parts, self._sizes)
 
     def _find_stranger(self, scan: StripScan) -> str:
         """Why the packets of the .wdp are certainly those of another strip; empty where they may be its own."""

@@ -23,24 +23,39 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct
 from wavebatch.files.disk.raw_bytes import Closing, take_whole_records
-from wavebatch.files.disk.temp_store import Spool, spread_keys
+from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
 from wavebatch.files.las.crs import metres_per_unit
 from wavebatch.files.las.header import locate
 from wavebatch.files.las.read_points import PointSource
 from wavebatch.files.strip import packet_check as check
 from wavebatch.files.strip.packets import PacketFile, StripFacts
 
-WINDOW = 16_384
-"""Points before a border that are compared with the unit after it; vendors write returns of a pulse together."""
 MAX_RETURNS = 32
 """More points on one packet are damage: LAS has at most 15 returns."""
-BINS = 1 << 18
-"""Bins of the packet file: 5 MiB of memory."""
 _LEAST_BIN = 64
-_PER_BUCKET = 500_000
-"""Keys that are sorted at a time, about 20 MB."""
 _KEY = np.dtype([("key", "<u8"), ("index", "<i8")])
 _WANT = np.dtype([("index", "<i8"), ("unit", "<i8")])
+
+
+@frozen
+class ScanSizes:
+    """What a scan holds at a time; its result does not depend on it."""
+
+    window: int = 16_384
+    """Points before a border that are compared with the unit after it; vendors write returns of a pulse together."""
+    bins: int = 1 << 18
+    """Bins of the packet file: 5 MiB of memory."""
+    keys: int = 500_000
+    """Keys that are sorted at a time, about 20 MB."""
+    part_units: int = 4
+    """Fewest units that a process scans: it reads again what lies before them, up to one unit."""
+    kept_bytes: int = 1 << 28
+    """Most bytes of decompressed points that are kept for later passes, in a temporary file."""
+    spooled: int = SPOOL_MEMORY
+    """Bytes of each table that are written to a temporary file at a time."""
+
+
+SCAN_SIZES = ScanSizes()
 
 
 @frozen(eq=False)
@@ -93,9 +108,9 @@ def cross_units(groups: PacketGroups, unit: np.ndarray) -> tuple[np.ndarray, np.
 class NearSharing:
     """Near search: takes the strip unit by unit and collects what is shared across borders within the window."""
 
-    def __init__(self, low: int, high: int, context: Spool) -> None:
-        self._low = np.uint64(low)
-        self._width = np.uint64(max(_LEAST_BIN, -(-(high - low) // BINS)))
+    def __init__(self, low: int, high: int, context: Spool, sizes: ScanSizes) -> None:
+        self._low, self._window = np.uint64(low), sizes.window
+        self._width = np.uint64(max(_LEAST_BIN, -(-(high - low) // sizes.bins)))
         bins = (high - low) // int(self._width) + 1
         self._first = np.full(bins, -1, np.int64)
         self._last = np.full(bins, -1, np.int64)
@@ -174,7 +189,7 @@ class NearSharing:
 
     def suspects(self) -> np.ndarray:
         """Return for each bin whether its points lie too far apart for the window."""
-        return (self._last - self._first) >= WINDOW
+        return (self._last - self._first) >= self._window
 
     def is_suspect(self, keys: np.ndarray, suspects: np.ndarray) -> np.ndarray:
         """Return whether keys (n,) lie in suspect bins, bool (n,)."""
@@ -186,16 +201,16 @@ class NearSharing:
 
 
 def find_far(
-    units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders: np.ndarray
+    units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders: np.ndarray, sizes: ScanSizes
 ) -> tuple[Spool, int, int, np.ndarray]:
     """Far search among all keys of `units`, as (keys, file index), `count` in all, in bounded memory.
 
     Returns for each unit which of its points which other unit needs, the number of packets, how far apart points of a
     packet lie, and the keys of overfull packets.
     """
-    buckets = count // _PER_BUCKET + 1
-    spool = Spool(buckets, _KEY)
-    wants = Spool(len(borders) - 1, _WANT)
+    buckets = count // sizes.keys + 1
+    spool = Spool(buckets, _KEY, memory=sizes.spooled)
+    wants = Spool(len(borders) - 1, _WANT, memory=sizes.spooled)
     packets, reach, overfull = 0, 0, []
     try:
         for keys, index in units:
@@ -330,14 +345,11 @@ _PAIRS, _VOTERS = 4096, 256
 _FAR_SAMPLES = 32
 """Units of a shuffled strip that vote again with their context."""
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
-PART_UNITS = 4
-"""Fewest units that a process scans: it reads again what lies before them, up to one unit."""
-_KEPT_BYTES = 1 << 28
-"""Most bytes of decompressed points that a scan keeps for later passes, in a temporary file."""
 
 
 def scan_strip(
-    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, parts: Sequence[ScanPart] = ()
+    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, parts: Sequence[ScanPart] = (),
+    sizes: ScanSizes = SCAN_SIZES,
 ) -> StripScan:
     """Scan all points of a strip.
 
@@ -345,19 +357,20 @@ def scan_strip(
     units, in their order; the result is the same.
     Raises InputError if points cannot be read; other reasons against processing are in the scan's `problems`.
     """
-    return _Scanner(facts, source, packets, unit_points).run(parts)
+    return _Scanner(facts, source, packets, unit_points, sizes).run(parts)
 
 
 def scan_units(
-    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, first: int, last: int
+    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, first: int, last: int,
+    sizes: ScanSizes = SCAN_SIZES,
 ) -> ScanPart:
     """Scan the units [first, last) of a strip; arguments and errors as for `scan_strip`."""
-    return _Scanner(facts, source, packets, unit_points).scan_units(first, last).seal()
+    return _Scanner(facts, source, packets, unit_points, sizes).scan_units(first, last).seal()
 
 
-def cut_scan(units: int, unit_points: int, parts: int) -> list[tuple[int, int]]:
+def cut_scan(units: int, unit_points: int, parts: int, sizes: ScanSizes = SCAN_SIZES) -> list[tuple[int, int]]:
     """Cut a strip into at most so many runs of units [first, last) that `scan_units` may take one by one."""
-    most = units // PART_UNITS if unit_points >= WINDOW + LONGEST_RUN else 1
+    most = units // sizes.part_units if unit_points >= sizes.window + LONGEST_RUN else 1
     parts = max(1, min(parts, most))
     return list(itertools.pairwise(units * part // parts for part in range(parts + 1)))
 
@@ -391,13 +404,13 @@ class _Tally:
 class ScanPart(Closing):
     """What was found in consecutive units of a strip; sealed it can be pickled."""
 
-    def __init__(self, facts: StripFacts, form: str, units: int) -> None:
+    def __init__(self, facts: StripFacts, form: str, units: int, sizes: ScanSizes) -> None:
         self.borders: list[int] = []
         self.tally, self.votes, self.sample, self.claimed = _Tally(), check.DirectionTally(form), check.FormSample(), 0
-        self.context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
-        self.decoded = Spool(units, facts.dtype)
+        self.context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]), memory=sizes.spooled)
+        self.decoded = Spool(units, facts.dtype, memory=sizes.spooled)
         low, high = facts.packets.offsets
-        self.near = NearSharing(low, max(low, high), self.context)
+        self.near = NearSharing(low, max(low, high), self.context, sizes)
 
     def seal(self) -> ScanPart:
         self.context.seal()
@@ -417,13 +430,15 @@ class ScanPart(Closing):
 
 
 class _Scanner:
-    def __init__(self, facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int) -> None:
-        self._facts, self._source, self._unit_points = facts, source, unit_points
+    def __init__(
+        self, facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, sizes: ScanSizes
+    ) -> None:
+        self._facts, self._source, self._unit_points, self._sizes = facts, source, unit_points, sizes
         self._packets = packets
         self._judge = check.Judge(facts)
         self._form = check.find_form(self._take_first())
         self._units = -(-facts.header.point_count // unit_points)
-        self._found = ScanPart(facts, self._form, self._units)
+        self._found = ScanPart(facts, self._form, self._units, sizes)
         self._keeps = facts.header.compressed
         self._widths = np.zeros(256, np.int64)
         self._widths[list(facts.digitizers)] = [digitizer.width for digitizer in facts.digitizers.values()]
@@ -485,7 +500,7 @@ class _Scanner:
         """Yields first index and points of each unit, and collects the borders."""
         step, count, borders = self._unit_points, self._facts.header.point_count, self._found.borders
         begin, end = first * step, min(last * step, count)
-        rest = self._source.read(max(begin - WINDOW, 0), begin)
+        rest = self._source.read(max(begin - self._sizes.window, 0), begin)
         for at in range(begin, end, step):
             part = self._source.read(at, min(at + step, count))
             cut = _find_cut(rest, part) if at else 0
@@ -508,7 +523,7 @@ class _Scanner:
     def _keep(self, unit: int, points: np.ndarray) -> None:
         """Keep the points of a compressed strip: to decode them again takes twenty times as long as to read them."""
         size = (unit + 1) * self._unit_points * points.itemsize
-        if self._keeps and size <= _KEPT_BYTES:
+        if self._keeps and size <= self._sizes.kept_bytes:
             self._try_keeping(lambda: self._found.decoded.append(np.full(len(points), unit), points))
 
     def _try_keeping(self, write: Callable[[], object]) -> None:
@@ -526,7 +541,7 @@ class _Scanner:
         self._found.tally.add(points, start, judged)
         rows = np.flatnonzero(judged.usable)
         part = _Part(judged.keys[rows], start + rows, unit, points, start)
-        tails = (old.tail(start - WINDOW) for old in self._window)
+        tails = (old.tail(start - self._sizes.window) for old in self._window)
         self._window = [tail for tail in tails if len(tail.keys)]
         parts = _Parts([*self._window, part])
         own = np.arange(len(parts.keys)) >= len(parts.keys) - len(rows)
@@ -560,7 +575,7 @@ class _Scanner:
         """Finds points anywhere in the strip that share packets of suspect bins, and adds them to the context."""
         borders = np.array(self._found.borders)
         count = int(self._found.tally.reasons[check.Reason.USABLE])
-        far, packets, reach, overfull = find_far(self._suspect_keys(suspects), count, borders)
+        far, packets, reach, overfull = find_far(self._suspect_keys(suspects), count, borders, self._sizes)
         try:
             for unit in range(len(borders) - 1):
                 wants = far.read(unit)

@@ -20,7 +20,7 @@ from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference, render_table, skew_system, skewed
 from wavebatch.stages.decompose.solve import EchoLimits, fit_gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.flags import flag_echoes
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, pulse_shape
 

@@ -23,7 +23,7 @@ from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
 from wavebatch.stages.detect.candidates import samples_of
-from wavebatch.stages.detect.maximum import choose_smoothing
+from wavebatch.stages.detect.direct import choose_smoothing
 from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes, scale_errors
 from wavebatch.stages.pulse_tables import (
     BROADEST,

@@ -27,7 +27,7 @@ from wavebatch.kernels.fit.describe import (
 )
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.detect.maximum import matched_filter
+from wavebatch.stages.detect.direct import matched_filter
 from wavebatch.stages.flags import misfit_factor, scale_errors
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits

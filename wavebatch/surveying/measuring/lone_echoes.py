@@ -10,7 +10,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.decompose.fit import closed_form
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.flags import use_noise_errors
 
 ALONE = 0.1

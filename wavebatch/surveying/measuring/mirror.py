@@ -14,7 +14,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.stages.detect.maximum import matched_filter, maximum
+from wavebatch.stages.detect.direct import matched_filter, maximum
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying.measuring.judge import explain

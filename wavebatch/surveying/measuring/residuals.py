@@ -22,7 +22,7 @@ from wavebatch.kernels.signal.floor import MOST_LEAST, floor_share
 from wavebatch.kernels.signal.noise import DRIFT, residual_noise
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.detect.maximum import matched_filter
+from wavebatch.stages.detect.direct import matched_filter
 from wavebatch.stages.flags import use_noise_errors
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits

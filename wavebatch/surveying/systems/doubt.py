@@ -63,8 +63,9 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
         if unseen or hidden:
             code, guess = "noise-guess", f"noise is a guess, of {system.noise.std:.3g} DN"
         elif known and not few:
-            values = f"{system.noise.std:.3g} DN and {100 * system.misfit:.2g} %"
-            code, guess = "noise-guess", f"noise and the misfit are guesses, of {values}"
+            misfit = f"{100 * system.misfit:.2g} %" if system.misfit else "none found"
+            noise = f"noise, {system.noise.std:.3g} DN"
+            code, guess = "noise-guess", f"{noise}, and the pulse's misfit, {misfit}, are guesses"
         yield StripWarning(
             code, f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
             f"{remedy}",

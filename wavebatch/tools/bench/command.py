@@ -49,7 +49,7 @@ from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import SAMPLE, choose_chain
 from wavebatch.surveying.look import pool_blocks
 from wavebatch.surveying.systems.survey_result import Survey
-from wavebatch.tools.api.strip import AUTO
+from wavebatch.tools.api import AUTO
 from wavebatch.tools.bench import accuracy
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene, simulate_blocks, simulate_strip
 from wavebatch.tools.simulate.scenes import Drawn

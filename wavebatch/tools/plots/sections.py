@@ -71,7 +71,7 @@ class Section:
     total: cells.Tally
     """Counts of all points of the clouds."""
     inside: int
-    """Points with a value in the section; at most MOST_POINTS are here."""
+    """Points with a value in the section; at most MOST_POINTS of them are here."""
     outside: int
     """Of these, far outliers in height, which are not here: they would press all others into a line."""
     shown: tuple[float, float]
@@ -88,11 +88,13 @@ def cut_section(
     *,
     line: tuple[float, float, float, float] | None = None,
     width: float | None = None,
+    most: int = MOST_POINTS,
 ) -> Section:
     """The points within half of `width` from a line, as distance along it and height.
 
     line: x0, y0, x1, y1; by default along the longer extent of the points, through their middle. width: by default a
-    fiftieth of the line, for voxels at least one voxel. Raises InputError if no point lies there.
+    fiftieth of the line, for voxels at least one voxel. most: an even sample of so many points at the most. Raises
+    InputError if no point lies there.
     """
     clouds = open_heights(paths, column, chosen)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
@@ -118,7 +120,7 @@ def cut_section(
         keep = (far >= 0) & (far <= length) & (np.abs(aside) <= 0.5 * width) & np.isfinite(height)
         return np.stack([far, height, rows["values"][:, 0]], axis=1)[keep]
 
-    total, sample, _ = cells.sample_points(clouds, lambda _, rows: cut(rows), MOST_POINTS)
+    total, sample, _ = cells.sample_points(clouds, lambda _, rows: cut(rows), most)
     if not sample.seen:
         raise InputError(
             f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} {crs.unit} of the line from "

@@ -42,6 +42,7 @@ def write_compare_page(target: Path, result: Comparison | Matchup, broken: Seque
 
 def _list_echoes(one: Comparison) -> Iterator[Part]:
     """How many echoes both sides have, and how many are the same."""
+    yield Later(partial(_draw, one))
     yield from (Fact("A", one.a), Fact("B", one.b))
     yield Fact("matched by", f"{one.matched_by}, within {one.tolerance_ns:g} ns")
     if one.left_out_a or one.left_out_b:
@@ -54,7 +55,6 @@ def _list_echoes(one: Comparison) -> Iterator[Part]:
     if one.pulses:
         yield Fact("exact count", one.exact_count, ".4f")
         yield Fact("pulses", one.pulses)
-    yield Later(partial(_draw, one))
     numbers = sorted({*one.counts_a, *one.counts_b}) if one.pulses else ()
     rows = [(str(n), one.counts_a.get(n, 0), one.counts_b.get(n, 0)) for n in numbers]
     yield Sheet("Echoes per pulse", [Table(("echoes per pulse", "A", "B"), rows), Later(lambda: [_sums(one)])])

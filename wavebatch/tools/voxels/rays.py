@@ -221,11 +221,12 @@ AROUND = np.array([a * _SHIFT + b for a in (-1, 0, 1) for b in (-1, 0, 1)])
 class CellMap:
     """The lowest or the highest return of each cell.
 
-    middle: a position in the strip; returns more than 2^28 cells from it are ignored. cell: side of the cells [m].
-    highest: keep the highest returns.
+    middle: a position in the strip; returns more than 2^28 cells from it are ignored. cell: side of the cells [m];
+    it is doubled where there are more cells than `most`. highest: keep the highest returns.
     """
 
-    def __init__(self, middle: np.ndarray, cell: float, *, highest: bool) -> None:
+    def __init__(self, middle: np.ndarray, cell: float, *, highest: bool, most: int = MOST_CELLS) -> None:
+        self._most = most
         self._middle = np.array([middle[0], middle[1], 0.0])
         self.cell = cell
         self._sign = -1.0 if highest else 1.0
@@ -239,7 +240,7 @@ class CellMap:
         index = np.floor(local[:, :2] / self.cell)
         good = (np.abs(index) < _REACH).all(axis=1) & np.isfinite(xyz[:, 2])
         self._keep_outermost(np.concatenate([self._kept, local[good]]))
-        while len(self._key) > MOST_CELLS:
+        while len(self._key) > self._most:
             self.cell *= 2.0
             self._keep_outermost(self._kept)
 
@@ -278,11 +279,11 @@ LEAST_WIDTH = 0.1
 class Floor(CellMap):
     """Ground below a strip: a plane through the lowest returns of each cell and of the eight around it.
 
-    middle: as for CellMap.
+    middle, most: as for CellMap.
     """
 
-    def __init__(self, middle: np.ndarray) -> None:
-        super().__init__(middle, CELL, highest=False)
+    def __init__(self, middle: np.ndarray, most: int = MOST_CELLS) -> None:
+        super().__init__(middle, CELL, highest=False, most=most)
         self._slope = np.empty((0, 2))
 
     def finish(self) -> Floor:
@@ -332,11 +333,11 @@ MOST_STEPS = 1024
 class Ceiling(CellMap):
     """Highest return of each cell of a map and its eight neighbours.
 
-    middle: as for CellMap. size: of the voxels [m].
+    middle, most: as for CellMap. size: of the voxels [m].
     """
 
-    def __init__(self, middle: np.ndarray, size: float) -> None:
-        super().__init__(middle, max(LEAST_CELL, VOXELS_PER_CELL * size), highest=True)
+    def __init__(self, middle: np.ndarray, size: float, most: int = MOST_CELLS) -> None:
+        super().__init__(middle, max(LEAST_CELL, VOXELS_PER_CELL * size), highest=True, most=most)
         self._top = np.empty(0)
 
     def finish(self) -> Ceiling:

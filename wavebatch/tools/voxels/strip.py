@@ -170,13 +170,14 @@ def voxelize_strip(
     progress: Callable[[int, int], object] | None = None,
     block_size: int | None = None,
     held: int = HELD,
+    unit_points: int | None = None,
 ) -> VoxelSummary:
     """Deconvolves the waveforms of a strip and writes the sums of every voxel, in the format of the target's suffix.
 
     system: a saved survey, instead of a survey of this strip. force: also where the strip contradicts it. calibration:
     for cross sections; it or the survey must have the divergence of the beam. profiles: an .npz for those of single
-    pulses. progress: called with the number of waveforms done since the last call, and the total. block_size, held:
-    packets at a time, and sums in memory; the output does not depend on them.
+    pulses. progress: called with the number of waveforms done since the last call, and the total. block_size, held,
+    unit_points: packets at a time, sums in memory and points of a unit; the output does not depend on them.
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
@@ -185,7 +186,8 @@ def voxelize_strip(
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: the voxels are written to this file; choose another name")
-    with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan(force=force) as scan:
+    reader = StripReader(strip, direction=direction, headerless=headerless, unit_points=unit_points)
+    with reader, reader.scan(force=force) as scan:
         if not scan.packets:
             raise InputError(f"{strip}: holds no waveform to put into voxels; see `wavebatch check`")
         positions = Positions.IF_KNOWN if calibration is None else Positions.REQUIRED
