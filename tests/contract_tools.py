@@ -7,8 +7,7 @@ from given_echoes import FINE, fine_recording, known_noise, simulate_echoes
 from published import PULSE_SIGMA as SIGMA
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, ReturnTable, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 from wavebatch.tools.simulate import simulate_block
 

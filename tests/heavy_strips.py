@@ -143,13 +143,13 @@ class Done(NamedTuple):
     """What it wrote."""
 
 
-def run_limited(command: str, strip: Path, out: Path) -> Done:
+def run_limited(command: str, strip: Path, out: Path, *, memory: int = MEMORY, seconds: int = SECONDS) -> Done:
     """Run a command on a strip in a process with limits."""
     words = [word.format(strip=strip, out=out) for word in command.split()]
     out.mkdir(exist_ok=True)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     process = subprocess.Popen(
-        [sys.executable, "-c", _LIMITED, str(MEMORY), str(SECONDS), *words],
+        [sys.executable, "-c", _LIMITED, str(memory), str(seconds), *words],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )  # fmt: skip

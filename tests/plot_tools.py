@@ -3,8 +3,7 @@
 import laspy
 import numpy as np
 
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.chain import STAGES, Chain, Step
 

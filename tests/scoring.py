@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.score import QUANTITIES, TOLERANCE_NS, ErrorStats, find_isolated_echoes, match_echoes
 
 _CLASS_FLAGS = {

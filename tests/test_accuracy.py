@@ -9,9 +9,8 @@ from scoring import score
 
 from wavebatch import surveying
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.decompose.merge import merge_unresolved

@@ -50,13 +50,10 @@ def test_a_plan_gives_the_same_small_strip_each_time(tmp_path):
     assert {8, 16, 32} < kinds and len(kinds & set(SHAPES)) > 6
 
 
-def test_what_takes_too_much_is_noticed(tmp_path, monkeypatch):
+def test_what_takes_too_much_is_noticed(tmp_path):
     strip = build_strip(LONG._replace(samples=60), tmp_path / "a.las")
-    monkeypatch.setattr("heavy_strips.SECONDS", 0)
-    assert "exit code" in run_limited("info {strip}", strip, tmp_path / "out").wrong
-    monkeypatch.setattr("heavy_strips.SECONDS", 20)
-    monkeypatch.setattr("heavy_strips.MEMORY", 100 << 20)
-    assert run_limited("info {strip}", strip, tmp_path / "out").wrong
+    assert "exit code" in run_limited("info {strip}", strip, tmp_path / "out", seconds=0).wrong
+    assert run_limited("info {strip}", strip, tmp_path / "out", memory=100 << 20).wrong
 
 
 @pytest.mark.parametrize("shape", list(SHAPES))

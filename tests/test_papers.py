@@ -6,17 +6,14 @@ import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from html_tools import Page
 
-from wavebatch.stages.decompose.fit import gaussian
-from wavebatch.tools.simulate import DiscreteReceiver
-
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "papers"
+README = FOLDER / "README.md"
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("s?_*.py"))
 
@@ -30,7 +27,7 @@ def load(monkeypatch):
 
 def test_there_is_one_for_every_paper():
     assert [name[:2] for name in SCRIPTS] == ["s0", "s1", "s2", "s3", "s4"]
-    told = (FOLDER / "README.md").read_text("utf-8")
+    told = README.read_text("utf-8")
     assert all(f"{name}.py" in told for name in SCRIPTS)
 
 
@@ -55,6 +52,14 @@ def test_papers_are_reproduced(name, seed):
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "FAIL" not in result.stdout and result.stdout.endswith("\n0 figures not accepted\n")
+    if seed == 0:  # the scripts' default: the README has what they print
+        shown = re.findall(r"(?m) (-?[\d.]+) +(?:\S+\.\.\S+|>= \S+|-)(?: +ok)?$", result.stdout)
+        told = README.read_text("utf-8")
+        (section,) = re.findall(rf"(?s)## `python examples/papers/{name}\.py`(.*?)(?=\n## |\Z)", told)
+        ours = [line.split("|")[-2] for line in section.splitlines() if line.startswith("| ")]
+        for figure in re.findall(r"(?<![\w.])-?\d*\.\d+", " ".join(ours)):
+            half = 0.5001 * 10.0 ** -len(figure.partition(".")[2])
+            assert any(abs(abs(float(one)) - abs(float(figure))) <= half for one in shown), figure
 
 
 def test_a_figure_outside_its_band_fails(load, monkeypatch, capsys):
@@ -77,22 +82,6 @@ def test_a_figure_outside_its_band_fails(load, monkeypatch, capsys):
     assert lines[6] == "a text"
     assert lines[-3:] == ["2 figures not accepted", "  things: bad", "  things: unknown"]
     assert table.main(lambda number, seed: [], "Things.", 10) == 0
-
-
-RIGHT = {
-    "s0_wagner": lambda s: s.table_of_cross_sections(1000, 0),
-    "s1_wang": lambda s: s.table_of_estimates(600, 0),
-    "s2_jutzi": lambda s: s.table_of_lines(2000, 0),
-    "s3_rhomberg_kauert": lambda s: s.table_of_rays(4000, 0),
-    "s4_ussyshkin": lambda s: s.table_of_synthesis(3000, 0),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", RIGHT)
-def test_what_is_right_is_accepted(name, load):
-    table = RIGHT[name](load(name))
-    assert not table.failures and len(table.rows) >= 4
 
 
 def test_tables_say_where_their_inputs_come_from(load):
@@ -123,53 +112,6 @@ def test_the_paper_column_has_what_is_printed(load):
     assert counts["maxima: 1"] == "58.08, 51.54" and counts["ASDF, mean pulse: 5 or more"] == "0.24, 0.27"
     models = {row[0]: row[1] for row in load("s1_wang").table_of_models(20, 0).rows}
     assert models["table 3: Leica, mean of both classes, log-normal"] == "0.0083"
-
-
-def break_height(s4, monkeypatch):
-    """Echoes of `synthesize` are .5 % too high."""
-    monkeypatch.setattr(s4, "gaussian", lambda *known: _raise(gaussian(*known)))
-    return s4.table_of_synthesis(3000, 0)
-
-
-def break_energy(s4, monkeypatch):
-    """Waveforms of `synthesize` have 3 % too much energy."""
-    made = s4.synthesize_strip
-
-    def synthesize_more(cloud, strip, options, **known):
-        return made(cloud, strip, replace(options, gain=1.03 * options.gain), **known)
-
-    monkeypatch.setattr(s4, "synthesize_strip", synthesize_more)
-    return s4.table_of_footprints(3000, 0)
-
-
-def break_dead_zone(s4, monkeypatch):
-    """The receiver is blind for 3 mm more."""
-    monkeypatch.setattr(s4, "DiscreteReceiver", lambda dead_zone: DiscreteReceiver(dead_zone + 0.003))
-    return s4.table_of_separations(s4.FULL, 0)
-
-
-def break_number(s4, monkeypatch):
-    """The receiver gives a fifth return."""
-    monkeypatch.setattr(s4, "DiscreteReceiver", lambda dead_zone: DiscreteReceiver(dead_zone, most=5))
-    return s4.table_of_numbers(s4.FULL, 0)
-
-
-def _raise(found):
-    return replace(found, amplitude=found.amplitude * np.float32(1.005))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("fault", "failures"),
-    [
-        (break_height, {"height of lone echoes over gain times intensity"}),
-        (break_energy, {"pulses of 1, shares of 1/1", "pulses of 2, shares of 1/2"}),
-        (break_dead_zone, {"0.64 m, least of 2-3", "0.67 m, least of 1-2"}),
-        (break_number, {"orion-20 m, numbers above 4", "gemini-24 m, numbers above 4"}),
-    ],
-)
-def test_small_faults_are_not_accepted(fault, failures, load, monkeypatch):
-    assert failures <= set(fault(load("s4_ussyshkin"), monkeypatch).failures)
 
 
 def test_the_profile_of_the_third_paper_has_its_table(load):
@@ -267,7 +209,8 @@ def test_long_tables_are_folded_unless_a_figure_is_not_accepted(load):
 
 @pytest.mark.quick_cases("draw_cases", "draw_peak")
 @pytest.mark.parametrize(
-    "name", ["draw_cases", "draw_coefficients", "draw_fan", "draw_noise", "draw_peak", "draw_record"]
+    "name",
+    ["draw_cases", "draw_coefficients", "draw_fan", "draw_noise", "draw_old_records", "draw_peak", "draw_record"],
 )
 def test_figures_are_drawn(name, load, tmp_path):
     pytest.importorskip("matplotlib")

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import list_profiles, load_profile
 

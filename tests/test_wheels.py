@@ -39,7 +39,7 @@ def test_a_newer_glibc_is_seen(tmp_path):
 
 def test_wheels_and_source_are_written(zig, tmp_path):
     """Of Windows: that of this machine would be installed with all it needs, which `make dist` does."""
-    # Not imported: setuptools cannot be, once a test of this process has looked for pip, as `core/optional.py` does.
+    # Not imported: setuptools cannot be, once a test of this process has looked for pip, as `core/errors.py` does.
     if importlib.util.find_spec("setuptools") is None:
         pytest.skip("needs setuptools")
     wheels.build_all(tmp_path, *zig, (TARGETS[-1],))

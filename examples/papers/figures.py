@@ -73,8 +73,8 @@ def draw_cases(folder: Path, seed: int, target: Path) -> None:
 
 
 def draw_coefficients(folder: Path, seed: int, target: Path) -> None:
-    """Wang et al., figure 1b: coefficients of the B3 wavelet at three scales, here of case e in noise 1."""
-    block, truth, recording = simulate_wang("e", 1.0, 1, np.random.default_rng(seed))
+    """Wang et al., figure 1: two echoes 5 ns apart in noise 1, and coefficients of the B3 wavelet at three scales."""
+    block, truth, recording = simulate_wang("b", 1.0, 1, np.random.default_rng(seed))
     noise, system = known_noise(recording, 1), known_system(recording)
     signal = (block.samples - noise.baseline[:, None]).T.astype(np.float32)
     time = np.arange(len(signal)) * block.spacing
@@ -189,13 +189,27 @@ def _plain(value: float, place: int) -> str:
     return f"{value:g}"
 
 
+def draw_old_records(folder: Path, seed: int, target: Path) -> None:
+    """Ussyshkin and Theriault, figure 1: pulses with four returns by receivers with long dead zones."""
+    with open_picture(target, (13.0, 4.6), overwrite=True) as figure:
+        every = figure.subplots(1, 2)
+        for axes, dead_zone in zip(every, (2.14, 1.54), strict=True):
+            _draw_modelled(axes, folder, seed, "orion-20", 4, dead_zone)
+            axes.set_title(f"figure 1: 4 returns over trees of 20 m, dead zone {dead_zone} m", loc="left", fontsize=10)
+        every[0].set_ylabel("signal [DN]")
+
+
 def draw_record(folder: Path, seed: int, target: Path) -> None:
-    """Ussyshkin and Theriault, figures 1, 2 and 7: pulses with four returns over trees of 6 m and with three over corn,
+    """Ussyshkin and Theriault, figures 2 and 7: pulses with four returns over trees of 6 m and with three over corn,
     and the waveforms modelled from them."""
     with open_picture(target, (13.0, 4.6), overwrite=True) as figure:
         every = figure.subplots(1, 2)
-        for axes, (stand, returns) in zip(every, (("orion-6", 4), ("corn", 3)), strict=True):
+        for axes, (stand, returns, name) in zip(
+            every, (("orion-6", 4, "figures 2a and 7a: 4 returns over trees of 6 m"),
+                    ("corn", 3, "figures 2b and 7b: 3 returns over corn")), strict=True,
+        ):  # fmt: skip
             _draw_modelled(axes, folder, seed, stand, returns)
+            axes.set_title(name, loc="left", fontsize=10)
         every[0].set_ylabel("signal [DN]")
         every[0].legend(fontsize=8)
 
@@ -209,10 +223,10 @@ def draw_peak(folder: Path, seed: int, target: Path) -> None:
         axes.legend(fontsize=8)
 
 
-def _draw_modelled(axes, folder: Path, seed: int, stand: str, returns: int) -> None:
+def _draw_modelled(axes, folder: Path, seed: int, stand: str, returns: int, dead_zone: float = 0.65) -> None:
     """A pulse with so many returns over a stand, and the waveform that `synthesize` models from them."""
-    cloud, strip = folder / f"record-{stand}.las", folder / f"modelled-{stand}.las"
-    fly_cloud(stand, cloud, 0.65, 2000, seed)
+    cloud, strip = (folder / f"{kind}-{stand}-{dead_zone}.las" for kind in ("record", "modelled"))
+    fly_cloud(stand, cloud, dead_zone, 2000, seed)
     synthesize_strip(cloud, strip, SynthesisOptions(bits=16, baseline=0.0), overwrite=True)
     with wb.open_strip(strip) as opened:
         block, row = next(

@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.tools.simulate.render import PulseModel, Recording, paint_echoes, record_counts
 from wavebatch.tools.simulate.scenes import flag_truth, tabulate_echoes
 

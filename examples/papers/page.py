@@ -68,10 +68,11 @@ PAPERS = (
                 "plot waveform forest.laz --packet 19 --show asdf --chain asdf.toml"),
         Picture("Echoes of the forest from the side.", "plot section out/forest.laz --column amplitude --aspect 3"),
     )),
-    Paper("s1_wang", "Wang, Wang, Tseng", "1b, 4, 5", (
+    Paper("s1_wang", "Wang, Wang, Tseng", "1, 4, 5", (
         Picture("Figure 5: the five cases without noise (dashed: their echoes), and the echoes that the B3 "
                 "wavelet finds at three scales.", "draw_cases", ""),
-        Picture("Figure 1b: the coefficients at these scales, of case e in noise 1.", "draw_coefficients", ""),
+        Picture("Figures 1a and 1b: two echoes 5 ns apart, and the coefficients of the wavelet at these scales.",
+                "draw_coefficients", ""),
         Picture("Figure 4: noise of the last samples of 60 waveforms, and the threshold of three standard deviations.",
                 "draw_noise", ""),
         Picture("A skewed pulse (kappa 0.1) and its fit by `decompose.skewed`: the model follows the falling edge.",
@@ -112,7 +113,10 @@ PAPERS = (
                 "plot histogram out/village.laz --column incidence_angle_normals --where 'z > 123.5'"),
     )),
     Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2a, 2b, 4, 6, 7a, 7b", (
-        Picture("Figures 1, 2a, 2b, 7a and 7b: pulses with four returns over trees of 6 m and with three over corn, "
+        Picture("Figure 1: pulses with four returns by receivers with dead zones of 2.14 m and 1.54 m, the least "
+                "distances that the paper names, with waveforms that `synthesize` models from them.",
+                "draw_old_records", ""),
+        Picture("Figures 2a and 7a, 2b and 7b: pulses with four returns over trees of 6 m and with three over corn, "
                 "and the waveforms that `synthesize` models from them.",
                 "draw_record", ""),
         Picture("Figure 6: a return as the peak of a Gaussian, as `synthesize` models it.", "draw_peak", ""),

@@ -20,7 +20,7 @@ from table import Table, main, scatter
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C, MAD_TO_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 from wavebatch.stages.attribute.basic import position
 from wavebatch.stages.attribute.radiometry import cross_section

@@ -16,7 +16,7 @@ from table import Table, main, scatter
 
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.physics.incidence import (
     angles_of_variance,
     direct_width,

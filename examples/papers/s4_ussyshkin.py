@@ -17,9 +17,8 @@ from published import PRINTED_SHARES, RETURN_TABLES
 from table import Table, main, scatter
 
 import wavebatch as wb
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
-from wavebatch.core.waveforms import Noise, SystemPulse
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse
 from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section, transmit
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.direct import maximum

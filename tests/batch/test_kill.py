@@ -9,7 +9,6 @@ import time
 import pytest
 from batch_tools import is_alive, read_outputs
 
-from wavebatch.batch.workers import serve
 from wavebatch.tools.simulate import simulate_strip
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
@@ -17,11 +16,11 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSI
 PROFILE = ["--profile", "fast"]
 
 
-@pytest.fixture(scope="module")
-def strips(tmp_path_factory):
-    """Three strips, the last with two units."""
+@pytest.fixture(scope="module", params=[300, pytest.param(56_000, marks=pytest.mark.slow)])
+def strips(request, tmp_path_factory):
+    """Three strips, the last with one unit or two."""
     folder = tmp_path_factory.mktemp("strips")
-    for name, pulses in (("a", 300), ("b", 300), ("c", 56_000)):
+    for name, pulses in (("a", 300), ("b", 300), ("c", request.param)):
         simulate_strip("flat", folder / f"{name}.las", pulses=pulses, seed=1)
     return folder
 
@@ -94,7 +93,7 @@ def _is_tracker(pid):
         return False
 
 
-@pytest.mark.quick_cases("event1")
+@pytest.mark.quick_cases("300-event1")
 @pytest.mark.parametrize("event", [REPORTED, DRAWN_UP])
 def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips, undisturbed, tmp_path, event):
     out = tmp_path / "out"
@@ -104,7 +103,7 @@ def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips,
     assert read_outputs(out) == undisturbed
 
 
-@pytest.mark.slow
+@pytest.mark.quick_cases("300-15")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path, number):
     out = tmp_path / "out"
@@ -116,7 +115,7 @@ def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path
         assert path.with_name(path.name.replace(".report.json", ".laz")).exists()
 
 
-@pytest.mark.quick_cases("True")
+@pytest.mark.quick_cases("300-True")
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
 @pytest.mark.parametrize("stopped", [False, True])
 def test_workers_die_with_their_parent(strips, tmp_path, stopped):
@@ -176,17 +175,6 @@ def test_a_worker_that_is_stopped_as_soon_as_our_code_runs_in_it_dies_with_its_p
     _wait_until_gone([worker])
 
 
-def test_a_worker_asks_for_the_death_signal_before_all_else(monkeypatch):
-    done = []
-    monkeypatch.setattr(serve, "_wake_when_parent_dies", lambda: done.append("death signal"))
-    monkeypatch.setattr(serve.signal, "signal", lambda *_: done.append("ignores Ctrl-C"))
-    monkeypatch.setattr(serve, "keep_freed_memory", lambda: done.append("memory"))
-    monkeypatch.setattr(serve.multiprocessing, "parent_process", lambda: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        serve.serve_calls(None)
-    assert done == ["death signal", "ignores Ctrl-C", "memory"]
-
-
 _SHOT = """
 import os, sys
 from pathlib import Path
@@ -213,7 +201,6 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
 def test_a_strip_at_which_a_worker_dies_is_tried_once_more_and_only_then_fails(strips, undisturbed, tmp_path):
     script = tmp_path / "shot.py"
     out = tmp_path / "out"

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from commands import run_command
 
-from wavebatch.core.system import Radiometry
 from wavebatch.core.units import HALF_C
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import Radiometry, SystemPulse
 from wavebatch.stages.chain_file import load_profile
-from wavebatch.surveying.calibrating.calibration_file import format_calibration, parse_calibration
+from wavebatch.surveying.calibrating.calibration_files import format_calibration, parse_calibration
 from wavebatch.surveying.calibration import (
     Calibration,
     with_physics,

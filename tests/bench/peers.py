@@ -79,14 +79,14 @@ def list_peers() -> list[str]:
     return [*(["gdecomp"] if importlib.util.find_spec("gdecomp") else []), "scipy leastsq"]
 
 
-def run_peer(name: str, block: WaveformBlock, system: SystemPulse) -> PeerResult:
+def run_peer(name: str, block: WaveformBlock, system: SystemPulse, *, patience: float = PATIENCE) -> PeerResult:
     """Runs the peer on every waveform of the block, one by one, in another process.
 
     It gets the waveforms minus the baselines of wavebatch; scipy also gets the candidates of wavebatch.
     """
     noise = pooled(block, system)
     if name == "gdecomp":
-        return _run_gdecomp(block, noise)
+        return _run_gdecomp(block, noise, patience)
     with Worker() as worker:
         return worker.call(fit_leastsq, block, noise, system)
 
@@ -140,13 +140,13 @@ def _table(rows: np.ndarray, parameters: np.ndarray, last: float) -> EchoTable:
     return EchoTable.build(rows[keep], when[keep], amplitude[keep], sigma[keep])
 
 
-def _run_gdecomp(block: WaveformBlock, noise: Noise) -> PeerResult:
+def _run_gdecomp(block: WaveformBlock, noise: Noise, patience: float) -> PeerResult:
     n = len(block)
     with tempfile.TemporaryDirectory() as folder:
         signal, results = Path(folder, "signal.npy"), Path(folder, "results.npy")
         np.save(signal, block.samples - noise.level.astype(np.float64))
         np.save(results, np.full((n, 2 + 3 * MOST), np.nan))
-        failures = _drive_gdecomp(signal, results, n, HEIGHT * float(noise.std[0]))
+        failures = _drive_gdecomp(signal, results, n, HEIGHT * float(noise.std[0]), patience)
         done = np.load(results)
     good = np.isfinite(done[:, 0])
     count = np.where(good, done[:, 0], 0).astype(np.int64)
@@ -159,7 +159,7 @@ def _run_gdecomp(block: WaveformBlock, noise: Noise) -> PeerResult:
     return PeerResult(found, float(done[good, 1].sum()), int(good.sum()), failures)
 
 
-def _drive_gdecomp(signal: Path, results: Path, n: int, height: float) -> int:
+def _drive_gdecomp(signal: Path, results: Path, n: int, height: float, patience: float) -> int:
     """Runs gdecomp, starting it again after every waveform on which it crashes or hangs; returns their number."""
     failures, place = 0, 0
     while place < n:
@@ -167,7 +167,7 @@ def _drive_gdecomp(signal: Path, results: Path, n: int, height: float) -> int:
             worker.call(os.getpid)  # so that starting up does not look like hanging
             call = caller.submit(worker.call, fit_gdecomp, signal, results, place, height)
             try:
-                _wait(call, results, place)
+                _wait(call, results, place, patience)
                 break
             except BenchWorkerDied:
                 pass
@@ -177,12 +177,12 @@ def _drive_gdecomp(signal: Path, results: Path, n: int, height: float) -> int:
     return failures
 
 
-def _wait(call: Future, results: Path, place: int) -> None:
+def _wait(call: Future, results: Path, place: int, patience: float) -> None:
     """Waits until the worker is done; raises WorkerDied when it ends or makes no progress."""
     before = -1
     while True:
         try:
-            call.result(PATIENCE)
+            call.result(patience)
             return
         except TimeoutError:
             now = int(np.isfinite(np.load(results, mmap_mode="r")[place:, 0]).sum())

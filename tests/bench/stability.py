@@ -49,6 +49,7 @@ def measure_stability(
     cases: Sequence[Case] = CASES,
     methods: Collection[str] = (),
     progress: Callable[[str], None] = lambda text: None,
+    groups: int = GROUPS,
 ) -> list[dict[str, Any]]:
     """A row per case and chain, plain values for JSON.
 
@@ -60,9 +61,9 @@ def measure_stability(
     for number, case in enumerate(cases):
         progress(f"stability: {case.hazard} {case.name}")
         if case.recording not in ordinary:
-            ordinary[case.recording] = _survey(case.recording, choose, surveyed, seed)
-        groups = [
-            _make_case(case, survey, waveforms // GROUPS, derive_seed(seed, 77, number, place), place)
+            ordinary[case.recording] = _survey(case.recording, choose, surveyed, seed, groups)
+        made = [
+            _make_case(case, survey, waveforms // groups, derive_seed(seed, 77, number, place), place)
             for place, (survey, _) in enumerate(ordinary[case.recording])
         ]
         chosen = [chains for _, chains in ordinary[case.recording]]
@@ -72,14 +73,14 @@ def measure_stability(
                 continue
             row = {"hazard": case.hazard, "case": case.name, "chain": name}
             row |= {"is_auto": name in (AUTO, twin), "is_method": name in methods}
-            rows.append(row | _measure([chains[name] for chains in chosen], groups))
+            rows.append(row | _measure([chains[name] for chains in chosen], made))
     return rows
 
 
 def _survey(
-    recording: Recording, choose: Callable[[Survey], Mapping[str, Chain]], surveyed: int, seed: int
+    recording: Recording, choose: Callable[[Survey], Mapping[str, Chain]], surveyed: int, seed: int, groups: int
 ) -> list[tuple[Survey, Mapping[str, Chain]]]:
-    """Survey and chains of GROUPS ordinary, open strips with this receiver.
+    """Survey and chains of so many ordinary, open strips with this receiver.
 
     For a receiver with a saturation level, one echo in a hundred is clipped; else none.
     """
@@ -92,7 +93,7 @@ def _survey(
         law = Mixture(0.99, law, LogUniform(recording.clip, 3.0 * recording.clip))
     scene: Scene = replace(urban, amplitude=law, recording=recording)
     surveys = []
-    for place in range(GROUPS):
+    for place in range(groups):
         ((block, _),) = simulate_blocks(scene, surveyed, seed=derive_seed(seed, 78, place), size=surveyed)
         survey = survey_block(block)
         surveys.append((survey, choose(survey)))

@@ -5,6 +5,7 @@ GeoJSON lies where the strip lies, by what RFC 7946 and GDAL make of its coordin
 
 import json
 import shutil
+import struct
 import sys
 from dataclasses import replace
 
@@ -19,7 +20,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.geojson import AreaFile, describe_miss, load_polygons, place_rings, plan_crs, read_area_file
 from wavebatch.files.las.crs import build_utm, read_crs, read_crs_definition
-from wavebatch.files.las.header import build_wkt, read_header
+from wavebatch.files.las.header import Vlr, build_wkt, read_header
 from wavebatch.tools.scan_slices import Segment
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.slice_output import SegmentWriter
@@ -77,27 +78,19 @@ def test_degrees_are_projected_into_the_strip(strip, tmp_path, crs):
     assert np.hypot(*np.diff(ring, axis=0).T).max() < 120
 
 
-def test_a_long_edge_is_straight_in_degrees_as_the_standard_says():
+def test_a_long_edge_is_straight_in_degrees_as_the_standard_says(strip):
     pyproj = pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
-    header = type("H", (), {"mins": (3e5, 5e6, 0), "maxs": (3.5e5, 5.1e6, 0), "vlrs": ()})()
+    header = replace(read_header(strip), mins=(3e5, 5e6, 0.0), maxs=(3.5e5, 5.1e6, 0.0))
     file = read_area_file("a.geojson", None, [np.zeros((1, 2))])
     edge = np.array([[13.0, 48.0], [14.0, 48.0], [14.0, 48.1]])
-    ring, = _place(file, [edge], header)  # fmt: skip
+    (ring,) = place_rings(file, [edge], strip, header)
     back = np.stack(pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True).transform(*ring.T), axis=1)
     south = back[: np.flatnonzero(np.isclose(back[:, 0], 14.0, atol=1e-9))[0]]
     np.testing.assert_allclose(south[:, 1], 48.0, atol=1e-9)
     assert len(south) > 500 and np.ptp(ring[: len(south), 1]) > 100  # in UTM it bends by more than 100 m
     # A neighbour that has the edge in the other direction has the same corners: no gap, no overlap.
-    other, = _place(file, [edge[::-1]], header)  # fmt: skip
+    (other,) = place_rings(file, [edge[::-1]], strip, header)
     assert {tuple(row) for row in ring.tolist()} == {tuple(row) for row in other.tolist()}
-
-
-def _place(file, rings, header):
-    import wavebatch.files.geojson as module
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "read_crs_definition", lambda path, header: ZONE)
-        return place_rings(file, rings, "s.las", header)
 
 
 def test_a_named_crs_is_projected_and_the_strips_own_is_not(strip, tmp_path):
@@ -198,11 +191,13 @@ def test_a_strip_without_a_crs_takes_no_small_coordinates_of_a_named_one(plain):
     assert place_rings(file, [_box(plain)], plain, header)[0].tolist() == _box(plain).tolist()
 
 
-def test_degrees_of_a_strip_in_degrees_stay(plain, monkeypatch):
+def test_degrees_of_a_strip_in_degrees_stay(plain, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyproj", None)
-    monkeypatch.setattr("wavebatch.files.geojson.read_crs_definition", lambda path, header: "EPSG:4326")
+    path = shutil.copy(plain, tmp_path / "degrees.las")
+    keys = struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 2, 2048, 0, 1, 4326)
+    add_record(path, Vlr(b"LASF_Projection", 34735, keys))
     file = read_area_file("a.geojson", {"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}, [_square(10, 80)])
-    assert place_rings(file, [_square(10, 80)], plain, _local(plain))[0].tolist() == _square(10, 80).tolist()
+    assert place_rings(file, [_square(10, 80)], path, _local(path))[0].tolist() == _square(10, 80).tolist()
 
 
 def test_an_unknown_crs_is_one_line(strip, tmp_path):

@@ -17,8 +17,7 @@ from commands import run_command
 from strips import descriptor, make_raw, read_all
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.packet_check import packed_bytes, unpack_samples
 from wavebatch.files.strip.reader import StripReader

@@ -1,6 +1,5 @@
 """Sums by key: the same whatever was spilled, and in bounded memory."""
 
-import errno
 import pickle
 import tempfile
 from contextlib import closing
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk import temp_store
 from wavebatch.files.disk.temp_store import (
     MOST_BUCKETS,
     KeyedSums,
@@ -19,6 +17,8 @@ from wavebatch.files.disk.temp_store import (
     spread_times,
     time_keys,
 )
+
+resource = pytest.importorskip("resource", reason="limits of POSIX systems")
 
 ROW = np.dtype([("gps_time", "<f8"), ("number", "<i4")])
 
@@ -115,33 +115,19 @@ def test_a_full_disk_is_one_line(monkeypatch, tmp_path):
             sums.add(key, value)
 
 
-def test_a_disk_that_is_full_for_a_moment_doubles_nothing(monkeypatch):
+def test_a_disk_that_is_full_for_a_moment_doubles_nothing():
     """The first pickling finds no room for its entries; the second writes them once."""
     spool = Spool(3, np.dtype("i8"))
     numbers = np.arange(400_000)
     spool.append(numbers % 3, numbers)
     spool.seal()
 
-    class FullDisk:
-        def __init__(self, *arguments):
-            self.file = open(*arguments)  # noqa: SIM115
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            self.file.close()
-
-        def tell(self):
-            return self.file.tell()
-
-        def write(self, data):
-            self.file.write(bytes(memoryview(data).cast("B")[:100]))
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(temp_store, "open", FullDisk, raising=False)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
         whole = pickle.loads(pickle.dumps(spool))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     with closing(spool):
         copy = pickle.loads(pickle.dumps(spool))
         for bucket in range(3):

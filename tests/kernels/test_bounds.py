@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.kernels.fit.closed_form import crlb
 
 
 def numeric_bounds(parameters, noise_std, spacing, n_samples):

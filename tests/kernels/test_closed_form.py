@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import fit_closed_form
 from wavebatch.stages.decompose.fit import closed_form
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.physics.incidence import (
     angle_of_spread,
     angles_above,

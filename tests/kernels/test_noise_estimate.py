@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from wavebatch import surveying
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import estimate_noise
 from wavebatch.stages.chain import STAGES
 from wavebatch.surveying.measuring.residuals import hides_noise

@@ -8,8 +8,7 @@ import pytest
 
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.stages import chain as chain_module
 from wavebatch.stages.chain import KINDS, STAGES, Chain, Range, Step, stage
 from wavebatch.stages.chain_file import list_profiles, load_profile
@@ -18,13 +17,13 @@ SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.0))
 
 
 @pytest.fixture(autouse=True)
-def own_stages(monkeypatch):
+def own_stages():
     """Stages and columns that a test registers are gone after it."""
-    monkeypatch.setattr(chain_module, "STAGES", dict(STAGES))
-    known = set(COLUMNS)
+    known = [(table, set(table)) for table in (STAGES, COLUMNS)]
     yield
-    for name in COLUMNS.keys() - known:
-        del COLUMNS[name]
+    for table, names in known:
+        for name in table.keys() - names:
+            del table[name]
 
 
 def block(n=3):

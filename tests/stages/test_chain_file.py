@@ -5,7 +5,7 @@ import pytest
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.stages.chain import STAGES, Chain
+from wavebatch.stages.chain import STAGES, Chain, stage
 from wavebatch.stages.chain_file import effective, list_profiles, load_chain_file, load_profile, parse_chain
 
 GOOD = """
@@ -126,13 +126,10 @@ def test_unknown_profile_names_the_nearest():
         load_profile("balance")
 
 
-def test_choices_are_checked(monkeypatch):
+def test_choices_are_checked():
     from typing import Literal
 
-    import wavebatch.stages.chain as chain_module
     from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-
-    monkeypatch.setattr(chain_module, "STAGES", STAGES.copy())
 
     def pick(block: WaveformBlock, system: SystemPulse, *, kind: Literal["a", "b"] = "a") -> Noise:
         """Noise.
@@ -143,7 +140,9 @@ def test_choices_are_checked(monkeypatch):
             Which.
         """
 
-    chain_module.stage("noise")(pick)
-    monkeypatch.setattr("wavebatch.stages.chain_file.STAGES", chain_module.STAGES)
-    with pytest.raises(ConfigError, match='kind must be one of "a", "b", it is "c"'):
-        parse_chain('[[chain]]\nstage = "noise.pick"\nkind = "c"\n', "x")
+    stage("noise")(pick)
+    try:
+        with pytest.raises(ConfigError, match='kind must be one of "a", "b", it is "c"'):
+            parse_chain('[[chain]]\nstage = "noise.pick"\nkind = "c"\n', "x")
+    finally:
+        del STAGES["noise.pick"]

@@ -6,9 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.learn_pulse import fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.signal.runs import lobe_edges

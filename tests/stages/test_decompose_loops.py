@@ -12,7 +12,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, WaveformBlock
 from wavebatch.kernels.fit import render
-from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import parse_chain

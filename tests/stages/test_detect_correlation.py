@@ -7,8 +7,7 @@ from given_echoes import known_noise, known_system
 from published import WAGNER
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.signal.filters import (
     find_minima,

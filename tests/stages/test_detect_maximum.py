@@ -4,8 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.filters import curvature_taps, gaussian_taps
 from wavebatch.stages.chain import STAGES
 

@@ -8,8 +8,7 @@ import pytest
 from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from published import WANG_CASES, simulate_wang
 
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.kernels.signal.deconvolve import (
     convolve_pulse,
     correlate_pulse,

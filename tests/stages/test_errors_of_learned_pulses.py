@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import maximum

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
 from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, find_unexplained, flag_echoes
 

@@ -6,11 +6,9 @@ from contract_tools import SYSTEMS, assert_same, check_echoes, inputs, make_bloc
 
 from wavebatch import surveying
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.chain import STAGES
-from wavebatch.stages.detect import transformed
 from wavebatch.stages.pulse_tables import error_factors, pulse_shape
 
 PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
@@ -73,16 +71,15 @@ def test_variants_give_the_same_bits_for_any_block_size(mixed, name, parameters)
         assert_same(EchoTable.concatenate(parts), whole)
 
 
-def test_parts_of_a_block_do_not_show(mixed, monkeypatch):
-    """More waveforms than are worked on at a time."""
-    block, system = mixed
-    names = ("detect.asdf", "detect.correlation", "detect.richardson_lucy")
-    whole = [call(name, {}, block, system) for name in names]
-    monkeypatch.setattr(transformed.filters, "COLUMNS_AT_A_TIME", 7)
-    monkeypatch.setattr(transformed, "AT_A_TIME", 7)
-    for name, table in zip(names, whole, strict=True):
-        assert_same(call(name, {}, block, system), table)
-        assert np.unique(table.waveform).size > 40
+def test_parts_of_a_block_do_not_show(mixed):
+    """More waveforms than are worked on at a time, 1024."""
+    (block, system), copies = mixed, 19
+    many = WaveformBlock.from_samples(np.tile(block.samples, (copies, 1)))
+    for name in ("detect.asdf", "detect.correlation", "detect.richardson_lucy"):
+        one = call(name, {}, block, system)
+        parts = [(one, copy * len(block)) for copy in range(copies)]
+        assert_same(call(name, {}, many, system), EchoTable.concatenate(parts))
+        assert np.unique(one.waveform).size > 40
 
 
 @pytest.mark.parametrize("name", sorted(name for name in STAGES if name.startswith(("detect.", "decompose."))))

@@ -6,8 +6,7 @@ import naive_signal
 import numpy as np
 import pytest
 
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 
 SYSTEM = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, baseline_spread=0.5, std=1.1))

@@ -10,7 +10,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.stages.decompose.models import rebuild_waveforms

@@ -9,11 +9,10 @@ from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain_no_data
-from wavebatch.core.system import LevelWidths, Radiometry, ReceiverNoise
 from wavebatch.core.units import HALF_C
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import LevelWidths, Noise, Radiometry, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.column_names import describe
-from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.kernels.physics.radiometry import receive_power

@@ -11,7 +11,7 @@ from commands import run_command
 
 import wavebatch as wb
 from wavebatch.core.echoes import COLUMNS
-from wavebatch.core.system import ReceiverNoise
+from wavebatch.core.waveforms import ReceiverNoise
 from wavebatch.stages import chain as chain_module
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import effective, load_plugins, parse_chain

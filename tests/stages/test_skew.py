@@ -10,8 +10,7 @@ import pytest
 import wavebatch as wb
 from wavebatch import surveying
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.compare_chains import measure_fit

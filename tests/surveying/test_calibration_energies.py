@@ -10,7 +10,7 @@ import wavebatch as wb
 from tests import facet_strips
 from tests.facet_strips import EAST, NORTH, START, Sensor, write_strip
 from tests.surveying.test_calibration_misuse import BASE, GROUND, LIGHT, call, fields, write_targets
-from wavebatch.surveying.calibrating.calibration_file import load_calibration
+from wavebatch.surveying.calibrating.calibration_files import load_calibration
 
 pytestmark = pytest.mark.kept_surveys
 

@@ -10,8 +10,9 @@ from commands import run_command as call
 import wavebatch as wb
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip
 from wavebatch.core.order import group_medians
-from wavebatch.surveying.calibrating.adjust_flight import TIE, Anchors, Ties, adjust_constants, measure_ties
-from wavebatch.surveying.calibrating.calibration_file import load_calibration
+from wavebatch.surveying.calibrating.adjust_flight import TIE, VIEW, Anchors, Ties, adjust_constants, measure_ties
+from wavebatch.surveying.calibrating.calibrate_flight import fit_swath
+from wavebatch.surveying.calibrating.calibration_files import load_calibration
 
 GAINS = {("a", 1): 1.0, ("b", 1): 1.08, ("c", 1): 0.95, ("c", 2): 0.4275}
 """Of each strip and channel: strips drift, and channel 2 has 0.45 of the gain of channel 1."""
@@ -141,6 +142,30 @@ def test_the_errors_of_the_adjustment_hold_its_errors(rng):
         found = adjust_constants(ties, Anchors(given, np.array([0.01, np.nan, 0.02])))
         ratios += list((found.value - constants) / found.error)
     assert 0.55 < np.mean(np.abs(ratios) < 1) < 0.8
+
+
+@pytest.mark.parametrize(("strips", "is_told"), [("abc", True), ("ab", False), ("ac", False)])
+def test_strips_of_three_headings_tell_light_that_falls_from_side_to_side(rng, strips, is_told):
+    """a and c fly east, b flies back between them: light falls by a tenth to the right of each."""
+    heading, middle = zip(*({"a": (1, 0.0), "b": (-1, 60.0), "c": (1, 100.0)}[name] for name in strips), strict=True)
+    place = rng.uniform(-100, 200, 3000)
+    angle = np.stack([sign * (place - at) / 1000 for sign, at in zip(heading, middle, strict=True)])
+    seen = np.abs(angle) < 0.1
+    source, cell = np.nonzero(seen & (seen.sum(axis=0) > 1))
+    view = np.zeros(len(cell), VIEW)
+    view["angle"] = angle[source, cell]
+    zero = np.zeros(len(cell))
+    # A strip sees light / constant: where the constant grows by exp(c u), the light falls by it.
+    value = rng.normal(-1, 0.4, 3000)[cell] - view["angle"] + rng.normal(0, 0.01, len(cell))
+    ties = Ties(cell, source, value, zero + 0.01, zero, zero, np.stack([place[cell], zero], axis=1), 5.0, view)
+    anchors = Anchors(np.zeros(len(strips)), np.full(len(strips), 0.01), None)
+    adjusted, (most, square, fourth, side), left_open = fit_swath(ties, anchors, np.zeros(len(strips), VIEW))
+    assert most == pytest.approx(0.1, abs=0.001)
+    if is_told:
+        assert side == pytest.approx(0.1, abs=0.01) and abs(square + fourth) < 0.02 and left_open is None
+        assert np.abs(adjusted.value).max() < 0.02
+    else:
+        assert side == 0 and 0.03 < left_open < 0.2
 
 
 def test_sources_without_ties_stay_unknown(rng):

@@ -15,14 +15,16 @@ from tests import facet_strips, footprints
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, path_of, write_strip, write_trajectory
 from tests.footprints import Flight, Plane
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
-from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
+from wavebatch.surveying.calibration import Calibration, ChannelConstant
 from wavebatch.surveying.matching import setting
-from wavebatch.surveying.matching.setting import NO_CHANGE, keep_places, weigh_change
-from wavebatch.surveying.matching.strip_match import judge_fading
+from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, weigh_alike, weigh_change
+from wavebatch.surveying.matching.strip_match import compare_setting, judge_fading
 
 pytestmark = pytest.mark.kept_surveys
 
@@ -342,6 +344,14 @@ def test_light_that_changes_evenly_along_a_strip_is_told_from_its_fields(rng, fa
     assert fade or _find_fading(time, forest).chance < 0.5
 
 
+def test_parts_of_one_field_count_as_few(rng):
+    """A slope's error is that of independent parts, and several times as large where halves are of two fields."""
+    alone = [weigh_alike(rng.standard_normal(32)) for _ in range(50)]
+    field = np.repeat([-1.0, 1.0], 16)
+    assert 1.2 < np.median(alone) < 2.5
+    assert weigh_alike(field + 0.1 * rng.standard_normal(32)) > 8
+
+
 @pytest.mark.slow
 def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, calibrated, monkeypatch):
     even = [Facet(lambda x, y: 0.1 + 0.5 * np.abs(np.sin(y)))]
@@ -519,6 +529,19 @@ def test_the_assumed_chance_of_a_change_says_how_much_error_holds_it(spread):
     assert 0.3 < errors[1] / errors[2] < 0.5 and 1.2 < errors[3] / errors[2] < 2.0
     # What the data show does not hang on it.
     assert all(weigh_change(0.5, 0.04, 0.5, chance=chance).chance > 0.9 for chance in (0.05, 0.3, 0.6))
+
+
+def test_a_chance_of_zero_adds_nothing_for_what_scenes_do_not_show():
+    scene = np.linspace(15.0, 17.0, 10)
+    other = tuple(scene + 0.2 * np.where(np.arange(10) % 2, 1.0, -1.0))
+    found = Setting(None, {}, {(1, 0): other}, {}, (1.0, 0.0), Change(0.0, 0.0, 0.0), None)
+    row = ChannelConstant(1, 0, 2e-8, 0.03, scene=tuple(scene))
+    said = []
+    for chance in (0.3, 0.0):
+        known = Calibration(2e-8, 0.03, 0.22, channels=(row,), change_chance=chance)
+        growth, lines, notes = compare_setting(known, found, SystemPulse(2.0))
+        said.append((growth, len(lines), "by an assumed chance of 30% (change_chance)" in "".join(notes)))
+    assert 0.08 < said[0][0] < 0.15 and said[0][1:] == (0, True) and said[1] == (0.0, 0, False)
 
 
 @pytest.mark.slow

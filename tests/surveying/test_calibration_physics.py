@@ -11,9 +11,13 @@ from tests import facet_strips
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip, write_trajectory
 from wavebatch.core.errors import InputError
 from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
-from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.calibrating.calibration_files import (
+    Target,
+    format_calibration,
+    load_calibration,
+    parse_calibration,
+)
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
-from wavebatch.surveying.calibrating.target_file import Target
 
 pytestmark = pytest.mark.kept_surveys
 

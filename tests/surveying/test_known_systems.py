@@ -17,9 +17,9 @@ from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems import known_systems as module
-from wavebatch.surveying.systems.doubt import doubt_survey
 from wavebatch.surveying.systems.known_systems import (
     compare_pulses,
+    doubt_survey,
     draw_pulse,
     find_likeness,
     find_source,

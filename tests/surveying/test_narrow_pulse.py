@@ -9,8 +9,7 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
-from wavebatch.surveying.measuring.trial import Trial, limit_surveys
-from wavebatch.surveying.systems.known_systems import draw_pulse, find_source
+from wavebatch.surveying.systems.known_systems import Trial, draw_pulse, find_source, limit_surveys
 
 NUMBER, LENGTH, NOISE = 600, 90, 1.2
 

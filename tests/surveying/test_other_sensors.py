@@ -8,8 +8,7 @@ import pytest
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.pulse_shape import PulseShape, measure_pulse
 from wavebatch.kernels.signal.noise import find_levels
@@ -173,6 +172,15 @@ def test_digitizers_that_record_otherwise_get_a_pulse_and_noise_of_their_own():
     assert np.std((echoes.time - time[echoes.waveform])[single[echoes.waveform]]) < 0.1
     assert system.with_radiometry(divergence=0.5).of(narrow).radiometry.divergence == 0.5
     assert survey.waveforms == 2112 and survey.figures.single_share > 0.98
+
+
+def test_a_digitizer_with_few_echoes_asks_of_weak_echoes_what_its_own_noise_does():
+    """The main one's noise is a ten-thousandth of its echoes; the other's is a two-hundredth."""
+    main = digitized(record(gaussian, 8, n=1500, amplitude=(5000, 20000), dtype="u2")[0], 1)
+    few = digitized(record(gaussian, 9, n=12, amplitude=(150, 600), noise=3.0, dtype="u2")[0], 2, gain=0.1)
+    system = survey_blocks([main, few]).system
+    assert set(system.digitizers) == {2} and system.of(few).sigma_ref == system.sigma_ref
+    assert system.faint_share < 0.01 < 0.013 < system.of(few).faint_share <= 0.02
 
 
 @pytest.mark.slow

@@ -11,8 +11,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
 from wavebatch.surveying.systems import known_systems as module
-from wavebatch.surveying.systems.doubt import MOST_DOUBTED, MOST_DOUBTED_KNOWN
-from wavebatch.surveying.systems.known_systems import find_source
+from wavebatch.surveying.systems.known_systems import MOST_DOUBTED, MOST_DOUBTED_KNOWN, find_source
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
 TAIL = PulseModel(2.2, 0.0, ((0.06, 5.0, 4.0),))

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.system import Defects, LevelWidths, Radiometry, ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import Defects, LevelWidths, Radiometry, ReceiverNoise, SystemPulse
 from wavebatch.files.text_file import write_text
 from wavebatch.files.toml_file import list_entries, list_keys
 from wavebatch.surveying import Decision, Survey, survey_block

@@ -9,8 +9,7 @@ import pytest
 from commands import run_command
 from helpers_scenes import make_scene
 
-from wavebatch.core.system import Radiometry
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import Radiometry, SystemPulse
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.flat_ground import Slopes, measure_reference
 from wavebatch.tools.simulate import find_scene, simulate_strip

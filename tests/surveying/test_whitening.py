@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import maximum

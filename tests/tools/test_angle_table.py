@@ -8,12 +8,11 @@ import pytest
 from commands import run_command
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.system import LevelWidths, ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA, C
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.core.waveforms import LevelWidths, ReceiverNoise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.physics.incidence import angles_of_variance
-from wavebatch.stages.attribute.incidence_angle import added_variance
+from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.surveying.flat_ground import REFERENCE_ERROR, SLOPE, predict_angles
 from wavebatch.tools.sheets.survey import ANGLES, format_angles, tabulate_angles
 

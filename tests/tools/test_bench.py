@@ -31,13 +31,12 @@ import wavebatch
 from wavebatch.cli.options import parse_length
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse
-from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
+from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
-from wavebatch.tools.bench import command, report
+from wavebatch.tools.bench import command
 from wavebatch.tools.bench.accuracy import (
     SURVEY_SCATTER,
     AccuracyTally,
@@ -59,12 +58,12 @@ from wavebatch.tools.bench.command import (
     BenchOptions,
     BenchWorkerDied,
     Worker,
+    format_document,
     list_methods,
     peak_memory,
     run_bench,
     shape_scene,
 )
-from wavebatch.tools.bench.report import format_document
 from wavebatch.tools.simulate import (
     PULSES,
     PulseModel,
@@ -90,7 +89,7 @@ def document():
     """A small benchmark with everything in it, whose chains are timed in this process."""
     with pytest.MonkeyPatch.context() as patch:
         time_here(patch)
-        return measure_small()
+        return measure_small(replace(SMALL, waveforms=400))
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +98,8 @@ def timed_document():
     return measure_small()
 
 
-def measure_small():
-    found = run_bench(SMALL, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=20))
+def measure_small(options=SMALL):
+    found = run_bench(options, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=20))
     return {**found, "promises": judge(found)}
 
 
@@ -124,14 +123,6 @@ def test_document_has_a_row_per_chain_and_peer(timed_document):
             assert 2e7 < row["peak_bytes"] < 5e8
     assert {row["kind"] for row in document["scenes"][0]["rows"] if row["pareto"]} == {"chain"}
     assert document["scenes"][0]["cheapest"] in names
-
-
-@pytest.mark.slow
-def test_isolated_echoes_are_at_the_bound(document):
-    figures = find_row(document, "accurate")["figures"]
-    for name in ("time", "amplitude", "sigma"):
-        ratio = figures[f"{name}_ratio_isolated"]
-        assert abs(ratio["value"] - 1) < 3 * ratio["error"] + 0.05
 
 
 def test_document_is_plain_json_and_its_tables_show_all(document):
@@ -180,7 +171,7 @@ def test_nothing_to_measure():
 
 @pytest.mark.slow
 def test_command_writes_what_it_prints(tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "has_matplotlib", lambda: False)
+    monkeypatch.setattr(command, "has_matplotlib", lambda: False)
     options = "--scene flat --waveforms 800 --pulses 0 --repeat 1 --json"
     chain = tmp_path / "mine.toml"
     chain.write_text(
@@ -199,7 +190,7 @@ def test_command_writes_what_it_prints(tmp_path, monkeypatch):
 
 def test_plot_is_written_where_matplotlib_is(tmp_path, document):
     pytest.importorskip("matplotlib")
-    lines = report.write_outputs(document, "text", tmp_path)
+    lines = command.write_outputs(document, "text", tmp_path)
     assert lines == [f"{tmp_path}: bench.json, bench.txt, bench-flat.png"]
     assert (tmp_path / "bench-flat.png").read_bytes()[:4] == b"\x89PNG"
 
@@ -363,13 +354,12 @@ def GaussianDecomposition(y, thres):
 def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     (tmp_path / "gdecomp.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(peers, "PATIENCE", 10.0)
     scene = replace(find_scene("flat"), recording=Recording(bits=16))
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()
     samples[7, 40], samples[20, 40] = 950, 850
     system = SystemPulse(2.0, noise=ReceiverNoise(baseline=12.0, std=1.04))
-    result = peers.run_peer("gdecomp", replace(block, samples=samples), system)
+    result = peers.run_peer("gdecomp", replace(block, samples=samples), system, patience=10.0)
     assert result.failures == 2 and result.waveforms == 38
     assert sorted(set(range(40)) - set(result.found.waveform.tolist())) == [7, 20]
     group = make_group(scene, 0, block, truth, Survey(SystemPulse(2.0), 40))
@@ -631,12 +621,12 @@ def test_all_methods_stand_in_one_table(timed_here):
 
 
 @pytest.mark.slow
-def test_every_method_goes_through_the_stiff_cases(monkeypatch):
-    monkeypatch.setattr("bench.stability.GROUPS", 1)
+def test_every_method_goes_through_the_stiff_cases():
     few = ("detect.asdf", "detect.wavelet", "decompose.residual_loop", "decompose.reference")
     methods = {name: list_methods()[name] for name in few}
     shown = {"accurate": load_profile("accurate"), **methods}
-    rows = measure_stability(lambda survey: shown, 50, 300, 3, cases=list_cases(["H10", "H2"]), methods=methods)
+    cases = list_cases(["H10", "H2"])
+    rows = measure_stability(lambda survey: shown, 50, 300, 3, cases=cases, methods=methods, groups=1)
     assert len(rows) == 4 * len(shown)
     for row in rows:
         assert row["is_method"] == (row["chain"] != "accurate")

@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 from published import RETURN_TABLES
 
-from wavebatch.cli.simulate import simulate
+from wavebatch.cli.strips import simulate
 from wavebatch.core.errors import ConfigError
 from wavebatch.tools.return_stats import count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, find_scene, simulate_block, simulate_returns

@@ -9,12 +9,10 @@ from commands import run_command
 from forest_scenes import fly, grow
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.kernels.physics.gap_probability import measure_attenuation
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey, format_survey
-from wavebatch.tools import cells
 from wavebatch.tools.raster import COLUMNS, Forest, ForestOptions, GridOptions, write_grid
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
@@ -28,12 +26,12 @@ def voxelize(strip, target, size=1.0, ratio=None):
     return target
 
 
-def measure(voxels, folder, size=CELL, box=(0.0, 0.0, SIDE, SIDE), **options):
+def measure(voxels, folder, size=CELL, box=(0.0, 0.0, SIDE, SIDE), held=2_000_000, **options):
     """The result, and each band by its name, rows from the north."""
     rasterio = pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     paths = voxels if isinstance(voxels, list) else [voxels]
     how = GridOptions(size=size, bbox=box, no_data=np.nan, forest=ForestOptions(**options))
-    result = write_grid(paths, folder / "f.tif", how, overwrite=True)
+    result = write_grid(paths, folder / "f.tif", how, overwrite=True, held=held)
     with rasterio.open(folder / "f.tif") as file:
         assert set(file.dtypes) == {"float32"} and file.tags()["LEAF_PROJECTION"] == f"{how.forest.leaf_projection:g}"
         return result, dict(zip(file.descriptions, file.read().astype(float), strict=True))
@@ -87,11 +85,10 @@ def test_leaves_that_show_more_of_themselves_are_fewer(even, tmp_path):
     np.testing.assert_allclose(whole, level["leaf_area_index"], rtol=1e-5)
 
 
-def test_cells_do_not_depend_on_memory_and_twice_the_same_voxels_are_the_same(even, tmp_path, monkeypatch):
+def test_cells_do_not_depend_on_memory_and_twice_the_same_voxels_are_the_same(even, tmp_path):
     _, once = measure(even[1], tmp_path)
     _, twice = measure([even[1], even[1]], tmp_path)
-    monkeypatch.setattr(cells, "HELD", 3000)
-    _, parts = measure(even[1], tmp_path)
+    _, parts = measure(even[1], tmp_path, held=3000)
     for name, band in once.items():
         np.testing.assert_array_equal(parts[name], band)
         if "err" not in name:

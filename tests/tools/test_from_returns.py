@@ -12,7 +12,7 @@ from batch_tools import read_cloud, run_one
 from click.testing import CliRunner
 from given_echoes import FINE, fine_recording, known_noise, known_system, simulate_echoes
 
-from wavebatch.cli.simulate import synthesize
+from wavebatch.cli.strips import synthesize
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader
@@ -109,11 +109,9 @@ def test_measured_widths_come_first(cloud, tmp_path):
     assert np.percentile(above, 10) >= 7
 
 
-def test_pieces_cut_no_pulse(cloud, tmp_path, monkeypatch):
+def test_pieces_cut_no_pulse(cloud, tmp_path):
     synthesize_strip(cloud, tmp_path / "whole.las", SynthesisOptions(gain=0.1))
-    monkeypatch.setattr("wavebatch.tools.simulate.returns._PIECE", 37)
-    monkeypatch.setattr("wavebatch.tools.simulate.returns._PAINTED", 1000)
-    summary = synthesize_strip(cloud, tmp_path / "parts.las", SynthesisOptions(gain=0.1))
+    summary = synthesize_strip(cloud, tmp_path / "parts.las", SynthesisOptions(gain=0.1), piece=37)
     assert summary.packets == 2000 and summary.scattered == 0
     whole, parts = read_cloud(tmp_path / "whole.las")[0], read_cloud(tmp_path / "parts.las")[0]
     assert np.array_equal(whole["gps_time"], parts["gps_time"])

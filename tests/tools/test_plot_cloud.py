@@ -15,8 +15,6 @@ from plot_tools import POINTS, write_cloud
 from wavebatch.core.condition import read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.order import EvenSample
-from wavebatch.files.cloud import cloud_reader as io_cloud
 from wavebatch.files.cloud.cloud_reader import ColumnReader
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.tools import cells
@@ -72,32 +70,6 @@ def test_chosen_bins_hold_all_but_far_outliers(cloud):
     found = count_values([cloud], "amplitude")
     assert found.counts.sum() + found.below[0] + found.above[0] == found.total.values
     assert found.above[0] < 0.002 * POINTS and 20 <= found.counts.shape[1] <= 300
-
-
-@pytest.mark.parametrize("size", [1, 7, 999, 250_000])
-def test_nothing_depends_on_the_size_of_the_pieces(cloud, monkeypatch, size):
-    if size == 1:
-        size = POINTS // 3
-    monkeypatch.setattr(io_cloud.CloudReader.read_pieces, "__defaults__", (size, 1 << 30))
-    monkeypatch.setattr(EvenSample, "LIMIT", 600)
-    with ColumnReader(cloud, "amplitude") as reader:
-        assert max(len(rows) for rows in reader.read_pieces()) == min(size, POINTS)
-    found = count_values([cloud], "amplitude", bins=20)
-    again = grid_values([cloud], "amplitude", "mean", size=1.7)
-    _, _, amplitude, _ = read_plainly(cloud)
-    good = amplitude[~np.isnan(amplitude)]
-    step = 8
-    assert np.array_equal(found.percentiles[0], np.percentile(good[::step], (5, 50, 95)))
-    total = np.zeros(again.values.size)
-    x, y, _, _ = read_plainly(cloud)
-    known = ~np.isnan(amplitude)
-    row, column, inside = again.grid.place(x[known], y[known])
-    assert inside.all()
-    cell = row * again.grid.columns + column
-    for at, value in zip(cell, good, strict=True):
-        total[at] += value
-    count = np.bincount(cell, minlength=len(total))
-    assert np.array_equal(again.values.ravel()[count > 0], total[count > 0] / count[count > 0])
 
 
 @example(low=0.0, span=5e-324, step=0.0, bins=None)
@@ -510,23 +482,3 @@ def test_more_than_six_groups_have_axes_of_their_own(tmp_path):
     assert len(drawn) == 8 and matplotlib
     few = count_values([path], "z", by=None)
     assert draw_cloud._split_series(few) == [few]
-
-
-def test_a_group_of_two_values_does_not_press_the_others_down(tmp_path):
-    pytest.importorskip("matplotlib")
-    from matplotlib.figure import Figure
-
-    from wavebatch.tools.plots import draw_cloud
-
-    tops = []
-    for few in (2, 0):
-        group = np.repeat([1, 2], [5000 - few, few]).astype("u1")
-        path = write_cloud(tmp_path / f"{few}.las", n=5000, group=(group, None, None, "-"))
-        found = count_values([path], "z", by="group")
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Figure, "savefig", lambda figure, *args, **more: tops.append(figure.axes[0].get_ylim()[1])
-                          or args[0].write(b"x"))  # fmt: skip
-            draw_cloud.draw_cloud_histogram(found, tmp_path / f"{few}.png")
-    assert found.names == ("group 1",) or len(found.names) == 1
-    shares = 100 * found.counts[0] / found.values[0]
-    assert tops[0] < 1.5 * shares.max() < 40

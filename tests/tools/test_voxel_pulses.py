@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from packet_strips import LENGTHS, draw_canopy, record, render, write_recorded
 
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import HALF_C
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.surveying import Survey
 from wavebatch.surveying.system_file import SavedSurvey

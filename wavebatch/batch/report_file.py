@@ -29,13 +29,13 @@ from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
-from wavebatch.stages.decompose.loops import loop_model
+from wavebatch.stages.decompose.fit import loop_model
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.flat_ground import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.inspect_strip import doubt_files, doubt_packets
 from wavebatch.surveying.sensor import SensorSource
 from wavebatch.surveying.system_file import format_survey
-from wavebatch.surveying.systems.doubt import doubt_survey
+from wavebatch.surveying.systems.known_systems import doubt_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 MOST_REPORT = 64 << 20

@@ -14,7 +14,14 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_scenes
 from wavebatch.cli.messages import print_result, talk
-from wavebatch.tools.bench.command import BenchOptions, run_bench
+from wavebatch.tools.bench.command import (
+    BenchOptions,
+    bench_sheet,
+    format_document,
+    run_bench,
+    write_bench_page,
+    write_outputs,
+)
 
 
 @click.command()
@@ -48,8 +55,6 @@ def bench(
       # the cheapest chain with 2 cm of range error
       wavebatch bench --scene open --tolerance 0.02m
     """
-    from wavebatch.tools.bench.report import bench_sheet, format_document, write_bench_page, write_outputs
-
     shared.check_html(html_file)
     strips = [path for path in files if path.suffix.lower() != ".toml"]
     silent = options["quiet"] or not sys.stderr.isatty()

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wavebatch.core.errors import StageError
+from wavebatch.core.errors import StageError, need
 from wavebatch.core.frozen import frozen
-from wavebatch.core.optional import need
 from wavebatch.core.order import find_order
 
 if TYPE_CHECKING:

@@ -21,8 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.optional import advise_install
+from wavebatch.core.errors import ConfigError, advise_install
 from wavebatch.files.disk.publish import Draft, check_target, reporting
 
 if TYPE_CHECKING:

@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError, need
 from wavebatch.core.frozen import frozen
-from wavebatch.core.optional import need
 from wavebatch.files.las.crs import CrsUnits, drop_empty_codes, find_epsg, parse_wkt, read_crs_definition
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.text_file import MOST_LIST, read_text

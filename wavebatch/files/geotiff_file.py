@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError, advise_install
 from wavebatch.core.frozen import frozen
-from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.publish import Draft, check_target
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.las.crs import read_wkt

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.errors import InputError
-from wavebatch.core.optional import need
+from wavebatch.core.errors import InputError, need
 from wavebatch.core.trajectory import Trajectory, apply_lever_arm
 from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads, widen_integers
 

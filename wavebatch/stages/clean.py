@@ -12,8 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.system import Defects
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.defects import (
     fill_spikes,
     find_pattern,

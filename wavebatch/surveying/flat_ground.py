@@ -23,16 +23,15 @@ from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.order import even_places
-from wavebatch.core.system import LevelWidths
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN, C, format_measure
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.geometry.normals import Surroundings, grow_tree, measure_normals, thin_out
 from wavebatch.kernels.geometry.planes import in_two_lines
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
-from wavebatch.stages.attribute.incidence_angle import added_variance
+from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR

@@ -19,8 +19,7 @@ import numpy as np
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.system import ReceiverNoise
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.choose_chain import decide, sample_size

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, stack_pulse
 from wavebatch.kernels.signal.outgoing import OutgoingReference, measure_outgoing

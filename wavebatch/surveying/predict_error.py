@@ -16,10 +16,9 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import without_nan
-from wavebatch.core.system import Defects
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.core.waveforms import Defects, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.fit.describe import render_pulses
 from wavebatch.kernels.signal.noise import whitening_filter
 from wavebatch.stages.chain import Chain

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.core.system import Defects, LevelWidths
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
@@ -23,7 +22,7 @@ from wavebatch.surveying.measuring.learn_pulse import (
     learn_pulse,
 )
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import limit_faint, measure_beside, measure_tail
+from wavebatch.surveying.measuring.misfit import MOST_FAINT, PEAK, limit_faint, measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
@@ -40,9 +39,15 @@ from wavebatch.surveying.measuring.noise_and_width import (
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.measuring.whitening import choose_whitening
 from wavebatch.surveying.predict_error import measure_hidden
-from wavebatch.surveying.systems.doubt import share_repeated, share_unexplained
 from wavebatch.surveying.systems.figures import Figures
-from wavebatch.surveying.systems.known_systems import find_lone, find_ringing, guess_width, list_known
+from wavebatch.surveying.systems.known_systems import (
+    find_lone,
+    find_ringing,
+    guess_width,
+    list_known,
+    share_repeated,
+    share_unexplained,
+)
 from wavebatch.surveying.systems.skew import measure_skew
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
 
@@ -195,7 +200,10 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> 
     if not learn or (own.figures.isolated_echoes or 0.0) >= FEW:
         return own.system
     measured = measure_gaussian(block, system.sigma_ref / block.spacing)
-    return replace(system, noise=measured.noise, saturation=measured.saturation)
+    other = replace(system, noise=measured.noise, saturation=measured.saturation)
+    # The main one's pulse, but what echoes must exceed beside strong ones follows from this one's noise too.
+    echoes = decompose_sample(block, other)
+    return limit_faint(replace(other, faint_share=MOST_FAINT), system.faint_share / PEAK, echoes)
 
 
 def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:

@@ -15,9 +15,15 @@ from wavebatch import __version__
 from wavebatch.core.frozen import frozen
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml
-from wavebatch.surveying.systems.figures import describe_figures, read_figures
+from wavebatch.surveying.systems.figures import (
+    REMEDY,
+    comment_system,
+    describe_figures,
+    describe_system,
+    read_figures,
+    read_system,
+)
 from wavebatch.surveying.systems.survey_result import Decision, Survey
-from wavebatch.surveying.systems.system_table import REMEDY, comment_system, describe_system, read_system
 
 SYSTEM_SCHEMA = "wavebatch.system/1"
 

@@ -30,7 +30,7 @@ from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.stages import chain_file
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
-from wavebatch.surveying.calibrating.calibration_file import load_calibration
+from wavebatch.surveying.calibrating.calibration_files import load_calibration
 from wavebatch.surveying.calibration import check_attenuation, needs_sensor
 from wavebatch.surveying.choose_chain import Request, choose_chain, decide, read_sample, widest
 from wavebatch.surveying.flat_ground import survey_angles

@@ -41,7 +41,7 @@ from wavebatch.files.pulsewaves_file import (
     Segments,
     read_pulse_header,
 )
-from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.signal.outgoing import OutgoingReference, find_reference, measure_outgoing
 from wavebatch.kernels.signal.signal import find_peaks, smooth_121, transpose_samples

@@ -27,7 +27,7 @@ from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, spread_times
 from wavebatch.files.las.header import CLASS_NAMES
-from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
 from wavebatch.tools.return_stats import pulses_told_apart
 from wavebatch.tools.simulate.strip import TruthReader

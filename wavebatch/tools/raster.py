@@ -29,6 +29,7 @@ from wavebatch.files.las.header import read_header
 from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.kernels.physics.gap_probability import ASSUMED_ERROR
 from wavebatch.tools.cells import (
+    HELD,
     LARGEST_SIZE,
     Box,
     Clouds,
@@ -369,8 +370,10 @@ class GridResult(Placed):
     """Of a forest: cells with metrics, with too few rays, and without light on the ground."""
 
 
-def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False) -> GridResult:
-    """Write the raster.
+def write_grid(
+    paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False, held: int = HELD
+) -> GridResult:
+    """Write the raster; held: points in memory at a time.
 
     Raises ConfigError for wrong options, InputError for clouds that cannot be read or have no point to write.
     """
@@ -407,7 +410,7 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}"}
     tags |= {"STATISTIC": options.statistic} if metrics is None else metrics.describe()
     with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
-        for row, column, values in compute_tiles(clouds, statistic, grid, points, result, options.bbox):
+        for row, column, values in compute_tiles(clouds, statistic, grid, points, result, options.bbox, held=held):
             result.filled += int(np.isfinite(values).any(axis=0).sum())
             writer.write_tile(row, column, values)
         writer.publish()

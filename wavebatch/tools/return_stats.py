@@ -456,7 +456,7 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter,
         number = count_buckets(reader.point_count, held)
         with Spool(number, _ROW) as buckets:
             keys = _Keys(by_time)
-            for rows in reader.read_pieces():
+            for rows in reader.read_pieces(held):
                 tally.add_points(rows)
                 shaped = _shape(rows, keys.of(rows))
                 buckets.append(spread_keys(shaped["key"], number), shaped)

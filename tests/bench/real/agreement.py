@@ -14,8 +14,7 @@ from bench.real.pool import Pool, Solver
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS
 from wavebatch.stages.score import match_echoes
-from wavebatch.surveying.measuring.trial import Trial, limit_surveys
-from wavebatch.surveying.systems.known_systems import find_likeness, find_source
+from wavebatch.surveying.systems.known_systems import Trial, find_likeness, find_source, limit_surveys
 
 COMPARED = 4000
 """Packets that are decomposed with either survey."""

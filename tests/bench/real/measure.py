@@ -30,7 +30,7 @@ from bench.real.pool import Pool, Solver, read_pool
 from bench.real.templates import TemplateSummary, learn_templates, summarize
 
 from wavebatch.core.errors import InputError
-from wavebatch.surveying.measuring.trial import Trial
+from wavebatch.surveying.systems.known_systems import Trial
 
 INJECTIONS = 8000
 

@@ -26,8 +26,7 @@ from typing import Any
 
 from wavebatch.batch.workers.futures import end_future, settle_future, wait_uninterrupted
 from wavebatch.batch.workers.worker_check import compare_workers, describe_worker, list_sizes
-from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.optional import advise_install
+from wavebatch.core.errors import ConfigError, InputError, advise_install
 from wavebatch.files.disk.publish import Draft, list_packet_files, reporting
 from wavebatch.files.disk.temp_store import owning_scratch, use_scratch
 

@@ -28,9 +28,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import InputError, advise_install
 from wavebatch.core.frozen import frozen
-from wavebatch.core.optional import advise_install
 from wavebatch.files.las import header as las
 
 DOUBLES_ID = 34736

@@ -1,20 +1,35 @@
-"""Attributes that need nothing but the fit: amplitude, width, energy, shape of the pulse, position."""
+"""Attributes of the fit alone (amplitude, width, energy, shape of the pulse, position), and incidence angles.
+
+Chains call the stages; the ground of a survey and `survey --angles` use `added_variance`. Angles come from echo widths,
+with their errors, NaN where widths cannot give one (docs/algorithms.md 1.4), and from the points around an echo: the
+check for angles from echo widths.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.no_data import SUFFIX, NoData, explain_no_data
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, LEAST_PULSE_WIDTH, SQRT_2PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.hermite import residual_moments
-from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, residual_moments
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.geometry.group_returns import match_returns
-from wavebatch.stages.attribute.radiometry import area_factor, light_error
+from wavebatch.kernels.geometry.normals import measure_normals
+from wavebatch.kernels.physics.incidence import (
+    angle_of_spread,
+    angles_above,
+    angles_of_variance,
+    paper_table,
+    pulse_table,
+    spread_variance,
+)
+from wavebatch.stages.attribute.radiometry import area_factor, light_error, sensor_distance
 from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 
@@ -240,3 +255,230 @@ def _shared_offset(
     contradict = (others > 0) & (scatter > others)
     doubt = np.sqrt(np.where(contradict, scatter, 0.0) / (np.maximum(others, 1) * np.where(total > 0, total, 1.0)))
     return offset, doubt, total > 0
+
+
+NARROW_ERRORS = 3.0
+"""An echo whose variance is negative by so many errors is flagged as narrower than the system pulse."""
+
+CLEAR_ERRORS = 4.0
+"""A weak echo whose variance is positive by so many errors certainly comes from a slope, and has an angle."""
+
+_UNCLEAN = {
+    NoData.OVERLAPPED: EchoFlag.OVERLAPPED | EchoFlag.MERGED,
+    NoData.SATURATED: EchoFlag.SATURATED,
+    NoData.CUT: EchoFlag.NEAR_EDGE,
+    NoData.UNSETTLED: EchoFlag.NOT_CONVERGED | EchoFlag.AT_BOUND,
+}
+"""Echoes with these flags have widths that do not depend on the surface alone."""
+
+_REASON = f"incidence_angle{SUFFIX}"
+
+
+def _check_widths(step: Step, chain: Chain, system: SystemPulse | None) -> str:
+    """Refuse decomposers whose widths never are those of one pulse."""
+    decomposer = chain.steps[2]
+    name = decomposer.stage.name
+    if "skew" in decomposer.stage.makes or decomposer.effective().get("kappa") == "free":
+        return f"{name} fits a skew per echo, which takes part of the width; use decompose.adaptive"
+    return ""
+
+
+LEAST_SKEW = 0.25
+"""Skew of the strip's pulse from which the pulse t^2 exp(-t) of mode `pulse` describes it: it has 0.48 itself."""
+
+
+def _other_pulse(system: SystemPulse, mode: str) -> bool:
+    """Whether widths were fitted with another pulse than a mode compares them with: angles would be off by degrees."""
+    if mode == "system":
+        return system.other_pulse
+    symmetric = mode == "pulse" and system.skew is not None and system.skew < LEAST_SKEW
+    return bool(system.components) or abs(system.kappa) >= NO_SKEW or symmetric
+
+
+@stage(
+    "attribute",
+    makes=("incidence_angle", "incidence_angle_err"),
+    needs=("x", "y", "z"),
+    check=_check_widths,
+)
+def incidence_angle(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    mode: Literal["system", "pulse", "paper"] = "system",
+    divergence: Annotated[float, Range(0.0, 100.0)] = 0.0,
+    max_error: Annotated[float, Range(1e-3, 180.0)] = 10.0,
+    reference_error: Annotated[float, Range(0.0, 1.0)] = 0.003,
+    alone: bool = True,
+) -> EchoTable:  # fmt: skip
+    """Angle between ray and surface normal of each echo [deg], from its width beyond the system pulse's; its error.
+
+    A plane spreads the pulse by R divergence tan(alpha) / (2 c). Rough ground and plants widen echoes too and look like
+    slopes. Echoes narrower than the system pulse have angle 0; where they are narrower by more than three errors they
+    have the flag NARROW.
+
+    No-data where the system pulse is shorter than 0.85 samples, where sensor, divergence or the width of a surface that
+    faces the sensor are not known, and where the echo is too weak for max_error: with a narrow beam and a long pulse
+    that is everywhere. No-data also if the decomposer fits another pulse than the mode needs, for example
+    Gaussians on a strip whose pulse is not a Gaussian.
+
+    Parameters
+    ----------
+    mode : {"system", "pulse", "paper"}
+        `system` takes the pulse of the survey, which the decomposer must have fitted (`decompose.adaptive`), `pulse`
+        a Gaussian fitted to t^2 exp(-t / tau) at the sampling of the file (`decompose.gaussian`), `paper` the printed
+        formulas, whose angles are too large.
+    divergence : float
+        Full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
+    max_error : float
+        Largest standard deviation that the angle of an echo of this strength would have on a surface that faces the
+        sensor, where angles are least certain [deg]. So only strong enough echoes get an
+        angle, whatever their width. A weaker echo gets one only if it is wider than the system pulse by four errors of
+        the variance; its angle and error are then corrected for this selection.
+    reference_error : float
+        Standard deviation of the system pulse's width, relative.
+    alone : bool
+        Only echoes that are alone in their waveform; others fill an unknown part of the beam.
+
+    References
+    ----------
+    Rhomberg-Kauert et al. (2024), as corrected by docs/algorithms.md 1.4.
+    """
+    beam = divergence or system.radiometry.divergence
+    short = system.sigma_ref < LEAST_PULSE_WIDTH * block.spacing
+    variance, variance_err = added_variance(block, system, echoes, mode, reference_error)
+    distance = sensor_distance(block, echoes)
+    angle, error = angles_of_variance(variance, variance_err, distance, 1e-3 * beam if beam else np.nan)
+    steep = np.isnan(angle) & np.isfinite(variance) & np.isfinite(variance_err) & np.isfinite(distance)
+    facing_err = _facing_error(system, echoes, reference_error)
+    flat_error = angle_of_spread(np.sqrt(facing_err), distance, 1e-3 * beam if beam else np.nan)
+    with np.errstate(invalid="ignore"):
+        weak = ~(flat_error <= np.radians(max_error))
+        clear = weak & (variance > CLEAR_ERRORS * variance_err)
+    if clear.any():
+        known = variance[clear], variance_err[clear], distance[clear]
+        angle[clear], error[clear] = angles_above(*known, 1e-3 * beam if beam else np.nan, CLEAR_ERRORS)
+    error = np.hypot(error, 0.5 * np.sin(2.0 * angle) * system.radiometry.divergence_error)
+    unproven = np.isinf(system.widths.error or 0.0)
+    with np.errstate(invalid="ignore"):
+        narrow = variance < -NARROW_ERRORS * variance_err
+    cases = (
+        (NoData.NO_SENSOR, np.isnan(distance)),
+        (NoData.NO_DIVERGENCE, not beam),
+        (NoData.OTHER_PULSE, _other_pulse(system, mode)),
+        (NoData.NO_LEVEL, unproven),
+        (NoData.SHORT_PULSE, short),
+        (NoData.SHARED_PULSE, ~echoes.alone(len(block)) & alone),
+        *((reason, (echoes.flags & np.uint16(flags)) != 0) for reason, flags in _UNCLEAN.items()),
+        (NoData.TOO_STEEP, steep),
+        (NoData.OTHER, np.isnan(error)),
+        # Weak echoes just above the limit may have any angle down to 0; as 0 they pulled the mean down by 3 to 11 deg.
+        (NoData.UNCERTAIN, weak & ~(clear & (angle > 0))),
+    )
+    bad = np.logical_or.reduce([np.broadcast_to(where, len(echoes)) for _, where in cases])
+    angle, error = (np.degrees(np.where(bad, np.nan, values)).astype(np.float32) for values in (angle, error))
+    columns = {"incidence_angle": angle, "incidence_angle_err": error, _REASON: explain_no_data(angle, *cases)}
+    return echoes.with_attributes(**columns).with_flags(EchoFlag.NARROW, narrow)
+
+
+def added_variance(
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, mode: str, reference_error: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the variance that the target adds to the pulse.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        The waveforms.
+    system : SystemPulse
+        Result of the survey.
+    echoes : EchoTable
+        m fitted echoes.
+    mode, reference_error
+        As for `incidence_angle`.
+
+    Returns
+    -------
+    variance, error : float64 array, shape (m,)
+        Variance and its standard deviation [ns2].
+    """
+    width = echoes.sigma.astype(np.float64)
+    error = np.hypot(echoes.sigma_err.astype(np.float64), system.widths.scatter)
+    reference = system.sigma_ref
+    if mode == "pulse":
+        variance = spread_variance(pulse_table(system.sigma_ref, block.spacing), width)
+    elif mode == "paper":
+        variance = spread_variance(paper_table(system.sigma_ref), width)
+    else:
+        width, error, reference = _model_width(block.spacing, system, width, error)
+        variance = width * width - reference * reference - system.widths.variance
+    fit_err = 2.0 * np.hypot(width * error, reference * reference * reference_error)
+    return variance, np.hypot(fit_err, system.widths.error or 0.0)
+
+
+def _facing_error(system: SystemPulse, echoes: EchoTable, reference_error: float) -> np.ndarray:
+    """Error that the added variance [ns2] of each echo would have on a surface that faces the sensor.
+
+    The relative error of a width goes with 1/(amplitude sqrt(sigma)), whose noise has nothing to do with that of the
+    width (docs/algorithms.md 2.1): what is decided by it selects no echoes by their width.
+    """
+    square = system.sigma_ref**2
+    relative = np.hypot(echoes.sigma_err / echoes.sigma, system.widths.scatter / system.sigma_ref)
+    return np.hypot(2.0 * square * np.hypot(relative, reference_error), system.widths.error or 0.0)
+
+
+def _model_width(
+    spacing: float, system: SystemPulse, sigma: np.ndarray, error: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Width of the part of the fitted pulse that a target widens as a Gaussian [ns], its error, the system's width."""
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing, most=BROADEST)
+    if not shape.components:
+        return sigma, error, system.sigma_ref
+    one = np.ones_like(sigma)
+    near = 1e-3 * system.sigma_ref / spacing
+    whole = sigma / spacing
+    low, middle, high = (
+        model_parameters(shape, limits, np.stack([one, one, whole + step], axis=1))[:, 2] for step in (-near, 0.0, near)
+    )
+    return middle * spacing, error * (high - low) / (2.0 * near), limits.ref * spacing
+
+
+@stage(
+    "attribute",
+    makes=("incidence_angle_normals", "incidence_angle_normals_err"),
+    needs=("x", "y", "z"),
+    second_pass=measure_normals,
+)
+def incidence_angle_normals(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    radius: Annotated[float, Range(0.0, 1000.0)] = 1.5,
+    min_points: Annotated[int, Range(4, 10_000)] = 8,
+    max_error: Annotated[float, Range(1e-3, 180.0)] = 5.0,
+) -> EchoTable:  # fmt: skip
+    """Angle between the packet's ray and the normal of the plane of the points around each echo [deg]; its error.
+
+    `run` computes it in a second pass, when all points of the strip are there; a block alone gives no-data. The plane
+    is fitted to all points within the radius that are not outliers. It needs neither sensor nor divergence.
+
+    No-data where there are fewer than min_points, or only two scan lines of them (any two lines are in a plane); where
+    the points form no plane (plants: less than 60 % of them in it, thicker than a fifth of its width, or the echo not
+    in it) or clearly two (a ridge, a valley or a step close by); where the angle exceeds 80 degrees (one sweep of the
+    scanner over plants makes a plane that contains its rays); and where its error exceeds max_error. The error includes
+    the change that two planes instead of one would make.
+
+    Parameters
+    ----------
+    radius : float
+        Radius of the neighbourhood [m]; three times the distance between points is a good start. 0: `run` chooses 1.5
+        or as much more as the distance between the points of the strip asks for, 12 at most.
+    min_points : int
+        Least number of points in the neighbourhood, and in the plane.
+    max_error : float
+        Largest standard deviation of an angle that is written [deg].
+
+    References
+    ----------
+    Rhomberg-Kauert et al. (2024), comparison of Fig. 6; docs/algorithms.md 1.4.
+    """
+    if not (radius == 0 or 1e-3 <= radius <= 1e3) or min_points < 4 or not max_error > 0:
+        raise ConfigError("radius must be 0 or lie in 0.001 to 1000 m, min_points be 4 at least, max_error above 0")
+    none = np.full(len(echoes), np.nan, np.float32)
+    return echoes.with_attributes(incidence_angle_normals=none, incidence_angle_normals_err=none)

@@ -6,7 +6,7 @@ quantities have stages of their own: amplitudes as they would be at one range co
 calibration. Source: docs/algorithms.md 5.
 
 What an echo returns, its distance, energy and backscatter with their errors (`measure_light`), is also what the
-calibration, the reference of level ground in `surveying`, `basic` and `incidence_angle` use. Before you change it:
+calibration, the reference of level ground in `surveying` and `basic` use. Before you change it:
 calibration and run must measure the energy of an echo in the same way (`echo_light`).
 
 Reflectance is that of surfaces that fill the beam, so it needs the angle at which the surface was struck. It comes
@@ -24,9 +24,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain_no_data
-from wavebatch.core.system import angle_to_vertical
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_2PI
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock, angle_to_vertical
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.physics import radiometry
 from wavebatch.stages.chain import Range, stage

@@ -21,8 +21,8 @@ from scipy.sparse.csgraph import connected_components
 
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import group_medians, robust_std
-from wavebatch.core.system import angle_across
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.waveforms import angle_across
 from wavebatch.kernels.geometry.planes import fit_planes
 from wavebatch.surveying.calibration import StripConstant
 

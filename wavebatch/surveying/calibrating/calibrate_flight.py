@@ -21,7 +21,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
-from wavebatch.core.system import angle_across, angle_to_vertical, swath_columns
+from wavebatch.core.waveforms import angle_across, angle_to_vertical, swath_columns
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.crs import describe_crs
 from wavebatch.files.strip.reader import StripReader
@@ -39,8 +39,8 @@ from wavebatch.surveying.calibrating.adjust_flight import (
     hash_squares,
     measure_ties,
 )
+from wavebatch.surveying.calibrating.calibration_files import Target
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, EchoSource, open_source
-from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.targets import (
     MOST_ECHOES,
     build_calibration,

@@ -34,8 +34,8 @@ from wavebatch.kernels.geometry.planes import fit_facet
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.surveying.calibrating.calibration_files import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
-from wavebatch.surveying.calibrating.target_file import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
 from wavebatch.surveying.matching.setting import SCANNERS, keep_places, read_day, read_sensor_name
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR

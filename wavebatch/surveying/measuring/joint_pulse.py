@@ -17,7 +17,7 @@ from wavebatch.kernels.fit.describe import gather_pulse
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, refine_gaussians
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.judge import Explained, find_own_width, sample_noise
-from wavebatch.surveying.measuring.trial import TRIAL
+from wavebatch.surveying.systems.known_systems import TRIAL
 
 BEFORE, CORE, AFTER = 5.0, 4.0, 40.0
 """Widths of the pulse before its peak where it may begin; after it up to which it is drawn in fine steps; and at which

@@ -17,8 +17,8 @@ from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, fit_lone
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, SMALL, find_edge
-from wavebatch.surveying.measuring.trial import TRIAL
 from wavebatch.surveying.systems.figures import Figures
+from wavebatch.surveying.systems.known_systems import TRIAL
 
 MOST_STACKED = 3000
 """Isolated echoes that a stack takes; more do not make it better."""

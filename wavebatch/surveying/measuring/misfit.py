@@ -58,6 +58,9 @@ PEAK, ABOVE_NOISE = 4.0, 3.0
 """Largest difference of a pulse from its model over the misfit, which is a mean over the echo; and noises that an echo
 must be high beside the strip's strongest ones, which taught the pulse."""
 
+MOST_FAINT = SystemPulse(1.0).faint_share
+"""What a pulse of which no more is known may leave beside strong echoes."""
+
 
 def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> SystemPulse:
     """The system with the `faint_share` that its misfit and its noise leave, where that is less than it has.

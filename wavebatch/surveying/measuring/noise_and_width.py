@@ -12,9 +12,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.order import median
-from wavebatch.core.system import ReceiverNoise
 from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.signal.noise import PooledNoise, estimate_noise, keep_longest

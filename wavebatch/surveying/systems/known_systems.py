@@ -1,12 +1,18 @@
-"""Pulses of known sensors, measured on real strips and shipped as SYSTEM.toml files in this folder.
+"""Pulses of known sensors, measured on real strips and shipped as SYSTEM.toml files in this folder; what is a guess.
 
 `survey` takes one where a strip has too few echoes to learn a pulse from; `wavebatch survey` names the one that a
 strip's pulse looks like. Before you change it: a wrong pulse is worse than none, so the margins must keep simulated
 strips of other sensors from getting one (tests/surveying/test_known_systems.py).
+
+`doubt_survey` says for `survey` and `run` whether pulse or noise of a survey are a guess. `Trial` is what surveys must
+do without, so that `bench --real` can compare surveys of one strip.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -15,21 +21,24 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import StripWarning
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import robust_std
-from wavebatch.core.units import MEDIAN_ERROR
+from wavebatch.core.units import FWHM_PER_SIGMA, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
+from wavebatch.kernels.elementary import log
+from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.flags import RINGING_REACH
+from wavebatch.stages.flags import RINGING_REACH, find_unexplained, list_neighbours
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
-from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
-from wavebatch.surveying.measuring.residuals import subtract_echoes
-from wavebatch.surveying.measuring.trial import TRIAL
-from wavebatch.surveying.systems.system_table import read_system
+from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, find_strongest, fit_lone
+from wavebatch.surveying.measuring.noise_and_width import FEW, HALVED
+from wavebatch.surveying.measuring.residuals import hides_noise, subtract_echoes
+from wavebatch.surveying.systems.figures import Figures, read_system
 
 LEAST_ECHOES = 8
 """Strong single echoes below which no pulse is taken: eight that all agree are chance once in 256 times."""
@@ -267,3 +276,112 @@ def gaussian_width(system: SystemPulse) -> float:
     """Return the width [ns] of the Gaussian that is nearest to a system's pulse."""
     widths = system.sigma_ref * np.linspace(0.7, 1.5, 41)
     return float(min(widths, key=lambda width: compare_pulses(system, SystemPulse(sigma_ref=float(width)))))
+
+
+WEAKER, REACH = 0.5, 15
+"""Height over that of a stronger echo, and distance from it [system widths], up to which one may be a part of it."""
+
+SAME_RATIO, CHANCE_RATIO = 0.3, 0.35
+"""Difference of the logarithms of two ratios up to which they are alike, and share of ratios that are so by chance."""
+
+MOST_SPREAD = 0.05
+"""Difference of widths, among pulses that describe the waveforms as well, from which the width is a guess where no
+echoes stand alone: that of close pairs that a pulse takes for one."""
+
+MOST_DOUBTED, MOST_DOUBTED_KNOWN = 0.15, 0.05
+"""Share of the echoes in doubt, because another pulse, misfit or noise serves as well, from which a survey's pulse is
+called a guess; of a known pulse, from which its noise is."""
+
+
+def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Iterator[StripWarning]:
+    """Say that pulse or noise is a guess: too few echoes to learn a pulse from, echoes that another one does not find,
+    or no samples to measure noise in.
+    """
+    alone, doubt = figures.isolated_echoes, figures.echoes_in_doubt
+    if alone is None:
+        return
+    # Known systems are read and compared only where that decides.
+    known = (alone < FEW or (doubt or 0.0) > MOST_DOUBTED_KNOWN) and find_source(system) is not None
+    most = MOST_DOUBTED_KNOWN if known else MOST_DOUBTED
+    reason = f"{100 * doubt:.0f} % of the echoes in doubt" if doubt is not None and doubt > most else ""
+    # So few that the judge sees what the pulse was learned from: many Gaussians explain any waveforms, and a shipped
+    # pulse may be that of another sensor. Of more waveforms the judge knows the width, or that it does not.
+    unsure = figures.width_in_doubt is None or figures.width_in_doubt > MOST_SPREAD
+    few = alone < FEW and (waveforms < HALVED or (unsure and not (known or system.components)))
+    if few:
+        reason = f"too few isolated echoes, {int(alone)} where {FEW} are needed"
+    measured = system.noise.by_kind
+    unseen = measured.get("quiet") == 0 and "outside" not in measured
+    if unseen and not reason:
+        reason = "too few samples without signal"
+    remedy = "give --system, a survey of a longer strip of this sensor"
+    hidden = hides_noise(system.noise)
+    if hidden and not reason:
+        reason, remedy = "most of the noise below count 0", "raise the level of the digitizer in the next flight"
+    if reason:
+        code, guess = "pulse-guess", f"system pulse is a guess, of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns"
+        if unseen or hidden:
+            code, guess = "noise-guess", f"noise is a guess, of {system.noise.std:.3g} DN"
+        elif known and not few:
+            misfit = f"{100 * system.misfit:.2g} %" if system.misfit else "none found"
+            noise = f"noise, {system.noise.std:.3g} DN"
+            code, guess = "noise-guess", f"{noise}, and the pulse's misfit, {misfit}, are guesses"
+        yield StripWarning(
+            code, f"the survey found {reason}: the {guess}, and widths, errors and the number of echoes depend on it; "
+            f"{remedy}",
+        )  # fmt: skip
+
+
+def share_unexplained(system: SystemPulse, echoes: EchoTable, spacing: float) -> float:
+    """Share of the clear echoes whose samples the pulse and the noise do not explain; 0 with too few of them."""
+    clear = echoes.amplitude > MIN_SNR * system.noise.std
+    unexplained = find_unexplained(echoes, system, spacing)[clear] > 1
+    return float(np.mean(unexplained)) if len(unexplained) >= FEW else 0.0
+
+
+def share_repeated(echoes: EchoTable, width: float) -> float:
+    """Twice the share of the echoes that, beyond chance, stand beside stronger ones, all at one lag and one ratio.
+
+    A pulse that few echoes show only roughly leaves such parts of it, each at its place.
+    """
+    pairs = []
+    for row, other, lag in list_neighbours(echoes):
+        ratio = echoes.amplitude[row] / echoes.amplitude[other]
+        near = (ratio < WEAKER) & (np.abs(lag) < REACH * width)
+        pairs.append(np.stack([lag[near] / width, log(ratio[near])]))
+    lags, ratios = np.concatenate(pairs, axis=1) if pairs else np.empty((2, 0))
+    most = 0.0
+    for centre in np.arange(-REACH, REACH, 0.5):
+        here = np.abs(lags - centre) <= 1
+        if np.count_nonzero(here) >= FEW:
+            alike = np.abs(ratios - np.median(ratios[here])) < SAME_RATIO
+            chance = max(np.mean(alike[~here]), 0.1) if np.count_nonzero(~here) >= FEW else CHANCE_RATIO
+            most = max(most, float(np.count_nonzero(alike & here) - chance * np.count_nonzero(here)))
+    return 2 * most / max(len(echoes), 1)
+
+
+@frozen
+class Trial:
+    """Limits of a survey."""
+
+    left_out: str = ""
+    """Name of a shipped pulse that is not known."""
+    most_components: int = MOST_COMPONENTS
+    """Gaussians of a learned pulse, at most."""
+
+
+ALL = Trial()
+"""What surveys obey but for comparisons."""
+
+TRIAL: ContextVar[Trial] = ContextVar("trial", default=ALL)
+"""The limits that hold now."""
+
+
+@contextmanager
+def limit_surveys(trial: Trial) -> Iterator[None]:
+    """Let all surveys within obey the limits."""
+    token = TRIAL.set(trial)
+    try:
+        yield
+    finally:
+        TRIAL.reset(token)

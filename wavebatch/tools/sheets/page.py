@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
-from wavebatch.core.errors import ConfigError, InputError, StageError
-from wavebatch.core.optional import advise_install
+from wavebatch.core.errors import ConfigError, InputError, StageError, advise_install
 from wavebatch.files.disk.publish import Draft, refuse_input, reporting
 from wavebatch.files.figure_file import has_matplotlib
 from wavebatch.tools.sheets.sheet import NO_VALUE, Cell, Code, Fact, Later, Note, Part, Picture, Table

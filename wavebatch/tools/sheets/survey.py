@@ -19,15 +19,14 @@ from wavebatch import __version__
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.system import swath_columns
 from wavebatch.core.units import FWHM_PER_SIGMA, count, format_measure, format_relative
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock, swath_columns
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture, open_picture, plain_text, set_head
 from wavebatch.files.text_file import write_text
-from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.closed_form import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
-from wavebatch.stages.attribute.incidence_angle import added_variance
+from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.surveying.flat_ground import REFERENCE_ERROR
 from wavebatch.surveying.systems.survey_result import Survey, name_model
 from wavebatch.tools.sheets import sheet as sheets
@@ -219,7 +218,7 @@ def calibration_sheet(flight: FlightCalibration) -> Sheet:
 
 def write_calibrate_page(target: Path, flight: FlightCalibration) -> None:
     """Write the page of a calibration of one strip or of several."""
-    from wavebatch.surveying.calibrating.calibration_file import format_calibration
+    from wavebatch.surveying.calibrating.calibration_files import format_calibration
     from wavebatch.tools.sheets.page import write_page
 
     found = flight.calibration

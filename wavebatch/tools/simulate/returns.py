@@ -28,7 +28,7 @@ from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader, Column
 from wavebatch.files.disk.publish import protecting
 from wavebatch.files.las.crs import repair_records
 from wavebatch.files.las.header import field_names, is_projection, read_header
-from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.kernels.geometry.group_returns import fit_rays, group_pulses
 from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section
 from wavebatch.tools.simulate.render import MOST_NOISE, PulseModel, Recording, paint_echoes, record_counts
@@ -455,7 +455,7 @@ _FORMATS = {0: 4, 1: 4, 2: 5, 3: 5, 4: 4, 5: 5, 6: 9, 7: 10, 8: 10, 9: 9, 10: 10
 _PACKET_FIELDS = ("wavepacket_index", "wavepacket_offset", "wavepacket_size", "return_point_wave_location")
 _LENGTHS = tuple(64 << number for number in range(8))
 """Lengths of the waveforms [samples], a digitizer for each. Pulses that need more keep their points without packet."""
-_PIECE = 50_000
+PIECE = 50_000
 """Points read at a time. Random numbers are drawn per piece: another value gives other noise."""
 _PAINTED = 1 << 22
 """Samples painted at a time."""
@@ -535,13 +535,14 @@ def synthesize_strip(
     *,
     overwrite: bool = False,
     progress: Callable[[int], object] | None = None,
+    piece: int = PIECE,
 ) -> SynthesisSummary:
     """Writes the points of `cloud` with modelled waveforms to `target` (.las or .laz); returns the counts.
 
     A pulse is a run of points of equal GPS time. Its waveform is a Gaussian per return, at the return's distance from
     the first one. The ray runs from the first to the last return; lone returns take the direction that the pulses
     around them have at their scan angle. All points keep their coordinates and fields (extra bytes are left out); point
-    formats 0 to 3 become 4 and 5, 6 to 8 become 9 and 10. Memory does not grow with the cloud.
+    formats 0 to 3 become 4 and 5, 6 to 8 become 9 and 10. piece: points in memory at a time.
     Raises InputError where the cloud cannot be read, has no GPS times or is not in metres, or the target exists,
     ConfigError where it lacks a column, or a column holds no widths or shares; no file remains then.
     """
@@ -563,7 +564,7 @@ def synthesize_strip(
         summary = SynthesisSummary(gain=gain, light=light.counts, level=recordings[0].empty_level)
         rise = options.spacing * (summary.level - options.baseline)
         with _open_writer(reader, Path(target), options, overwrite) as writer:
-            for number, (rows, records) in enumerate(_read_pulses(reader)):
+            for number, (rows, records) in enumerate(_read_pulses(reader, piece)):
                 rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(number,)))
                 pulses = _model_pulses(rows, records, gain, light, rng)
                 offset, energy = _write_packets(writer, recordings, pulses, rng)
@@ -578,11 +579,11 @@ def synthesize_strip(
     return summary
 
 
-def _read_pulses(reader: CloudReader) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _read_pulses(reader: CloudReader, size: int = PIECE) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Rows and raw records in pieces that cut no pulse."""
     rows: np.ndarray | None = None
     records: np.ndarray | None = None
-    for piece in reader.read_pieces(_PIECE):
+    for piece in reader.read_pieces(size):
         rows = piece if rows is None else np.concatenate([rows, piece])
         records = reader.records if records is None else np.concatenate([records, reader.records])
         starts = group_pulses(rows["gps_time"], rows["number"])

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch import __version__
+from wavebatch.core.echoes import Column
 from wavebatch.core.errors import ConfigError, InputError, nearest
 from wavebatch.core.frozen import frozen
 from wavebatch.files.cloud.cloud_reader import ColumnFacts
@@ -58,36 +59,24 @@ _CLASSES = 40
 _LEAST_PAIRS = 10.0
 """Pairs of neighbours that weigh as much as the spread of all classes."""
 
-@frozen
-class VoxelColumn:
-    """One value of a voxel."""
-
-    name: str
-    dtype: str
-    unit: str
-    meaning: str
-    """With the unit at most 32 bytes, for the description in LAS."""
-    no_data: float | None = None
-    """Value for no data in LAS; .npz files have NaN."""
-
-
 COLUMNS = (
-    VoxelColumn("energy", "f4", "DN ns", "signal from the voxel"),
-    VoxelColumn("cross_section", "f4", "m2", "backscatter cross section", -9999.0),
-    VoxelColumn("rays", "u4", "-", "rays that crossed with light"),
-    VoxelColumn("path", "f4", "m", "length of these rays in it"),
-    VoxelColumn("light", "f4", "rays", "light that reached it"),
-    VoxelColumn("share", "f4", "-", "share of it returned here", -9999.0),
-    VoxelColumn("share_error", "f4", "-", "std of share, 1 sigma", -9999.0),
+    Column("energy", "f4", "DN ns", "signal from the voxel", None),
+    Column("cross_section", "f4", "m2", "backscatter cross section"),
+    Column("rays", "u4", "-", "rays that crossed with light", None),
+    Column("path", "f4", "m", "length of these rays in it", None),
+    Column("light", "f4", "rays", "light that reached it", None),
+    Column("share", "f4", "-", "share of it returned here"),
+    Column("share_error", "f4", "-", "std of share, 1 sigma"),
 )
-"""Values of every voxel; cross_section only with a calibration."""
+"""Values of every voxel; cross_section only with a calibration. Meaning and unit have at most 32 bytes together, for
+the description in LAS. No data is NaN in .npz files."""
 
 FOREST_COLUMNS = (
-    VoxelColumn("height", "f4", "m", "centre above the ground", -9999.0),
-    VoxelColumn("ground", "f4", "-", "share returned by ground", -9999.0),
-    VoxelColumn("free_path", "f4", "m", "light times its path"),
-    VoxelColumn("attenuation", "f4", "1/m", "caught by plants", -9999.0),
-    VoxelColumn("attenuation_error", "f4", "1/m", "std of attenuation", -9999.0),
+    Column("height", "f4", "m", "centre above the ground"),
+    Column("ground", "f4", "-", "share returned by ground"),
+    Column("free_path", "f4", "m", "light times its path", None),
+    Column("attenuation", "f4", "1/m", "caught by plants"),
+    Column("attenuation_error", "f4", "1/m", "std of attenuation"),
 )
 """Further values that forest metrics need. free_path: light times the way that it goes in the voxel until it is caught.
 attenuation: the part of the light that plants catch per metre."""
@@ -318,7 +307,7 @@ def check_voxel_target(target: Path, strip: Path) -> None:
 class VoxelSpace:
     """Contents of a voxel file besides the values of the voxels."""
 
-    columns: Sequence[VoxelColumn]
+    columns: Sequence[Column]
     facts: StripFacts
     """Facts of the strip, for its CRS and header."""
     origin: np.ndarray
