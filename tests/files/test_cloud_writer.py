@@ -544,17 +544,6 @@ def test_a_killed_publication_of_two_files_can_be_finished(tmp_path):
 # --- whole or not at all ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_an_aborted_file_leaves_nothing(tmp_path, suffix):
-    points = write_source(tmp_path / "a.las", 9, (1, 4))
-    layout = plan_output(tmp_path / "a.las", [])
-    with pytest.raises(KeyError), CloudWriter(layout, tmp_path / f"out{suffix}", provenance={}) as cloud:
-        cloud.write(layout.rows(points))
-        raise KeyError("stop")
-    cloud.abort()
-    assert os.listdir(tmp_path) == ["a.las"]
-
-
 REMEDY = "free space or choose another output folder"
 FULL_DISK = """
 import resource, sys
@@ -606,16 +595,6 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, name):
     lines = run.stdout.splitlines()
     assert len(lines) == 1 and lines[0] == f"{target}: cannot be written: File too large; {REMEDY}", lines
     assert os.listdir(tmp_path / "out") == []
-
-
-def test_rows_of_another_layout_are_refused(tmp_path):
-    points = write_source(tmp_path / "a.las", 9, (1, 4))
-    layout = plan_output(tmp_path / "a.las", [])
-    with (
-        CloudWriter(layout, tmp_path / "out.las", provenance={}) as cloud,
-        pytest.raises(InputError, match="rows of another layout"),
-    ):
-        cloud.write(points)
 
 
 def test_nothing_waits_in_a_buffer_that_a_forked_worker_would_write_again(tmp_path):

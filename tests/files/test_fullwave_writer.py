@@ -161,17 +161,6 @@ def test_nothing_is_replaced_unless_asked(tmp_path, existing):
     assert read_raw(tmp_path / "a.las").tobytes() == points.tobytes()
 
 
-@pytest.mark.parametrize("internal", [True, False])
-def test_an_aborted_strip_leaves_nothing(tmp_path, internal):
-    with (
-        pytest.raises(KeyError),
-        FullwaveWriter(tmp_path / "a.laz", point_format=9, internal=internal, digitizers=ONE) as writer,
-    ):
-        writer.write_packets(np.zeros((5, 80), np.uint8), 1)
-        raise KeyError("stop")
-    assert os.listdir(tmp_path) == []
-
-
 def test_a_strip_that_appears_meanwhile_is_kept(tmp_path):
     with FullwaveWriter(tmp_path / "a.las", point_format=9, internal=False, digitizers=ONE) as writer:
         (tmp_path / "a.las").write_bytes(b"other")

@@ -89,7 +89,7 @@ def document():
     """A small benchmark with everything in it, whose chains are timed in this process."""
     with pytest.MonkeyPatch.context() as patch:
         time_here(patch)
-        return measure_small()
+        return measure_small(replace(SMALL, waveforms=400))
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +98,8 @@ def timed_document():
     return measure_small()
 
 
-def measure_small():
-    found = run_bench(SMALL, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=20))
+def measure_small(options=SMALL):
+    found = run_bench(options, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=20))
     return {**found, "promises": judge(found)}
 
 
@@ -123,14 +123,6 @@ def test_document_has_a_row_per_chain_and_peer(timed_document):
             assert 2e7 < row["peak_bytes"] < 5e8
     assert {row["kind"] for row in document["scenes"][0]["rows"] if row["pareto"]} == {"chain"}
     assert document["scenes"][0]["cheapest"] in names
-
-
-@pytest.mark.slow
-def test_isolated_echoes_are_at_the_bound(document):
-    figures = find_row(document, "accurate")["figures"]
-    for name in ("time", "amplitude", "sigma"):
-        ratio = figures[f"{name}_ratio_isolated"]
-        assert abs(ratio["value"] - 1) < 3 * ratio["error"] + 0.05
 
 
 def test_document_is_plain_json_and_its_tables_show_all(document):
