@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.kernels import library
-from wavebatch.kernels.fit.cluster import Clusters, Solution
+from wavebatch.kernels.fit.decompose import Clusters, Solution
 from wavebatch.kernels.library import call, place
 
 AS_FITTED, STRETCHED, SUMMED = range(3)

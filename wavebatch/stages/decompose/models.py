@@ -18,8 +18,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
-from wavebatch.kernels.fit.cluster import Settings, Solution, choose
-from wavebatch.kernels.fit.decompose import decompose_clusters
+from wavebatch.kernels.fit.decompose import Settings, Solution, choose, decompose_clusters
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.kernels.fit.render import render_echoes, render_skewed, skewed_pulse
 from wavebatch.stages.chain import Range, Step, stage
@@ -32,7 +31,7 @@ from wavebatch.stages.decompose.solve import (
     fit_gaussian,
     make_settings,
 )
-from wavebatch.stages.detect.candidates import samples_of
+from wavebatch.stages.detect.direct import samples_of
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, reference_pulse, shape_limits
 
 POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
