@@ -4,8 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings
-from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
+from wavebatch.kernels.fit.decompose import Candidates, Clusters, Samples, Settings, decompose_clusters
 
 TIGHT = {"tolerance": 1e-8, "max_iterations": 60}
 

@@ -14,7 +14,7 @@ from facet_strips import _render
 
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.las.header import ExtraRecord
-from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.strip.packets import FullwaveWriter
 
 SPEED = 0.299792458 * 0.9997 / 2
 """One-way metres per two-way ns, in air."""

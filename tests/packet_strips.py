@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.strip.packets import FullwaveWriter
 
 SIGMA = 2.0
 LENGTHS = np.arange(32, 513, 32)

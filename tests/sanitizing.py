@@ -21,8 +21,14 @@ import numpy as np
 
 from wavebatch.kernels import library
 from wavebatch.kernels.build_kernels import compile_library, find_compiler
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings, cluster_candidates
-from wavebatch.kernels.fit.decompose import decompose_clusters, promise_echoes
+from wavebatch.kernels.fit.decompose import (
+    Candidates,
+    Clusters,
+    Settings,
+    cluster_candidates,
+    decompose_clusters,
+    promise_echoes,
+)
 from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import find_maxima, quiet_levels

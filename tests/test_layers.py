@@ -24,7 +24,7 @@ INSIDE = {
         {"misfit", "learn_pulse", "judge", "whitening", "return_scatter"}, {"joint_pulse", "mirror"}, {"choose_pulse"},
     ],
     "batch/workers": [
-        {"serve", "worker_check"}, {"processes"}, {"dask_cluster"},
+        {"futures", "serve", "worker_check"}, {"spawned"}, {"processes"}, {"dask_cluster"},
     ],
     "surveying": [
         {"measuring"}, {"look", "predict_error"}, {"survey", "sensor"}, {"system_file"}, {"outgoing"},

@@ -16,9 +16,8 @@ from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.las.header import LasHeader, Vlr, build_dtype, encode_evlr_header, read_header
 from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.files.strip.packets import StripFacts
+from wavebatch.files.strip.packets import FullwaveWriter, StripFacts
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.files.strip.writer import FullwaveWriter
 
 BACKENDS = (laspy.LazBackend.Lazrs, laspy.LazBackend.Laszip)
 

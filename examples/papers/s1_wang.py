@@ -22,8 +22,7 @@ from wavebatch.kernels.signal.signal import find_peaks
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.stages.decompose.fit import gaussian, residual_loop
 from wavebatch.stages.decompose.models import render_table, skewed
-from wavebatch.stages.detect.candidates import signal_above
-from wavebatch.stages.detect.direct import maximum
+from wavebatch.stages.detect.direct import maximum, signal_above
 from wavebatch.stages.detect.transformed import wavelet
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.score import match_echoes

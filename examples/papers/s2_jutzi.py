@@ -21,8 +21,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.closed_form import bound_time
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings
-from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
+from wavebatch.kernels.fit.decompose import Candidates, Clusters, Samples, Settings, decompose_clusters
 from wavebatch.stages.decompose.fit import gauss_newton
 from wavebatch.stages.detect.direct import matched_filter, sustained_threshold
 from wavebatch.tools.scan_slices import ScanLine, SliceOptions, cut_slice, find_segments, read_scan_lines

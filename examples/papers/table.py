@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from wavebatch.tools.bench.report import align
+from wavebatch.tools.bench.command import align
 
 HEADS = ["figure", "paper", "spec", "ours", "accepted", ""]
 

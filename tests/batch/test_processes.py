@@ -12,7 +12,8 @@ from concurrent.futures import Future
 
 import pytest
 
-from wavebatch.batch.workers.processes import WorkerDied, Workers
+from wavebatch.batch.workers.futures import WorkerDied
+from wavebatch.batch.workers.processes import Workers
 from wavebatch.batch.workers.worker_check import _probe_alone
 from wavebatch.tools.bench.command import Worker
 

@@ -10,14 +10,14 @@ from batch_tools import is_alive
 
 EARLY = """
 import os, sys, time
-from wavebatch.batch.workers.processes import start_early
+from wavebatch.batch.workers.spawned import start_early
 if __name__ == "__main__":
     start_early(2)
     with open(f"/proc/{os.getpid()}/task/{os.getpid()}/children") as file:
         print(file.read(), flush=True)
     if sys.argv[1] == "stopped":
         import signal
-        from wavebatch.batch.workers.processes import _early
+        from wavebatch.batch.workers.spawned import _early
         for one in _early:
             os.kill(one.process.pid, signal.SIGSTOP)
 """

@@ -25,7 +25,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.process import ONE_THREAD
-from wavebatch.tools.bench.report import write_texts
+from wavebatch.tools.bench.command import write_texts
 from wavebatch.tools.simulate import find_scene, simulate_strip
 
 SCENES = ("mixed", "open", "forest", "empty")

@@ -22,11 +22,12 @@ from wavebatch.tools.bench.command import (
     BenchOptions,
     BenchProgress,
     choose_chains,
+    format_document,
     list_methods,
     load_chains,
     run_bench,
+    write_outputs,
 )
-from wavebatch.tools.bench.report import format_document, write_outputs
 
 SCENES = ("mixed", "open", "forest", "empty")
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from wavebatch.stages.score import QUANTITIES
-from wavebatch.tools.bench.report import align, figure_text
+from wavebatch.tools.bench.command import align, figure_text
 
 
 def format_stability(rows: Sequence[Mapping[str, Any]]) -> str:

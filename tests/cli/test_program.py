@@ -478,19 +478,6 @@ def _talk(child, keys, wanted, seconds=100.0):
             shown += os.read(child.stdout.fileno(), 65536)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["stages"], ["stages", "--help"], ["run", "-h"]])
-def test_a_full_disk_behind_stdout_is_one_line(arguments):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with open("/dev/full", "w") as full:
-        result = subprocess.run(
-            [sys.executable, "-m", "wavebatch", *arguments], stdout=full, stderr=subprocess.PIPE, env=environment
-        )
-    (line,) = result.stderr.decode().splitlines()
-    assert result.returncode == 1 and line.startswith("error: ") and "No space left on device" in line
-    assert "bug" not in line
-
-
 def _invoke(*arguments):
     return run_command("stages", *arguments)
 

@@ -1,8 +1,6 @@
 """`wavebatch simulate`: options reach the strip, errors are one line with the documented exit code."""
 
 import json
-import subprocess
-import sys
 
 import laspy
 import numpy as np
@@ -66,11 +64,3 @@ def test_help_lists_every_scene():
     text = run("--help").output
     for name in SCENES:
         assert f"{name}:" in text
-
-
-def test_as_a_shell_command(tmp_path):
-    command = [sys.executable, "-m", "wavebatch", "simulate", "flat", "-o", str(tmp_path / "s.laz"), "--pulses", "50"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0
-    assert done.stdout == ""
-    assert (tmp_path / "s.laz").exists()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from commands import run_command
 
-from wavebatch.surveying.calibrating.calibration_file import format_calibration
+from wavebatch.surveying.calibrating.calibration_files import format_calibration
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.tools.simulate import simulate_strip
 

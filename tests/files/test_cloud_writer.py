@@ -129,23 +129,6 @@ def test_lascompressed_1_5_input(tmp_path):
     assert header.gps_range == (rows["gps_time"].max(), rows["gps_time"].min())
 
 
-@pytest.mark.parametrize("new", [6, 7, 8])
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_promoted_files_come_back(tmp_path, new, suffix):
-    wkt = Vlr(b"LASF_Projection", 2112, b"PROJCRS[]\0", b"wkt")
-    points = write_source(tmp_path / "a.las", 4, (1, 3), vlrs=[wkt], creation=(60, 2024), user_bytes=b"mine")
-    layout = plan_output(tmp_path / "a.las", COLUMNS, point_format=new)
-    rows = make_rows(layout, points)
-    target = tmp_path / f"out{suffix}"
-    write(layout, target, rows)
-    for backend in BACKENDS:
-        assert read_raw(target, backend).tobytes() == rows.tobytes()
-    check_truth(target, rows)
-    header = read_header(target)
-    assert (header.version, header.point_format, header.user_bytes) == ((1, 4), new, b"mine")
-    assert header.global_encoding & 16 and header.vlrs[0].encode() == wkt.encode()
-
-
 def test_the_wkt_bit_says_the_truth(tmp_path):
     geotiff, wkt = Vlr(b"LASF_Projection", 34735, bytes(8)), Vlr(b"LASF_Projection", 2112, b"PROJCRS\0")
     for name, vlrs, evlrs, bit in (
@@ -266,12 +249,13 @@ def test_records_are_kept_to_the_byte(tmp_path):
         Vlr(b"LAS_Spec", 101, bytes(26), b"Leica's spelling"),
         Vlr(b"long", 2, bytes(65535)),
     ]
-    points = write_source(tmp_path / "a.laz", 9, (1, 4), vlrs=vlrs, padding=b"\xdd\xcc", project_id=bytes(range(16)))
+    points = write_source(tmp_path / "a.laz", 9, (1, 4), vlrs=vlrs, padding=b"\xdd\xcc", project_id=bytes(range(16)),
+                          user_bytes=b"mine")  # fmt: skip
     layout = plan_output(tmp_path / "a.laz", COLUMNS)
     for suffix in (".las", ".laz"):
         write(layout, tmp_path / f"out{suffix}", layout.rows(points))
         header = read_header(tmp_path / f"out{suffix}")
-        assert (header.padding, header.project_id) == (b"\xdd\xcc", bytes(range(16)))
+        assert (header.padding, header.project_id, header.user_bytes) == (b"\xdd\xcc", bytes(range(16)), b"mine")
         # laspy opens no file with ids that are not UTF-8.
         shown = [dataclasses.replace(vlr, user_id=vlr.user_id.replace(b"\xe9", b"?")) for vlr in vlrs]
         expected = [vlr.encode() for vlr in shown if vlr.record_id not in (100, 101) and vlr.user != "copc"]
@@ -544,17 +528,6 @@ def test_a_killed_publication_of_two_files_can_be_finished(tmp_path):
 # --- whole or not at all ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_an_aborted_file_leaves_nothing(tmp_path, suffix):
-    points = write_source(tmp_path / "a.las", 9, (1, 4))
-    layout = plan_output(tmp_path / "a.las", [])
-    with pytest.raises(KeyError), CloudWriter(layout, tmp_path / f"out{suffix}", provenance={}) as cloud:
-        cloud.write(layout.rows(points))
-        raise KeyError("stop")
-    cloud.abort()
-    assert os.listdir(tmp_path) == ["a.las"]
-
-
 REMEDY = "free space or choose another output folder"
 FULL_DISK = """
 import resource, sys
@@ -606,16 +579,6 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, name):
     lines = run.stdout.splitlines()
     assert len(lines) == 1 and lines[0] == f"{target}: cannot be written: File too large; {REMEDY}", lines
     assert os.listdir(tmp_path / "out") == []
-
-
-def test_rows_of_another_layout_are_refused(tmp_path):
-    points = write_source(tmp_path / "a.las", 9, (1, 4))
-    layout = plan_output(tmp_path / "a.las", [])
-    with (
-        CloudWriter(layout, tmp_path / "out.las", provenance={}) as cloud,
-        pytest.raises(InputError, match="rows of another layout"),
-    ):
-        cloud.write(points)
 
 
 def test_nothing_waits_in_a_buffer_that_a_forked_worker_would_write_again(tmp_path):

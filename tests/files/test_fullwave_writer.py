@@ -10,7 +10,7 @@ from writer_tools import BACKENDS, random_points, read_raw, write_strip
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.las.header import ExtraRecord, find_evlrs, read_header
-from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.strip.packets import FullwaveWriter
 
 FORMATS = [(4, "1.3"), (5, "1.3"), (4, "1.4"), (5, "1.4"), (9, "1.4"), (10, "1.4"), (9, "1.5"), (10, "1.5")]
 ONE = (Digitizer(1, 8, 80, 1.0),)
@@ -159,17 +159,6 @@ def test_nothing_is_replaced_unless_asked(tmp_path, existing):
     assert os.listdir(tmp_path) == [existing] and (tmp_path / existing).read_bytes() == b"old"
     points = write_strip(tmp_path / "a.las", internal=False, overwrite=True)
     assert read_raw(tmp_path / "a.las").tobytes() == points.tobytes()
-
-
-@pytest.mark.parametrize("internal", [True, False])
-def test_an_aborted_strip_leaves_nothing(tmp_path, internal):
-    with (
-        pytest.raises(KeyError),
-        FullwaveWriter(tmp_path / "a.laz", point_format=9, internal=internal, digitizers=ONE) as writer,
-    ):
-        writer.write_packets(np.zeros((5, 80), np.uint8), 1)
-        raise KeyError("stop")
-    assert os.listdir(tmp_path) == []
 
 
 def test_a_strip_that_appears_meanwhile_is_kept(tmp_path):

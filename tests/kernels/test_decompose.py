@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from fits import decompose, settings
 
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
-from wavebatch.kernels.fit.decompose import Samples, decompose_clusters, promise_echoes
+from wavebatch.kernels.fit.decompose import Candidates, Clusters, Samples, decompose_clusters, promise_echoes
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, PulseTable
 from wavebatch.kernels.signal.noise import whitening_filter
 

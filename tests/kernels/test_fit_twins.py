@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from wavebatch.kernels.elementary import exp, log, log1p, solve
 from wavebatch.kernels.fit.closed_form import estimate_starts, fit_parabola, start_errors
-from wavebatch.kernels.fit.cluster import Solution, choose
+from wavebatch.kernels.fit.decompose import Solution, choose
 from wavebatch.kernels.fit.learn_pulse import Stack, fit_bounded, refine_gaussians, stack_pulse
 from wavebatch.kernels.fit.pulse_shape import (
     TAIL_STEP,

@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.cluster import Candidates, cluster_candidates
+from wavebatch.kernels.fit.decompose import Candidates, cluster_candidates
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import find_maxima, gaussian_taps, quiet_levels
 

@@ -226,11 +226,6 @@ def test_the_recovery_is_that_of_a_loop(rng, tail):
     assert measure_recovery(signal[:, :90], pooled, 4, 4.0) == 0
 
 
-def assert_same_noise(found, expected):
-    assert found[:5] == pytest.approx(expected[:5], rel=1e-3, abs=2e-4)
-    assert found.correlation == pytest.approx(expected[5], abs=2e-4)
-
-
 def test_coloured_noise_widens_errors_as_its_covariance_says():
     x = np.arange(-12, 13) / 2.0
     pulse = np.exp(-0.5 * x * x)

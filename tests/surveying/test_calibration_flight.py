@@ -12,7 +12,7 @@ from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_str
 from wavebatch.core.order import group_medians
 from wavebatch.surveying.calibrating.adjust_flight import TIE, VIEW, Anchors, Ties, adjust_constants, measure_ties
 from wavebatch.surveying.calibrating.calibrate_flight import fit_swath
-from wavebatch.surveying.calibrating.calibration_file import load_calibration
+from wavebatch.surveying.calibrating.calibration_files import load_calibration
 
 GAINS = {("a", 1): 1.0, ("b", 1): 1.08, ("c", 1): 0.95, ("c", 2): 0.4275}
 """Of each strip and channel: strips drift, and channel 2 has 0.45 of the gain of channel 1."""

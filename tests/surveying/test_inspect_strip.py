@@ -8,15 +8,14 @@ from commands import run_command as run
 from strips import descriptor, make_raw
 from writer_tools import data_file
 
-from wavebatch.core.errors import InputError
-from wavebatch.files.strip.describe import describe_strip
 from wavebatch.surveying.inspect_strip import check_file
+from wavebatch.tools.file_facts import describe_file
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 
 
 def test_info_of_the_riegl_pair():
-    facts = describe_strip(data_file(RIEGL))
+    facts = describe_file(data_file(RIEGL))
     assert (facts["points"], facts["points_with_waveform"], facts["share_with_waveform"]) == (2535, 2535, 1.0)
     assert (facts["las_version"], facts["point_format"], facts["compressed"]) == ("1.4", 9, False)
     assert facts["packets"]["count"] == 2375
@@ -32,7 +31,7 @@ def test_info_of_the_riegl_pair():
 
 
 def test_info_of_the_leica_file():
-    facts = describe_strip(data_file("leica-als/simple1_3_full_internal.las"))
+    facts = describe_file(data_file("leica-als/simple1_3_full_internal.las"))
     assert (facts["packets"]["count"], facts["packets"]["where"]) == (999, "internal")
     assert facts["packets"]["descriptors"][0]["gain"] == pytest.approx(0.01729, abs=1e-5)
 
@@ -45,8 +44,7 @@ def test_info_prints_text_and_json(tmp_path):
         assert word in text.stdout
     result = run("info", path, "--json")
     facts = json.loads(result.stdout)  # with header and points, which every LAS file has
-    strip = describe_strip(path)
-    assert {name: facts[name] for name in strip} == strip and facts["gps_time"]
+    assert facts.pop("schema") and facts == describe_file(path) and facts["gps_time"]
 
 
 def test_info_counts_samples_at_the_limit(tmp_path):
@@ -54,7 +52,7 @@ def test_info_counts_samples_at_the_limit(tmp_path):
     data = bytearray(b"\x0a" * 320)
     data[33] = data[40] = data[100] = 255
     raw.packets = bytes(data)
-    samples = describe_strip(raw.write(tmp_path / "a.las"))["samples"]
+    samples = describe_file(raw.write(tmp_path / "a.las"))["samples"]
     assert samples == {
         "waveforms_read": 10, "least": 10, "largest": 255, "waveforms_at_limit": 2, "waveforms_with_gaps": 0,
         "lengths": [32],
@@ -65,7 +63,7 @@ def test_info_of_a_strip_that_cannot_be_processed_still_tells_what_it_holds(tmp_
     raw = make_raw()
     raw.packets = b""
     path = raw.write(tmp_path / "a.las")
-    facts = describe_strip(path)
+    facts = describe_file(path)
     assert facts["points_broken"] == facts["points"]
     assert facts["problems"][0].startswith("no packet can be used")
     assert facts["samples"]["least"] is None
@@ -131,16 +129,6 @@ def test_check_notes_do_no_harm_unless_strict(tmp_path):
     assert "note: descriptor 1 has gain 0" in result.stdout
     assert "note: counts by return in the header are wrong (first returns: 0, counted: 40)" in result.stdout
     assert run("check", path, "--strict").exit_code == 1
-
-
-def test_check_notices_packets_that_cannot_be_read(tmp_path, monkeypatch):
-    path = make_raw().write(tmp_path / "a.las")
-
-    def fail(*arguments):
-        raise InputError(f"{path}: packets cannot be read: Input/output error; check the disk")
-
-    monkeypatch.setattr("wavebatch.files.strip.packets.PacketFile.read", fail)
-    assert any("Input/output error" in line for line in check_file(path).problems)
 
 
 def test_check_takes_chain_files(tmp_path):

@@ -8,8 +8,8 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.las.header import ExtraRecord
 from wavebatch.files.pulse_energy import find_pulse_energy
+from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
 from wavebatch.surveying import Survey
 from wavebatch.surveying.outgoing import compare_outgoing, learn_shape, save_outgoing

@@ -9,11 +9,16 @@ import pytest
 from commands import run_command as call
 
 from wavebatch.core.units import MAD_TO_STD
+from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.geometry.planes import fit_planes
-from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
-from wavebatch.surveying.calibrating.target_file import Target, load_targets
+from wavebatch.surveying.calibrating.calibration_files import (
+    Target,
+    format_calibration,
+    load_calibration,
+    load_targets,
+    parse_calibration,
+)
 from wavebatch.tools.simulate import find_scene, simulate_strip, strip
 from wavebatch.tools.simulate.render import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, FlightLine, trace_rays
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS

@@ -10,7 +10,7 @@ import pytest
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.report_file import _sum_up as sum_up
 from wavebatch.stages.chain_file import effective, load_chain_file
-from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration
+from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_calibration
 from wavebatch.surveying.system_file import format_survey, load_survey
 
 FOLDER = Path(__file__).parent / "written_files"

@@ -19,11 +19,9 @@ from wavebatch.stages.decompose.models import fitted_pulse, rebuild_waveforms
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.tools.compare_chains import (
-    ChainRun,
     Contender,
     FitQuality,
     find_contender,
-    match_chains,
     match_sides,
     measure_fit,
 )
@@ -49,17 +47,6 @@ def call(*arguments, code=0):
     result = run_command(*arguments)
     assert result.exit_code == code, result.output
     return result
-
-
-def wagner_waveforms(n, seed):
-    """The waveforms of the reproduction in docs/algorithms.md 1.1."""
-    rng, x = np.random.default_rng(seed), np.arange(120.0)
-    y = np.zeros((n, 120))
-    for w, k in enumerate(1 + rng.choice(5, n, p=[0.58, 0.30, 0.09, 0.025, 0.005])):
-        sigma = 2 * np.sqrt(1 + (0.105 if k == 1 else 0.35) * np.abs(rng.standard_normal(k)))
-        amplitude = np.clip(25 * np.exp(0.8 * rng.standard_normal(k)), 5, 230)
-        y[w] = sum(a * naive.pulse(x, t, s) for a, t, s in zip(amplitude, rng.uniform(10, 110, k), sigma, strict=True))
-    return WaveformBlock.from_samples(np.rint(20 + y + rng.standard_normal(y.shape)).astype(np.uint16))
 
 
 def pair_naively(a, b, tolerance):
@@ -108,24 +95,6 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed):
     assert parts.vendor["b"].missed_by == result.vendor["b"].missed_by
     assert parts.fit["a"]["multi"].median == result.fit["a"]["multi"].median
     assert parts.fit["b"]["all"].mean == pytest.approx(result.fit["b"]["all"].mean, rel=1e-12)
-
-
-@pytest.mark.parametrize("seed", [11, 12])
-def test_tables_of_wagner_et_al(seed):
-    """T6: Gaussian decomposition with ASDF: 80 % and more identical, |median| < 0.002 ns, rms 0.10 to 0.16 ns."""
-    block = wagner_waveforms(4000, seed)
-    system = SystemPulse(2.0, noise=ReceiverNoise(baseline=20.0, std=1.04))
-    chains = make_chain("maximum", "gaussian"), make_chain("asdf", "none", rule="paper", interpolation="parabola")
-    runs = {key: ChainRun(chain, system, 1.0) for key, chain in zip("ab", chains, strict=True)}
-    found = match_chains(iter([block.rows(slice(0, 2500)), block.rows(slice(2500, None))]), runs, ("GD", "ASDF"), 1.0)
-    assert found.identical >= 0.80
-    assert abs(found.differences["time"].median) < 0.002
-    assert 0.10 < found.differences["time"].rms < 0.16
-    assert found.differences["time"].nmad < 0.02
-    assert sum(found.counts_a.values()) == sum(found.counts_b.values()) == 4000
-    assert runs["b"].fit.result() == {}
-    fit = runs["a"].fit.result()
-    assert 0.9 < fit["single"].mean / fit["single"].floor_mean < 1.05
 
 
 def test_a_fit_with_the_right_number_of_echoes_is_at_the_noise_floor(mixed):
@@ -303,24 +272,6 @@ def test_as_a_loop_does_it(rng):
 
 WANG = [(0.104, 0.0214, 0.0089, 0.0069), (0.184, 0.0158, 0.0100, 0.0037), (0, 0.0097, 0.0014, 0.0014)]
 WANG += [(0.05, 0.0186, 0.0058, 0.0052)]
-
-
-@pytest.mark.parametrize(("kappa", "noise_share", "gaussian", "log_normal"), WANG)
-def test_tables_of_wang_et_al(kappa, noise_share, gaussian, log_normal):
-    """T7: mean E of Gaussian and log-normal fits for Leica ground, tree, Riegl ground, tree, within 10 %."""
-    n, x, sigma = 400, np.arange(60.0), 5 / 2.354820045
-    rng = np.random.default_rng(int(1e4 * noise_share) + 1)
-    time, std = 30 + rng.uniform(-0.5, 0.5, n), 100 * noise_share
-    y = np.stack([100 * naive.pulse(x, t, sigma, kappa) for t in time]) + std * rng.standard_normal((n, 60))
-    block, noise = record(y, std)
-    system = SystemPulse(sigma, kappa=kappa)
-    for name, published in (("gaussian", gaussian), ("skewed", log_normal)):
-        step, found = decompose(name, block, noise, system)
-        misfit, floor = measure_fit(block, noise, system, step, found)
-        alone = found.count(n) == 1
-        assert alone.mean() > 0.95
-        assert misfit[alone].mean() == pytest.approx(published, rel=0.10), name
-        assert floor[alone].mean() == pytest.approx(60 * noise_share**2 / (np.sqrt(np.pi) * sigma), rel=0.03)
 
 
 def test_the_floor_is_that_of_single_samples_where_noise_is_coloured():

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from commands import run_command
 
+from wavebatch.cli.compare import HEAD, format_comparison
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.tools.pairing import SPEED, Differences, compare_clouds, compare_truth, measure_lag
-from wavebatch.tools.sheets.compare import HEAD, format_comparison
 from wavebatch.tools.simulate import StripOptions, TruthReader, simulate_strip
 
 

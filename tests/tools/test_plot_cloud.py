@@ -156,6 +156,9 @@ def test_each_cloud_has_its_series_and_all_together_are_their_sum(cloud, tmp_pat
     assert both.names == ("cloud.laz", "other.las") and both.counts.shape == (2, 30)
     one = count_values([cloud, other], "amplitude", bins=30, limits=(0.0, 200.0))
     assert np.array_equal(one.counts[0], both.counts.sum(axis=0)) and one.total == both.total
+    _, _, amplitude, _ = read_plainly(cloud)
+    every = np.append(amplitude[~np.isnan(amplitude)], np.full(POINTS, 50.0))
+    assert np.array_equal(one.percentiles[0], np.percentile(every, (5, 50, 95)))
     assert both.percentiles[1].tolist() == [50.0, 50.0, 50.0]
     late = write_cloud(tmp_path / "late.las", wb_amplitude=(np.full(POINTS, 50, "f4"), None, None, "[DN]"))
     for clouds in ([late, other], [other, late]):
@@ -482,23 +485,3 @@ def test_more_than_six_groups_have_axes_of_their_own(tmp_path):
     assert len(drawn) == 8 and matplotlib
     few = count_values([path], "z", by=None)
     assert draw_cloud._split_series(few) == [few]
-
-
-def test_a_group_of_two_values_does_not_press_the_others_down(tmp_path):
-    pytest.importorskip("matplotlib")
-    from matplotlib.figure import Figure
-
-    from wavebatch.tools.plots import draw_cloud
-
-    tops = []
-    for few in (2, 0):
-        group = np.repeat([1, 2], [5000 - few, few]).astype("u1")
-        path = write_cloud(tmp_path / f"{few}.las", n=5000, group=(group, None, None, "-"))
-        found = count_values([path], "z", by="group")
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Figure, "savefig", lambda figure, *args, **more: tops.append(figure.axes[0].get_ylim()[1])
-                          or args[0].write(b"x"))  # fmt: skip
-            draw_cloud.draw_cloud_histogram(found, tmp_path / f"{few}.png")
-    assert found.names == ("group 1",) or len(found.names) == 1
-    shares = 100 * found.counts[0] / found.values[0]
-    assert tops[0] < 1.5 * shares.max() < 40

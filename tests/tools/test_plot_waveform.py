@@ -23,7 +23,6 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.surveying import survey_block
-from wavebatch.tools.bench.report import _draw_panel
 from wavebatch.tools.compare_chains import ChainRun, measure_fit
 from wavebatch.tools.plots.charts import measure_view_residuals
 from wavebatch.tools.plots.draw_waveform import _draw_panels, draw_waveform_panels, draw_waveform_sheet
@@ -100,13 +99,6 @@ def test_curves_are_the_fit_of_every_decomposer(name):
         assert centre == pytest.approx(float(view.echoes.time[0]), abs=0.1)
     rms = np.sqrt(np.mean([np.mean(view.residual[np.abs(view.time - 30) <= 5] ** 2) for view in views]))
     assert rms < worst
-
-
-def test_where_nothing_is_fitted_nothing_is_drawn():
-    chain = make_chain("decompose.none")
-    (view,) = build_views(simulate(PulseShape(), [(100.0, 30.3, 2.0)], n=1), chain, PULSE, [7])
-    assert view.residual is None and view.fit is None and len(view.curves) == 0
-    assert len(view.echoes) == 1 and view.packet == 7
 
 
 def test_view_against_a_plain_sum_of_gaussians():
@@ -341,27 +333,6 @@ def test_real_waveforms(riegl, leica, tmp_path):
 def test_long_texts_lose_their_middle():
     assert plain_text("a" * 100, 21) == "a" * 9 + "..." + "a" * 9
     assert plain_text(" a\n\x00 b\t") == "a b" and plain_text("abc", 3) == "abc"
-
-
-def test_the_benchs_plot_names_every_point(tmp_path):
-    pytest.importorskip("matplotlib")
-    points = {
-        "fast": (8.0, 0.1),
-        "balanced": (10.0, 0.0701),
-        "accurate": (10.3, 0.07),
-        "gdecomp 1.0.6": (105.0, 0.082),
-        "scipy leastsq": (150.0, 0.0821),
-    }
-    rows = [
-        {"name": name, "kind": "peer" if " " in name else "chain", "kernels": {"median": time},
-         "figures": {"wrong": {"value": value, "error": 0.001}}}
-        for name, (time, value) in points.items()
-    ]  # fmt: skip
-    with open_picture(tmp_path / "b.png", (5.5, 4.6)) as figure:
-        axes = figure.subplots()
-        _draw_panel(axes, rows, "wrong", 100.0, "wrong [%]")
-        shown = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert sorted(shown) == sorted(["Pareto front", *points])
 
 
 @pytest.mark.slow

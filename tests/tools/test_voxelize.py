@@ -14,8 +14,8 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer, ReceiverNoise, SystemPulse
 from wavebatch.files.las.header import read_header
+from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.physics.radiometry import backscatter, compute_cross_section
 from wavebatch.surveying import Survey, survey_block
 from wavebatch.surveying.calibration import Calibration

@@ -24,7 +24,8 @@ from wavebatch.batch.job import StripJob, plan_filter, plan_layout
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing, cloud_path, report_path
 from wavebatch.batch.strip_task import StripTask
-from wavebatch.batch.workers.processes import WorkerDied, Workers, refuse_import
+from wavebatch.batch.workers.futures import WorkerDied
+from wavebatch.batch.workers.processes import Workers, refuse_import
 from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen

@@ -75,8 +75,7 @@ def calibrate(
     from wavebatch.files.disk.publish import refuse_existing
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
-    from wavebatch.surveying.calibrating.calibration_file import format_calibration
-    from wavebatch.surveying.calibrating.target_file import load_targets
+    from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_targets
     from wavebatch.tools.api import find_request, read_sensor
     from wavebatch.tools.sheets.sheet import list_lines
     from wavebatch.tools.sheets.survey import calibration_sheet, write_calibrate_page

@@ -243,7 +243,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     """  # fmt: skip
     from wavebatch.batch.options import RunOptions
     from wavebatch.files.cloud.point_filter import PointFilter
-    from wavebatch.surveying.calibrating.calibration_file import load_calibration
+    from wavebatch.surveying.calibrating.calibration_files import load_calibration
     from wavebatch.surveying.system_file import load_survey
     from wavebatch.tools.api import read_sensor
 

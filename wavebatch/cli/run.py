@@ -260,7 +260,7 @@ def _start_processes(options: dict[str, Any]) -> None:
     jobs = options["jobs"] or os.cpu_count() or 1
     # A limit of memory may allow fewer processes, and resume may find nothing to do.
     if jobs > 1 and not (options["memory"] or options["resume"] or options["dry_run"]):
-        from wavebatch.batch.workers.processes import end_early, start_early
+        from wavebatch.batch.workers.spawned import end_early, start_early
 
         click.get_current_context().call_on_close(end_early)  # where an option is wrong, no run takes them
         start_early(jobs)

@@ -86,7 +86,7 @@ class Stage:
     """What is wrong with this stage in a chain and for a strip (None before the strip is known); empty if nothing."""
     searches: tuple[str, Callable[..., Any]] | None = None
     """Of a detector: the kind of signal in which it searches, by which `plot waveform --show` names it, or empty, and
-    the function that gives this signal as `stages.detect.candidates.Searched`. It takes what the stage takes."""
+    the function that gives this signal as `stages.detect.direct.Searched`. It takes what the stage takes."""
 
     @property
     def summary(self) -> str:

@@ -1,6 +1,6 @@
 """The calibration of a sensor: its constants, what they were measured with, and the stages that it adds to a chain.
 
-`calibrating.targets` measures a calibration, `calibrating.calibration_file` keeps it as CAL.toml, and `wavebatch run`
+`calibrating.targets` measures a calibration, `calibrating.calibration_files` keeps it as CAL.toml, and `wavebatch run`
 fits it to each strip with `matching.strip_match`. Before you change it: give new fields a default, since older files
 lack them.
 """

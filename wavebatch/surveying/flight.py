@@ -24,7 +24,7 @@ from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.choose_chain import decide, sample_size
 from wavebatch.surveying.inspect_strip import doubt_files
-from wavebatch.surveying.look import compare_echoes, compare_looks, kind_of, look_at, read_flight
+from wavebatch.surveying.look import Glance, compare_echoes, compare_looks, glance_at, kind_of, look_at, read_flight
 from wavebatch.surveying.measuring.noise_and_width import FIRST_WIDTH
 from wavebatch.surveying.survey import survey_blocks
 from wavebatch.surveying.system_file import SavedSurvey
@@ -193,13 +193,14 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     until the group stays.
     """
     kinds = _agree_on_kinds(samples)
-    group = _find_group([sample for sample in samples if not _compare_kinds(sample.blocks, kinds)], spread)
+    group, seen = _find_group([sample for sample in samples if not _compare_kinds(sample.blocks, kinds)], spread)
     for _ in range(ROUNDS):
         blocks = [block for sample in group for block in sample.blocks]
         survey = survey_blocks(blocks)
         survey = replace(survey, decisions=decide(survey))
         whole = look_at(blocks, survey.system)
-        held = list(spread(functools.partial(_hold, system=survey.system, whole=whole, kinds=kinds), samples))
+        hold = functools.partial(_hold, system=survey.system, whole=whole, kinds=kinds)
+        held = list(spread(hold, [(sample, seen.get(sample.path)) for sample in samples]))
         fitting = [sample for sample, strip in zip(samples, held, strict=True) if strip.fits]
         if not fitting or fitting == group:
             break
@@ -233,12 +234,16 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: Survey) -> str:
     whole, kinds = read_flight(flight)
     number = min(HELD, sample_size(reader, scan))
     sample = StripSample(reader.facts.path, {}, tuple(reader.sample_blocks(scan, number)))
-    return _hold(sample, flight.system, whole, kinds).reason if sample.blocks else ""
+    return _hold((sample, None), flight.system, whole, kinds).reason if sample.blocks else ""
 
 
-def _hold(sample: StripSample, system: SystemPulse, whole: Look | None, kinds: Mapping[int, Kind]) -> Held:
-    """A strip compared with what the flight records."""
-    kind, look = _compare_kinds(sample.blocks, kinds), look_at(sample.blocks, system)
+def _hold(
+    strip: tuple[StripSample, Glance | None], system: SystemPulse, whole: Look | None, kinds: Mapping[int, Kind]
+) -> Held:
+    """A strip compared with what the flight records; with a glance at it, if there was one."""
+    sample, seen = strip
+    kind = _compare_kinds(sample.blocks, kinds)
+    look = look_at(sample.blocks, system, None if system.digitizers else seen)
     # Counts of other bits or another gain say nothing; times do.
     pulse = "" if look is None or whole is None else (compare_echoes if kind else compare_looks)(look, whole, system)
     reason = "; ".join(filter(None, (pulse, kind)))
@@ -275,16 +280,17 @@ def _compare_kinds(blocks: Iterable[WaveformBlock], kinds: Mapping[int, Kind]) -
     return ""
 
 
-def _find_group(samples: list[StripSample], spread: Spread) -> list[StripSample]:
-    """The strips that agree with the one that the most waveforms agree with, in level, noise and width."""
+def _find_group(samples: list[StripSample], spread: Spread) -> tuple[list[StripSample], dict[Path, Glance | None]]:
+    """The strips that agree with the one that the most waveforms agree with, in level, noise and width; and glances."""
     if len(samples) < 2:
-        return samples
+        return samples, {}
     # Pulses are not known yet: every Gaussian misses strong echoes alike.
     first = SystemPulse(sigma_ref=FIRST_WIDTH * samples[0].blocks[0].spacing)
-    seen = look_at(samples[0].blocks, first)
-    if seen is not None and seen.width:
-        first = replace(first, sigma_ref=seen.width)  # most strips will have it
-    looks = list(spread(functools.partial(look_at, system=first), [sample.blocks for sample in samples]))
+    seen = glance_at(samples[0].blocks, first)
+    if seen is not None and seen.look.width:
+        first = replace(first, sigma_ref=seen.look.width)  # most strips will have it
+    glances = list(spread(functools.partial(glance_at, system=first), [sample.blocks for sample in samples]))
+    looks = [None if glance is None else glance.look for glance in glances]
     best: list[StripSample] = []
     for candidate in looks[:: max(len(looks) // CANDIDATES, 1)]:
         if candidate is None:
@@ -298,4 +304,4 @@ def _find_group(samples: list[StripSample], spread: Spread) -> list[StripSample]
         ]
         if sum(sample.waveforms for sample in group) > sum(sample.waveforms for sample in best):
             best = group
-    return best or samples
+    return best or samples, dict(zip((sample.path for sample in samples), glances, strict=True))

@@ -1,6 +1,7 @@
-"""The problems of a strip or a chain file, for `wavebatch check`.
+"""The problems of a strip or a chain file, for `wavebatch check`; what a sample of its packets shows, for `info` too.
 
-Before you change it: an error in a file is a finding here, never an exception.
+`check` compares the header's claims with the points, which wavebatch itself does not use. Before you change it: an
+error in a file is a finding here, never an exception.
 """
 
 from __future__ import annotations
@@ -15,8 +16,12 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError, StripWarning
 from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import without_nan
-from wavebatch.files.strip.describe import audit_header, describe_samples
+from wavebatch.files.las.header import LasHeader, read_header
+from wavebatch.files.las.write_points import Statistics
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
+
+_SAMPLED = 4096
+"""Waveforms of which extremes are read."""
 
 _MATCHED = 1024
 """Waveforms whose echoes are compared with the returns."""
@@ -111,6 +116,48 @@ def _note_descriptors(facts: StripFacts, scan: StripScan) -> Iterator[str]:
             yield f"descriptor {index} has gain 0; counts are used as they are"
     if not scan.with_waveform + scan.broken:
         yield "no point has a waveform; every point would be passed through"
+
+
+def audit_header(reader: StripReader, scan: StripScan) -> Iterator[str]:
+    """Yield a line for each count or bound of the header that the points contradict."""
+    facts = reader.facts
+    claimed = read_header(facts.path)
+    true = LasHeader(claimed.version, claimed.point_format, claimed.point_length, claimed.scales, claimed.offsets)
+    statistics = Statistics(facts.dtype, ())
+    for start, stop in zip(scan.borders[:-1].tolist(), scan.borders[1:].tolist(), strict=True):
+        statistics.add(reader.read_points(start, stop))
+    statistics.fill(true)
+    if not true.point_count:
+        return
+    known = 15 if claimed.version >= (1, 4) else 5
+    if claimed.by_return[:known] != true.by_return[:known]:
+        first, really = claimed.by_return[0], true.by_return[0]
+        yield f"counts by return in the header are wrong (first returns: {first}, counted: {really})"
+    slack = 1.5 * np.abs(claimed.scales)
+    outside = (np.array(true.mins) < np.array(claimed.mins) - slack) | (np.array(true.maxs) > claimed.maxs + slack)
+    if not np.all(~outside):
+        axes = ", ".join(np.array(list("xyz"))[outside].tolist())
+        yield f"points lie outside the bounds that the header claims ({axes})"
+
+
+def describe_samples(reader: StripReader, scan: StripScan) -> dict[str, Any]:
+    """Extremes of waveforms spread over the strip; of none where no packet can be used."""
+    rows = []
+    for block in reader.sample_blocks(scan, _SAMPLED) if scan.with_waveform else ():
+        at_limit = (block.samples == block.digitizer.max_count).any(axis=1)
+        extremes = int(block.samples.min()), int(block.samples.max())
+        gaps = 0 if block.missing is None else int(block.missing.any(axis=1).sum())
+        rows.append((len(block), *extremes, int(np.count_nonzero(at_limit)), gaps, block.samples.shape[1]))
+    columns: Any = zip(*rows, strict=True) if rows else ((),) * 6
+    numbers, least, largest, limited, with_gaps, lengths = columns
+    return {
+        "waveforms_read": sum(numbers),
+        "least": min(least, default=None),
+        "largest": max(largest, default=None),
+        "waveforms_at_limit": sum(limited),
+        "waveforms_with_gaps": sum(with_gaps),
+        "lengths": sorted(set(lengths)),
+    }
 
 
 def _without_name(path: Path, error: Exception) -> str:

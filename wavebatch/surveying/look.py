@@ -13,6 +13,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.order import quantile
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -156,41 +157,66 @@ def compare_levels(own: Level, rest: list[Level], noise: float, most: float = ST
     return ""
 
 
-def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None:
-    """Measure what waveforms record, without learning a pulse.
+@frozen(eq=False)
+class Glance:
+    """What a look finds before it tries the flight's pulse, in most of its time."""
 
-    Parameters
-    ----------
-    blocks : iterable of WaveformBlock
-        Of any descriptors; only those of the main digitizer are used.
-    system : SystemPulse
-        Of the flight: its pulse is tried on the strong echoes.
+    plain: SystemPulse
+    """A Gaussian, and the noise."""
+    lone: EchoTable
+    look: Look
+    """Without a misfit."""
 
-    Returns
-    -------
-    Look or None
-        None without waveforms of the main digitizer.
-    """
-    kinds: dict[Kind, list[WaveformBlock]] = {}
-    for block in blocks:
-        if block.digitizer.index not in system.digitizers:
-            kinds.setdefault(kind_of(block), []).append(block)
-    if not kinds:
+
+def glance_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Glance | None:
+    """Measure level, noise and width; arguments and result as for `look_at`."""
+    block = _pool_main(blocks, system)
+    if block is None:
         return None
-    block = pool_blocks(max(kinds.values(), key=lambda group: sum(map(len, group))))
     plain, lone, width = _find_width(block, system.sigma_ref)
     level = describe_level(block, plain)
     quiet = plain.noise.by_kind.get("quiet", 0.0)
     if quiet:
         # The mean square of all quiet samples holds weak echoes too: 2.2 DN in a RIEGL strip, 1.6 in a part of it.
         level = replace(level, std=max(quiet, QUANTISATION_STD))
-    if not width:
-        return Look(level, 0.0, 0.0, 0.0)
-    steady = float(np.mean(np.abs(np.log(lone.sigma / width)) < SAME_WIDTH))
-    strong = take_strongest(lone)
-    noise = level.std / strong.amplitude.astype(np.float64)
-    left = quantile(fit_alone(block, with_pulse(plain, system), strong)[0] ** 2 - noise**2, 0.25)
-    return Look(level, width, steady, float(np.sqrt(max(left, 0.0))))
+    steady = float(np.mean(np.abs(np.log(lone.sigma / width)) < SAME_WIDTH)) if width else 0.0
+    return Glance(plain, lone, Look(level, width, steady, 0.0))
+
+
+def _pool_main(blocks: Iterable[WaveformBlock], system: SystemPulse) -> WaveformBlock | None:
+    """The waveforms of the main digitizer; None without any."""
+    kinds: dict[Kind, list[WaveformBlock]] = {}
+    for block in blocks:
+        if block.digitizer.index not in system.digitizers:
+            kinds.setdefault(kind_of(block), []).append(block)
+    return pool_blocks(max(kinds.values(), key=lambda group: sum(map(len, group)))) if kinds else None
+
+
+def look_at(blocks: Sequence[WaveformBlock], system: SystemPulse, seen: Glance | None = None) -> Look | None:
+    """Measure what waveforms record, without learning a pulse.
+
+    Parameters
+    ----------
+    blocks : sequence of WaveformBlock
+        Of any descriptors; only those of the main digitizer are used.
+    system : SystemPulse
+        Of the flight: its pulse is tried on the strong echoes.
+    seen : Glance, optional
+        At these waveforms, for a system of the same digitizers.
+
+    Returns
+    -------
+    Look or None
+        None without waveforms of the main digitizer.
+    """
+    seen = glance_at(blocks, system) if seen is None else seen
+    block = _pool_main(blocks, system)
+    if seen is None or block is None or not seen.look.width:
+        return None if seen is None else seen.look
+    strong = take_strongest(seen.lone)
+    noise = seen.look.level.std / strong.amplitude.astype(np.float64)
+    left = quantile(fit_alone(block, with_pulse(seen.plain, system), strong)[0] ** 2 - noise**2, 0.25)
+    return replace(seen.look, misfit=float(np.sqrt(max(left, 0.0))))
 
 
 def _find_width(block: WaveformBlock, expected: float) -> tuple[SystemPulse, EchoTable, float]:

@@ -17,10 +17,10 @@ from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.header import EXTRA_BYTES_RECORD_ID, STANDARD_TIME, Vlr, decode_text, has_record, is_projection
-from wavebatch.files.strip.describe import audit_header
 from wavebatch.files.strip.packet_check import VECTORS, read_toward
+from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
-from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.surveying.inspect_strip import audit_header
 
 SUFFIXES = (".las", ".laz", ".npz")
 USER_ID = b"wavebatch_export"

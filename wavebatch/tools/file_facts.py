@@ -1,6 +1,6 @@
 """Header, records and points of any LAS or LAZ file, and how wavebatch made it.
 
-`wavebatch info` prints it; strips with waveforms add what `files.strip.describe` finds of their packets. All points
+`wavebatch info` prints it; strips with waveforms add what their packets hold, without a survey. All points
 are read once, in bounded memory, because headers are often wrong.
 """
 
@@ -22,7 +22,10 @@ from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import name_units, read_crs
 from wavebatch.files.las.read_points import CheckedHeader, read_checked_header
-from wavebatch.files.strip.describe import describe_strip
+from wavebatch.files.strip.packets import StripFacts
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.scanner import StripScan
+from wavebatch.surveying.inspect_strip import describe_samples
 
 _GPS_EPOCH = datetime(1980, 1, 6)
 _ADJUSTED = 1e9
@@ -36,7 +39,7 @@ _MOST_SOURCES = 20
 def describe_file(path: Path, *, direction: str = "auto", headerless: bool = False) -> dict[str, Any]:
     """Return everything that `wavebatch info` shows of a file, as plain values.
 
-    direction, headerless: as for `describe_strip`, for files with waveforms. What cannot be read of the packets or the
+    direction, headerless: as for `open_strip`, for files with waveforms. What cannot be read of the packets or the
     points goes to `problems`. Raises InputError where the header cannot be read.
     """
     checked = read_checked_header(path, waveforms=False)
@@ -57,9 +60,59 @@ def describe_file(path: Path, *, direction: str = "auto", headerless: bool = Fal
 def _describe_waveforms(path: Path, direction: str, headerless: bool) -> dict[str, Any]:
     """What a strip holds besides points; the reason where its packets cannot be found, because points still can."""
     try:
-        return describe_strip(path, direction=direction, headerless=headerless)
+        with (
+            StripReader(path, direction=direction, headerless=headerless) as reader,
+            reader.scan(tolerant=True) as scan,
+        ):
+            facts = reader.facts
+            return {
+                "points_with_waveform": scan.with_waveform,
+                "points_without_waveform": scan.without_waveform,
+                "points_broken": scan.broken,
+                "share_with_waveform": scan.with_waveform / scan.points if scan.points else None,
+                "packets": _describe_packets(facts, scan),
+                "samples": describe_samples(reader, scan),
+                "vectors": {
+                    "direction": scan.vectors.direction,
+                    "evidence": scan.vectors.evidence,
+                    "length_over_half_c": scan.vectors.ratio,
+                    "form": scan.vectors.form,
+                },
+                "notes": list(scan.notes),
+                "warnings": [*facts.warnings, *scan.warnings],
+                "problems": list(scan.problems),
+            }
     except InputError as error:
         return {"problems": [" ".join(str(error).split()).removeprefix(f"{path}: ")]}
+
+
+def _describe_packets(facts: StripFacts, scan: StripScan) -> dict[str, Any]:
+    used = {index: count for index, count in scan.by_descriptor.items() if index in facts.digitizers}
+    return {
+        "count": scan.packets,
+        "where": None if facts.packets.file is None else "internal" if facts.packets.internal else "external",
+        "file": None if facts.packets.file is None else str(facts.packets.file),
+        "bytes": facts.packets.end - facts.packets.start,
+        "shorter_than_descriptor": scan.short,
+        "farthest_shared": scan.reach,
+        "descriptors": [_describe_descriptor(facts, scan, index, count) for index, count in used.items()],
+        "descriptors_unused": len(facts.digitizers) - len(used),
+    }
+
+
+def _describe_descriptor(facts: StripFacts, scan: StripScan, index: int, points: int) -> dict[str, Any]:
+    digitizer = facts.digitizers[index]
+    form = scan.forms.get(index)
+    return {
+        "index": index,
+        "points": points,
+        "bits": digitizer.bits,
+        "samples": digitizer.n_samples,
+        "spacing_ns": digitizer.spacing,
+        "gain": digitizer.gain,
+        "offset": digitizer.offset,
+        "inverted": form is not None and form.inverted,
+    }
 
 
 def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from bench.real.measure import APART, NEAR_SIGMAS, Calibration, Class, RealRepor
 
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
-from wavebatch.tools.bench.report import NO_PLOT, align, write_texts
+from wavebatch.tools.bench.command import NO_PLOT, align, write_texts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

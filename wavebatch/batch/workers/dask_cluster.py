@@ -24,7 +24,7 @@ from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.workers.processes import end_future, settle_future, wait_uninterrupted
+from wavebatch.batch.workers.futures import end_future, settle_future, wait_uninterrupted
 from wavebatch.batch.workers.worker_check import compare_workers, describe_worker, list_sizes
 from wavebatch.core.errors import ConfigError, InputError, advise_install
 from wavebatch.files.disk.publish import Draft, list_packet_files, reporting

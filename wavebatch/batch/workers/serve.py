@@ -26,9 +26,6 @@ _FIRST_MODULE = "wavebatch.batch.neighbour_pass"
 _SET_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of linux/prctl.h."""
 
-PATIENCE = 3.0
-"""Seconds that processes have to end before they are killed."""
-
 
 def serve_calls(pipe: Connection) -> None:
     """Make calls until the parent process closes the pipe."""

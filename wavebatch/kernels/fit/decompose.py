@@ -1,18 +1,188 @@
-"""Decomposition of waveforms into echoes by the compiled library: one cluster after the other (kernels/c/decompose.h).
+"""Decomposition of waveforms into echoes by the compiled library: its types, clusters of candidates, the call, echoes.
 
-Called by stages/decompose and the survey.
+stages/decompose and the survey make Settings, group candidates before the fit (kernels/c/signal.h does it) and read
+Solution: the library fits one cluster after the other (kernels/c/decompose.h). All widths and times are in samples. A
+cluster of overlapping echoes has a window of samples; windows of neighbouring clusters must not overlap: a window that
+reaches into its neighbour finds false echoes there (9 % false splits instead of 0.9 %).
+
+At the end fits become echoes of the whole pulse, with errors (kernels/c/echoes.h).
 """
 
 from __future__ import annotations
 
 import ctypes
+from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.kernels import library
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings, Solution
-from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, PulseShape
 from wavebatch.kernels.library import Samples, call, place
+
+
+class Candidates(NamedTuple):
+    """Candidate echoes sorted by waveform, then time."""
+
+    waveform: np.ndarray
+    """Row of the block, int64 (m,)."""
+    time: np.ndarray
+    """Place of the peak, float64 (m,), samples."""
+    amplitude: np.ndarray
+    """Height above the baseline, float64 (m,), count."""
+    width: np.ndarray
+    """Gaussian standard deviation, float64 (m,), samples."""
+
+
+class Clusters(NamedTuple):
+    """Candidates that are fitted together, sorted by waveform."""
+
+    waveform: np.ndarray
+    """Row of the block, int64 (c,)."""
+    low: np.ndarray
+    """First sample of the window, int64 (c,)."""
+    high: np.ndarray
+    """End of the window: one after its last sample, int64 (c,)."""
+    first: np.ndarray
+    """First candidate of the cluster, int64 (c,)."""
+    number: np.ndarray
+    """Number of its candidates, int64 (c,)."""
+
+
+def cluster_candidates(
+    samples: Samples,
+    candidates: Candidates,
+    *,
+    margin: int,
+    reach: int,
+    most: int,
+    tail: np.ndarray | None = None,
+) -> Clusters:
+    """Joins candidates that stand on one run of signal above the noise, and gives each cluster its window.
+
+    Parameters
+    ----------
+    samples : Samples
+        Waveforms with their levels; smoothed with [1 2 1]/4, a run lies above 2 standard deviations.
+    candidates : Candidates
+        Sorted by waveform, then time.
+    margin : int, samples
+        Added on both sides of a run.
+    reach : int, samples
+        Smallest distance between the outer candidates and the ends of the window.
+    most : int
+        Largest number of candidates per cluster.
+    tail : int (m,), samples, optional
+        How far the after-pulses of each candidate reach.
+
+    Returns
+    -------
+    Clusters
+        With windows that do not overlap.
+    """
+    samples, m = samples.checked(), len(candidates.waveform)
+    waveform = np.ascontiguousarray(candidates.waveform, np.int64)
+    time = np.ascontiguousarray(candidates.time, np.float64)
+    if m and not (waveform.min() >= 0 and waveform.max() < len(samples.counts) and np.isfinite(time).all()):
+        raise ValueError("a candidate lies in no waveform")
+    columns = [np.empty(m, np.int64) for _ in Clusters._fields]
+    tail = None if tail is None else np.ascontiguousarray(tail, np.int64)
+    grouping = library.Grouping(margin, reach, most, None if tail is None else place(tail, np.int64))
+    groups = library.CGroups(*(place(column, np.int64) for column in columns))
+    c = call("group_candidates", samples.as_block(), ctypes.c_int64(m), waveform, time, grouping, groups)
+    return Clusters(*(column[:c] for column in columns))
+
+
+class Settings(NamedTuple):
+    """Options of a decomposition; widths in samples."""
+
+    width_ref: float
+    """Width of the system pulse: that of new echoes."""
+    width_low: float
+    """Smallest width allowed."""
+    width_high: float
+    """Largest width allowed."""
+    shape: PulseShape = GAUSSIAN
+    """Model of the pulse."""
+    clip: float | None = None
+    """Raw count from which samples are clipped; None where none is."""
+    noise_gain: float = 0.0
+    """Noise variance per count of signal (docs/algorithms.md H12) [count]."""
+    tolerance: float = 1e-2
+    """A fit has converged when the next step promises a fall of chi2 below this."""
+    max_iterations: int = 40
+    """Largest number of iterations of one fit; 40 at least where samples are clipped."""
+    grow: bool = True
+    """Whether echoes are added where the residual shows more than noise."""
+    acceptance: float = 15.0
+    """Smallest fall of chi2 for which an echo is added (docs/algorithms.md 2.3)."""
+    misfit: float = 0.0
+    """Deviation of the pulse from its model as a share of the amplitude: raises the acceptance of strong echoes."""
+    max_echoes: int = 6
+    """Largest number of echoes of one cluster that growth may reach."""
+    prior_spread: float = 0.0
+    """Standard deviation of a one-sided prior on widths of overlapping echoes below `width_ref`; 0 for none. Without
+    it, close echoes trade width against amplitude (docs/algorithms.md H1)."""
+    gate_residual: float = 4.2
+    """Limit of the smoothed residual [noise standard deviations] (docs/algorithms.md 4.2)."""
+    gate_hermite: float = 8.5
+    """Limit of h3^2 + h4^2 (docs/algorithms.md 4.2)."""
+    known: float = 0.0
+    """Errors that the amplitude of an echo needs beside others, or chi2 must rise enough without it; 0: any will do."""
+    whitening: np.ndarray | None = None
+    """Filter that makes the noise white, float64 (3, 3), `whitening_filter`; None where fits take it for white."""
+    undamped: bool = False
+    """Gauss-Newton steps without damping or limits, for comparison (docs/algorithms.md 1.3)."""
+    skew_mean: float = 0.0
+    """Mean of the normal prior on the skew of each echo (docs/algorithms.md 1.2)."""
+    skew_spread: float = 0.0
+    """Its standard deviation; 0 for echoes without a skew of their own."""
+
+
+class Solution(NamedTuple):
+    """Echoes of c clusters, m in all, sorted by cluster."""
+
+    number: np.ndarray
+    """Number of echoes of each cluster, int64 (c,)."""
+    converged: np.ndarray
+    """Whether the fit of each cluster has converged, bool (c,)."""
+    misfit: np.ndarray
+    """Root mean square residual of each cluster in noise standard deviations, float64 (c,)."""
+    cost: np.ndarray
+    """chi2 plus prior of each cluster, float64 (c,)."""
+    parameters: np.ndarray
+    """Amplitude [count], time [samples of the waveform], width [samples], skew of each echo, float64 (m, 4)."""
+    errors: np.ndarray
+    """One standard deviation of each parameter, float64 (m, 4)."""
+    shared: np.ndarray
+    """Covariance of the width of each echo with its amplitude, and with its time, float64 (m, 2)."""
+    at_bound: np.ndarray
+    """Whether a parameter of the echo lies on its limit, bool (m,)."""
+
+    @property
+    def cluster(self) -> np.ndarray:
+        """Cluster of each echo, int64 (m,)."""
+        return np.repeat(np.arange(len(self.number)), self.number)
+
+
+    def take(self, rows: np.ndarray) -> Solution:
+        """The clusters `rows`, int (r,), in that order, with their echoes."""
+        first = np.cumsum(self.number) - self.number
+        number = self.number[rows]
+        echo = np.arange(number.sum()) + np.repeat(first[rows] - (np.cumsum(number) - number), number)
+        return Solution(*(column[rows] for column in self[:4]), *(column[echo] for column in self[4:]))
+
+
+def choose(solutions: list[Solution], chosen: np.ndarray) -> Solution:
+    """For each cluster the solution number `chosen`, int (c,), of solutions of the same clusters."""
+    per_cluster = (np.choose(chosen, fields) for fields in zip(*(s[:4] for s in solutions), strict=True))
+    kept = [np.flatnonzero(chosen[solution.cluster] == i) for i, solution in enumerate(solutions)]
+    cluster = np.concatenate([s.cluster[rows] for s, rows in zip(solutions, kept, strict=True)])
+    order = np.argsort(cluster, kind="stable")
+    per_echo = (
+        np.concatenate([field[rows] for field, rows in zip(fields, kept, strict=True)])[order]
+        for fields in zip(*(s[4:] for s in solutions), strict=True)
+    )
+    return Solution(*per_cluster, *per_echo)
 
 
 def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clusters, settings: Settings) -> Solution:
@@ -143,3 +313,126 @@ def _kind(shape: PulseShape) -> int:
     if shape.power != 2.0:
         return library.Pulse.POWER
     return library.Pulse.SKEWED if abs(shape.kappa) >= NO_SKEW else library.Pulse.SUM_OF_GAUSSIANS
+
+
+AS_FITTED, STRETCHED, SUMMED = range(3)
+"""The parameters are those of the echo; the pulse is stretched; it is a sum, described by tables."""
+
+NO_ROWS = np.empty((0, 5))
+
+
+class WholePulse(NamedTuple):
+    """A pulse by its fitted width [samples]."""
+
+    kind: int = AS_FITTED
+    near: np.ndarray = NO_ROWS
+    """SUMMED, for usual widths, float64 (k, 5): width, ascending; peak and its slope; sigma and its slope."""
+    wide: np.ndarray = NO_ROWS
+    """The same for wider ones; without rows where there is none."""
+    datum: float = 0.0
+    """SUMMED: after the fitted time [samples]. STRETCHED: of width 1."""
+    ref: float = 1.0
+    """STRETCHED: width of the system pulse."""
+    least: float = 0.0
+    """STRETCHED: over `ref`, width below which the datum stays."""
+
+    def as_structure(self, widths: np.ndarray) -> library.CWhole:
+        """The structure, which points into its arrays; raises ValueError where a table has no row for a width."""
+        near, wide = (np.asarray(table, np.float64).reshape(-1, 5) for table in (self.near, self.wide))
+        if self.kind == SUMMED and (not len(near) or (not len(wide) and (widths > near[-1, 0]).any())):
+            raise ValueError("the pulse has no table for these widths")
+        tables = [np.ascontiguousarray(part) for table in (near, wide) for part in (table[:, 0], table[:, 1:])]
+        whole = library.CWhole(self.kind, len(near), len(wide), *(place(part, np.float64) for part in tables),
+                               self.datum, self.ref, self.least)  # fmt: skip
+        whole.arrays = tables
+        return whole
+
+
+def describe_whole(
+    whole: WholePulse, parameters: np.ndarray, errors: np.ndarray, shared: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitude, time and width of the whole pulse.
+
+    Parameters
+    ----------
+    whole : WholePulse
+    parameters, errors : float64 (m, 3)
+        Of its main component [count, samples, samples], and their standard deviations.
+    shared : float64 (m, 2)
+        Covariance of the width with the amplitude, and with the time.
+
+    Returns
+    -------
+    parameters, errors : float64 (m, 3)
+    """
+    values, spreads = (np.array(array, np.float64, order="C") for array in (parameters, errors))
+    shared = np.ascontiguousarray(shared, np.float64)
+    if not (values.shape == spreads.shape == (len(shared), 3) and shared.shape[1:] == (2,)):
+        raise ValueError(f"parameters of shape {values.shape} need as many errors and covariances")
+    structure = whole.as_structure(values[:, 2])
+    call("describe_echoes", ctypes.c_int64(len(values)), structure, values, spreads, shared)
+    return values, spreads
+
+
+def keep_echoes(
+    clusters: Clusters,
+    solution: Solution,
+    whole: WholePulse,
+    factors: np.ndarray,
+    std: np.ndarray,
+    spacing: float,
+    length: int,
+    significance: float,
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Echoes of fits that noise does not explain and that lie in their waveform, as columns of a table.
+
+    Parameters
+    ----------
+    clusters : Clusters
+    solution : Solution
+        Their fits.
+    whole : WholePulse
+    factors : float64 (m, 4)
+        On the errors of amplitude, time, sigma and energy.
+    std : float32 (n,)
+        Noise of each waveform [count].
+    spacing : float
+        Time between two samples [ns].
+    length : int
+        Samples of a waveform.
+    significance : float
+        Least energy of an echo [standard deviations].
+
+    Returns
+    -------
+    columns : dict of arrays (k,)
+        The core columns of an EchoTable, in the order of the fits.
+    row : int64 (k,)
+        Of each echo among the m fitted ones.
+    """
+    m, n = len(solution.parameters), len(solution.number)
+    factors, std = np.ascontiguousarray(factors, np.float64), np.ascontiguousarray(std, np.float32)
+    waveform = np.ascontiguousarray(clusters.waveform, np.int64)
+    fits: list[np.ndarray] = [
+        np.ascontiguousarray(column, kind) for column, kind in zip(solution, _SOLUTION, strict=True)
+    ]
+    shapes = [(n,)] * 4 + [(m, 4), (m, 4), (m, 2), (m,), (m, 4), (n,)]
+    if [column.shape for column in (*fits, factors, waveform)] != shapes or fits[0].sum() != m or (fits[0] < 0).any():
+        raise ValueError("columns of fits, clusters or factors differ in length")
+    if n and not 0 <= waveform.min() <= waveform.max() < len(std):
+        raise ValueError("a cluster lies in no waveform")
+    columns = {name: np.empty(m, kind) for name, kind in _COLUMNS.items()}
+    kept = call(
+        "keep_echoes", library.CClusters(n, library.address(waveform)),
+        library.Echoes(m, *map(library.address, fits)), whole.as_structure(fits[4][:, 2]),
+        library.CKeeping(library.address(std), library.address(factors), spacing, length - 1, significance),
+        library.CKept(*map(library.address, columns.values())),
+    )  # fmt: skip
+    found = {name: column[:kept] for name, column in columns.items()}
+    return found, found.pop("row")
+
+
+_SOLUTION = (np.int64, np.bool_, *[np.float64] * 5, np.bool_)
+_FLOATS = ("amplitude", "sigma", "time_err", "amplitude_err", "sigma_err", "relative_energy_err", "residual")
+_COLUMNS = {"waveform": np.int32, "time": np.float64, **dict.fromkeys(_FLOATS, np.float32), "flags": np.uint16,
+            "row": np.int64}  # fmt: skip

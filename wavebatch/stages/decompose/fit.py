@@ -21,8 +21,7 @@ from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference, render_table, skew_system, skewed
 from wavebatch.stages.decompose.solve import FIT, EchoLimits, FitOptions, fit_candidates, fit_gaussian, make_settings
-from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
-from wavebatch.stages.detect.direct import maximum
+from wavebatch.stages.detect.direct import candidate_table, find_varying, maximum, signal_above
 from wavebatch.stages.flags import flag_echoes
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, fit_misfit, pulse_shape, shape_limits
 

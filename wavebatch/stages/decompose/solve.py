@@ -14,16 +14,21 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings, Solution, cluster_candidates
-from wavebatch.kernels.fit.decompose import decompose_clusters
+from wavebatch.kernels.fit.decompose import (
+    Candidates,
+    Clusters,
+    Settings,
+    Solution,
+    cluster_candidates,
+    decompose_clusters,
+    keep_echoes,
+)
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
-from wavebatch.kernels.fit.whole_pulse import keep_echoes
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.merge import cover_hidden, drop_twins, merge_unresolved
-from wavebatch.stages.detect.candidates import samples_of
-from wavebatch.stages.detect.direct import choose_smoothing
+from wavebatch.stages.detect.direct import choose_smoothing, samples_of
 from wavebatch.stages.flags import clear_lone, cover_misfit, drop_unproven, flag_echoes, scale_errors
 from wavebatch.stages.pulse_tables import (
     BROADEST,
@@ -149,7 +154,7 @@ def _explain_tails(
     std = noise.std[waveform]
     keep = amplitude - expected > 2.2 * std + 0.5 * expected
     # A tail below the noise of what found a candidate does not explain it, however broad the pulse is.
-    keep |= expected <= choose_smoothing(ref).gain * std
+    keep |= expected <= choose_smoothing(ref)[2] * std
     candidates = Candidates(*(field[keep] for field in candidates))
     return candidates, tail_reach(tail, candidates.amplitude / std[keep])
 

@@ -1,26 +1,187 @@
-"""Detectors that search the waveform itself, smoothed or filtered: the standard ones, then the classic ones.
+"""What all detectors share, and the detectors that search the waveform itself, smoothed or filtered.
 
-Times in ns; widths are first guesses for the fit. The classic detectors are those of Wagner et al. (2007) and of Jutzi
-and Stilla (2005); `detect.maximum` finds more than each of them at the same cost (docs/algorithms.md 1.1, 1.3).
+Shared are the signal that they search and the table of candidates that they return. Times in ns; widths are first
+guesses for the fit. The classic detectors are those of Wagner et al. (2007) and of Jutzi and Stilla (2005);
+`detect.maximum` finds more than each of them at the same cost (docs/algorithms.md 1.1, 1.3).
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.fit.closed_form import estimate_starts
+from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal import filters
-from wavebatch.kernels.signal.runs import find_runs, highest_samples, run_moments, walk_down
-from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
+from wavebatch.kernels.signal.runs import find_runs, gap_distance, highest_samples, run_moments, walk_down
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121, transpose_samples
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.detect.candidates import Searched, candidate_table, make_table, samples_of, signal_above
+
+
+@frozen(eq=False)
+class Searched:
+    """The signal in which a detector searches n waveforms for echoes; `wavebatch plot waveform --show` draws it."""
+
+    label: str
+    """What it is, with its unit."""
+    rule: str
+    """When a maximum or a minimum of it is an echo."""
+    values: np.ndarray
+    """(q, n) as kernels give it."""
+    least: np.ndarray
+    """Threshold: a level, or the depth that a minimum needs, (n,); NaN without one."""
+    signal: np.ndarray
+    """What it was made of: waveforms above their baselines [DN], f4 (s, n)."""
+    unit: float = 1.0
+    """What one DN is in it: pictures divide by it."""
+    first: float = 0.0
+    """Place of the first value [samples]."""
+    deep: bool = False
+    """Whether `least` is the depth of minima instead of a level."""
+    second: np.ndarray | None = None
+    """A further line with the same unit and times, to which `least` belongs, as `values`."""
+    second_label: str = ""
+
+
+def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
+    """Subtract the baseline of each waveform.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        n waveforms of s samples.
+    noise : Noise
+        Their baselines.
+
+    Returns
+    -------
+    float32 array, shape (s, n)
+        Signal above the baseline [count]; waveforms lie along the last axis, as kernels need it.
+    """
+    signal = transpose_samples(block.samples)
+    signal -= noise.level.T
+    if block.missing is not None:
+        missing = block.missing.T
+        signal[missing] = 0
+        # An echo across a single sample is one.
+        single = missing[1:-1] & ~missing[:-2] & ~missing[2:]
+        signal[1:-1] = np.where(single, 0.5 * (signal[:-2] + signal[2:]), signal[1:-1])
+    return signal
+
+
+def samples_of(block: WaveformBlock, noise: Noise) -> Samples:
+    """Put the waveforms of a block and their noise together, as kernels take them.
+
+    Parameters
+    ----------
+    block, noise
+        As for a stage.
+
+    Returns
+    -------
+    Samples
+        Raw counts with their levels.
+    """
+    return Samples(block.samples, noise.for_fits, noise.std, block.missing)
+
+
+def make_table(
+    block: WaveformBlock, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
+) -> EchoTable:
+    """Turn candidates in samples into a table in ns.
+
+    Constant waveforms and gaps between two recordings get none, whatever a filter shows at their ends.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        The waveforms.
+    waveform : int array, shape (m,)
+        Row of the block.
+    time, width : float array, shape (m,)
+        Centre and standard deviation [samples].
+    amplitude : float array, shape (m,)
+        Height above the baseline [count].
+
+    Returns
+    -------
+    EchoTable
+        Candidates, sorted.
+
+    References
+    ----------
+    docs/algorithms.md H10.
+    """
+    rows, row = np.unique(waveform, return_inverse=True)
+    varies = find_varying(block.samples[rows])[row]
+    if block.missing is not None:
+        varies &= gap_distance(block.missing, waveform, time) > -1.0
+    columns = (waveform, time * block.spacing, amplitude, width * block.spacing)
+    return EchoTable.build(*(columns if varies.all() else (values[varies] for values in columns)))
+
+
+def find_varying(samples: np.ndarray) -> np.ndarray:
+    """Find the waveforms that are not constant.
+
+    Parameters
+    ----------
+    samples : uint array, shape (n, s)
+        Raw counts.
+
+    Returns
+    -------
+    bool array, shape (n,)
+        True where samples differ.
+    """
+    return (samples != samples[:, :1]).any(axis=1)
+
+
+def candidate_table(
+    block: WaveformBlock,
+    system: SystemPulse,
+    waveform: np.ndarray,
+    time: np.ndarray,
+    amplitude: np.ndarray,
+    width: np.ndarray | None = None,
+) -> EchoTable:
+    """Turn candidates in samples into a table in ns, with all values brought into their legal ranges.
+
+    Widths are clipped to 0.7 to 4 system widths, times to the waveform, amplitudes to 0 and above.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        The waveforms.
+    system : SystemPulse
+        With the width of the system pulse.
+    waveform : int array, shape (m,)
+        Row of the block.
+    time : float array, shape (m,)
+        Centre [samples].
+    amplitude : float array, shape (m,)
+        Height above the baseline [count].
+    width : float array, shape (m,), optional
+        Standard deviation [samples]; the system's by default.
+
+    Returns
+    -------
+    EchoTable
+        Candidates, sorted.
+    """
+    ref = system.sigma_ref / block.spacing
+    last = block.samples.shape[1] - 1
+    width = np.full(len(time), ref) if width is None else width
+    return make_table(
+        block, waveform, np.clip(time, 0.0, last), np.maximum(amplitude, 0.0), np.clip(width, 0.7 * ref, 4.0 * ref)
+    )
+
 
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
 """Standard deviation of white noise after two passes of the [1 2 1]/4 filter."""
@@ -66,18 +227,7 @@ def maximum(
     return make_table(block, waveform, time, amplitude, width)
 
 
-class Smoothing(NamedTuple):
-    """How waveforms are smoothed before their maxima are searched."""
-
-    broad: float
-    """Width of the Gaussian [samples]; 0 for two passes of the [1 2 1]/4 filter."""
-    taps: np.ndarray | None
-    """Half of the Gaussian, of unit sum; None without one."""
-    gain: float
-    """Standard deviation of unit white noise after it."""
-
-
-def choose_smoothing(ref: float) -> Smoothing:
+def choose_smoothing(ref: float) -> tuple[float, np.ndarray | None, float]:
     """Return the smoothing that a system pulse asks for.
 
     Parameters
@@ -87,15 +237,19 @@ def choose_smoothing(ref: float) -> Smoothing:
 
     Returns
     -------
-    Smoothing
-        A Gaussian for pulses broader than BROAD.
+    broad : float
+        Width of the Gaussian [samples], for pulses broader than BROAD; 0 for two passes of the [1 2 1]/4 filter.
+    taps : np.ndarray, optional
+        Half of the Gaussian, of unit sum; None without one.
+    gain : float
+        Standard deviation of unit white noise after it.
     """
     if ref <= BROAD:
-        return Smoothing(0.0, None, TWICE_SMOOTHED_GAIN)
+        return 0.0, None, TWICE_SMOOTHED_GAIN
     broad = 0.5 * (ref - BROAD) + 1.0
     taps = filters.gaussian_taps(broad)
     taps = taps / (taps[0] + 2 * taps[1:].sum())
-    return Smoothing(broad, taps, float(np.sqrt(filters.filter_energy(taps))))
+    return broad, taps, float(np.sqrt(filters.filter_energy(taps)))
 
 
 def _correlate(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float) -> Searched:
@@ -400,7 +554,12 @@ def zero_crossing(
         waveform, time = _falls_through_zero(found.values)
         width = np.full(len(time), ref)
     else:
-        waveform, time, width = _between_inflections(found, max(scale * ref, LEAST_BLUR))
+        # The middle of each stretch of positive curvature that exceeds the noise.
+        blur = max(scale * ref, LEAST_BLUR)
+        waveform, sample = find_peaks(found.values, found.least)
+        left, right = (walk_down(found.values, waveform, sample, np.zeros(len(sample)), side) for side in (-1, 1))
+        half = 0.5 * (right - left)
+        time, width = left + half, np.sqrt(np.maximum(half * half - blur * blur, 0.0))
     sample = np.clip(np.rint(time), 0, len(smoothed) - 1).astype(np.int64)
     amplitude = smoothed[sample, waveform]
     high = amplitude > (level * SMOOTH_GAIN) * noise.std[waveform]
@@ -415,12 +574,3 @@ def _falls_through_zero(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sample, waveform = np.divmod(np.flatnonzero(falling), n) if n else (np.empty(0, np.int64),) * 2
     before, after = slope[sample, waveform], slope[sample + 1, waveform]
     return waveform, sample + before / (before - after)
-
-
-def _between_inflections(found: Searched, blur: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Waveform, time and width (m,) of the stretches of positive curvature that exceed the noise."""
-    waveform, sample = find_peaks(found.values, found.least)
-    zero = np.zeros(len(sample))
-    left, right = (walk_down(found.values, waveform, sample, zero, side) for side in (-1, 1))
-    half = 0.5 * (right - left)
-    return waveform, left + half, np.sqrt(np.maximum(half * half - blur * blur, 0.0))

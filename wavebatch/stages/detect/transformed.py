@@ -22,7 +22,7 @@ from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
 from wavebatch.kernels.signal.runs import list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.detect.candidates import Searched, candidate_table, signal_above
+from wavebatch.stages.detect.direct import Searched, candidate_table, signal_above
 from wavebatch.stages.pulse_tables import ReferenceKind, reference_pulse
 
 HAT_WIDTH = 0.75

@@ -39,8 +39,8 @@ from wavebatch.surveying.calibrating.adjust_flight import (
     hash_squares,
     measure_ties,
 )
+from wavebatch.surveying.calibrating.calibration_files import Target
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, CalibrationOptions, EchoSource, open_source
-from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.targets import (
     MOST_ECHOES,
     build_calibration,

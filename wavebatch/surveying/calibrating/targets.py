@@ -34,8 +34,8 @@ from wavebatch.kernels.geometry.planes import fit_facet
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.surveying.calibrating.calibration_files import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
-from wavebatch.surveying.calibrating.target_file import LEAST_REFLECTANCE, Target
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
 from wavebatch.surveying.matching.setting import SCANNERS, keep_places, read_day, read_sensor_name
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
@@ -628,4 +628,7 @@ def _list_doubts(
     ratio = max(good)[0] / min(good)[0]
     # Channels may have different constants, so that targets that they see unequally may differ too.
     if limits and max(limits) > 1 and len(channels) < 2:
-        yield f"constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates"
+        yield (
+            f"constants of the targets differ by a factor of {ratio:.2f}, which the error holds: check reflectances "
+            "and coordinates; a receiver that weakens strong light does that too"
+        )

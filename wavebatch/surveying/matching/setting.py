@@ -379,11 +379,15 @@ def _find_fading(time: np.ndarray, light: np.ndarray, *, chance: float) -> Chang
     half = 2.0 * np.abs(place).mean() / (place @ place)
     slopes, middle = half * (place @ scenes), np.median(scenes, axis=1)
     rest = middle - middle.mean() - place * (place @ middle) / (place @ place)
-    alike = np.correlate(rest, rest, "full")[FADING_PARTS - 1 :] / max(float(rest @ rest), 1e-30)
-    shared = 1.0 + 2.0 * float(alike[1 : int(np.argmax(alike <= 0.0))].sum())
-    error = FEW_PARTS * shared * half * float(np.sqrt(rest @ rest / (FADING_PARTS - 2) * (place @ place)))
+    error = weigh_alike(rest) * half * float(np.sqrt(rest @ rest / (FADING_PARTS - 2) * (place @ place)))
     spread = np.sqrt(LEAST_UNLIKE**2 + np.var(slopes) + error**2)
     return weigh_change(float(np.median(slopes)), float(spread), chance=chance)
+
+
+def weigh_alike(rest: np.ndarray) -> float:
+    """Factor of the error of a slope along the strip, by what parts in their order scatter about it, f8 (n,)."""
+    alike = np.correlate(rest, rest, "full")[len(rest) - 1 :] / max(float(rest @ rest), 1e-30)
+    return FEW_PARTS * (1.0 + 2.0 * float(alike[1 : int(np.argmax(alike <= 0.0))].sum()))
 
 
 def sum_light(block: WaveformBlock) -> np.ndarray:

@@ -19,7 +19,7 @@ from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.matching.setting import SCANNERS, sum_light
+from wavebatch.surveying.matching.setting import SCANNERS, sum_light, weigh_alike
 
 OTHER_UNIT = 3.0
 """Ratio of mean energies from which a log is in another unit: lasers lose a half of their energy at most."""
@@ -228,5 +228,7 @@ def _compare_drift(reader: StripReader, scan: StripScan, energy: PulseEnergy) ->
     if not slow:
         return 0.0
     slope = float(sent @ light / (sent @ sent))
-    error = math.sqrt(float(np.sum((light - slope * sent) ** 2)) / (len(sent) - 2) / float(sent @ sent))
+    rest = light - slope * sent
+    # A field's border in the middle of the strip looks like a drift: parts beside each other are of one field.
+    error = weigh_alike(rest) * math.sqrt(float(rest @ rest) / (len(sent) - 2) / float(sent @ sent))
     return slow * min(math.hypot(1.0 - slope, error), 1.0)

@@ -182,7 +182,7 @@ def compare_setting(
         more = math.expm1(abs(change.shift) if change.chance > LIKELY else change.error)
         growth = max(growth, more)
         if change.chance <= LIKELY and more > HIDDEN:
-            known = f"ground in common scatters {which}" if ground else f"surfaces {which} differ, no ground is common"
+            known = f"ground in common {which} scatters" if ground else f"surfaces {which} differ, no ground is common"
             notes.append(
                 f"calibration: {known}, so that another energy under the same "
                 f"header would not show: {100 * more:.0f} % of error hold it, by an assumed chance of "

@@ -113,14 +113,19 @@ def _sample(reader: StripReader, scan: StripScan, system: SystemPulse) -> Iterat
         size = max(min(RUN, RUN_SAMPLES // int(unit.packets.n_samples[rows].max(initial=1))), 1)
         # Runs that overlap would count packets twice.
         runs = max(min(RUNS // len(chosen), len(rows) // size), 1)
-        for start in even_places(max(len(rows) - size, 0) + 1, runs).tolist():
-            for block, _ in reader.read_rows(unit, rows[start : start + size], RUN):
-                if block.returns is not None and len(block.returns):
-                    yield _compare(block, block.returns, system.of(block))
+        run = np.full(len(unit.packets), -1)
+        for place, start in enumerate(even_places(max(len(rows) - size, 0) + 1, runs).tolist()):
+            run[rows[start : start + size]] = place
+        # All runs at once: each call of the decomposition takes as long as some hundred waveforms of it.
+        for block, taken in reader.read_rows(unit, rows[run[rows] >= 0], runs * size):
+            if block.returns is not None and len(block.returns):
+                yield _compare(block, block.returns, run[taken], system.of(block))
 
 
-def _compare(block: WaveformBlock, returns: ReturnTable, system: SystemPulse) -> tuple[np.ndarray, ...]:
-    """The same of one block."""
+def _compare(
+    block: WaveformBlock, returns: ReturnTable, run: np.ndarray, system: SystemPulse
+) -> tuple[np.ndarray, ...]:
+    """The same of one block; run: of each waveform (n,). Only waveforms of one run are neighbours."""
     echoes = decompose_sample(block, system)
     match = match_returns(echoes.waveform, echoes.time, returns.waveform, returns.time, REACH + 0.5 * block.spacing)
     clear = (match >= 0) & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.WEAK)) == 0) & (echoes.time_err > 0)
@@ -133,14 +138,15 @@ def _compare(block: WaveformBlock, returns: ReturnTable, system: SystemPulse) ->
 
     lone = echoes.alone(len(block))[rows] & (np.bincount(returns.waveform, minlength=len(block))[waveform] == 1)
     waveform, error, place = waveform[lone], error[lone], returns.xyz[match[rows[lone]]]
-    order = np.argsort(block.gps_time[waveform], kind="stable")
-    error, place, ray = error[order], place[order], block.direction[waveform[order]][1:-1]
+    order = np.lexsort((block.gps_time[waveform], run[waveform]))
+    error, place, run, ray = error[order], place[order], run[waveform[order]], block.direction[waveform[order]][1:-1]
     chord, ahead = place[2:] - place[:-2], place[1:-1] - place[:-2]
     with np.errstate(divide="ignore", invalid="ignore"):
         share = (ahead * chord).sum(axis=1) / (chord * chord).sum(axis=1)
         aside = ray - chord * ((ray * chord).sum(axis=1) / (chord * chord).sum(axis=1))[:, None]
         off = ((ahead - share[:, None] * chord) * aside).sum(axis=1) / (aside * aside).sum(axis=1)
-    between = np.flatnonzero((share > BETWEEN[0]) & (share < BETWEEN[1]) & np.isfinite(off))
+    between = (share > BETWEEN[0]) & (share < BETWEEN[1]) & np.isfinite(off)
+    between = np.flatnonzero(between & (run[2:] == run[:-2]))
     before, after = (1.0 - share) ** 2, share**2
     fits = np.sqrt(error[1:-1] ** 2 + before * error[:-2] ** 2 + after * error[2:] ** 2)
     neighbours = np.stack([off, 1.0 + before + after, fits])[:, between]

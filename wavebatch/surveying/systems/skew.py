@@ -12,9 +12,8 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, Settings
-from wavebatch.kernels.fit.decompose import decompose_clusters
-from wavebatch.stages.detect.candidates import samples_of
+from wavebatch.kernels.fit.decompose import Candidates, Clusters, Settings, decompose_clusters
+from wavebatch.stages.detect.direct import samples_of
 from wavebatch.stages.noise import pooled
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, find_edge

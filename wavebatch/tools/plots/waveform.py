@@ -32,7 +32,7 @@ from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadC
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.decompose.models import echo_pulses, fitted_pulse
-from wavebatch.stages.detect.candidates import Searched
+from wavebatch.stages.detect.direct import Searched
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.sensor import SensorRequest, find_sensor
 from wavebatch.tools.sheets.sheet import format_csv

@@ -218,7 +218,7 @@ def calibration_sheet(flight: FlightCalibration) -> Sheet:
 
 def write_calibrate_page(target: Path, flight: FlightCalibration) -> None:
     """Write the page of a calibration of one strip or of several."""
-    from wavebatch.surveying.calibrating.calibration_file import format_calibration
+    from wavebatch.surveying.calibrating.calibration_files import format_calibration
     from wavebatch.tools.sheets.page import write_page
 
     found = flight.calibration

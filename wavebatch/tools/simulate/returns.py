@@ -28,7 +28,7 @@ from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader, Column
 from wavebatch.files.disk.publish import protecting
 from wavebatch.files.las.crs import repair_records
 from wavebatch.files.las.header import field_names, is_projection, read_header
-from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.kernels.geometry.group_returns import fit_rays, group_pulses
 from wavebatch.kernels.physics.radiometry import receive_power, spread_cross_section
 from wavebatch.tools.simulate.render import MOST_NOISE, PulseModel, Recording, paint_echoes, record_counts

@@ -31,7 +31,7 @@ from wavebatch.files.disk.publish import Draft
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.las.header import WITHOUT_WAVES, LasHeader, build_dtype, field_names
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.stages.score import find_isolated_echoes
 from wavebatch.tools.simulate.render import EAST, NORTH, FlightLine
 from wavebatch.tools.simulate.returns import DiscreteReceiver, Returns, fill_packets, list_returns

@@ -42,7 +42,7 @@ from wavebatch.kernels.physics import radiometry
 from wavebatch.kernels.physics.gap_probability import ASSUMED_ERROR, estimate_canopy_ratio
 from wavebatch.kernels.signal import deconvolve
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121, widen
-from wavebatch.stages.detect.candidates import signal_above
+from wavebatch.stages.detect.direct import signal_above
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.pulse_tables import clip_level, reference_pulse
 from wavebatch.surveying.measuring.learn_pulse import AFTER, BEFORE
