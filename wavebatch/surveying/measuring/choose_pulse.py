@@ -25,6 +25,7 @@ from wavebatch.surveying.measuring.judge import (
     Explained,
     count_errors,
     describe_waveforms,
+    exceed,
     explain,
     find_changed,
     find_own_width,
@@ -127,8 +128,7 @@ class Candidate:
 
     def exceeds(self, other: Candidate) -> float:
         """Standard errors by which descriptions are longer than with another candidate."""
-        more = self.length - other.length
-        return count_errors(np.clip(more, *np.quantile(more, (0.02, 0.98))))
+        return exceed(self.length, other.length)
 
 
 @frozen(eq=False)

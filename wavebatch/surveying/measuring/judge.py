@@ -184,6 +184,15 @@ def count_errors(values: np.ndarray) -> float:
     return float(values.sum() / max(values.std() * np.sqrt(len(values)), 1.0))
 
 
+def exceed(length: np.ndarray, other: np.ndarray) -> float:
+    """Return by how many standard errors descriptions (n,) are longer than others.
+
+    The 2 % that differ most, either way, count as the next ones: what no pulse explains must not decide.
+    """
+    more = length - other
+    return count_errors(np.clip(more, *np.quantile(more, (0.02, 0.98))))
+
+
 def find_own_width(explained: Explained, ref: float) -> float:
     """Find the narrowest width that strong echoes repeat (`find_edge`), over the pulse's own width `ref` [samples].
 

@@ -9,7 +9,7 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
-from wavebatch.surveying.measuring.judge import SURE, count_errors, describe_waveforms, explain
+from wavebatch.surveying.measuring.judge import SURE, describe_waveforms, exceed, explain
 from wavebatch.surveying.measuring.noise_and_width import FEW, thin_samples
 
 LEAST_NOISE = 0.5
@@ -63,7 +63,7 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
     # Whitened fits take small changes of the pulse for echoes: the description, which knows both, is then longer.
     length = describe_waveforms(block, whitened, explained, [change])[0]
     other = describe_waveforms(block, plain, explain(block, plain), [change])[0]
-    return whitened if count_errors(length - other) <= SURE else plain
+    return whitened if exceed(length, other) <= SURE else plain
 
 
 def _predicted(whitening: tuple[float, float]) -> float:
