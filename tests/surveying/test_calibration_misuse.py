@@ -497,6 +497,25 @@ def test_one_bright_target_and_a_receiver_that_compresses(tmp_path, most, pulse)
         assert 0.06 < row.relative_error < 0.13
 
 
+def test_a_dark_and_a_bright_target_hold_a_receiver_that_weakens_whole_pulses(tmp_path):
+    """No shape of an echo shows it. The constants of both lie about one error off the one between them."""
+    x0, y0 = EAST + 41, NORTH + 1
+    rows = [f"{name},{value},{x0} {y0 + up} {x0 + 18} {y0 + up} {x0 + 18} {y0 + up + 18} {x0} {y0 + up + 18}"
+            for name, value, up in (("dark", 0.1, 20), ("bright", 0.6, 0))]  # fmt: skip
+    (tmp_path / "t.csv").write_text("\n".join(["name,reflectance,vertices", *rows]))
+
+    def weaken(wave):
+        return wave * (1 - 6e-4 * wave.max(axis=1, keepdims=True))
+
+    ground = [Facet(0.6, inside=box(40, 0, 60, 20)), Facet(0.1, inside=box(40, 20, 60, 40)), Facet(fields)]
+    write_strip(tmp_path / "a.las", ground, Sensor(**BASE, light=3e8), 18_000, seed=5, receive=weaken)
+    found, told = calibrate(tmp_path, "--report", tmp_path / "cal.json", strips=["a.las"])
+    dark, bright = (row["constant"] for row in json.loads((tmp_path / "cal.json").read_text())["targets"])
+    assert bright > 1.15 * dark and "a receiver that weakens strong light does that too" in told
+    for constant in (dark, bright):
+        assert abs(found.constant / constant - 1) < 1.2 * found.relative_error
+
+
 @pytest.mark.parametrize("spread", [0.04, 0.2, 0.4])
 def test_the_assumed_chance_of_a_change_says_how_much_error_holds_it(spread):
     errors = [weigh_change(0.0, spread, 0.0, chance=chance).error for chance in (0.0, 0.05, 0.3, 0.6)]
