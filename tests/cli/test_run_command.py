@@ -65,6 +65,7 @@ def test_report_of_the_batch_to_a_file_and_to_stdout(tiny_strip, tmp_path):
     assert [strip["status"] for strip in document["strips"]] == ["written"]
     again = _run(tiny_strip, "-o", tmp_path / "a", "--report", "-", "--profile", "fast", "--resume", "-q")
     printed = json.loads(again.stdout)
+    assert again.exit_code == 0
     assert printed["counts"] == document["counts"] and printed["strips"][0]["status"] == "skipped"
 
 
