@@ -62,14 +62,14 @@ HOPELESS = 5.0
 once in three million times."""
 
 HINT, FEWER = 1.5, 0.95
-"""Standard errors by which another pulse must describe shorter, in place of SURE, where it needs at most this share of
-a learned pulse's echoes, or where that is known to miss the stacked echoes by more than the change from shot to shot;
-and beyond SURE, where it needs more echoes than any. Each echo is a claim too; one in twenty is what `run` calls a
-doubt. Chance makes so many errors once in fifteen times."""
+"""Standard errors by which another pulse must describe shorter, in place of SURE, where it needs no more echoes than a
+learned pulse of several Gaussians (AS_FEW), at most this share of those of a learned Gaussian, or where that is known to
+miss the stacked echoes by more than the change from shot to shot; and beyond SURE, where it needs more echoes than any.
+Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes so many errors once in fifteen times."""
 
-LEAST_SAVED, LEAST_OF_KNOWN = 0.5, 2.0
+LEAST_SAVED, LEAST_OF_KNOWN = 0.25, 2.0
 """Nats per echo that other pulses must save in place of a Gaussian, and learned ones in place of one from elsewhere:
-chi2 of 1 and 4, one and two standard errors of an echo. What a strip's scene has in common is in a pulse that is
+chi2 of a half and of 4, of which an echo alone tells nothing. What a strip's scene has in common is in a pulse that is
 learned from it and in all of its waveforms, and saves some (.2 in a canopy, .3 on RIEGL, 1.1 on LVIS), however many
 tell it."""
 
