@@ -63,9 +63,10 @@ once in three million times."""
 
 HINT, FEWER = 1.5, 0.95
 """Standard errors by which another pulse must describe shorter, in place of SURE, where it needs no more echoes than a
-learned pulse of several Gaussians (AS_FEW), at most this share of those of a learned Gaussian, or where that is known to
-miss the stacked echoes by more than the change from shot to shot; and beyond SURE, where it needs more echoes than any.
-Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes so many errors once in fifteen times."""
+learned pulse of several Gaussians (AS_FEW), at most this share of those of a learned Gaussian, or where that is known
+to miss the stacked echoes by more than the change from shot to shot; and beyond SURE, where it needs more echoes than
+any. Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes so many errors once in fifteen
+times."""
 
 LEAST_SAVED, LEAST_OF_KNOWN = 0.25, 2.0
 """Nats per echo that other pulses must save in place of a Gaussian, and learned ones in place of one from elsewhere:
