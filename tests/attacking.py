@@ -91,6 +91,8 @@ class Attack(NamedTuple):
 class Attacker:
     """Runs attacks in a folder; `attack` returns what is wrong, or an empty text."""
 
+    longest, stay = LONGEST, STAY
+
     def __init__(self, folder: Path) -> None:
         self.base, self._folder = folder / "base", folder
         self.base.mkdir()
@@ -152,20 +154,20 @@ class Attacker:
         _empty(out), _empty(temporary)
         start = time.monotonic()
         process = self._start(name, out, temporary)
-        said = process.communicate(timeout=LONGEST)[0]
+        said = process.communicate(timeout=self.longest)[0]
         assert process.returncode == 0, said
         self.sound[name], self.seconds[name] = _contents(out), time.monotonic() - start
 
     def _start(self, name: str, out: Path, temporary: Path) -> subprocess.Popen:
-        words = [sys.executable, "-m", "wavebatch", *self._words(name, out)]
         env = {**os.environ, "TMPDIR": str(temporary), "PYTHONFAULTHANDLER": "1"}
         return subprocess.Popen(
-            words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-            start_new_session=True, preexec_fn=_listen, env=env,
+            self._words(name, out), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            text=True, start_new_session=True, preexec_fn=_listen, env=env,
         )  # fmt: skip
 
     def _words(self, name: str, out: Path) -> list[str]:
-        return [word.format(base=self.base, out=out) for word in shlex.split(COMMANDS[name])]
+        words = [word.format(base=self.base, out=out) for word in shlex.split(COMMANDS[name])]
+        return [sys.executable, "-m", "wavebatch", *words]
 
     def _disturb(self, process: subprocess.Popen, attack: Attack) -> tuple[bool, int | str, str]:
         """Send the signals; whether the process had begun, and its exit code or "hangs", and stderr."""
@@ -182,7 +184,7 @@ class Attacker:
                     process.send_signal(number)
                     time.sleep(random.random() * 0.01)
         try:
-            said = process.communicate(timeout=LONGEST)[1]
+            said = process.communicate(timeout=self.longest)[1]
         except subprocess.TimeoutExpired:
             return is_ready, "hangs", "; ".join(map(_describe, _session(process.pid))) + _stacks(process)
         return is_ready, process.returncode, said
@@ -201,7 +203,7 @@ class Attacker:
 
     def _end(self, process: subprocess.Popen) -> list[str]:
         """Wait until all processes of the session are gone; those that stay are killed and returned."""
-        deadline = time.monotonic() + STAY
+        deadline = time.monotonic() + self.stay
         while (left := _session(process.pid)) and time.monotonic() < deadline:
             time.sleep(0.01)
         found = [_command_line(pid).replace(b"\0", b" ").decode()[:200] for pid in left]
@@ -216,7 +218,7 @@ class Attacker:
     def _judge_end(self, attack: Attack, is_ready: bool, code: int | str, said: str) -> str:
         """The exit code and stderr."""
         if code == "hangs":
-            return f"hangs for more than {LONGEST:.0f} s: {said}"
+            return f"hangs for more than {self.longest:.0f} s: {said}"
         if has_not_begun(is_ready, code, said):
             return ""
         killed = "KILL" in attack.kind and not attack.kind.startswith("worker K")
@@ -261,7 +263,7 @@ class Attacker:
         again = ["--resume", "--jobs", "1"] if name.startswith("run") else ["--overwrite"]
 
         def work() -> None:
-            done = run_command(*self._words(name, out), *again)
+            done = run_command(*self._words(name, out)[3:], *again)
             assert done.exit_code == 0, done.output
 
         try:

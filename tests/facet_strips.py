@@ -7,7 +7,7 @@ pulse widths, edges and mixed targets come out of geometry, not out of the formu
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,8 @@ class Sensor:
     divergence: float = 0.5e-3
     """Full angle between the 1/e2 points [rad]."""
     noise: float = 0.6
+    air: float = AIR
+    """Attenuation of the air below the sensor [dB/km]."""
     energy_spread: float = 0.0
     """Relative standard deviation of the energy of shots."""
     store_energy: bool = False
@@ -97,8 +99,30 @@ def write_trajectory(path: Path, sensor: Sensor, duration: float, lower: float =
     return path
 
 
-def write_strip(path: Path, facets: Sequence[Facet], sensor: Sensor, pulses: int, seed: int = 1) -> Path:
-    """A strip over the facets (the first that a sub-ray meets counts), point format 4, or 9 with scanner channels."""
+@dataclass
+class Stored:
+    """What a file says of its pulses, arrays of n."""
+
+    origin: np.ndarray
+    ray: np.ndarray
+    first: np.ndarray
+    """Time of sample 0 [ns]."""
+    hit: np.ndarray
+    """Range of the return [m]."""
+    facing: np.ndarray
+    """Reflectance in the vendor's column."""
+
+
+def write_strip(
+    path: Path, facets: Sequence[Facet], sensor: Sensor, pulses: int, seed: int = 1, *,
+    light: Callable[[np.ndarray], np.ndarray] | None = None, receive: Callable[[np.ndarray], np.ndarray] | None = None,
+    store: Callable[[Stored], object] | None = None,
+) -> Path:  # fmt: skip
+    """A strip over the facets (the first that a sub-ray meets counts), point format 4, or 9 with scanner channels.
+
+    light: a factor of each pulse by its seconds, which no energy tells. receive: what becomes of the waveforms. store:
+    changes what the file says of the pulses.
+    """
     rng = np.random.default_rng(seed)
     seconds = np.arange(pulses) / sensor.rate
     origin = path_of(sensor, seconds)
@@ -114,12 +138,19 @@ def write_strip(path: Path, facets: Sequence[Facet], sensor: Sensor, pulses: int
     )
     phase = (seconds * sensor.line_rate) % 1.0
     energy *= 1 - sensor.falloff * (1.0 - 2.0 * phase) ** 2
-    wave = _render(distance / C_AIR - first[:, None], strength * energy[:, None], sensor)
+    sent = strength * energy[:, None]
+    if light is not None:
+        sent = sent * light(seconds)[:, None]
+    wave = _render(distance / C_AIR - first[:, None], sent, sensor)
+    wave = wave if receive is None else receive(wave)
     clean = np.rint(20.0 + wave + sensor.noise * rng.standard_normal(wave.shape))
     samples = np.clip(clean, 0, (1 << sensor.bits) - 1).astype(np.uint16 if sensor.bits > 8 else np.uint8)
     hit = (strength * distance).sum(axis=1) / strength.sum(axis=1)
-    facing = (strength * distance**2 * 10.0 ** (2e-4 * AIR * distance)).sum(axis=1) / sensor.light
-    _write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy, facing)
+    facing = (strength * distance**2 * 10.0 ** (2e-4 * sensor.air * distance)).sum(axis=1) / sensor.light
+    stored = Stored(origin, ray, first, hit, facing)
+    if store is not None:
+        store(stored)
+    _write(path, sensor, stored, seconds, channel, samples, energy)
     return path
 
 
@@ -159,7 +190,7 @@ def _trace(origin: np.ndarray, ray: np.ndarray, facets: Sequence[Facet], sensor:
         bright = facet.reflectance(x, y) if callable(facet.reflectance) else facet.reflectance
         strength = np.where(hit, bright * facing, strength)
     best = np.where(np.isfinite(best), best, 1e6)
-    air = 10.0 ** (-2e-4 * AIR * best)
+    air = 10.0 ** (-2e-4 * sensor.air * best)
     return best, sensor.light * strength * air / best**2 / len(offsets)
 
 
@@ -173,7 +204,8 @@ def _render(time: np.ndarray, strength: np.ndarray, sensor: Sensor) -> np.ndarra
     return wave
 
 
-def _write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy, facing) -> None:
+def _write(path, sensor, stored, seconds, channel, samples, energy) -> None:
+    origin, ray, first, hit, facing = (getattr(stored, one.name) for one in fields(stored))
     indices = [1] if sensor.scanners else list(sensor.gains)
     digitizers = [
         Digitizer(index, sensor.bits, sensor.n_samples, sensor.spacing, sensor.descriptor_gain) for index in indices

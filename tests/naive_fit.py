@@ -5,8 +5,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from wavebatch.core.echoes import EchoFlag
+from wavebatch.kernels.fit.decompose import AS_FITTED, STRETCHED
 from wavebatch.kernels.fit.learn_pulse import fit_bounded
-from wavebatch.kernels.fit.whole_pulse import AS_FITTED, STRETCHED
 
 GAIN_121 = np.sqrt(6.0) / 4.0
 

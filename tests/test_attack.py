@@ -21,31 +21,29 @@ def attacker(tmp_path_factory):
     return Attacker(tmp_path_factory.mktemp("attack"))
 
 
-def _plant(attacker, monkeypatch, code):
-    """A program in place of `survey`; undisturbed it writes `a.toml` after half a second."""
-    program = f"""
-        import os, pathlib, signal, subprocess, sys, time
-        out = pathlib.Path(sys.argv[-1]); out.mkdir(exist_ok=True)
-        signal.signal(signal.SIGTERM, lambda *_: None)
-        sys.exit = lambda code: (sys.stderr.flush(), os._exit(code))  # Python dies of a signal that comes while it ends
-        {code}
-    """
-    words = [sys.executable, "-c", textwrap.dedent(program), "spawn_main", str(attacker._folder / "out")]
-    monkeypatch.setattr(attacking.subprocess, "Popen", lambda _, **how: _begin(words, **how))
-    monkeypatch.setattr(attacker, "sound", {"survey": {"a.toml": b"whole"}})
-    monkeypatch.setattr(attacker, "seconds", {"survey": 0.0})
+class Planted(Attacker):
+    """Runs a program in place of `survey`; undisturbed it would write `a.toml`."""
 
+    def __init__(self, like, code):
+        self.__dict__.update(like.__dict__, sound={"survey": {"a.toml": b"whole"}}, seconds={"survey": 0.0}, code=code)
 
-def _begin(words, **how):
-    """The process, once it does not die of the signal: on a busy machine that takes a while."""
-    process, deadline = _POPEN(words, **how), time.monotonic() + 300
-    while process.poll() is None and not attacking._handles_signals(process.pid):
-        assert time.monotonic() < deadline, "the program does not begin"
-        time.sleep(0.01)
-    return process
+    def _words(self, name, out):
+        program = f"""
+            import os, pathlib, signal, subprocess, sys, time
+            out = pathlib.Path(sys.argv[-1]); out.mkdir(exist_ok=True)
+            signal.signal(signal.SIGTERM, lambda *_: None)
+            sys.exit = lambda code: (sys.stderr.flush(), os._exit(code))  # Python dies of a signal as it ends
+            {self.code}
+        """
+        return [sys.executable, "-c", textwrap.dedent(program), "spawn_main", str(out)]
 
-
-_POPEN = attacking.subprocess.Popen
+    def _start(self, *places):
+        """The process, once it does not die of the signal: on a busy machine that takes a while."""
+        process, deadline = super()._start(*places), time.monotonic() + 300
+        while process.poll() is None and not attacking._handles_signals(process.pid):
+            assert time.monotonic() < deadline, "the program does not begin"
+            time.sleep(0.01)
+        return process
 
 
 @pytest.mark.slow
@@ -63,11 +61,11 @@ _POPEN = attacking.subprocess.Popen
         ("(out / 'a.toml').write_text('whole')", "cannot be run again|other bytes"),
     ],
 )
-def test_the_attacker_sees_every_kind_of_failure(attacker, monkeypatch, code, why):
-    monkeypatch.setattr(attacking, "LONGEST", 3.0 if why == "hangs" else attacking.LONGEST)
-    monkeypatch.setattr(attacking, "STAY", 1.0 if why == "stay" else attacking.STAY)
-    _plant(attacker, monkeypatch, code)
-    assert re.search(why, attacker.attack(Attack("survey", "TERM", 0.3)))
+def test_the_attacker_sees_every_kind_of_failure(attacker, code, why):
+    planted = Planted(attacker, code)
+    planted.longest = 3.0 if why == "hangs" else attacker.longest
+    planted.stay = 1.0 if why == "stay" else attacker.stay
+    assert re.search(why, planted.attack(Attack("survey", "TERM", 0.3)))
 
 
 _OWN = 'Traceback (most recent call last):\n  File "<frozen abc>", line 48, in <module>\nKeyboardInterrupt\n'

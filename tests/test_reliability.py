@@ -11,7 +11,7 @@ HELD = ROOT / "tests" / "reliability_tests.txt"
 
 def split_sentences(text):
     """The sentences of a Markdown text, each on one line; rows of a table and items of a list are split too."""
-    text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    text = re.sub(r"```.*?```|(?m:^    [^\n]*$)", "", text, flags=re.DOTALL)
     found = []
     for block in re.split(r"\n\s*\n|\n(?=- |\|)", text):
         line = " ".join(block.split())

@@ -244,6 +244,7 @@ def test_chains_get_what_is_known_and_nothing_twice():
     assert "cross_section" not in with_physics(chain, sensor=True, calibrated=True, divergence=False).makes
 
 
+@pytest.mark.quick_cases("-1.0-0.25-55")
 @pytest.mark.parametrize(("first", "last", "share"), [(-1.0, 0.25, 55), (0.1, 3.0, 18), (-1.0, 0.7, 0)])
 def test_a_trajectory_that_does_not_cover_the_strip_is_told_with_counts(tmp_path, wide_strip, first, last, share):
     time = START_TIME + np.arange(first, last + 1e-9, 0.0005)

@@ -17,13 +17,6 @@ def _run(*arguments):
     return run_command("run", *arguments)
 
 
-@pytest.fixture
-def done(tiny_strip, tmp_path):
-    """A folder with the tiny strip's outputs."""
-    assert _run(tiny_strip, "-o", tmp_path, "--profile", "fast").exit_code == 0
-    return tmp_path
-
-
 def test_a_strip_is_written_and_said_in_one_line_on_stderr(tiny_strip, tmp_path):
     result = _run(tiny_strip, "-o", tmp_path / "new" / "folder", "--profile", "fast")
     assert result.exit_code == 0 and result.stdout == ""
@@ -40,13 +33,6 @@ def test_some_failed_is_3_none_written_is_4(tiny_strip, tmp_path):
     none = _run(bad, "-o", tmp_path / "out")
     assert none.exit_code == 4
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["tiny.laz", "tiny.report.json"]
-
-
-def test_existing_outputs(tiny_strip, done):
-    refused = _run(tiny_strip, "-o", done)
-    assert refused.exit_code == 4 and "--overwrite" in refused.stderr and refused.stderr.count("\n") == 1
-    assert _run(tiny_strip, "-o", done, "--profile", "fast", "--resume").stderr.endswith("is up to date, skipped\n")
-    assert _run(tiny_strip, "-o", done, "--profile", "fast", "--overwrite").exit_code == 0
 
 
 @pytest.mark.parametrize("more", [[], ["--dry-run"]])
@@ -79,6 +65,7 @@ def test_report_of_the_batch_to_a_file_and_to_stdout(tiny_strip, tmp_path):
     assert [strip["status"] for strip in document["strips"]] == ["written"]
     again = _run(tiny_strip, "-o", tmp_path / "a", "--report", "-", "--profile", "fast", "--resume", "-q")
     printed = json.loads(again.stdout)
+    assert again.exit_code == 0
     assert printed["counts"] == document["counts"] and printed["strips"][0]["status"] == "skipped"
 
 
@@ -178,12 +165,6 @@ def test_commands_import_only_what_they_use(tmp_path, tiny_strip, command, unuse
     plain = {name: value for name, value in os.environ.items() if not name.startswith("WAVEBATCH_")}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=plain)
     assert done.stdout.splitlines()[-1] == "[]"
-
-
-@pytest.mark.parametrize("name", list(COMMANDS))
-def test_every_command_has_help(name):
-    result = run_command(name, "--help")
-    assert result.exit_code == 0 and "Usage:" in result.output
 
 
 def test_python_m_wavebatch_is_the_command():

@@ -14,7 +14,7 @@ from commands import run_command
 from strips import cut_strip
 
 from wavebatch.cli import COMMANDS, main
-from wavebatch.files.inputs import find_files
+from wavebatch.files.text_file import find_files
 
 
 def invoke(*arguments):

@@ -129,23 +129,6 @@ def test_lascompressed_1_5_input(tmp_path):
     assert header.gps_range == (rows["gps_time"].max(), rows["gps_time"].min())
 
 
-@pytest.mark.parametrize("new", [6, 7, 8])
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_promoted_files_come_back(tmp_path, new, suffix):
-    wkt = Vlr(b"LASF_Projection", 2112, b"PROJCRS[]\0", b"wkt")
-    points = write_source(tmp_path / "a.las", 4, (1, 3), vlrs=[wkt], creation=(60, 2024), user_bytes=b"mine")
-    layout = plan_output(tmp_path / "a.las", COLUMNS, point_format=new)
-    rows = make_rows(layout, points)
-    target = tmp_path / f"out{suffix}"
-    write(layout, target, rows)
-    for backend in BACKENDS:
-        assert read_raw(target, backend).tobytes() == rows.tobytes()
-    check_truth(target, rows)
-    header = read_header(target)
-    assert (header.version, header.point_format, header.user_bytes) == ((1, 4), new, b"mine")
-    assert header.global_encoding & 16 and header.vlrs[0].encode() == wkt.encode()
-
-
 def test_the_wkt_bit_says_the_truth(tmp_path):
     geotiff, wkt = Vlr(b"LASF_Projection", 34735, bytes(8)), Vlr(b"LASF_Projection", 2112, b"PROJCRS\0")
     for name, vlrs, evlrs, bit in (
@@ -266,12 +249,13 @@ def test_records_are_kept_to_the_byte(tmp_path):
         Vlr(b"LAS_Spec", 101, bytes(26), b"Leica's spelling"),
         Vlr(b"long", 2, bytes(65535)),
     ]
-    points = write_source(tmp_path / "a.laz", 9, (1, 4), vlrs=vlrs, padding=b"\xdd\xcc", project_id=bytes(range(16)))
+    points = write_source(tmp_path / "a.laz", 9, (1, 4), vlrs=vlrs, padding=b"\xdd\xcc", project_id=bytes(range(16)),
+                          user_bytes=b"mine")  # fmt: skip
     layout = plan_output(tmp_path / "a.laz", COLUMNS)
     for suffix in (".las", ".laz"):
         write(layout, tmp_path / f"out{suffix}", layout.rows(points))
         header = read_header(tmp_path / f"out{suffix}")
-        assert (header.padding, header.project_id) == (b"\xdd\xcc", bytes(range(16)))
+        assert (header.padding, header.project_id, header.user_bytes) == (b"\xdd\xcc", bytes(range(16)), b"mine")
         # laspy opens no file with ids that are not UTF-8.
         shown = [dataclasses.replace(vlr, user_id=vlr.user_id.replace(b"\xe9", b"?")) for vlr in vlrs]
         expected = [vlr.encode() for vlr in shown if vlr.record_id not in (100, 101) and vlr.user != "copc"]

@@ -6,7 +6,7 @@ from commands import run_command
 
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.inputs import find_files, find_strips
+from wavebatch.files.text_file import find_files, find_strips
 
 
 @pytest.fixture

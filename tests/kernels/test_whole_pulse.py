@@ -4,9 +4,8 @@ import naive_fit
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.decompose import Clusters, Solution
+from wavebatch.kernels.fit.decompose import Clusters, Solution, WholePulse, describe_whole, keep_echoes
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
-from wavebatch.kernels.fit.whole_pulse import WholePulse, describe_whole, keep_echoes
 from wavebatch.stages.pulse_tables import ShapeLimits, whole_pulse
 
 LIMITS = ShapeLimits(2.0, 1.0, 30.0)

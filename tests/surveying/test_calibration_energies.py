@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import wavebatch as wb
-from tests import facet_strips
 from tests.facet_strips import EAST, NORTH, START, Sensor, write_strip
 from tests.surveying.test_calibration_misuse import BASE, GROUND, LIGHT, call, fields, write_targets
 from wavebatch.surveying.calibrating.calibration_files import load_calibration
@@ -111,16 +110,10 @@ def test_logs_that_stand_still_or_drift_alone_are_named_and_in_the_error(tmp_pat
 
 
 @pytest.mark.slow
-def test_two_lasers_that_take_turns_without_a_mark_are_named_and_in_the_error(tmp_path, flickering, monkeypatch):
-    render = facet_strips._render
-
-    def take_turns(time, strength, sensor):
-        return render(time, strength * np.where(np.arange(len(time)) % 2, 0.7, 1.0)[:, None], sensor)
-
-    monkeypatch.setattr(facet_strips, "_render", take_turns)
+def test_two_lasers_that_take_turns_without_a_mark_are_named_and_in_the_error(tmp_path, flickering):
     plain = replace(FLICKERS, store_energy=False)
-    write_strip(tmp_path / "two.las", GROUND, replace(plain, energy_spread=0.02), 8000, seed=4)
-    monkeypatch.undo()
+    write_strip(tmp_path / "two.las", GROUND, replace(plain, energy_spread=0.02), 8000, seed=4,
+                light=lambda seconds: np.where(np.arange(len(seconds)) % 2, 0.7, 1.0))  # fmt: skip
     off, stated, line = judge(tmp_path, tmp_path / "two.las", flickering / "without.toml")
     assert "alternates by a factor of 0.70, as of two lasers" in line
     assert abs(np.mean(off)) < np.median(stated) and np.median(stated) > 0.24

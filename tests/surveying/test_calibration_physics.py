@@ -7,8 +7,7 @@ import pytest
 from commands import run_command as call
 
 import wavebatch as wb
-from tests import facet_strips
-from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip, write_trajectory
+from tests.facet_strips import AIR, EAST, NORTH, START, Facet, Sensor, box, write_strip, write_trajectory
 from wavebatch.core.errors import InputError
 from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_files import (
@@ -381,18 +380,15 @@ def test_a_vendors_column_of_reflectances_is_an_anchor(tmp_path, vendor):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("held", [0.0, 0.5, 1.0])
-def test_air_that_a_vendors_column_still_holds_is_taken_off(tmp_path, monkeypatch, held):
+def test_air_that_a_vendors_column_still_holds_is_taken_off(tmp_path, held):
     """Constants by such a column were 7 to 15 % off, with an error of 3 %."""
-    write = facet_strips._write
 
-    def write_held(*arguments):
-        hit, facing = arguments[8], arguments[10]
-        write(*arguments[:10], facing * 10 ** (-2e-4 * facet_strips.AIR * hit * held))
+    def hold(stored):
+        stored.facing *= 10 ** (-2e-4 * AIR * stored.hit * held)
 
-    monkeypatch.setattr(facet_strips, "_write", write_held)
     sensor = Sensor(vendor="dB", divergence=0.3e-3, half_angle=28.0, height=1000.0, light=4e8, n_samples=100)
     ground = [Facet(0.15, inside=box(0, -900, 60, 900)), Facet(0.5, slope=(0.3, 0.0), z0=-9.0, centre=(30.0, 0.0))]
-    strip = write_strip(tmp_path / "s.las", ground, sensor, 16_000, seed=77)
+    strip = write_strip(tmp_path / "s.las", ground, sensor, 16_000, seed=77, store=hold)
     done = call("calibrate", strip, "--from-column", "Reflectance", "-o", tmp_path / "cal.toml")
     row = load_calibration(tmp_path / "cal.toml").channels[0]
     assert row.constant == pytest.approx(constant_of(sensor), rel=0.015) and row.relative_error < 0.05

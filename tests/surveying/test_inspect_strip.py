@@ -8,7 +8,6 @@ from commands import run_command as run
 from strips import descriptor, make_raw
 from writer_tools import data_file
 
-from wavebatch.core.errors import InputError
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.file_facts import describe_file
 
@@ -130,16 +129,6 @@ def test_check_notes_do_no_harm_unless_strict(tmp_path):
     assert "note: descriptor 1 has gain 0" in result.stdout
     assert "note: counts by return in the header are wrong (first returns: 0, counted: 40)" in result.stdout
     assert run("check", path, "--strict").exit_code == 1
-
-
-def test_check_notices_packets_that_cannot_be_read(tmp_path, monkeypatch):
-    path = make_raw().write(tmp_path / "a.las")
-
-    def fail(*arguments):
-        raise InputError(f"{path}: packets cannot be read: Input/output error; check the disk")
-
-    monkeypatch.setattr("wavebatch.files.strip.packets.PacketFile.read", fail)
-    assert any("Input/output error" in line for line in check_file(path).problems)
 
 
 def test_check_takes_chain_files(tmp_path):

@@ -18,12 +18,11 @@ from wavebatch.surveying import Decision, Survey, survey_block
 from wavebatch.surveying.system_file import (
     SYSTEM_SCHEMA,
     SavedSurvey,
-    describe_system,
     format_survey,
     load_survey,
     parse_survey,
 )
-from wavebatch.surveying.systems.figures import Figures, Kind, Level, Look
+from wavebatch.surveying.systems.figures import Figures, Kind, Level, Look, describe_system
 
 SYSTEM = SystemPulse(
     sigma_ref=1.8581162121217176,

@@ -156,6 +156,9 @@ def test_each_cloud_has_its_series_and_all_together_are_their_sum(cloud, tmp_pat
     assert both.names == ("cloud.laz", "other.las") and both.counts.shape == (2, 30)
     one = count_values([cloud, other], "amplitude", bins=30, limits=(0.0, 200.0))
     assert np.array_equal(one.counts[0], both.counts.sum(axis=0)) and one.total == both.total
+    _, _, amplitude, _ = read_plainly(cloud)
+    every = np.append(amplitude[~np.isnan(amplitude)], np.full(POINTS, 50.0))
+    assert np.array_equal(one.percentiles[0], np.percentile(every, (5, 50, 95)))
     assert both.percentiles[1].tolist() == [50.0, 50.0, 50.0]
     late = write_cloud(tmp_path / "late.las", wb_amplitude=(np.full(POINTS, 50, "f4"), None, None, "[DN]"))
     for clouds in ([late, other], [other, late]):

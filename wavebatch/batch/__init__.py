@@ -2,7 +2,7 @@
 
 How one strip flows through the modules:
 
-1. `files.inputs` lists the strips; a `job` says what is asked of one.
+1. `files.text_file` lists the strips; a `job` says what is asked of one.
 2. `run` checks memory and the names of the outputs before anything is read. It keeps the `workers` busy: processes of
    this machine, or a dask cluster. It opens a `strip_task` per strip, writes results in order, and keeps a strip that
    fails from stopping the others.

@@ -30,7 +30,7 @@ from wavebatch.core.errors import StageError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import SUFFIX, NoData, count_reasons
 from wavebatch.core.process import Seconds
-from wavebatch.files.disk.temp_store import SPOOL_MEMORY, RowStore, Spool
+from wavebatch.files.disk.temp_store import SPOOL_MEMORY, STORE_PIECE, RowStore, Spool
 from wavebatch.files.las.header import field_names
 from wavebatch.kernels.geometry.normals import (
     FINENESS,
@@ -138,7 +138,7 @@ class SecondPass:
         self._found.extend(self._rows.count)
         self._entries = Spool(len(tiles), ENTRY, memory=self._spooled)
         counts, at = np.zeros(len(tiles), np.int64), 0
-        for rows in self._rows.pieces():
+        for rows in self._rows.pieces(min(self._part_points, STORE_PIECE)):
             rows["row"] = np.arange(at, at + len(rows))
             place = rows["xyz"] * np.array(self._scales)
             able = np.flatnonzero(np.isfinite(place).all(axis=1))

@@ -14,14 +14,7 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_scenes
 from wavebatch.cli.messages import print_result, talk
-from wavebatch.tools.bench.command import (
-    BenchOptions,
-    bench_sheet,
-    format_document,
-    run_bench,
-    write_bench_page,
-    write_outputs,
-)
+from wavebatch.tools.bench import command
 
 
 @click.command()
@@ -29,11 +22,11 @@ from wavebatch.tools.bench.command import (
 @click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete_scenes,
               help="Simulate this scene, e.g. mixed, open or forest; `wavebatch simulate --help` lists all; may be "
               "repeated.")
-@shared.options_of(BenchOptions, "waveforms", "pulses", "repeats")
+@shared.options_of(command.BenchOptions, "waveforms", "pulses", "repeats")
 @shared.seed_option("Seed of the simulated waveforms.")
 @shared.declared("tolerance", "Name the cheapest chain whose range error of isolated echoes is at most this, "
                  "e.g. 0.02m.")
-@shared.options_of(BenchOptions, "all_methods")
+@shared.options_of(command.BenchOptions, "all_methods")
 @shared.output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR",
                       required=False, folder=True)
 @shared.html_option
@@ -62,17 +55,17 @@ def bench(
     if len(strips) > 1:
         raise click.UsageError(f"one strip at a time, not {len(strips)}; chain files end in .toml")
     settings = shared.from_options(
-        BenchOptions,
+        command.BenchOptions,
         options,
         strip=strips[0] if strips else None,
         scenes=options["scenes"] or (() if strips else ("mixed",)),
         chains=tuple(path for path in files if path.suffix.lower() == ".toml"),
         tolerance_cm=100.0 * tolerance if tolerance else None,
     )
-    document = run_bench(settings, say)
-    for line in write_outputs(document, format_document(document), output) if output else []:
+    document = command.run_bench(settings, say)
+    for line in command.write_outputs(document, command.format_document(document), output) if output else []:
         talk(line)
     if html_file is not None:
-        write_bench_page(html_file, document)
+        command.write_bench_page(html_file, document)
         talk(f"{html_file}: written")
-    print_result(options["as_json"], document, bench_sheet(document))
+    print_result(options["as_json"], document, command.bench_sheet(document))

@@ -25,7 +25,7 @@ from wavebatch.cli.messages import LEVELS, LOG, begin_log, keep_level, one_line,
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
 from wavebatch.files.disk.publish import protecting, refuse_input
-from wavebatch.files.inputs import find_files
+from wavebatch.files.text_file import find_files
 
 _Options = TypeVar("_Options")
 

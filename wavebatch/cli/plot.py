@@ -20,8 +20,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
-from wavebatch.files.inputs import SUFFIXES
-from wavebatch.files.text_file import write_text
+from wavebatch.files.text_file import SUFFIXES, write_text
 
 output_option = shared.output_option("Picture to write: .png, .svg or .pdf.")
 

@@ -180,8 +180,8 @@ def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Pat
 
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
     from wavebatch.surveying.choose_chain import chain_text
-    from wavebatch.surveying.system_file import SYSTEM_SCHEMA, describe_system
-    from wavebatch.surveying.systems.figures import describe_figures
+    from wavebatch.surveying.system_file import SYSTEM_SCHEMA
+    from wavebatch.surveying.systems.figures import describe_figures, describe_system
     from wavebatch.surveying.systems.known_systems import doubt_survey
 
     doubts = doubt_survey(saved.survey.system, saved.survey.figures, saved.survey.waveforms)

@@ -17,6 +17,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, interpolate, log, solve
+from wavebatch.kernels.fit.decompose import NO_ROWS, STRETCHED, SUMMED, WholePulse, describe_whole
 from wavebatch.kernels.fit.pulse_shape import (
     GAUSSIAN,
     NO_SKEW,
@@ -26,7 +27,6 @@ from wavebatch.kernels.fit.pulse_shape import (
     find_datum,
     measure_pulse,
 )
-from wavebatch.kernels.fit.whole_pulse import NO_ROWS, STRETCHED, SUMMED, WholePulse, describe_whole
 from wavebatch.kernels.signal.filters import refine_peaks
 from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, coloured_variance, whitening_filter
 

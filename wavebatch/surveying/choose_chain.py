@@ -24,8 +24,8 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import format_step, load_profile, parse_chain
 from wavebatch.surveying.look import join_digitizers
-from wavebatch.surveying.system_file import SavedSurvey, describe_system
-from wavebatch.surveying.systems.figures import describe_figures
+from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.systems.figures import describe_figures, describe_system
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey
 
 TYPE_CHECKING = False

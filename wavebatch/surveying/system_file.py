@@ -15,14 +15,7 @@ from wavebatch import __version__
 from wavebatch.core.frozen import frozen
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml
-from wavebatch.surveying.systems.figures import (
-    REMEDY,
-    comment_system,
-    describe_figures,
-    describe_system,
-    read_figures,
-    read_system,
-)
+from wavebatch.surveying.systems import figures as tables
 from wavebatch.surveying.systems.survey_result import Decision, Survey
 
 SYSTEM_SCHEMA = "wavebatch.system/1"
@@ -54,12 +47,12 @@ def format_survey(saved: SavedSurvey) -> str:
         "strip": saved.strip,
         "sensor": saved.sensor or None,
         "waveforms": int(survey.waveforms),
-        "system": describe_system(survey.system),
-        "figures": describe_figures(survey.figures),
+        "system": tables.describe_system(survey.system),
+        "figures": tables.describe_figures(survey.figures),
         "decision": [{**asdict(decision), "needed": bool(decision.needed)} for decision in survey.decisions] or None,
         "fingerprint": saved.fingerprint or None,
     }
-    return format_toml(document, heading=_HEADING, comments=comment_system())
+    return format_toml(document, heading=_HEADING, comments=tables.comment_system())
 
 
 def load_survey(path: Path | str) -> SavedSurvey:
@@ -89,12 +82,12 @@ def parse_survey(text: str, name: str) -> SavedSurvey:
     table = parse_toml(text, name)
     table.check_kind("system")
     known = ("schema", "version", "strip", "sensor", "waveforms", "system", "figures", "decision", "fingerprint")
-    table.check_keys(known, ("schema", "system"), REMEDY)
+    table.check_keys(known, ("schema", "system"), tables.REMEDY)
     table.check_schema(SYSTEM_SCHEMA, "survey again")
     survey = Survey(
-        system=read_system(table.table("system")),
+        system=tables.read_system(table.table("system")),
         waveforms=table.integer("waveforms", 0, 10**12, 0),
-        figures=read_figures(table.table("figures", {})),
+        figures=tables.read_figures(table.table("figures", {})),
         decisions=tuple(map(_read_decision, table.tables("decision"))),
     )
     texts = (table.get("strip", str, ""), table.get("fingerprint", dict, {}), table.get("version", str, __version__))
@@ -103,5 +96,5 @@ def parse_survey(text: str, name: str) -> SavedSurvey:
 
 def _read_decision(table: TomlTable) -> Decision:
     kinds = {"part": str, "needed": bool, "reason": str}
-    table.check_keys(kinds, kinds, REMEDY)
+    table.check_keys(kinds, kinds, tables.REMEDY)
     return Decision(**{key: table.get(key, kind) for key, kind in kinds.items()})

@@ -21,11 +21,11 @@ from wavebatch.core.errors import ConfigError, InputError, nearest
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.raw_bytes import Closing, open_regular, reporting_reads
-from wavebatch.files.inputs import find_strips
 from wavebatch.files.pulse_energy import NONE
 from wavebatch.files.strip.packets import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scanner import StripScan
+from wavebatch.files.text_file import find_strips
 from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.stages import chain_file
 from wavebatch.stages.chain import Chain

@@ -146,12 +146,6 @@ def sample_points(
     return total, sample, box
 
 
-def find_positions(rows: np.ndarray) -> np.ndarray:
-    """Finite x and y of points, f8 (k, 2)."""
-    places = np.stack([rows["x"], rows["y"]], axis=1)
-    return places[np.isfinite(places).all(axis=1)]
-
-
 def round_up(size: float) -> float:
     """The next of 1, 2, 5, 10 ... times a power of ten."""
     power = 10.0 ** math.floor(math.log10(size))
@@ -520,7 +514,8 @@ def survey_places(clouds: Clouds, bounds: Box | None = None, option: str = "--bb
     each = [EvenSample() for _ in clouds.paths]
 
     def pick(cloud: int, rows: np.ndarray) -> np.ndarray:
-        places = find_positions(rows)
+        places = np.stack([rows["x"], rows["y"]], axis=1)
+        places = places[np.isfinite(places).all(axis=1)]
         if bounds is not None:
             return places[(places >= bounds[:2]).all(axis=1) & (places <= bounds[2:]).all(axis=1)]
         if len(clouds.paths) > 1:

@@ -28,19 +28,12 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import option
 from wavebatch.core.units import MAD_TO_STD, PS_PER_NS, QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
+from wavebatch.files import pulsewaves_file
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.crs import GeoKeys, build_utm
 from wavebatch.files.las.header import GEOTIFF_ID, ExtraRecord, Vlr, read_header
-from wavebatch.files.pulsewaves_file import (
-    OUTGOING,
-    RETURNING,
-    PulseHeader,
-    PulsePiece,
-    PulseReader,
-    Segments,
-    read_pulse_header,
-)
+from wavebatch.files.pulsewaves_file import OUTGOING, RETURNING, PulseHeader, PulsePiece, PulseReader, Segments
 from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.signal.outgoing import OutgoingReference, find_reference, measure_outgoing
@@ -263,7 +256,9 @@ def make_plan(reader: PulseReader) -> Plan:
         raise InputError(f"{reader.header.path}: none of its {reader.header.count} pulses has a returning waveform")
     primary = found.channels.most_common(1)[0][0]
     overlap = found.overlaps.get(primary, Overlaps())
-    ratios, unknown = _find_ratios(found, primary)
+    others = tuple(channel for channel in found.channels if channel != primary)
+    ratio = overlap.find_ratio() if len(others) == 1 else None  # overlaps show that of sensors with two channels
+    ratios, unknown = ({}, others) if ratio is None or ratio <= 1 else ({others[0]: ratio}, ())
     steps = np.concatenate([np.zeros(1), *found.steps])
     noise = max(float(np.median(steps)) * MAD_TO_STD / np.sqrt(2), QUANTISATION_STD)
     header = reader.header
@@ -296,15 +291,6 @@ def _add(found: _Found, piece: PulsePiece, every: int) -> None:
         found.outgoing.setdefault(int(code_segments(segments, rows[:1])[0]), []).append((piece.samples(rows), start))
     for (rows,) in group_rows(segments, returning[chosen[returning] & (segments.length[returning] > 1)]):
         found.steps.append(np.abs(np.diff(piece.samples(rows).astype(np.int64), axis=1)).mean(axis=1))
-
-
-def _find_ratios(found: _Found, primary: int) -> tuple[dict[int, float], tuple[int, ...]]:
-    """Ratios of gains; overlaps show only that of sensors with two channels."""
-    others = [channel for channel in found.channels if channel != primary]
-    ratio = found.overlaps[primary].find_ratio() if len(others) == 1 and primary in found.overlaps else None
-    if ratio is None or ratio <= 1:
-        return {}, tuple(others)
-    return {others[0]: ratio}, ()
 
 
 def _list_digitizers(codes: Counter[int], ratios: dict[int, float]) -> dict[int, Digitizer]:
@@ -720,7 +706,7 @@ def import_file(
     InputError
         Where the file cannot be read to its end, or the strip cannot be written; nothing is left behind.
     """
-    header = read_pulse_header(path)
+    header = pulsewaves_file.read_pulse_header(path)
     source = {"file": path.name, **take_fingerprint(path, header.waves)}
     account = {"import": source, "options": options.describe(), "version": __version__}
     state = _find_state(target, account)
@@ -731,8 +717,16 @@ def import_file(
     refuse_existing(target, overwrite)
     with PulseReader(header) as reader:
         plan, frame = make_plan(reader), find_frame(reader)
-        counts = ImportSummary(str(path), str(target), header.count, outgoing=_describe_outgoing(plan.outgoing),
-                               descriptors=len({one.index for one in plan.digitizers.values()}))  # fmt: skip
+        descriptors = len({one.index for one in plan.digitizers.values()})
+        counts = ImportSummary(str(path), str(target), header.count, descriptors=descriptors)
+        if (sent := plan.outgoing) is not None:
+            counts.outgoing = {
+                "fwhm_ns": float("nan") if sent.shape is None else sent.shape.fwhm,
+                "energy_scatter": sent.scatter,
+                "energy_error": sent.error,
+                "width_scatter": sent.width_scatter,
+                "unknown": 0,
+            }
         with _open_writer(target, header, plan, frame, options, account, overwrite) as writer:
             system = _draft_system(writer, path, plan, source, overwrite)
             for piece in reader.pieces():
@@ -793,18 +787,6 @@ def _draft_system(
     with reporting(draft.target):
         draft.file.write(format_survey(saved).encode())
     return draft.target
-
-
-def _describe_outgoing(sent: Outgoing | None) -> dict[str, float] | None:
-    if sent is None:
-        return None
-    return {
-        "fwhm_ns": float("nan") if sent.shape is None else sent.shape.fwhm,
-        "energy_scatter": sent.scatter,
-        "energy_error": sent.error,
-        "width_scatter": sent.width_scatter,
-        "unknown": 0,
-    }
 
 
 def _note(header: PulseHeader, plan: Plan, counts: ImportSummary) -> list[str]:

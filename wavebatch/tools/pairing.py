@@ -343,7 +343,10 @@ class Pairing:
             counted = np.unique(group[len(a) + len(b) :])
         self.pulses += len(number_a[counted])
         self.exact += int((number_a[counted] == number_b[counted]).sum())
-        self.counts = [_add_counts(old, n[counted]) for old, n in zip(self.counts, (number_a, number_b), strict=True)]
+        for side, number in enumerate((number_a, number_b)):
+            new = np.bincount(number[counted], minlength=len(self.counts[side]))
+            new[: len(self.counts[side])] += self.counts[side]
+            self.counts[side] = new
         left, right = pair_echoes(in_a, a["xyz"], in_b, b["xyz"], self.tolerance)
         self.differences.add(a[left], b[right])
         self._count(0, a, left, number_b[in_a])
@@ -464,12 +467,6 @@ def check_tolerance(tolerance_ns: float) -> float:
     if not 0 < tolerance_ns < 1e6:
         raise ConfigError(f"tolerance {tolerance_ns:g} ns (--within): must be above 0 and below 1e6")
     return tolerance_ns
-
-
-def _add_counts(old: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    new = np.bincount(numbers, minlength=len(old))
-    new[: len(old)] += old
-    return new
 
 
 def _list_counts(counts: np.ndarray) -> dict[int, int]:

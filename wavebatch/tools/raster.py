@@ -28,18 +28,7 @@ from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
 from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.kernels.physics.gap_probability import ASSUMED_ERROR
-from wavebatch.tools.cells import (
-    HELD,
-    LARGEST_SIZE,
-    Box,
-    Clouds,
-    Grid,
-    Placed,
-    check_cells,
-    check_statistic,
-    compute_tiles,
-    is_in_bounds,
-)
+from wavebatch.tools import cells
 
 COLUMNS = ("x", "y", "height", "light", "path", "share", "ground", "free_path", "attenuation", "attenuation_error")
 """Columns of voxels that are used."""
@@ -166,8 +155,8 @@ class Forest:
         """Bands f8 (m, number) from the cell of each voxel i8 (n,) and its COLUMNS f8 (n, 10); NaN without voxels."""
         height = values[:, 2]
         inside = (height + 0.5 * self.size > 0) & (height < TALLEST)
-        cells, cell = np.unique(cell, return_inverse=True)
-        n, voxels = len(cells), _join(values[inside], cell[inside], self.size)
+        filled, cell = np.unique(cell, return_inverse=True)
+        n, voxels = len(filled), _join(values[inside], cell[inside], self.size)
         columns, column = np.unique(voxels.column, return_inverse=True)
         owner = np.zeros(len(columns), np.int64)
         owner[column] = voxels.cell
@@ -198,7 +187,7 @@ class Forest:
         reason = np.where(light < LEAST_LIGHT, FEW_RAYS, np.where(soil < LEAST_GROUND, NO_GROUND, KNOWN))
         self.reasons += np.bincount(reason, minlength=3)
         result = np.full((len(bands) + 1, number), np.nan)
-        result[:, cells] = np.concatenate([np.where(reason == KNOWN, bands, np.nan), reason[None]])
+        result[:, filled] = np.concatenate([np.where(reason == KNOWN, bands, np.nan), reason[None]])
         return result
 
     def _place(self, height: np.ndarray) -> np.ndarray:
@@ -341,9 +330,9 @@ class GridOptions:
     statistic: Literal["mean", "median", "min", "max", "std", "count", "density"] = option(
         "mean", "Statistic of the values in a cell; density is points per area."
     )
-    bbox: Box | None = None
+    bbox: cells.Box | None = None
     """Only this part."""
-    size: Annotated[float, Above(0.0, LARGEST_SIZE)] = option(
+    size: Annotated[float, Above(0.0, cells.LARGEST_SIZE)] = option(
         1.0, "Side of a cell, in the unit of the coordinates. Borders are multiples of it, so that neighbouring "
         "rasters fit together.", form="M",
     )  # fmt: skip
@@ -356,7 +345,7 @@ class GridOptions:
 
 
 @dataclass(slots=True, kw_only=True)
-class GridResult(Placed):
+class GridResult(cells.Placed):
     """What was written."""
 
     layout: RasterLayout
@@ -371,7 +360,7 @@ class GridResult(Placed):
 
 
 def write_grid(
-    paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False, held: int = HELD
+    paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False, held: int = cells.HELD
 ) -> GridResult:
     """Write the raster; held: points in memory at a time.
 
@@ -385,15 +374,18 @@ def write_grid(
         metrics = Forest(paths, options.size, options.forest)
         options = replace(options, columns=tuple(COLUMNS))
     _check(options)
-    options = replace(options, bbox=_grow(options.bbox, options.size))
+    if options.bbox is not None:  # up to the next borders of cells, so that no cell holds a part of its points only
+        west, south, east, north = (value / options.size for value in options.bbox)
+        borders = math.floor(west), math.floor(south), math.ceil(east), math.ceil(north)
+        options = replace(options, bbox=tuple(border * options.size for border in borders))
     crs, unit, unnamed = _find_crs(paths, options.crs)
     if metrics is not None and unit != "m":
         raise ConfigError(f"{paths[0]}: --forest: voxels are measured in metres, and coordinates are in {unit}; "
                           "project the strip to a CRS in metres first")  # fmt: skip
-    clouds = Clouds(paths, options.columns or (None,), options.chosen)
+    clouds = cells.Clouds(paths, options.columns or (None,), options.chosen)
     facts = (clouds.facts, *clouds.other_facts)
     for one in facts:
-        check_statistic(one.name, options.statistic, one, paths[0])
+        cells.check_statistic(one.name, options.statistic, one, paths[0])
     box, points, largest = _find_extent(clouds, options)
     if unit == "degree" and options.size > max(box[2] - box[0], box[3] - box[1]):
         raise ConfigError(f"{paths[0]}: coordinates are degrees, and cells of {options.size:g} degrees are larger than "
@@ -410,7 +402,8 @@ def write_grid(
     tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}"}
     tags |= {"STATISTIC": options.statistic} if metrics is None else metrics.describe()
     with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
-        for row, column, values in compute_tiles(clouds, statistic, grid, points, result, options.bbox, held=held):
+        tiles = cells.compute_tiles(clouds, statistic, grid, points, result, options.bbox, held=held)
+        for row, column, values in tiles:
             result.filled += int(np.isfinite(values).any(axis=0).sum())
             writer.write_tile(row, column, values)
         writer.publish()
@@ -421,19 +414,11 @@ def write_grid(
 
 
 def _check(options: GridOptions) -> None:
-    check_cells(options.statistic, options.bbox)
-    check_statistic(next(iter(options.columns), None), options.statistic)
+    cells.check_cells(options.statistic, options.bbox)
+    cells.check_statistic(next(iter(options.columns), None), options.statistic)
     check_options(options)
     if not (math.isnan(options.no_data) or abs(options.no_data) <= float(np.finfo(np.float32).max)):
         raise ConfigError(f"--no-data must be nan or a number that float32 holds, got {options.no_data:g}")
-
-
-def _grow(bounds: Box | None, size: float) -> Box | None:
-    """The bounds up to the next borders of cells, so that no cell holds a part of its points only."""
-    if bounds is None:
-        return None
-    west, south, east, north = (value / size for value in bounds)
-    return math.floor(west) * size, math.floor(south) * size, math.ceil(east) * size, math.ceil(north) * size
 
 
 def _find_crs(paths: Sequence[Path], given: str | None) -> tuple[str | None, str, tuple[Path, ...]]:
@@ -455,12 +440,12 @@ def _find_crs(paths: Sequence[Path], given: str | None) -> tuple[str | None, str
     return (None, unit, ()) if first is None else (first[1], unit, tuple(unnamed))
 
 
-def _find_extent(clouds: Clouds, options: GridOptions) -> tuple[Box, int, np.ndarray]:
+def _find_extent(clouds: cells.Clouds, options: GridOptions) -> tuple[cells.Box, int, np.ndarray]:
     """The box of all points, their number, and the largest absolute value of each column."""
     low, high, points = np.full(2, np.inf), np.full(2, -np.inf), 0
     largest = np.zeros(1 + len(clouds.other_facts))
     for _, rows, _ in clouds.read_all():
-        rows = rows[is_in_bounds(rows, options.bbox)]
+        rows = rows[cells.is_in_bounds(rows, options.bbox)]
         if len(rows):
             places = np.stack([rows["x"], rows["y"]], axis=1)
             low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
@@ -481,7 +466,7 @@ def _choose_dtype(facts: Sequence[ColumnFacts], largest: np.ndarray) -> str:
     return "float64" if any(wide) else "float32"
 
 
-def _lay_out(where: str, box: Box, options: GridOptions) -> Grid:
+def _lay_out(where: str, box: cells.Box, options: GridOptions) -> cells.Grid:
     """The cells of the raster; ConfigError for too many."""
     west, south, east, north = box
     size = options.size
@@ -495,8 +480,8 @@ def _lay_out(where: str, box: Box, options: GridOptions) -> Grid:
     if options.bbox is not None:  # its cells end at a border, where no other cell begins
         first = round(west / size), round(south / size)
         last = max(round(east / size) - 1, first[0]), max(round(north / size) - 1, first[1])
-        return Grid(size, *first, last[1] - first[1] + 1, last[0] - first[0] + 1)
-    return Grid.cover(box, size)
+        return cells.Grid(size, *first, last[1] - first[1] + 1, last[0] - first[0] + 1)
+    return cells.Grid.cover(box, size)
 
 
 def _describe(facts: ColumnFacts, statistic: str, length: str) -> Band:

@@ -21,14 +21,7 @@ from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_puls
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.geometry.group_returns import match_returns
 from wavebatch.kernels.geometry.normals import measure_normals
-from wavebatch.kernels.physics.incidence import (
-    angle_of_spread,
-    angles_above,
-    angles_of_variance,
-    paper_table,
-    pulse_table,
-    spread_variance,
-)
+from wavebatch.kernels.physics import incidence
 from wavebatch.stages.attribute.radiometry import area_factor, light_error, sensor_distance
 from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
@@ -347,16 +340,16 @@ def incidence_angle(
     short = system.sigma_ref < LEAST_PULSE_WIDTH * block.spacing
     variance, variance_err = added_variance(block, system, echoes, mode, reference_error)
     distance = sensor_distance(block, echoes)
-    angle, error = angles_of_variance(variance, variance_err, distance, 1e-3 * beam if beam else np.nan)
+    angle, error = incidence.angles_of_variance(variance, variance_err, distance, 1e-3 * beam if beam else np.nan)
     steep = np.isnan(angle) & np.isfinite(variance) & np.isfinite(variance_err) & np.isfinite(distance)
     facing_err = _facing_error(system, echoes, reference_error)
-    flat_error = angle_of_spread(np.sqrt(facing_err), distance, 1e-3 * beam if beam else np.nan)
+    flat_error = incidence.angle_of_spread(np.sqrt(facing_err), distance, 1e-3 * beam if beam else np.nan)
     with np.errstate(invalid="ignore"):
         weak = ~(flat_error <= np.radians(max_error))
         clear = weak & (variance > CLEAR_ERRORS * variance_err)
     if clear.any():
         known = variance[clear], variance_err[clear], distance[clear]
-        angle[clear], error[clear] = angles_above(*known, 1e-3 * beam if beam else np.nan, CLEAR_ERRORS)
+        angle[clear], error[clear] = incidence.angles_above(*known, 1e-3 * beam if beam else np.nan, CLEAR_ERRORS)
     error = np.hypot(error, 0.5 * np.sin(2.0 * angle) * system.radiometry.divergence_error)
     unproven = np.isinf(system.widths.error or 0.0)
     with np.errstate(invalid="ignore"):
@@ -405,9 +398,9 @@ def added_variance(
     error = np.hypot(echoes.sigma_err.astype(np.float64), system.widths.scatter)
     reference = system.sigma_ref
     if mode == "pulse":
-        variance = spread_variance(pulse_table(system.sigma_ref, block.spacing), width)
+        variance = incidence.spread_variance(incidence.pulse_table(system.sigma_ref, block.spacing), width)
     elif mode == "paper":
-        variance = spread_variance(paper_table(system.sigma_ref), width)
+        variance = incidence.spread_variance(incidence.paper_table(system.sigma_ref), width)
     else:
         width, error, reference = _model_width(block.spacing, system, width, error)
         variance = width * width - reference * reference - system.widths.variance

@@ -22,15 +22,7 @@ from wavebatch.kernels.fit.decompose import Settings, Solution, choose, decompos
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.kernels.fit.render import render_echoes, render_skewed, skewed_pulse
 from wavebatch.stages.chain import Range, Step, stage
-from wavebatch.stages.decompose.solve import (
-    FIT,
-    FitOptions,
-    describe_solution,
-    find_clusters,
-    fit_candidates,
-    fit_gaussian,
-    make_settings,
-)
+from wavebatch.stages.decompose import solve
 from wavebatch.stages.detect.direct import samples_of
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, reference_pulse, shape_limits
 
@@ -53,7 +45,7 @@ def _shape_reference(system: SystemPulse, spacing: float, parameters: Mapping[st
     return pulse_shape(system, spacing)
 
 
-@stage("decompose", fits=_fit_reference, shape=_shape_reference, shares=FIT)
+@stage("decompose", fits=_fit_reference, shape=_shape_reference, shares=solve.FIT)
 def reference(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     model: Literal["broadened", "stretched", "given"] = "broadened",
@@ -78,11 +70,11 @@ def reference(
     docs/algorithms.md R1; Mallet and Bretar (2009).
     """
     shape = _shape_reference(system, block.spacing, {"model": model, "pulse": pulse})
-    fit = replace(FIT, **options)
-    settings = make_settings(block, system, shape, fit, grow=False)
+    fit = replace(solve.FIT, **options)
+    settings = solve.make_settings(block, system, shape, fit, grow=False)
     if model != "broadened":
         system = replace(system, components=())
-    return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
+    return solve.fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
 
 
 def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> PulseShape:
@@ -97,7 +89,7 @@ def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> 
     return PulseShape(table=tabulate_pulse(x, value))
 
 
-@stage("decompose", fits=fit_gaussian, shares=FIT)
+@stage("decompose", fits=solve.fit_gaussian, shares=solve.FIT)
 def generalized_gaussian(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: Any
 ) -> EchoTable:
@@ -110,9 +102,9 @@ def generalized_gaussian(
     ----------
     Chauve et al. (2007), eq. 4.
     """
-    fit = replace(FIT, **options)
-    plain = make_settings(block, system, GAUSSIAN, fit, grow=False)
-    candidates, clusters = find_clusters(block, noise, system, echoes, plain)
+    fit = replace(solve.FIT, **options)
+    plain = solve.make_settings(block, system, GAUSSIAN, fit, grow=False)
+    candidates, clusters = solve.find_clusters(block, noise, system, echoes, plain)
     samples, solutions = samples_of(block, noise), []
     for power in POWERS:
         factor = half_width_factor(power)
@@ -122,7 +114,7 @@ def generalized_gaussian(
     chosen = np.argmin([solution.cost for solution in solutions], axis=0)
     best = choose(solutions, chosen)
     columns = {"power": np.array(POWERS, np.float32)[chosen[best.cluster]]}
-    return describe_solution(block, noise, system, clusters, best, plain, fit.significance, columns)
+    return solve.describe_solution(block, noise, system, clusters, best, plain, fit.significance, columns)
 
 
 def half_width_factor(power: float) -> float:
@@ -200,7 +192,7 @@ def skew_system(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPul
     return replace(system, components=(), kappa=0.0 if kappa == "free" else kappa or system_skew(system))
 
 
-@stage("decompose", fits=skew_system, shares=FIT)
+@stage("decompose", fits=skew_system, shares=solve.FIT)
 def skewed(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     kappa: Annotated[float, Range(-0.9, 0.9)] | Literal["free"] = 0.0,
@@ -222,10 +214,10 @@ def skewed(
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 0, 1.2.
     """
     shape = pulse_shape(skew_system(system, {"kappa": 0.0 if kappa == "free" else kappa}), block.spacing)
-    fit = replace(FIT, **options)
-    settings = make_settings(block, system, shape, fit, grow=False)
+    fit = replace(solve.FIT, **options)
+    settings = solve.make_settings(block, system, shape, fit, grow=False)
     if kappa != "free":
-        return fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
+        return solve.fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
     free = settings._replace(skew_mean=shape.kappa, skew_spread=system.skew_spread or UNKNOWN_SPREAD)
     return fit_each(block, noise, system, echoes, free, fit.significance)
 
@@ -252,7 +244,7 @@ def fit_each(
     EchoTable
         Fitted echoes with the columns skew and skew_err.
     """
-    candidates, clusters = find_clusters(block, noise, system, echoes, settings)
+    candidates, clusters = solve.find_clusters(block, noise, system, echoes, settings)
     solution = decompose_clusters(samples_of(block, noise), candidates, clusters, settings)
     columns = {
         "skew": solution.parameters[:, 3].astype(np.float32),
@@ -262,10 +254,10 @@ def fit_each(
     solution = solution._replace(shared=np.full_like(solution.shared, np.nan))
     # Widths and times are of the skewed pulse, which has no further components to be described.
     plain = settings._replace(shape=GAUSSIAN)
-    return describe_solution(block, noise, system, clusters, solution, plain, significance, columns)
+    return solve.describe_solution(block, noise, system, clusters, solution, plain, significance, columns)
 
 
-_LOG_NORMAL = FitOptions(max_iterations=60)
+_LOG_NORMAL = solve.FitOptions(max_iterations=60)
 
 
 def _fit_skews(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
@@ -296,7 +288,7 @@ def log_normal(
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 1.2.
     """
     fit = replace(_LOG_NORMAL, **options)
-    settings = make_settings(block, system, PulseShape(origin=origin), fit, grow=False)
+    settings = solve.make_settings(block, system, PulseShape(origin=origin), fit, grow=False)
     return fit_each(block, noise, system, echoes, settings, fit.significance)
 
 

@@ -21,9 +21,9 @@ from wavebatch.kernels.fit.decompose import (
     Solution,
     cluster_candidates,
     decompose_clusters,
+    keep_echoes,
 )
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
-from wavebatch.kernels.fit.whole_pulse import keep_echoes
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range

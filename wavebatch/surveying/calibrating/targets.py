@@ -628,4 +628,7 @@ def _list_doubts(
     ratio = max(good)[0] / min(good)[0]
     # Channels may have different constants, so that targets that they see unequally may differ too.
     if limits and max(limits) > 1 and len(channels) < 2:
-        yield f"constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates"
+        yield (
+            f"constants of the targets differ by a factor of {ratio:.2f}, which the error holds: check reflectances "
+            "and coordinates; a receiver that weakens strong light does that too"
+        )

@@ -92,7 +92,12 @@ def draw_waveform_panels(
             axes.set_axis_off()
             note = axes.text(0.0, 1.0, text, va="top", family="monospace", fontsize=8, linespacing=1.3)
             note.set_in_layout(False)
-        _place_legend(figure, width)
+        # One legend for all panels, with the items that occur in them.
+        found = [pair for axes in figure.axes for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+        items = {label: handle for handle, label in reversed(found)}
+        items = {label: items[label] for label in _LEGEND if label in items}
+        lines = max(int(-(-len(items) * 1.35 // width)), 1)
+        figure.legend(items.values(), items, loc="outside lower left", ncols=-(-len(items) // lines))
         # The panels must have their final size before labels can be placed.
         figure.draw_without_rendering()
         for axes, view in zip(panels, views, strict=True):
@@ -300,15 +305,6 @@ def fit_signal_panel(axes: Axes, view: WaveformView, times: tuple[float, float])
     axes.set_ylim(low - 0.05 * (high - low), high + 0.17 * (high - low))
 
 
-def _place_legend(figure: Figure, width: float) -> None:
-    """One legend for all panels, with the items that occur in them; width: of the picture [inches]."""
-    found = [pair for axes in figure.axes for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
-    items = {label: handle for handle, label in reversed(found)}
-    items = {label: items[label] for label in _LEGEND if label in items}
-    rows = -(-len(items) * 1.35 // width)
-    figure.legend(items.values(), items, loc="outside lower left", ncols=-(-len(items) // max(int(rows), 1)))
-
-
 CELL = (2.3, 1.9)
 """Width and height of a small picture [inch]."""
 
@@ -396,13 +392,9 @@ def _draw_cell(
     upper.locator_params(nbins=4)
     upper.tick_params(labelbottom=False)
     lower.set_yticks([])
-    title = fit_text(figure, _small_title(view, note), CELL[0] - 0.45, size=6.5)
-    upper.set_title(title, fontsize=6.5, pad=2)
-
-
-def _small_title(view: WaveformView, note: str) -> str:
     name = f"packet {view.packet}" if view.packet >= 0 else f"point {view.point}"
     strongest = f"{view.echoes.amplitude.max():.0f} DN" if len(view.echoes) else "no echo"
     flags = EchoFlag(int(np.bitwise_or.reduce(view.echoes.flags, initial=0))) & ~QUIET_FLAGS
     names = ", ".join(flag.name for flag in flags)
-    return "   ".join(filter(None, (name, strongest, note))) + (f"\n{names}" if names else "")
+    title = "   ".join(filter(None, (name, strongest, note))) + (f"\n{names}" if names else "")
+    upper.set_title(fit_text(figure, title, CELL[0] - 0.45, size=6.5), fontsize=6.5, pad=2)

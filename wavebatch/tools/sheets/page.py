@@ -129,7 +129,14 @@ def _render(parts: Iterable[Part | str], level: int) -> Iterator[str]:
         elif kind is Note:
             yield from (f"<p>{text(one.text)}</p>" for one in some)
         elif kind is Picture:
-            drawn = "\n".join(map(_picture, some))
+            figures = []
+            for one in some:
+                address = f"data:image/svg+xml;base64,{base64.b64encode(one.svg.encode()).decode()}"
+                words = f"<figcaption>{text(one.words)}</figcaption>" if one.words else ""
+                wide, high = (round(96 * side) for side in one.size)
+                image = f'<img alt="{text(one.title)}" width="{wide}" height="{high}" src="{address}">'
+                figures.append(f"<figure>{image}{words}</figure>")
+            drawn = "\n".join(figures)
             yield f'<div class="figures {word}">{drawn}</div>'
         elif kind is Table:
             yield from (_table(one) for one in some if one.rows)
@@ -145,13 +152,6 @@ def _render(parts: Iterable[Part | str], level: int) -> Iterator[str]:
                     yield render(Note(f"{one.what} cannot be drawn: {error}", "warning"))
         else:
             yield from (section(one.title, *_render(one.parts, level + 1), level=level, mark=one.mark) for one in some)
-
-
-def _picture(one: Picture) -> str:
-    address = f"data:image/svg+xml;base64,{base64.b64encode(one.svg.encode()).decode()}"
-    caption = f"<figcaption>{text(one.words)}</figcaption>" if one.words else ""
-    wide, high = (round(96 * side) for side in one.size)
-    return f'<figure><img alt="{text(one.title)}" width="{wide}" height="{high}" src="{address}">{caption}</figure>'
 
 
 def _table(one: Table) -> str:

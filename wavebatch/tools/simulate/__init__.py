@@ -1,3 +1,4 @@
+# ruff: noqa: F401
 """Simulation with known truth: scenes as blocks of waveforms, as strips, or as clouds of discrete returns.
 
 Where to find what:
@@ -31,10 +32,3 @@ from wavebatch.tools.simulate.strip import (
     simulate_returns,
     simulate_strip,
 )
-
-__all__ = [
-    "CANOPIES", "OTHER_NAMES", "PULSES", "SCENES",
-    "DiscreteReceiver", "PulseModel", "Recording", "ReturnSummary", "Scene", "StripOptions", "StripSummary",
-    "TruthReader", "find_pulse", "find_scene", "flag_truth",
-    "shape_pulse", "simulate_block", "simulate_blocks", "simulate_returns", "simulate_strip",
-]  # fmt: skip

@@ -33,16 +33,10 @@ from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.sensor import SensorRequest, SensorSource
-from wavebatch.surveying.system_file import SavedSurvey, describe_system
+from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.systems.figures import describe_system
+from wavebatch.tools.voxels import grid as voxel_grid
 from wavebatch.tools.voxels import rays
-from wavebatch.tools.voxels.grid import (
-    ProfileWriter,
-    VoxelGrid,
-    VoxelSpace,
-    check_voxel_target,
-    energy_unit,
-    write_voxels,
-)
 
 LARGEST = 1e6
 """Largest voxel [m]."""
@@ -181,7 +175,7 @@ def voxelize_strip(
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
-    check_voxel_target(target, strip)
+    voxel_grid.check_voxel_target(target, strip)
     keep = _plan(strip, options.chosen)
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
@@ -215,7 +209,7 @@ def voxelize_strip(
         with (
             _open_grid(reader, middle, options, calibration is not None, tracer.floor, held) as grid,
             (
-                ProfileWriter(Path(profiles), strip, sections=calibration is not None, overwrite=overwrite)
+                voxel_grid.ProfileWriter(Path(profiles), strip, sections=calibration is not None, overwrite=overwrite)
                 if profiles is not None
                 else nullcontext()
             ) as writer,
@@ -242,13 +236,13 @@ def voxelize_strip(
                 "hidden_light": rule.hidden_light,
             }
             meta["pulse_energy"] = None if energy is None else energy.describe()
-            space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
+            space = voxel_grid.VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
             # Profiles and voxels, or neither.
             others = []
             if writer is not None:
                 known = {name: value for name, value in meta.items() if name not in ("columns", "size_m", "headroom_m")}
                 others.append(writer.complete_profiles(known, space.facts.crs or ""))
-            summary.voxels = write_voxels(target, space, grid.pieces(rule.log_error), others=others,
+            summary.voxels = voxel_grid.write_voxels(target, space, grid.pieces(rule.log_error), others=others,
                                           overwrite=overwrite)  # fmt: skip
             summary.profile_samples = 0 if writer is None else writer.samples
             summary.shape, summary.origin = tuple(grid.shape.tolist()), tuple((grid.low * grid.size).tolist())
@@ -290,12 +284,12 @@ def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) ->
 
 def _open_grid(
     reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, floor: rays.Floor, held: int
-) -> VoxelGrid:
+) -> voxel_grid.VoxelGrid:
     digitizers = reader.facts.digitizers.values()
-    return VoxelGrid(
+    return voxel_grid.VoxelGrid(
         options.size,
         np.floor(middle / options.size).astype(np.int64),
-        energy_unit(max(digitizer.bits for digitizer in digitizers if digitizer.n_samples)),
+        voxel_grid.energy_unit(max(digitizer.bits for digitizer in digitizers if digitizer.n_samples)),
         sections=sections,
         everything=options.all_crossed or options.forest,
         floor=floor if options.forest else None,
@@ -349,7 +343,7 @@ class _Tracer:
 
 
 def _describe(
-    strip: Path, options: VoxelOptions, grid: VoxelGrid, pulse: SystemPulse, calibration: Calibration | None
+    strip: Path, options: VoxelOptions, grid: voxel_grid.VoxelGrid, pulse: SystemPulse, calibration: Calibration | None
 ) -> dict[str, Any]:
     """How the voxels were made; goes into the file, so it holds no time of day."""
     deconvolution = options.deconvolution
