@@ -198,7 +198,7 @@ def assemble_echoes(
     records = take_whole_records(members.source, rows.source)
     xyz = np.stack([np.append(table.attributes[name], np.nan)[rows.echo] for name in "xyz"], axis=1)
     packet = np.where(rows.echo >= 0, np.append(table.waveform, -1)[rows.echo], members.packet[rows.source])
-    direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0)[packet]
+    direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0).take(packet, axis=0)
     places = np.where(np.isnan(xyz), locate(records, layout.source.header), xyz)
     flags = np.append(table.flags, np.uint16(0))[rows.echo] | rows.reason
     pulse = find_pulses(unit.points["gps_time"])[rows.owner]
@@ -311,9 +311,10 @@ def _number_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return number and number of returns; pulses without any waveform, and rows not counted, keep the input's."""
     number, total = (given.astype(np.int64) for given in split_numbers(records))
-    found, count, known = number_returns(pulse[counted], xyz[counted], direction[counted])
-    number[counted] = np.where(known, found, number[counted])
-    total[counted] = np.where(known, count, total[counted])
+    rows = np.flatnonzero(counted)
+    found, count, known = number_returns(pulse[rows], xyz.take(rows, axis=0), direction.take(rows, axis=0))
+    number[rows] = np.where(known, found, number[rows])
+    total[rows] = np.where(known, count, total[rows])
     return number, total
 
 

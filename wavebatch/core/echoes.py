@@ -236,8 +236,9 @@ class EchoTable:
 
     def take(self, rows: np.ndarray) -> EchoTable:
         """The echoes at `rows` (indices or mask), in that order."""
-        core = {name: getattr(self, name)[rows] for name in _FIELDS}
-        return EchoTable(**core, attributes={name: values[rows] for name, values in self.attributes.items()})
+        rows = np.flatnonzero(rows) if rows.dtype == bool else rows  # once for all columns
+        core = {name: getattr(self, name).take(rows) for name in _FIELDS}
+        return EchoTable(**core, attributes={name: values.take(rows) for name, values in self.attributes.items()})
 
     def with_attributes(self, **columns: np.ndarray) -> EchoTable:
         """A new table with `columns`, arrays (m,), added or replaced.

@@ -199,8 +199,8 @@ def number_returns(
     group[grouped] = np.cumsum(is_first) - 1
     with_ray = np.minimum.reduceat(np.where(has_ray[grouped], np.arange(m), m), first) if m else first
     head = grouped[np.where(with_ray < m, with_ray, first)][group]
-    away = xyz - xyz[head]
-    ray = direction[head]
+    away = xyz - xyz.take(head, axis=0)
+    ray = direction.take(head, axis=0)
     along = away[:, 0] * ray[:, 0] + away[:, 1] * ray[:, 1] + away[:, 2] * ray[:, 2]
     order = find_order(group, along)
     order = np.arange(m) if order is None else order
