@@ -166,7 +166,8 @@ def choose_pulse(
     given : mapping of SystemPulse by name
         Pulses known from elsewhere: shipped ones, the strip's outgoing pulse.
     plain : bool
-        Whether lone echoes show no more than a Gaussian: nothing else is learned where all echoes have its width too.
+        Whether lone echoes show no more than the start "gaussian": where all echoes have its width too, nothing else is
+        tried.
 
     Returns
     -------
@@ -185,7 +186,10 @@ def choose_pulse(
     part = block.rows(rows)
     taught, held = (part, part) if small else (part.rows(slice(0, None, 2)), part.rows(slice(1, None, 2)))
     few = thin_block(held, FEWEST)
-    given = given or {}
+    if plain:
+        own = _find_gaussian(taught, starts["gaussian"], CHANGES[1])
+        plain = abs(own.sigma_ref / starts["gaussian"].sigma_ref - 1) < SAME_WIDTH
+    given = {} if plain else given or {}
     every: dict[str, SystemPulse] = {}
     for name, system in {**starts, **given}.items():
         if not any(_same_pulse(system, other) for other in every.values()):
@@ -195,10 +199,7 @@ def choose_pulse(
     hopeful = [one for one in looked if one.exceeds(leader) < HOPELESS]
     begin = min((one for one in looked if one.name in starts), key=lambda one: one.typical)
     tried = {one.name: one.system for one in hopeful}
-    for name, system in _learn(taught, begin):
-        tried[name] = system
-        if plain and abs(system.sigma_ref / begin.system.sigma_ref - 1) < SAME_WIDTH:
-            break
+    tried |= {OF_ALL: own} if plain else dict(_learn(taught, begin))
     found = [_judge(held, name, system, CHANGES[1], known=name in given) for name, system in tried.items()]
     found = _try_changes(held, found)
     choice = _decide(found)
