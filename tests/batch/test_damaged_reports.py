@@ -48,3 +48,9 @@ def test_a_report_that_was_altered_is_made_anew(done, alter):
     outcome = run_one(done / "a.las", done / "out", batch={"resume": True})
     assert outcome.status == "written"
     assert json.loads(path.read_text())["checksum"] == json.loads(sound)["checksum"]
+
+
+@pytest.mark.parametrize("data", [b"", b"[" * 100_000, b"\xff", b"null"])
+def test_a_report_that_is_no_report_is_made_anew(done, data):
+    (done / "out" / "a.report.json").write_bytes(data)
+    assert run_one(done / "a.las", done / "out", batch={"resume": True}).status == "written"

@@ -179,6 +179,11 @@ def test_cut_laz_files(tmp_path, cut, point_format):
     refused(path, "LAZ chunks|waveform record at byte")
 
 
+def test_a_chunk_that_does_not_fit_memory_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(read_points, "MAX_CHUNK_BYTES", 100)
+    refused(laz_of(tmp_path)[1], "chunks are too large|table of LAZ chunks")
+
+
 def test_other_vlrs_do_not_confuse(tmp_path):
     raw = make_raw(60)
     raw.vlrs.append(vlr(b"other", 22204, b"x" * 10))

@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_scenes import make_block, make_scene
 from hypothesis import given
 from hypothesis import strategies as st
 from scoring import score
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.score import ErrorStats, find_isolated_echoes, list_pairs, match_echoes
 
 
@@ -70,6 +72,21 @@ def test_pairs_are_every_pair_within_the_tolerance():
     expected = {(i, j) for i in range(60) for j in range(70) if group_a[i] == group_b[j] and abs(a[i] - b[j]) <= 7.0}
     assert set(zip(left.tolist(), right.tolist(), strict=True)) == expected
     assert len(left) == len(expected)
+
+
+def test_bounds_follow_the_spacing():
+    scene = make_scene("flat", spacing=2.0)
+    block, truth = make_block(scene, 5000)
+    noise = scene.recording.recorded_noise
+    bounds = crlb(truth.amplitude, truth.sigma.astype(float), noise, 2.0)
+    scatter = np.random.default_rng(4).standard_normal((3, len(truth)))
+    columns = [
+        getattr(truth, name) + bound * one
+        for name, bound, one in zip(("time", "amplitude", "sigma"), bounds, scatter, strict=True)
+    ]
+    found = EchoTable.build(truth.waveform, *columns)
+    result = score(found, truth, len(block), noise_std=noise, spacing=2.0)
+    assert result.errors["isolated"]["time"].rms_per_bound == pytest.approx(1.0, rel=0.03)
 
 
 def test_shares_count_what_they_say():

@@ -445,3 +445,10 @@ def test_echoes_of_a_hundredth_beside_strong_ones_are_found():
     complete, correct, _ = compare(echoes, np.r_[rows, rows[:60]], np.r_[time, later], 5.0)
     assert complete > 0.995 and correct > 0.995
     assert system.faint_share < 0.01
+
+
+def test_steps_that_are_no_echo_are_surveyed():
+    """A digitizer's test pattern: nothing is learned of it."""
+    samples = np.where(np.arange(80) < 40, 20, 200).astype(np.uint8)[None].repeat(300, axis=0)
+    found = survey_blocks([WaveformBlock.from_samples(samples, spacing=1.0, bits=8)])
+    assert found.waveforms == 300 and np.isfinite(found.system.sigma_ref)

@@ -179,9 +179,6 @@ def _check_thresholds(result: Comparison, options: dict) -> list[str]:
     return lines
 
 
-if TYPE_CHECKING:
-    from wavebatch.tools.compare_chains import Matchup
-
 _UNITS = {"time": "time ns", "echo_time": "echo_time ns", "amplitude": "amplitude DN", "echo_width": "width ns"}
 _SPREAD = ("number", "median", "mean", "rms", "nmad")
 """What the tables show of a difference."""

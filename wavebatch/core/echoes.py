@@ -236,9 +236,10 @@ class EchoTable:
 
     def take(self, rows: np.ndarray) -> EchoTable:
         """The echoes at `rows` (indices or mask), in that order."""
-        rows = np.flatnonzero(rows) if rows.dtype == bool else rows  # once for all columns
+        rows = np.arange(len(self))[rows]  # once for all columns
         core = {name: getattr(self, name).take(rows) for name in _FIELDS}
-        return EchoTable(**core, attributes={name: values.take(rows) for name, values in self.attributes.items()})
+        others = {name: values.take(rows, axis=0) for name, values in self.attributes.items()}
+        return EchoTable(**core, attributes=others)
 
     def with_attributes(self, **columns: np.ndarray) -> EchoTable:
         """A new table with `columns`, arrays (m,), added or replaced.

@@ -501,7 +501,8 @@ class SystemPulse:
 
     def __repr__(self) -> str:
         """One line: kind and width of the pulse, and the noise."""
-        kind = f"{len(self.components)} Gaussians" if self.components else f"a Gaussian of skew {self.kappa:g}"
+        skew = f" of skew {self.kappa:g}" if self.kappa else ""
+        kind = f"{len(self.components)} Gaussians" if self.components else f"a Gaussian{skew}"
         return f"<SystemPulse: {kind}, s_ref {self.sigma_ref:.4f} ns, noise {self.noise.std:.3f} DN>"
 
     def of(self, block: WaveformBlock) -> SystemPulse:

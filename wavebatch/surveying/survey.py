@@ -15,6 +15,7 @@ from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_d
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
 from wavebatch.surveying.measuring.choose_pulse import MISFITS, choose_pulse, settle
+from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
     find_isolated,
@@ -398,7 +399,9 @@ def _explain_pulse(candidates: tuple[Tried, ...]) -> str:
     chosen = next(one for one in candidates if one.chosen)
     others = [one for one in candidates if not one.chosen]
     text = f"{chosen.name}: {chosen.nats:.1f} nats describe a waveform"
-    return text + "".join(f", {one.nats:.1f} with {one.name}" for one in others[:2])
+    text += "".join(f", {one.nats:.1f} with {one.name}" for one in others[:2])
+    shorter = any(one.longer_by < -SURE for one in others)
+    return text + ("; a shorter one saves too little per echo, or needs more echoes" if shorter else "")
 
 
 def _explain_skew(system: SystemPulse, figures: Figures) -> str:

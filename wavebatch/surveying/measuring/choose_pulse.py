@@ -138,7 +138,7 @@ class Choice:
 
     best: Candidate
     tried: tuple[Tried, ...]
-    """The best first."""
+    """The shortest first."""
     doubt: float
     """Share by which the number of echoes differs between candidates that cost the same."""
     spread: float

@@ -79,7 +79,8 @@ def learn_jointly(
     Returns
     -------
     SystemPulse
-        With the new pulse, its ringing, and as misfit what the Gaussians miss of it.
+        With the new pulse, its ringing, and as misfit what the Gaussians miss of it; as it was where the waveforms show
+        no pulse.
 
     Notes
     -----
@@ -90,6 +91,8 @@ def learn_jointly(
     spacing = block.spacing
     stack = stack_jointly(system, explained, change, spacing)
     half = stack.lag[stack.value > 0.5]
+    if not len(half):  # of steps and other signal that is no echo nothing is learned
+        return system
     width = float(half[-1] - half[0]) / FWHM_PER_SIGMA
     if len(system.components) > 1 and not last:
         fits = [refine_gaussians(stack, np.array(system.components) / [1, spacing, spacing])]
@@ -149,7 +152,7 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     rows = exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2) / sigma
     value = np.einsum("lk,k->l", rows, weight[:-1])
     error = np.sqrt(np.maximum(np.einsum("lk,kj,lj->l", rows, inverse[:-1, :-1], rows), 0.0))
-    top = float(value.max())
+    top = max(float(value.max()), 1e-30)
     return Stack(lag, value / top, np.maximum(error / top, LEAST_ERROR))
 
 
