@@ -226,7 +226,8 @@ def draw_peak(folder: Path, seed: int, target: Path) -> None:
 def _draw_modelled(axes, folder: Path, seed: int, stand: str, returns: int, dead_zone: float = 0.65) -> None:
     """A pulse with so many returns over a stand, and the waveform that `synthesize` models from them."""
     cloud, strip = (folder / f"{kind}-{stand}-{dead_zone}.las" for kind in ("record", "modelled"))
-    fly_cloud(stand, cloud, dead_zone, 2000, seed)
+    if not cloud.exists():  # another picture shows more of it
+        fly_cloud(stand, cloud, dead_zone, 2000, seed)
     synthesize_strip(cloud, strip, SynthesisOptions(bits=16, baseline=0.0), overwrite=True)
     with wb.open_strip(strip) as opened:
         block, row = next(

@@ -211,7 +211,7 @@ def test_models_that_were_not_chosen_are_compared(strip):
 @pytest.mark.slow
 def test_errors_and_further_echoes_are_given_by_separation(report):
     near = [row for row in report.near_by_separation if abs(row.apart[0]) >= 1.5 and row.low >= 10 and row.found > 50]
-    assert len(near) > 4 and all(0.75 < row.ratio[0] < 1.3 and row.extra < 0.03 * row.injected for row in near)
+    assert len(near) > 4 and all(0.75 < row.ratio[0] < 1.35 and row.extra < 0.03 * row.injected for row in near)
     names = ("found %", "further echoes %", "time error / reported")
     text = format_report(replace(report, left_out="nasa-lvis"))
     assert all(f"{name} near the strongest" in text for name in names)
