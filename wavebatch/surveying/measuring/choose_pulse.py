@@ -34,6 +34,7 @@ from wavebatch.surveying.measuring.judge import (
 )
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, HALVED, spread_rows, thin_block
+from wavebatch.surveying.systems.known_systems import MOST_SPREAD
 from wavebatch.surveying.systems.survey_result import Tried
 
 STRICT = 0.92
@@ -42,9 +43,6 @@ to 4 %."""
 
 SAMPLES, MOST, LEAST = 60_000, 384, 96
 """Samples that candidates are judged on, as many waveforms at most, and as many at least where they are long."""
-
-SAME_WIDTH = 0.05
-"""Difference of two widths of the pulse that is none: more is said to be in doubt."""
 
 MORE = 4
 """Times as many waveforms on which candidates are judged where another one costs the same as the best."""
@@ -188,7 +186,7 @@ def choose_pulse(
     few = thin_block(held, FEWEST)
     if plain:
         own = _find_gaussian(taught, starts["gaussian"], CHANGES[1])
-        plain = abs(own.sigma_ref / starts["gaussian"].sigma_ref - 1) < SAME_WIDTH
+        plain = abs(own.sigma_ref / starts["gaussian"].sigma_ref - 1) < MOST_SPREAD
     given = {} if plain else given or {}
     every: dict[str, SystemPulse] = {}
     for name, system in {**starts, **given}.items():
@@ -326,7 +324,7 @@ def _decide(found: list[Candidate]) -> Choice:
         )
         for one in sorted(found, key=lambda one: one.typical)
     ]  # fmt: skip
-    other = any(one.gaussians != best.gaussians for one in tied) or spread > SAME_WIDTH or doubt > 1 - AS_FEW
+    other = any(one.gaussians != best.gaussians for one in tied) or spread > MOST_SPREAD or doubt > 1 - AS_FEW
     return Choice(best, tuple(tried), doubt, spread, other)
 
 

@@ -14,13 +14,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, solve
 from wavebatch.kernels.fit.describe import gather_pulse
-from wavebatch.kernels.fit.learn_pulse import (
-    MOST_COMPONENTS,
-    PulseFit,
-    Stack,
-    fit_gaussians,
-    refine_gaussians,
-)
+from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, refine_gaussians
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.judge import Explained, find_own_width, sample_noise
 from wavebatch.surveying.systems.known_systems import TRIAL
@@ -101,7 +95,7 @@ def learn_jointly(
     missed = [float(np.mean(_miss(fit, stack) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
-    misfit = misfit_of(_miss(best, stack)[core], max(FINEST, STEP * system.sigma_ref / spacing), width)
+    misfit = misfit_of(_miss(best, stack)[core], _find_step(system.sigma_ref / spacing), width)
     system = replace(system, kappa=0.0, components=(), ringing=0.0, misfit=misfit)
     if len(best.components) == 1:
         return replace(system, sigma_ref=float(best.components[0, 2]) * spacing)
@@ -147,13 +141,18 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     matrix += 1e-9 * np.trace(matrix) / len(delay) * np.eye(len(matrix))
     inverse = solve(matrix, np.eye(len(matrix)))
     weight = np.einsum("ij,j->i", inverse, right)
-    step, end = max(FINEST, STEP * width), min(AFTER * width, 0.8 * s)
+    step, end = _find_step(width), min(AFTER * width, 0.8 * s)
     lag = np.r_[np.arange(-6 * width, 8 * width, step), np.arange(8 * width, end, TAIL_STEP * step)]
     rows = exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2) / sigma
     value = np.einsum("lk,k->l", rows, weight[:-1])
     error = np.sqrt(np.maximum(np.einsum("lk,kj,lj->l", rows, inverse[:-1, :-1], rows), 0.0))
     top = max(float(value.max()), 1e-30)
     return Stack(lag, value / top, np.maximum(error / top, LEAST_ERROR))
+
+
+def _find_step(width: float) -> float:
+    """The step of the lag at which the core of a pulse of this width is drawn [samples]."""
+    return max(FINEST, STEP * width)
 
 
 def _place_gaussians(width: float, s: int) -> tuple[np.ndarray, np.ndarray]:

@@ -86,12 +86,12 @@ def look_in_mirror(
         alone[match_echoes(other, echoes, SAME * width).found] = False
         rest = other.take(np.flatnonzero(alone))
         energy = _measure_energy(rest, system, block.spacing)
-        alone = _lie_far(rest, echoes, ZONE * width)
-        false.append((energy[~_lie_far(rest, mains, ZONE * width)], energy[alone]))
+        beside, quiet = ~_lie_far(rest, mains, ZONE * width), _lie_far(rest, echoes, ZONE * width)
+        false.append((energy[beside], energy[quiet]))
     energy = _measure_energy(echoes, system, block.spacing)
     for level in levels:
-        beside, quiet = (max(int(np.count_nonzero(one >= level)) for one in kind) for kind in zip(*false, strict=True))
-        yield level, Mirror(len(mains), beside, int(np.count_nonzero(energy >= level)), quiet)
+        most = [max(int(np.count_nonzero(one >= level)) for one in kind) for kind in zip(*false, strict=True)]
+        yield level, Mirror(len(mains), most[0], int(np.count_nonzero(energy >= level)), most[1])
 
 
 def _measure_energy(echoes: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:
