@@ -26,15 +26,18 @@ from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.misfit import MOST_FAINT, PEAK, limit_faint, measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
+    FAR_OFF,
     FEW,
     FIRST_WIDTH,
     RESIDUAL_LOOK,
     SMALL,
     list_widths,
     measure_again,
+    measure_begin,
     measure_gaussian,
     measure_once_more,
     measure_quiet,
+    measure_whole,
     thin_samples,
 )
 from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
@@ -91,15 +94,15 @@ def _survey_joined(joined: list[WaveformBlock], *, learn: bool) -> Survey:
     """As `survey_blocks`, from one block per descriptor whose seams are marked."""
     groups = _group_descriptors(joined)
     (main, members), *others = groups
-    plain = measure_gaussian(main)
-    strangers = find_strangers(members, plain) if len(members) > 1 else {}
+    begin = measure_begin(main)
+    strangers = find_strangers(members, begin) if len(members) > 1 else {}
     if strangers:
         others = [*((block, [block]) for block in members if block.digitizer.index in strangers), *others]
         members = [block for block in members if block.digitizer.index not in strangers]
         main = pool_blocks(members)
-        plain = measure_gaussian(main)
+        begin = measure_begin(main)
     raw = main
-    main, plain = clean_sample(raw, plain)
+    main, plain = clean_sample(raw, begin)
     found = _survey(main, plain, learn=learn)
     _note_counts(found.figures, raw)
     found.figures.descriptors_pooled = float(len(members))
@@ -211,7 +214,7 @@ def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
     """Survey of one block: noise and width of isolated echoes, the pulse's shape, noise again, the threshold."""
     if not len(block):
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0)
-    found = _survey(*clean_sample(block, measure_gaussian(block)), learn=learn)
+    found = _survey(*clean_sample(block, measure_begin(block)), learn=learn)
     _note_counts(found.figures, block)
     return found
 
@@ -222,14 +225,16 @@ def _note_counts(figures: Figures, block: WaveformBlock) -> None:
     figures.largest_count = float(block.samples.max(initial=0))
 
 
-def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlock, SystemPulse]:
-    """The block without the defects of its waveforms, and the system with them, once more from what is left."""
-    found = measure_defects(block, system)
+def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBlock, SystemPulse]:
+    """The block without the defects of its waveforms, and its noise and width with them, where `measure_begin` ended."""
+    found = measure_defects(block, begin)
     if not found.defects:
-        return block, system
+        return block, measure_whole(block, begin)
     block = clean_block(block, found)
-    cleaned = measure_gaussian(block, system.sigma_ref / block.spacing, known=True)
-    return block, replace(cleaned, defects=found.defects)
+    system = measure_whole(block, begin, cleaned=True)
+    if abs(system.sigma_ref / begin.sigma_ref - 1) > FAR_OFF:
+        system = measure_gaussian(block, system.sigma_ref / block.spacing)
+    return block, replace(system, defects=found.defects)
 
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:

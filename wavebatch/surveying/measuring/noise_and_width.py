@@ -66,14 +66,19 @@ UNDITHERED, DITHERED = 0.35, 0.41
 With the error of rounding that is 0.41 DN."""
 
 
-def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known: bool = False) -> SystemPulse:
+def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPulse:
     """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all.
 
-    first: width to begin with [samples], and to end with where too few echoes are isolated; known: it is nearly right.
+    first: width to begin with [samples], and to end with where too few echoes are isolated.
     """
+    return measure_whole(block, measure_begin(block, first))
+
+
+def measure_begin(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPulse:
+    """As `measure_gaussian`, from FIRST_LOOK samples."""
     saturation = find_saturation(block.samples, block.digitizer.max_count)
     few = thin_samples(block, FIRST_LOOK)
-    width, last = first, first if known else 0.0
+    width, last = first, 0.0
     noises: dict[int, PooledNoise] = {}
     for _ in range(MOST_ROUNDS):
         if abs(width - last) <= SETTLED * width:
@@ -83,11 +88,23 @@ def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known:
             noises[reach] = _find_noise(few, width)
         last = width
         width = _isolated_width(few, _gaussian_system(noises[reach], few.spacing, width, saturation))
-    system = _gaussian_system(_find_noise(thin_samples(block, NOISE_LOOK), width), block.spacing, width, saturation)
-    last, width = width, _isolated_width(block, system)
-    if known and abs(width / last - 1) > FAR_OFF:
-        return measure_gaussian(block, width)
-    return replace(system, sigma_ref=width * block.spacing)
+    return _gaussian_system(noises[reach], block.spacing, width, saturation)
+
+
+def measure_whole(block: WaveformBlock, begin: SystemPulse, *, cleaned: bool = False) -> SystemPulse:
+    """As `measure_gaussian`, from NOISE_LOOK samples and all echoes, where `measure_begin` ended.
+
+    cleaned: whether the block was changed since.
+    """
+    part, system = thin_samples(block, NOISE_LOOK), begin
+    if cleaned or len(part) > len(thin_samples(block, FIRST_LOOK)):
+        width, noise = begin.sigma_ref / block.spacing, begin.noise
+        found = _find_noise(part, width, PooledNoise(
+            noise.baseline, noise.quiet, noise.baseline_spread, noise.by_kind["quiet"], np.array(noise.correlation),
+            round(noise.recovery / block.spacing),
+        ))  # fmt: skip
+        system = _gaussian_system(found, block.spacing, width, begin.saturation)
+    return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
 
 
 def list_widths(block: WaveformBlock) -> list[float]:
@@ -149,10 +166,10 @@ def _reach(width: float) -> int:
     return int(np.ceil(3 * width))
 
 
-def _find_noise(block: WaveformBlock, width: float) -> PooledNoise:
-    """Noise outside of echoes of this width [samples]."""
+def _find_noise(block: WaveformBlock, width: float, begin: PooledNoise | None = None) -> PooledNoise:
+    """Noise outside of echoes of this width [samples], from that of a part of the block."""
     missing = None if block.missing is None else keep_longest(block.missing.T)
-    return estimate_noise(transpose_samples(block.samples), _reach(width), missing=missing)
+    return estimate_noise(transpose_samples(block.samples), _reach(width), missing=missing, begin=begin)
 
 
 def _noise_of_pulse(std: float, correlation: tuple[float, ...], width: float) -> tuple[float, float]:
