@@ -87,6 +87,10 @@ OF_ALL = "gaussian of all echoes"
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, "all echoes": {}}
 """Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
 
+LEARNED_WITH = 0.01
+"""Change of the pulse from shot to shot, at least, with which waveforms are decomposed to learn from: what the present
+pulse misses must not become echoes, which would keep the shoulders of the next one as wrong."""
+
 FALSE_QUIET = 0.0075
 """Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
 threshold than these add: echoes of 4 to 6 noises are some 2 % of a scene's."""
@@ -213,7 +217,7 @@ def _learn_from_all(block: WaveformBlock, best: Candidate) -> Candidate:
         return replace(best, system=_find_gaussian(block, best.system, best.change))
     if best.name not in ROUNDS:
         return best
-    explained = explain(block, _bear(best.system, best.change), **ROUNDS[best.name])
+    explained = explain(block, _bear(best.system, max(best.change, LEARNED_WITH)), **ROUNDS[best.name])
     return replace(best, system=learn_jointly(block, best.system, explained, best.change, last=True))
 
 
@@ -235,7 +239,7 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
         yield OF_ALL, _find_gaussian(block, system, begin.change)
     for name, options in ROUNDS.items():
         for last in (False, True):
-            explained = explain(block, _bear(system, begin.change), **options)
+            explained = explain(block, _bear(system, max(begin.change, LEARNED_WITH)), **options)
             if count_telling(explained) < ENOUGH_TO_LEARN:
                 return
             system = learn_jointly(block, system, explained, begin.change, last=last)
