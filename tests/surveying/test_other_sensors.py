@@ -231,17 +231,18 @@ def search_misfit(monkeypatch, cost, loud, change):
     """Misfit and doubt where a misfit at a place costs so much, and the places that were looked at."""
     scatter, looked = np.resize([1.0, -1.0], 100), []
 
-    def explain_between(block, system, found, place):
-        return SimpleNamespace(place=place, echoes=range(100 + place))
+    def explain_between(block, system, changes, found, place):
+        explained = SimpleNamespace(place=place, echoes=range(100 + int(max(place, 0))))
+        return choose_pulse.Looked(explained, (np.empty(0), np.empty(0)))
 
-    def describe(block, system, explained, changes):
+    def describe(block, system, explained, changes, left):
         looked.append(explained.place)
         return [np.full(100, cost[explained.place] / 100) + (5.0 if explained.place == loud else 0.3) * scatter]
 
     monkeypatch.setattr(choose_pulse, "describe_waveforms", describe)
     monkeypatch.setattr(choose_pulse, "_explain_between", explain_between)
     block = record(gaussian, 5, n=100)[0]
-    return *choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0, change), looked
+    return *choose_pulse._choose_misfit(block, SystemPulse(2.0), 0.0, change)[:2], looked
 
 
 def test_no_misfit_is_looked_for_below_none(monkeypatch):

@@ -226,7 +226,7 @@ def _note_counts(figures: Figures, block: WaveformBlock) -> None:
 
 
 def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBlock, SystemPulse]:
-    """The block without the defects of its waveforms, and its noise and width with them, where `measure_begin` ended."""
+    """The block without its defects, and its noise and width with them, from where `measure_begin` ended."""
     found = measure_defects(block, begin)
     if not found.defects:
         return block, measure_whole(block, begin)

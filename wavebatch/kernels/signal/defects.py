@@ -158,8 +158,10 @@ def find_seam(samples: np.ndarray) -> int:
     values = samples[:: max(n * s // MOST_SEAM_VALUES, 1)].astype(np.int64)
     if len(values) < SEAM_ROWS or s < 2 * LEAST_RECORDING:
         return 0
-    near = np.lib.stride_tricks.sliding_window_view(values, 2 * SEAM_REACH + 1, axis=1)
-    active = near.max(axis=2) - near.min(axis=2) >= SEAM_SPAN
+    low = high = values
+    for step in (1, 2, SEAM_REACH):  # least and largest of 2, 4 and then all 7 values
+        low, high = np.minimum(low[:, :-step], low[:, step:]), np.maximum(high[:, :-step], high[:, step:])
+    active = high - low >= SEAM_SPAN
     middle = values[:, SEAM_REACH:-SEAM_REACH]
     bend = 2 * middle - values[:, SEAM_REACH - 1 : -SEAM_REACH - 1] - values[:, SEAM_REACH + 1 : 1 - SEAM_REACH]
     number = active.sum(axis=0)

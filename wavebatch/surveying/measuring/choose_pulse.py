@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
+from wavebatch.kernels.fit.describe import describe_left
 from wavebatch.stages.pulse_tables import clip_level, shape_limits
 from wavebatch.surveying.measuring.joint_pulse import count_telling, learn_jointly
 from wavebatch.surveying.measuring.judge import (
@@ -31,6 +32,7 @@ from wavebatch.surveying.measuring.judge import (
     find_own_width,
     measure_change,
     replace_rows,
+    sample_noise,
 )
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, HALVED, spread_rows, thin_block
@@ -87,9 +89,9 @@ OF_ALL = "gaussian of all echoes"
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, "all echoes": {}}
 """Rounds in which a pulse is learned from all waveforms, and how these are decomposed."""
 
-LEARNED_WITH = 0.01
-"""Change of the pulse from shot to shot, at least, with which waveforms are decomposed to learn from: what the present
-pulse misses must not become echoes, which would keep the shoulders of the next one as wrong."""
+FIRST_CHANGE = 0.01
+"""Change of the pulse from shot to shot, at least, in the first round of each: what a pulse of few Gaussians misses
+must not become echoes, which would keep the shoulders of the next one as wrong."""
 
 FALSE_QUIET = 0.0075
 """Share of the echoes that mirrored residuals may add in quiet stretches. A survey's user loses more points to a higher
@@ -217,7 +219,7 @@ def _learn_from_all(block: WaveformBlock, best: Candidate) -> Candidate:
         return replace(best, system=_find_gaussian(block, best.system, best.change))
     if best.name not in ROUNDS:
         return best
-    explained = explain(block, _bear(best.system, max(best.change, LEARNED_WITH)), **ROUNDS[best.name])
+    explained = explain(block, _bear(best.system, best.change), **ROUNDS[best.name])
     return replace(best, system=learn_jointly(block, best.system, explained, best.change, last=True))
 
 
@@ -239,7 +241,8 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
         yield OF_ALL, _find_gaussian(block, system, begin.change)
     for name, options in ROUNDS.items():
         for last in (False, True):
-            explained = explain(block, _bear(system, max(begin.change, LEARNED_WITH)), **options)
+            change = begin.change if last else max(begin.change, FIRST_CHANGE)
+            explained = explain(block, _bear(system, change), **options)
             if count_telling(explained) < ENOUGH_TO_LEARN:
                 return
             system = learn_jointly(block, system, explained, begin.change, last=last)
@@ -389,38 +392,43 @@ def settle(
         Share by which the number of echoes differs between misfits that cost the same.
     """
     part = thin_block(block, int(np.clip(4 * SAMPLES // block.samples.shape[1], 2 * LEAST, 2048)))
-    misfit, doubt = _choose_misfit(part, system, seen, change)
-    system = replace(system, misfit=max(misfit, missed))
+    # What clipped echoes hide is no misfit, and has no mirror.
+    whole = np.flatnonzero((part.samples < clip_level(part, system)).all(axis=1))
+    part = part.rows(whole) if len(whole) >= FEWEST else part
+    misfit, doubt, explained = _choose_misfit(part, system, seen, change, missed)
+    system = replace(system, misfit=misfit)
     harder = np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER)
     tried = []
-    for significance, mirror in look_in_mirror(part, system, [0.0, *map(float, harder)]):
+    for significance, mirror in look_in_mirror(part, system, explained, [0.0, *map(float, harder)]):
         tried.append((replace(system, significance=significance), mirror))
         if mirror.quiet <= _bound(FALSE_QUIET, mirror.echoes):
             break
     return *max(tried, key=lambda one: one[1].worth), doubt
 
 
-def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float, change: float) -> tuple[float, float]:
-    """Return the least misfit whose description is longer than the shortest by at most one standard error, and a doubt.
+def _choose_misfit(
+    block: WaveformBlock, system: SystemPulse, seen: float, change: float, missed: float = 0.0
+) -> tuple[float, float, Explained]:
+    """The least misfit that describes in at most one standard error more than the shortest, its doubt, and its echoes.
 
     It decides what is split beside strong echoes: with too little of it echoes describe what the pulse misses, with too
     much of it neighbours are not found, and both lengthen the description. Between two misfits that are tried it is
     found by their standard errors: halves of a strip then agree. The doubt is the share by which the number of echoes
     differs between misfits whose descriptions are longer by at most one.
     """
-    # What clipped echoes hide is no misfit.
-    whole = np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1))
-    block = block.rows(whole) if len(whole) >= FEWEST else block
     changes = [change for change in CHANGES if change <= STEP_OF_CHANGES * seen]
-    found: dict[int, Explained] = {}
+    found: dict[float, Looked] = {}
     lengths: dict[int, np.ndarray] = {}
+
+    def at(misfit: float) -> SystemPulse:
+        return replace(system, misfit=float(misfit))
 
     def look(*places: int) -> tuple[int, list[float]]:
         """The best place of those tried, and by how many standard errors each of them is longer, by the best change."""
         for place in places:
             if place not in found:
-                found[place] = _explain_between(block, replace(system, misfit=float(MISFITS[place])), found, place)
-                lengths[place] = describe_waveforms(block, system, found[place], changes)
+                looked = found[place] = _explain_between(block, at(MISFITS[place]), changes, found, place)
+                lengths[place] = describe_waveforms(block, system, looked.explained, changes, looked.left)
         tried = product(sorted(lengths), range(len(changes)))
         best, change = min(tried, key=lambda one: lengths[one[0]][one[1]].mean())
         least = lengths[best][change]
@@ -443,27 +451,45 @@ def _choose_misfit(block: WaveformBlock, system: SystemPulse, seen: float, chang
         best, longer = look(min(lengths) - 1)
     places = sorted(lengths)
     between = np.linspace(places[0], places[-1], 8 * len(MISFITS))
-    numbers = np.interp(between, places, [len(found[place].echoes) for place in places])
+    numbers = np.interp(between, places, [len(found[place].explained.echoes) for place in places])
     as_likely = numbers[np.interp(between, places, longer) <= 1]
-    doubt = float(np.ptp(as_likely)) / max(len(found[best].echoes), 1) if len(as_likely) else 0.0
-    if longer[0] <= 1:
-        return 0.0, doubt
-    first = next(place for place, errors in enumerate(longer) if errors <= 1)
-    before, after = MISFITS[places[first - 1]], MISFITS[places[first]]
-    # Near its least a length is a parabola.
-    over, under = np.sqrt(longer[first - 1]), np.sqrt(max(longer[first], 0.0))
-    share = (over - 1) / (over - under)
-    return float(before * (after / before) ** share), doubt
+    doubt = float(np.ptp(as_likely)) / max(len(found[best].explained.echoes), 1) if len(as_likely) else 0.0
+    misfit = 0.0
+    if longer[0] > 1:
+        first = next(place for place, errors in enumerate(longer) if errors <= 1)
+        before, after = MISFITS[places[first - 1]], MISFITS[places[first]]
+        # Near its least a length is a parabola.
+        over, under = np.sqrt(longer[first - 1]), np.sqrt(max(longer[first], 0.0))
+        misfit = float(before * (after / before) ** ((over - 1) / (over - under)))
+    misfit = max(misfit, missed)
+    place = float(np.log2(misfit / MISFITS[0])) if misfit else -np.inf
+    return misfit, doubt, _explain_between(block, at(misfit), changes, found, place).explained
 
 
-def _explain_between(block: WaveformBlock, system: SystemPulse, found: dict[int, Explained], place: int) -> Explained:
+class Looked(NamedTuple):
+    """Waveforms decomposed with one misfit."""
+
+    explained: Explained
+    left: tuple[np.ndarray, np.ndarray]
+    """What `describe_left` says of each of them."""
+
+
+def _explain_between(
+    block: WaveformBlock, system: SystemPulse, changes: list[float], found: Mapping[float, Looked], place: float
+) -> Looked:
     """Echoes of a block with a misfit. What the next smaller and the next larger one explain alike, it does too."""
-    below = max((one for one in found if one < place), default=None)
-    above = min((one for one in found if one > place), default=None)
+    below = max((one for one in found if one <= place), default=None)
+    above = min((one for one in found if one >= place), default=None)
     if below is None or above is None:
-        return explain(block, system)
-    rows = find_changed(found[below], found[above])
-    return replace_rows(found[below], rows, explain(block.rows(rows), system)) if len(rows) else found[below]
+        explained = explain(block, system)
+        return Looked(explained, describe_left(explained.sums, sample_noise(system), changes))
+    near, length, volume = found[below], *(one.copy() for one in found[below].left)
+    rows = find_changed(near.explained, found[above].explained)
+    if not len(rows):
+        return near
+    part = explain(block.rows(rows), system)
+    length[:, rows], volume[rows] = describe_left(part.sums, sample_noise(system), changes)
+    return Looked(replace_rows(near.explained, rows, part), (length, volume))
 
 
 def _bound(share: float, number: int) -> float:

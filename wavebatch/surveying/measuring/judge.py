@@ -134,7 +134,11 @@ def measure_change(system: SystemPulse, explained: Explained) -> float:
 
 
 def describe_waveforms(
-    block: WaveformBlock, system: SystemPulse, explained: Explained, changes: Sequence[float]
+    block: WaveformBlock,
+    system: SystemPulse,
+    explained: Explained,
+    changes: Sequence[float],
+    left: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
     """Measure how long the description of each waveform is: its echoes, and what they leave.
 
@@ -146,6 +150,8 @@ def describe_waveforms(
         The block decomposed with this system, of any misfit.
     changes : sequence of float, k of them
         Of the pulse from shot to shot, as shares of its amplitude (`describe_left`).
+    left : pair of float64 arrays, optional
+        What `describe_left` says of the waveforms, where it is known.
 
     Returns
     -------
@@ -161,7 +167,7 @@ def describe_waveforms(
     """
     echoes, sums = explained.echoes, explained.sums
     n, s = sums.left.shape
-    length, volume = describe_left(sums, sample_noise(system), changes)
+    length, volume = describe_left(sums, sample_noise(system), changes) if left is None else left
     ratio, error, known = _measure_widths(echoes, echoes.sigma.astype(np.float64) / system.sigma_ref)
     amplitude = echoes.amplitude.astype(np.float64)
     typical = max(float(np.mean(amplitude)), 1.0) if len(amplitude) else 1.0

@@ -15,9 +15,8 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.detect.direct import matched_filter, maximum
-from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
-from wavebatch.surveying.measuring.judge import explain
+from wavebatch.surveying.measuring.judge import Explained, explain
 
 STRONG = 30.0
 """Amplitude of a main echo, over the noise: a misfit of 3 % is then no more than noise."""
@@ -49,17 +48,18 @@ class Mirror:
 
 
 def look_in_mirror(
-    block: WaveformBlock, system: SystemPulse, levels: Sequence[float] = (0.0,)
+    block: WaveformBlock, system: SystemPulse, explained: Explained, levels: Sequence[float] = (0.0,)
 ) -> Iterator[tuple[float, Mirror]]:
     """Decompose samples less twice their residual, and count the echoes that match none of the waveforms' own.
 
     Noise makes as many echoes up as down; so does a pulse that misses its echoes. Close targets are in the mirror too.
-    Waveforms with clipped samples are left out: what is beyond the limit has no residual.
 
     Parameters
     ----------
     block : WaveformBlock
     system : SystemPulse
+    explained : Explained
+        The block decomposed with it.
     levels : sequence of float
         Least energies of an echo that are tried [standard deviations].
 
@@ -69,8 +69,6 @@ def look_in_mirror(
     mirror : Mirror
         Of the echoes that have this energy, by the detector that is worse off.
     """
-    block = block.rows(np.flatnonzero((block.samples < clip_level(block, system)).all(axis=1)))
-    explained = explain(block, system)
     echoes = explained.echoes
     mirrored = replace(block, samples=(block.samples - 2 * explained.sums.left).astype(np.float32))
     width = system.sigma_ref * FWHM_PER_SIGMA
