@@ -19,7 +19,7 @@ from wavebatch.kernels.library import CStacked, call, place
 STEP, IN_BIN = 0.2, 10.0
 """Grid of the stack [samples]; coarser where fewer echoes would fall into a bin than IN_BIN."""
 
-MOST_COMPONENTS = 5
+MOST_COMPONENTS = 6
 
 GAIN = 0.10
 """Share by which the residual must fall for one more component."""

@@ -136,7 +136,7 @@ def estimate_noise(
     missing : bool (s, n), optional
         Samples that were not recorded; a waveform without any other does not count.
     begin : PooledNoise, optional
-        That of a part of these waveforms, to begin with.
+        That of a part of these waveforms, to begin with; its recovery, if any, stays.
 
     Returns
     -------
@@ -160,6 +160,10 @@ def estimate_noise(
         signal = np.where(missing, np.float32(np.nan), signal)
         signal = np.where(missing, np.nanmedian(signal, axis=0), signal)
     signal = signal.astype(np.float32)
+    if begin is not None and begin.recovery:
+        found = _estimate_from(signal, reach, limit, missing, begin.recovery, begin=begin)
+        if found.share > 0:
+            return found
     found = _estimate_from(signal, reach, limit, missing, 0, begin=begin)
     recovery = measure_recovery(signal, found, reach, limit, missing) if found.share else 0
     if not recovery:

@@ -286,6 +286,8 @@ def _try_changes(block: WaveformBlock, found: list[Candidate]) -> list[Candidate
 def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
     """The pulse with the least change of shape that no other one beats by HINT, of those that its echoes show.
 
+    Its length is that with the best change: by that of the least one, which was within HINT of it or not, two pulses
+    changed places.
     By SURE one half of a strip had a change that the other, as likely, had not: its echoes were described by more.
     Neighbours too close to be found change the shape of some echoes, which is no change from shot to shot.
     """
@@ -299,7 +301,7 @@ def _find_change(block: WaveformBlock, judged: Candidate) -> Candidate:
     best = min(tried, key=lambda one: one.typical)
     found = next(one for one in tried if one.exceeds(best) < HINT)
     as_likely = tuple(one.echoes / max(found.echoes, 1) for one in tried if one.exceeds(best) < SURE)
-    return replace(found, as_likely=as_likely)
+    return replace(found, length=best.length, as_likely=as_likely)
 
 
 def _decide(found: list[Candidate]) -> Choice:

@@ -99,8 +99,9 @@ def measure_whole(block: WaveformBlock, begin: SystemPulse, *, cleaned: bool = F
     part, system = thin_samples(block, NOISE_LOOK), begin
     if cleaned or len(part) > len(thin_samples(block, FIRST_LOOK)):
         width, noise = begin.sigma_ref / block.spacing, begin.noise
-        known, correlation = noise.by_kind["quiet"], np.array(noise.correlation)
-        first = PooledNoise(noise.baseline, noise.quiet, noise.baseline_spread, known, correlation)
+        known, recovery = noise.by_kind["quiet"], round(noise.recovery / block.spacing)
+        correlation = np.array(noise.correlation)
+        first = PooledNoise(noise.baseline, noise.quiet, noise.baseline_spread, known, correlation, recovery)
         found = _find_noise(part, width, first)
         system = _gaussian_system(found, block.spacing, width, begin.saturation)
     return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
