@@ -464,7 +464,7 @@ def _choose_misfit(
         over, under = np.sqrt(longer[first - 1]), np.sqrt(max(longer[first], 0.0))
         misfit = float(before * (after / before) ** ((over - 1) / (over - under)))
     misfit = max(misfit, missed)
-    place = float(np.log2(misfit / MISFITS[0])) if misfit else -np.inf
+    place = float(np.log2(max(misfit / MISFITS[0], 1.0)))  # none is taken where the least one was looked at
     return misfit, doubt, _explain_between(block, at(misfit), changes, found, place).explained
 
 

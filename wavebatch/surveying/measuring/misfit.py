@@ -34,8 +34,8 @@ TAIL_BEFORE, TAIL_AFTER = 15, 40
 BESIDE, NOT_ABSORBED = 10, 3
 """Widths of the pulse beside an echo up to which what is left is measured, and from which."""
 
-ADDED, MOST_TURNS = 1024, 8
-"""Echoes that are added and found, some 200 within two widths of each lag, and how often they are tried: in a canopy
+ADDED, MOST_TURNS = 512, 8
+"""Echoes that are added and found, some 100 within two widths of each lag, and how often they are tried: in a canopy
 hardly a place is free."""
 
 HEIGHTS = 10.0, 40.0

@@ -54,15 +54,16 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
         return plain
     block = thin_samples(block, LOOK)
     whitened = replace(system, noise=replace(system.noise, whitening=whitening))
-    explained = explain(block, whitened)
+    explained = explain(block, plain)
     echoes = explained.echoes
     strong = echoes.alone(len(block)) & (echoes.amplitude > STRONG * system.noise.std)
-    left = echoes.residual[strong & ((echoes.flags & np.uint16(UNCLEAN)) == 0)].astype(np.float64) ** 2
+    lone = echoes.waveform[strong & ((echoes.flags & np.uint16(UNCLEAN)) == 0)]
+    left = explain(block.rows(lone), whitened, max_echoes=1).echoes.residual.astype(np.float64) ** 2
     if len(left) < FEW or np.median(left) > MOST_LEFT:
         return plain
     # Whitened fits take small changes of the pulse for echoes: the description, which knows both, is then longer.
-    length = describe_waveforms(block, whitened, explained, [change])[0]
-    other = describe_waveforms(block, plain, explain(block, plain), [change])[0]
+    length = describe_waveforms(block, whitened, explain(block, whitened), [change])[0]
+    other = describe_waveforms(block, plain, explained, [change])[0]
     return whitened if exceed(length, other) <= SURE else plain
 
 
