@@ -243,7 +243,8 @@ def judge(name: str, data: Path, cache: Path, *, brief: bool, classes: int | Non
         result = {
             "strip": name if name in STRIPS else path.stem, "survey_s": survey_s, "run_s": run_s,
             "decompose_s": decompose_s, "doubts": doubts, "fwhm": float(survey.system.sigma_ref) * FWHM_PER_SIGMA,
-            "outgoing": outgoing, "counts": counts.tolist(), "reference_fwhm": fwhm * strip.spacing, "per_packet": float(counts.mean()),
+            "outgoing": outgoing, "counts": counts.tolist(),
+            "reference_fwhm": fwhm * strip.spacing, "per_packet": float(counts.mean()),
             "unsure": 100 * float(np.mean((found["amplitude_err"] > found["amplitude"])[~clipped])),
             "splits": measure_splits(found, fwhm, noise), **compare_reference(found, reference),
         }  # fmt: skip
