@@ -197,6 +197,7 @@ def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
         "decisions": [
             {"part": one.part, "needed": bool(one.needed), "reason": one.reason} for one in saved.survey.decisions
         ],
+        "candidates": [one._asdict() for one in saved.survey.candidates],
         "chain": chain_text(saved.survey),
         "looks_like": _find_likeness(saved),
     }
