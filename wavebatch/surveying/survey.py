@@ -26,7 +26,6 @@ from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.misfit import MOST_FAINT, PEAK, limit_faint, measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
-    FAR_OFF,
     FEW,
     FIRST_WIDTH,
     RESIDUAL_LOOK,
@@ -227,14 +226,14 @@ def _note_counts(figures: Figures, block: WaveformBlock) -> None:
 
 def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBlock, SystemPulse]:
     """The block without its defects, and its noise and width with them, from where `measure_begin` ended."""
+    guessed = begin.sigma_ref == FIRST_WIDTH * block.spacing
+    if guessed:  # too few echoes stand alone to know how far signal reaches
+        begin = measure_whole(block, begin)
     found = measure_defects(block, begin)
     if not found.defects:
-        return block, measure_whole(block, begin)
+        return block, begin if guessed else measure_whole(block, begin)
     block = clean_block(block, found)
-    system = measure_whole(block, begin, cleaned=True)
-    if abs(system.sigma_ref / begin.sigma_ref - 1) > FAR_OFF:
-        system = measure_gaussian(block, system.sigma_ref / block.spacing)
-    return block, replace(system, defects=found.defects)
+    return block, replace(measure_whole(block, begin, cleaned=True), defects=found.defects)
 
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:

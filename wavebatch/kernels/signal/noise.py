@@ -117,11 +117,7 @@ class PooledNoise(NamedTuple):
 
 
 def estimate_noise(
-    signal: np.ndarray,
-    reach: int,
-    limit: float = 4.0,
-    missing: np.ndarray | None = None,
-    begin: PooledNoise | None = None,
+    signal: np.ndarray, reach: int, limit: float = 4.0, missing: np.ndarray | None = None, recovery: int = 0
 ) -> PooledNoise:
     """Level, variance and correlation of the samples before the first and after the last signal of each waveform.
 
@@ -135,8 +131,8 @@ def estimate_noise(
         A smoothed sample further from the level than this many standard deviations is signal.
     missing : bool (s, n), optional
         Samples that were not recorded; a waveform without any other does not count.
-    begin : PooledNoise, optional
-        That of a part of these waveforms, to begin with; its recovery, if any, stays.
+    recovery : int, samples
+        Until the level is back after strong signal, where it is known; else it is measured.
 
     Returns
     -------
@@ -160,37 +156,27 @@ def estimate_noise(
         signal = np.where(missing, np.float32(np.nan), signal)
         signal = np.where(missing, np.nanmedian(signal, axis=0), signal)
     signal = signal.astype(np.float32)
-    if begin is not None and begin.recovery:
-        found = _estimate_from(signal, reach, limit, missing, begin.recovery, begin=begin)
-        if found.share > 0:
-            return found
-    found = _estimate_from(signal, reach, limit, missing, 0, begin=begin)
+    known = _estimate_from(signal, reach, limit, missing, recovery) if recovery else None
+    if known is not None and known.share > 0:
+        return known
+    found = _estimate_from(signal, reach, limit, missing, 0)
     recovery = measure_recovery(signal, found, reach, limit, missing) if found.share else 0
     if not recovery:
         return found
-    again = _estimate_from(signal, reach, limit, missing, recovery, begin=found)
+    again = _estimate_from(signal, reach, limit, missing, recovery)
     return again if again.share > 0 else found
 
 
 def _estimate_from(
-    signal: np.ndarray,
-    reach: int,
-    limit: float,
-    missing: np.ndarray | None,
-    recovery: int,
-    room: float = 1.0,
-    begin: PooledNoise | None = None,
+    signal: np.ndarray, reach: int, limit: float, missing: np.ndarray | None, recovery: int, room: float = 1.0
 ) -> PooledNoise:
-    """The noise of quiet samples, found from each other from the quiet edges, or from a noise that is nearly known, on.
+    """The noise of quiet samples, found from each other from the quiet edges on.
 
     room: standard deviations by which the first level, that of few samples, may be wrong; 0 with a limit that comes
     from such noise.
     """
     level, std = quiet_edges(signal, missing)
     covariance = np.array([std**2])
-    if begin is not None and begin.share > 0:
-        std = begin.std
-        covariance = std**2 * np.r_[1.0, begin.correlation]
     number = np.zeros(len(level), np.int32)
     for turn in range(ROUNDS):
         last = _smoothed_std(covariance)

@@ -22,8 +22,9 @@ from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import noise_factors
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, fit_lone
 
-MOST_ROUNDS = 12
-"""Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
+MOST_ROUNDS, MOST_RETURNS = 12, 3
+"""Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width. And times that
+all echoes may send back to it."""
 
 FAR_OFF = 0.1
 """Change of a width that was nearly known, as a share of it, from which it is looked for from the start."""
@@ -94,17 +95,20 @@ def measure_begin(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPul
 def measure_whole(block: WaveformBlock, begin: SystemPulse, *, cleaned: bool = False) -> SystemPulse:
     """As `measure_gaussian`, from NOISE_LOOK samples and all echoes, where `measure_begin` ended.
 
-    cleaned: whether the block was changed since.
+    From there again where all echoes show another width. cleaned: whether the block was changed since.
     """
-    part, system = thin_samples(block, NOISE_LOOK), begin
-    if cleaned or len(part) > len(thin_samples(block, FIRST_LOOK)):
-        width, noise = begin.sigma_ref / block.spacing, begin.noise
-        known, recovery = noise.by_kind["quiet"], round(noise.recovery / block.spacing)
-        correlation = np.array(noise.correlation)
-        first = PooledNoise(noise.baseline, noise.quiet, noise.baseline_spread, known, correlation, recovery)
-        found = _find_noise(part, width, first)
-        system = _gaussian_system(found, block.spacing, width, begin.saturation)
-    return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
+    part = thin_samples(block, NOISE_LOOK)
+    more = len(part) > len(thin_samples(block, FIRST_LOOK))
+    for _ in range(MOST_RETURNS):
+        system, width = begin, begin.sigma_ref / block.spacing
+        if more or cleaned:
+            noise = _find_noise(part, width, round(begin.noise.recovery / block.spacing))
+            system = _gaussian_system(noise, block.spacing, width, begin.saturation)
+        found = _isolated_width(block, system)
+        if abs(found / width - 1) <= FAR_OFF:
+            break
+        begin, cleaned = measure_begin(block, found), False
+    return replace(system, sigma_ref=found * block.spacing)
 
 
 def list_widths(block: WaveformBlock) -> list[float]:
@@ -166,10 +170,10 @@ def _reach(width: float) -> int:
     return int(np.ceil(3 * width))
 
 
-def _find_noise(block: WaveformBlock, width: float, begin: PooledNoise | None = None) -> PooledNoise:
-    """Noise outside of echoes of this width [samples], from that of a part of the block."""
+def _find_noise(block: WaveformBlock, width: float, recovery: int = 0) -> PooledNoise:
+    """Noise outside of echoes of this width [samples]; recovery: as for `estimate_noise`."""
     missing = None if block.missing is None else keep_longest(block.missing.T)
-    return estimate_noise(transpose_samples(block.samples), _reach(width), missing=missing, begin=begin)
+    return estimate_noise(transpose_samples(block.samples), _reach(width), missing=missing, recovery=recovery)
 
 
 def _noise_of_pulse(std: float, correlation: tuple[float, ...], width: float) -> tuple[float, float]:
