@@ -8,6 +8,8 @@ static const double MOST_AMPLITUDE = 1e12;     /* above any count of 32 bits, al
 static const double BREATH = 1.1;              /* widths of the second try, over or under that of the pulse */
 static const double PROVEN = 2;                /* errors of an amplitude whose echo chi2 proves: simulated pairs scatter by
                                                   .35 to .65 of it, however much chi2 rises without the echo */
+static const double STEADY = 0.01;             /* misfit below which no pulse is known: from shot to shot those of real sensors
+                                                  change by .4 to 1.2 % of the amplitude */
 static const double ROOT_PI = 1.7724538509055161;
 
 /* Amplitudes from 0, times within 3 samples of the window, widths and skews as set. */
@@ -56,12 +58,16 @@ static int may_grow(const Settings *s, const Window *w) {
     return s->grow && w->n <= s->max_echoes * 2 * HERMITE_REACH * s->width_high;
 }
 
+/* Energy of Gaussians in that of the noise. */
+static double energy_of(int64_t k, const double *parameters, double std) {
+    double energy = 0;
+    for (int64_t j = 0; j < k; j++) energy += parameters[j] * parameters[j] * parameters[2 * k + j];
+    return ROOT_PI * energy / (std * std);
+}
+
 /* Fall of chi2 that one more echo needs: the acceptance, and what a misfit of the pulse model may explain (R3). */
 static double least_fall(const Settings *s, int64_t k, const double *parameters, double std) {
-    const double *amplitude = parameters, *width = parameters + 2 * k;
-    double energy = 0;
-    for (int64_t j = 0; j < k; j++) energy += amplitude[j] * amplitude[j] * width[j];
-    return s->acceptance + s->misfit * s->misfit * ROOT_PI * energy / (std * std);
+    return s->acceptance + s->misfit * s->misfit * energy_of(k, parameters, std);
 }
 
 static void exchange(Solution *one, Solution *other) {
@@ -151,8 +157,8 @@ static void renew_errors(const Settings *s, const Prior *prior, Work *work) {
    than a new echo must lower it.
 
    Errors of close echoes are those of a parabola, and the valley of chi2 is none: where they say that an amplitude may
-   as well be 0, the fit without the echo says how far chi2 rises on the way there. An echo without which it rises
-   enough has an amplitude of PROVEN errors at least, and those that share its light have less to share. Where one is
+   as well be 0, the fit without the echo says how far chi2 rises on the way there. Of strong echoes it must be more
+   than what a pulse of another shape makes: one echo of it looks like two. An echo without which it rises enough has an amplitude of PROVEN errors at least, and those that share its light have less to share. Where one is
    left out, the time of each other may be wrong by as much as it moves. */
 static void leave_out_unknown(const Settings *s, Work *work) {
     const Limits limits = limits_of(s, &work->window);
@@ -173,7 +179,8 @@ static void leave_out_unknown(const Settings *s, Work *work) {
         for (int64_t i = 0; i < 3 * k; i++)
             if (i % k != least) work->fit.parameters[left++] = best->parameters[i];
         fit_window(k - 1, 3, s, &limits, k > 2 ? &prior : &none, INFINITY, work);
-        if (!(amplitude > 0) || work->fit.cost - best->cost < least_fall(s, k - 1, work->fit.parameters, noise)) {
+        const double *fewer = work->fit.parameters, proof = work->fit.cost - best->cost;
+        if (!(amplitude > 0) || proof < least_fall(s, k - 1, fewer, noise) || proof < STEADY * STEADY * energy_of(k - 1, fewer, noise)) {
             memset(work->known, 0, k * sizeof(double));
             memmove(before + least, before + least + 1, (k - 1 - least) * sizeof(double));
             describe_fit(&limits, work, best);
