@@ -26,6 +26,8 @@ COMPILED = {
     "interpolate_columns": ("interpolate", "np.interp"), "fit_stack": ("refine_gaussians", "naive_fit.fit_stack"),
     "describe_echoes": ("describe_whole", "naive_fit.describe_whole"), "keep_echoes": ("keep_echoes", "naive_fit.keep"),
     "match_returns": ("match_returns", "naive.match_returns"),
+    "find_faint": ("drop_unproven", "test_flags.pairs"), "weigh_fits": ("cover_misfit", "test_flags.pairs"),
+    "set_flags": ("flag_echoes", "test_flags.pairs"), "find_pairs": ("merge_unresolved", "test_flags._unresolved"),
 }  # fmt: skip
 """Function of the library, the kernel that calls it, and the twin that a test compares that with."""
 
