@@ -622,7 +622,7 @@ class _Votes:
 
     def join(self, other: _Votes) -> _Votes:
         """Return both together."""
-        return _Votes(*(getattr(self, name) + getattr(other, name) for name in _Votes.__slots__))
+        return _Votes(*(getattr(self, name) + getattr(other, name) for name in _Votes.__annotations__))
 
     @property
     def skewness(self) -> float:
