@@ -63,8 +63,8 @@ PAPERS = (
                 "draw_voxels", ""),
         Picture("Figure 2: a waveform as a sum of Gaussians: samples, echoes and residual.",
                 f"plot waveform forest.laz --packet 19 {_WAVES} --show detector"),
-        Picture("Figures 3 and 5: the square difference to a reference pulse of the waveform's height (ASDF), with the "
-                "paper's rule of 30 %: the bars are the depth that a minimum needs.",
+        Picture("Figures 3 and 5: the square difference to a reference pulse of the waveform's height (ASDF), with "
+                "the paper's rule of 30 %: the bars are the depth that a minimum needs.",
                 "plot waveform forest.laz --packet 19 --show asdf --chain asdf.toml"),
         Picture("Echoes of the forest from the side.", "plot section out/forest.laz --column amplitude --aspect 3"),
     )),
@@ -81,8 +81,8 @@ PAPERS = (
     Paper("s2_jutzi", "Jutzi, Stilla (2005)", "6, 8", (
         Picture("The waveform deconvolved with the system pulse: the signal of the surfaces along the ray.",
                 "plot waveform forest.laz --packet 17:21 --profile balanced --show deconvolved"),
-        Picture("Figure 6: slices of the data cube of a village: x across the scan lines, y one scan line over a row of roofs, t "
-                "one time, at which the roofs are missing in the ground.",
+        Picture("Figure 6: slices of the data cube of a village: x across the scan lines, y one scan line over a row "
+                "of roofs, t one time, at which the roofs are missing in the ground.",
                 "plot cube cube.npz --x 980 --y 5 --t 154.5"),
         Picture("Figure 8: straight segments of the ground and of the roofs in all scan lines, in plan and in 3D.",
                 "slice village.laz --most 60", "--overview"),
