@@ -8,7 +8,7 @@
 #                  either, as --pulses or --scene: BENCH_OPTIONS="--scene open" (tests/bench/against.py, release.py)
 #   make dist      wheels for Linux, macOS and Windows and the source distribution, in dist/: zig compiles for all
 #   make figures   what README and docs print, made anew by their commands
-#   make bench-real STRIP=...              echoes injected into the waveforms of real strips: what is found, in bench
+#   make bench-real STRIP=...              a reference fit, halves, and injected echoes of real strips: bench/real.jsonl
 #   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
 #   make attack    signals to running commands and their workers at random instants, RUNS=1000 SEED=1
@@ -99,8 +99,9 @@ else
 	PYTHONPATH=tests $(BIN)/python -m bench.release -o $(BENCH) $(BENCH_OPTIONS)
 endif
 
-bench-real: $(VENV)/.plot $(VENV)/.test
-	PYTHONPATH=tests $(BIN)/python -m bench.real $(STRIP) -o $(BENCH) --seed $(SEED)
+bench-real: $(VENV)/.test
+	@mkdir -p $(BENCH)
+	$(BIN)/python tests/judging/real.py --strips "$(STRIP)" --classes $(SEED) --cache $(BENCH) -o $(BENCH)/real.jsonl
 
 fuzz: $(VENV)/.test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/fuzzing.py --minutes $(MINUTES) --seed $(SEED)

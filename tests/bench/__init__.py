@@ -2,5 +2,4 @@
 
 release       everything of `wavebatch bench`, other decomposers, stiff cases, start-up, memory, jobs, promised figures
 against       this wavebatch and another version take turns on the same strips
-real          echoes injected into the waveforms of real strips: `make bench-real STRIP=...`
 """

@@ -1,7 +1,7 @@
 """Judges a survey on the real strips: `python tests/judging/real.py --help`.
 
 Beside a reference fit of its own (reference_fit.py) it judges by what needs no truth: mirrored residuals, parts of a
-strip, injected echoes. Beside the public API only `subtract_echoes` is used, wherever it is.
+strip, injected echoes (injections.py). Beside the public API only `subtract_echoes` is used, wherever it is.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import sys
 import tempfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +20,8 @@ from typing import Any
 
 import numpy as np
 from checkouts import FWHM_PER_SIGMA, find_doubts, find_function, flatten, format_table, read_lines, run_in, timed
-from reference_fit import Fitter, Pulse, Waveform
+from injections import classify, format_classes, inject
+from reference_fit import Fitter, Waveform
 from strangers import match
 from strip_parts import list_packets, without_sensor, write_part
 
@@ -31,7 +34,7 @@ STRIPS = {
     "optech": ("optech/optech_a.las", 14.07, None, None),
 }
 """File, FWHM of the outgoing pulse [ns], name of the sensor's shipped file, and the pulse of the reference fit; without
-the last it is stacked from lone echoes."""
+the last it is stacked from lone echoes. A strip that is given by its path is one without all these."""
 
 REFERENCE = 250
 """Packets that the reference fit decomposes."""
@@ -67,6 +70,12 @@ class Decomposed:
         """Echoes of each packet, in the order of `points`."""
         packets = self.flat(tables)["packet"].astype(int)
         return np.bincount(np.searchsorted(self.points, packets), minlength=len(self.points))
+
+
+def find_strip(name: str, data: Path) -> tuple[Path, float | None, str | None, str | None]:
+    """Path of a strip and what is known of it, by its name in STRIPS or by its path."""
+    path, *known = STRIPS.get(name, (Path(name).resolve(), None, None, None))
+    return data / path, *known
 
 
 def lift_system(system: Any) -> Any:
@@ -129,9 +138,10 @@ def measure_splits(found: dict[str, np.ndarray], fwhm: float, noise: float) -> f
 
 def refer(name: str, strip: Decomposed, data: Path, cache: Path) -> dict[str, np.ndarray]:
     """The reference fit of a strip, made once: echoes, the packets that it looked at, pulse and noise."""
-    file = cache / f"reference-{name}.npz"
+    path, _, _, known = find_strip(name, data)
+    label = name if name in STRIPS else f"{path.stem}-{zlib.crc32(path.read_bytes()):08x}"
+    file = cache / f"reference-{label}.npz"
     if not file.exists():
-        known = STRIPS[name][3]
         if known:
             root = Path(__file__).parents[2] if known.endswith(".toml") else data
             known = next(root.rglob(known))
@@ -181,46 +191,6 @@ def compare_reference(found: dict[str, np.ndarray], reference: dict[str, np.ndar
     return {"complete": 100 * pair.mean(), "correct": 100 * right.mean(), "exact": 100 * exact.mean()}
 
 
-def inject(strip: Decomposed, survey: Any, tables: list[Any], reference: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Adds an echo to every waveform, .75 widths or more from those found, and looks for it: shares and scatters."""
-    pulse = Pulse.widen(reference["lag"], reference["pulse"])
-    fwhm, noise, rng = pulse.fwhm, float(reference["noise"]), np.random.default_rng(7)
-    blocks, truth = [], []
-    for block, echoes in zip(strip.blocks, tables, strict=True):
-        samples = block.samples.astype(float)
-        n, s = samples.shape
-        x = np.arange(s)
-        for row in range(n):
-            old = echoes.time[echoes.waveform == row] / strip.spacing
-            place = rng.uniform(fwhm, max(s - fwhm, fwhm + 1))
-            height = noise * np.exp(rng.uniform(np.log(8), np.log(100)))
-            away = np.abs(old - place).min(initial=1e9) / fwhm
-            drawn = height * pulse.at(x - place, 0.0)[0]
-            hidden = block.missing is not None and block.missing[row][drawn > 0.01 * height].any()
-            if away < 0.75 or hidden or (samples[row] + drawn).max() > 0.9 * samples.max():
-                continue
-            samples[row] += drawn
-            truth.append((block.point[row], place, height, away))
-        blocks.append(replace(block, samples=np.rint(samples).astype(block.samples.dtype)))
-    found, (packet, time, height, away) = strip.flat(strip.run(survey, blocks)), np.array(truth).T
-    order = np.argsort(packet)
-    packet, time, height, away = (one[order] for one in (packet, time, height, away))
-    added = {"packet": packet, "time": time, "fwhm": np.full(len(time), fwhm)}
-    nearest, _ = match(added, found, fwhm)
-    near, hit = away < 1.5, nearest >= 0
-    late = found["time"][nearest] - time
-    strong = hit & ~near & (height > STRONG * noise)
-    late -= np.median(late[strong]) if strong.any() else 0.0
-    result = {"injected": len(time)}
-    for name, which in (("near", near), ("far", ~near)):
-        rows = which & hit
-        result[f"found_{name}"] = 100 * float(hit[which].mean()) if which.any() else float("nan")
-        for kind, off, error in (("t", late, "time_err"), ("a", found["amplitude"][nearest] - height, "amplitude_err")):
-            ratio = (off / found[error][nearest])[rows]
-            result[f"{kind}_{name}"] = float(1.4826 * np.median(np.abs(ratio))) if len(ratio) > 10 else float("nan")
-    return result
-
-
 def survey_parts(path: Path, strip: Decomposed, counts: np.ndarray, folder: Path) -> dict[str, Any]:
     """Surveys of halves, tiles and fifties by themselves, and what they change: shares of packets [%]."""
     import wavebatch as wb
@@ -253,11 +223,14 @@ def survey_parts(path: Path, strip: Decomposed, counts: np.ndarray, folder: Path
             "fifties": fifties}  # fmt: skip
 
 
-def judge(name: str, data: Path, cache: Path, *, brief: bool) -> dict[str, Any]:
-    """All figures of one strip with the wavebatch that can be imported; brief: without parts, mirror and injections."""
+def judge(name: str, data: Path, cache: Path, *, brief: bool, classes: int | None = None) -> dict[str, Any]:
+    """All figures of one strip with the wavebatch that can be imported; brief: without parts, mirror and injections.
+
+    classes: seed of the injections whose shares are told by class; without one there are none.
+    """
     import wavebatch as wb
 
-    path, outgoing = data / STRIPS[name][0], STRIPS[name][1]
+    path, outgoing, *_ = find_strip(name, data)
     with wb.open_strip(path) as opened, tempfile.TemporaryDirectory() as folder:
         strip = Decomposed(opened)
         reference = refer(name, strip, data, cache)
@@ -268,12 +241,15 @@ def judge(name: str, data: Path, cache: Path, *, brief: bool) -> dict[str, Any]:
         fwhm, noise = float(reference["fwhm_of_pulse"]), float(reference["noise"])
         clipped = (found["flags"] & 8) != 0
         result = {
-            "strip": name, "survey_s": survey_s, "run_s": run_s, "decompose_s": decompose_s, "doubts": doubts,
-            "fwhm": float(survey.system.sigma_ref) * FWHM_PER_SIGMA, "outgoing": outgoing, "counts": counts.tolist(),
+            "strip": name if name in STRIPS else path.stem, "survey_s": survey_s, "run_s": run_s,
+            "decompose_s": decompose_s, "doubts": doubts, "fwhm": float(survey.system.sigma_ref) * FWHM_PER_SIGMA,
+            "outgoing": outgoing, "counts": counts.tolist(),
             "reference_fwhm": fwhm * strip.spacing, "per_packet": float(counts.mean()),
             "unsure": 100 * float(np.mean((found["amplitude_err"] > found["amplitude"])[~clipped])),
             "splits": measure_splits(found, fwhm, noise), **compare_reference(found, reference),
         }  # fmt: skip
+        if classes is not None:
+            result["classes"] = format_classes(classify(strip, survey, tables, reference, classes))
         if brief:
             return result
         parts = (
@@ -316,30 +292,35 @@ def tabulate(results: list[dict[str, Any]], older: list[dict[str, Any]]) -> str:
             f"{out['complete']:.1f}/{out['correct']:.1f}/{out['exact']:.1f}{' said' if out['doubts'] else ''}"
         )  # fmt: skip
         rows.append([label, fifties, text, " | ".join([*one["doubts"], *one.get("errors", [])])[:150] or "-"])
-    return "\n\n".join([*texts, format_table(rows)])
+    texts.append(format_table(rows))
+    texts += [f"{one['strip']}: injected echoes\n{one['classes']}" for one in results if "classes" in one]
+    return "\n\n".join(texts)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     beside = Path(__file__).parents[3]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, default=Path(__file__).parents[2], help="checkout to judge")
-    parser.add_argument("--strips", default=",".join(STRIPS), help="which, as riegl,optech")
+    parser.add_argument("--strips", default=",".join(STRIPS), help="names, as riegl,optech, or paths")
     parser.add_argument("--data", type=Path, default=os.environ.get("WAVEBATCH_DATA", beside / "shared" / "data"))
     parser.add_argument("--cache", type=Path, default=beside / "strangers", help="folder that keeps the reference fits")
     parser.add_argument("-o", "--output", type=Path, help="JSON lines; replaced")
     parser.add_argument("--compare", type=Path, help="JSON lines of another checkout")
     parser.add_argument("--brief", action="store_true", help="without parts, mirrored residuals and injections")
+    parser.add_argument("--classes", type=int, metavar="SEED", help="also injected echoes by height and separation")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
     if given.child:
-        print(json.dumps(judge(given.strips, given.data, given.cache, brief=given.brief)), flush=True)
+        result = judge(given.strips, given.data, given.cache, brief=given.brief, classes=given.classes)
+        print(json.dumps(result), flush=True)
         return 0
     root, results = given.root.resolve(), []
-    for name in given.strips.split(","):
+    for name in re.split("[ ,]+", given.strips):
         options = ["--data", str(given.data), "--cache", str(given.cache), "--strips", name]
         brief = ["--brief"] if given.brief else []
-        for result in run_in(root, Path(__file__), [*options, *brief]):
-            sensor = STRIPS[name][2]
+        classes = [] if given.classes is None else ["--classes", str(given.classes)]
+        for result in run_in(root, Path(__file__), [*options, *brief, *classes]):
+            sensor = find_strip(name, given.data)[2]
             if sensor:
                 with tempfile.TemporaryDirectory() as folder:
                     hidden = without_sensor(root, sensor, Path(folder))

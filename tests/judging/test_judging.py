@@ -1,11 +1,15 @@
 """The judges say what is true of answers that are known; the fast tests run one small stranger."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from reference_fit import Fitter, Waveform
-from stranger_strips import draw_sensor, make_strip
+from injections import classify, format_classes, inject
+from real import Decomposed, main
+from reference_fit import FINE, Fitter, Waveform
+from stranger_strips import draw_sensor, make_shape, make_strip
 from strangers import judge_strip, score, tabulate, verdict
 from strip_parts import list_packets, write_part
 
@@ -89,3 +93,47 @@ def test_the_reference_fit_finds_clear_echoes(tmp_path):
         true, times = np.sort(time[packet == row]), fitter.fit(waveforms[row])[0][:, 0]
         assert len(times) == len(true)
         assert np.abs(times - true).max(initial=0) < 0.2 * sensor.fwhm
+
+
+@pytest.mark.slow
+def test_injected_echoes_are_counted_by_height_and_separation(tmp_path):
+    """With the true pulse strong ones are found, weak and close ones are not, and a survey that is deaf is seen."""
+    sensor, path = draw_sensor(LONE)[0], make_strip(LONE, tmp_path)
+    lag, height, _ = make_shape(sensor)
+    fine = np.arange(lag[0] * sensor.fwhm, lag[-1] * sensor.fwhm, 1 / FINE)
+    with wb.open_strip(path) as opened:
+        strip, survey = Decomposed(opened), wb.survey(opened)
+    noise = survey.system.noise.std
+    reference = {"lag": fine, "pulse": np.interp(fine / sensor.fwhm, lag, height[0]), "noise": noise}
+    deaf = replace(survey, system=replace(survey.system, noise=replace(survey.system.noise, std=4 * noise)))
+    tables = strip.run(survey)
+    one, same, off = (classify(strip, system, tables, reference, seed=1) for system in (survey, survey, deaf))
+    for name in one:
+        np.testing.assert_array_equal(one[name], same[name])
+
+    def share(echoes, kind, low, high, near=None):
+        beside = np.isnan(echoes["lag"]) if near is None else (abs(echoes["lag"]) >= near[0]) & (
+            abs(echoes["lag"]) < near[1])  # fmt: skip
+        which = beside & (echoes["height"] >= low) & (echoes["height"] < high)
+        assert which.sum() > 40
+        return echoes[kind][which].mean()
+
+    assert share(one, "found", 10, 160) > 0.98 and share(one, "found", 2.5, 4) < 0.9
+    assert share(one, "found", 4, 10, (2, 4)) > 0.9 > 0.7 > share(one, "found", 2.5, 8, (0.5, 0.75))
+    assert share(one, "further", 10, 160) < 0.02 and share(off, "found", 8, 12) < 0.5
+    strong = (one["height"] > 10) & np.isnan(one["lag"]) & (one["found"] > 0)
+    for kind in ("time", "amplitude"):
+        assert 0.8 < 1.4826 * np.median(np.abs(one[kind][strong])) < 1.25
+    text = format_classes(one)
+    assert "alone, noises" in text and "before 10-20" in text and "0.5-0.75" in text
+    result = inject(strip, survey, tables, reference)
+    assert result["found_far"] > 98 and 0.8 < result["t_far"] < 1.25 and result["injected"] > 100
+
+
+@pytest.mark.slow
+def test_a_strip_is_judged_by_its_path(strip, tmp_path, capfd):
+    out = tmp_path / "real.jsonl"
+    assert main(["--strips", str(strip), "--brief", "--classes", "1", "--cache", str(tmp_path), "-o", str(out)]) == 0
+    result = json.loads(out.read_text())
+    assert result["strip"] == strip.stem and result["complete"] > 90 and "alone, noises" in result["classes"]
+    assert f"{strip.stem}: injected echoes" in capfd.readouterr().out

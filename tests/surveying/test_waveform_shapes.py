@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bench.real.pool import read_pool
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -15,6 +14,7 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
+from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.measuring import learn_pulse
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
 
@@ -358,8 +358,9 @@ def test_noise_that_grows_with_the_signal_makes_no_narrow_pulse(gain):
 @pytest.mark.slow
 def test_coloured_noise_is_no_slope(riegl):
     """Its slopes scatter by twice what white noise does: every second waveform seemed to rise or fall by .025 DN/ns."""
-    pool = read_pool(riegl)
-    system = survey_blocks([block.rows(slice(1, None, 2)) for block in pool.blocks]).system
+    with StripReader(riegl) as reader, reader.scan() as scan:
+        blocks = list(reader.sample_blocks(scan, 2 * sample_size(reader, scan)))
+    system = survey_blocks([block.rows(slice(1, None, 2)) for block in blocks]).system
     assert system.defects.slope_spread == 0
 
 
