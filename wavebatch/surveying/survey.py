@@ -23,7 +23,7 @@ from wavebatch.surveying.measuring.learn_pulse import (
     learn_pulse,
 )
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.misfit import MOST_FAINT, PEAK, limit_faint, measure_beside, measure_tail
+from wavebatch.surveying.measuring.misfit import MOST_FAINT, PEAK, cover_fits, limit_faint, measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
@@ -49,7 +49,6 @@ from wavebatch.surveying.systems.known_systems import (
     guess_width,
     list_known,
     share_repeated,
-    share_unexplained,
 )
 from wavebatch.surveying.systems.skew import measure_skew
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey, Tried
@@ -278,10 +277,12 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
+        misfit, left = cover_fits(system, echoes, block.spacing)
+        if misfit > system.misfit:
+            system = replace(system, misfit=misfit)
+            echoes = decompose_sample(part, system)
         figures.width_in_doubt = choice.spread
-        figures.echoes_in_doubt = max(choice.doubt, doubt, share_unexplained(system, echoes, block.spacing))
-        if len(block) < SMALL:
-            figures.echoes_in_doubt = max(figures.echoes_in_doubt, share_repeated(echoes, system.sigma_ref))
+        figures.echoes_in_doubt = max(choice.doubt, doubt, left, share_repeated(echoes, system.sigma_ref))
     else:
         part = thin_samples(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)

@@ -14,6 +14,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.flags import find_unexplained
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
@@ -58,6 +59,13 @@ PEAK, ABOVE_NOISE = 4.0, 3.0
 """Largest difference of a pulse from its model over the misfit, which is a mean over the echo; and noises that an echo
 must be high beside the strip's strongest ones, which taught the pulse."""
 
+UNEXPLAINED = 0.05
+"""Share of clear echoes that may miss their samples: neighbours too close to be found change the shape of some."""
+
+LEAST_MISFIT, STEP_OF_MISFITS, MOST_MISFIT = 5e-4, 2**0.5, 0.125
+"""Misfit from which, step by which, and about up to which it is raised: half a noise at 1,000 noises; beyond an eighth
+it is no pulse of this strip."""
+
 MOST_FAINT = SystemPulse(1.0).faint_share
 """What a pulse of which no more is known may leave beside strong echoes."""
 
@@ -82,6 +90,36 @@ def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> System
         return system
     seen = ABOVE_NOISE * system.noise.std / max(float(np.quantile(echoes.amplitude, 0.99)), 1e-9)
     return replace(system, faint_share=min(max(PEAK * max(system.misfit, change), seen), system.faint_share))
+
+
+def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[float, float]:
+    """Find the misfit, from the system's own on, that explains what the fits of clear echoes leave.
+
+    The description of waveforms alone does not see it where false echoes describe what the pulse misses of strong ones.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        With the misfit by the description.
+    echoes : EchoTable
+        Of a sample, decomposed with it.
+    spacing : float
+        Of the samples [ns].
+
+    Returns
+    -------
+    misfit : float
+    left : float
+        Share of the clear echoes whose samples it does not explain; 0 with too few of them.
+    """
+    clear = echoes.amplitude > MIN_SNR * system.noise.std
+    if np.count_nonzero(clear) < FEW:
+        return system.misfit, 0.0
+    while True:
+        left = float(np.mean(find_unexplained(echoes, system, spacing)[clear] > 1))
+        if left <= UNEXPLAINED or system.misfit > MOST_MISFIT:
+            return system.misfit, left
+        system = replace(system, misfit=max(STEP_OF_MISFITS * system.misfit, LEAST_MISFIT))
 
 
 def measure_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:

@@ -32,10 +32,10 @@ from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.flags import RINGING_REACH, find_unexplained, list_neighbours
+from wavebatch.stages.flags import RINGING_REACH, list_neighbours
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
-from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, find_strongest, fit_lone
+from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
 from wavebatch.surveying.measuring.noise_and_width import FEW, HALVED
 from wavebatch.surveying.measuring.residuals import hides_noise, subtract_echoes
 from wavebatch.surveying.systems.figures import Figures, read_system
@@ -332,17 +332,11 @@ def doubt_survey(system: SystemPulse, figures: Figures, waveforms: int) -> Itera
         )  # fmt: skip
 
 
-def share_unexplained(system: SystemPulse, echoes: EchoTable, spacing: float) -> float:
-    """Share of the clear echoes whose samples the pulse and the noise do not explain; 0 with too few of them."""
-    clear = echoes.amplitude > MIN_SNR * system.noise.std
-    unexplained = find_unexplained(echoes, system, spacing)[clear] > 1
-    return float(np.mean(unexplained)) if len(unexplained) >= FEW else 0.0
-
-
 def share_repeated(echoes: EchoTable, width: float) -> float:
     """Twice the share of the echoes that, beyond chance, stand beside stronger ones, all at one lag and one ratio.
 
-    A pulse that few echoes show only roughly leaves such parts of it, each at its place.
+    A pulse that few echoes show only roughly leaves such parts of it, each at its place; so does a part so far before
+    the peak that no pulse is learned there. Two layers of one distance do not scatter as one.
     """
     pairs = []
     for row, other, lag in list_neighbours(echoes):
