@@ -9,6 +9,7 @@ arguments is kept, because outputs are made in it.
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import io
 import os
@@ -187,7 +188,8 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
         return
     path = folder / argument
     if argument.startswith("~") and not os.path.lexists(path):  # shells expand it, but neither in quotes nor in lists
-        path = folder / _expand_home(argument)
+        with contextlib.suppress(ValueError):  # no user can have this name
+            path = folder / os.path.expanduser(argument)
     if os.path.isdir(path):
         try:
             names = _walk(path) if recursive else os.listdir(path)
@@ -218,13 +220,6 @@ def _walk(folder: Path) -> list[str]:
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         found += [os.path.relpath(os.path.join(place, name), folder) for name in files]
     return found
-
-
-def _expand_home(name: str) -> str:
-    try:
-        return os.path.expanduser(name)
-    except ValueError:  # no user can have this name
-        return name
 
 
 def _read_list(path: Path, recursive: bool, kinds: Sequence[Sequence[str]]) -> Iterator[Path]:

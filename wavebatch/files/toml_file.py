@@ -141,21 +141,17 @@ def parse_toml(text: str, name: str) -> TomlTable:
         raise ConfigError(f"{name}: a number has more than {MOST_DIGITS} digits")
     try:
         document = tomllib.loads(text)
-        if _is_deep(document):
+        level: list[Any] = [document]
+        for _ in range(MOST_NESTED):
+            tables = [value.values() if isinstance(value, dict) else value for value in level]
+            level = [item for items in tables for item in items if isinstance(item, dict | list)]
+        if level:
             raise RecursionError
     except RecursionError as error:
         raise ConfigError(f"{name}: keys or values are nested more than {MOST_NESTED} deep") from error
     except ValueError as error:
         raise ConfigError(f"{name}: not valid TOML: {_one_line(str(error))}") from error
     return TomlTable(document, name)
-
-
-def _is_deep(document: dict[str, Any]) -> bool:
-    level: list[Any] = [document]
-    for _ in range(MOST_NESTED):
-        tables = [value.values() if isinstance(value, dict) else value for value in level]
-        level = [item for items in tables for item in items if isinstance(item, dict | list)]
-    return bool(level)
 
 
 KINDS = {"chain": "a chain file", "system": "a survey", "calibration": "a calibration"}

@@ -241,7 +241,13 @@ class Draft(contextlib.AbstractContextManager):
                     raise InputError(_exists(self.target)) from None
             else:
                 self.published = True
-            _sync_folder(self.target.parent)
+            # The new name survives a power cut; Windows cannot open folders, some file systems cannot sync them.
+            with contextlib.suppress(OSError):
+                descriptor = os.open(self.target.parent, os.O_RDONLY)
+                try:
+                    os.fsync(descriptor)
+                finally:
+                    os.close(descriptor)
         self.discard()
 
     def discard(self) -> None:
@@ -409,13 +415,3 @@ def _link(path: Path, target: Path) -> None:
         # No hard links here: only one process can create this empty file, so it reserves the name.
         os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         os.replace(path, target)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes the new name survive a power cut; Windows cannot open folders, some file systems cannot sync them."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -522,11 +522,6 @@ class ExtraRecord:
         return self.data[2]
 
     @property
-    def is_known(self) -> bool:
-        """Whether the size of the dimension is known."""
-        return self.code <= 30 and self.dtype.itemsize > 0
-
-    @property
     def dtype(self) -> np.dtype:
         """Stored type, with the shape (k,) of the deprecated vectors and of undocumented bytes."""
         if self.code == 0:
@@ -625,7 +620,7 @@ def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
     left = size
     for at in range(0, len(payload) - RECORD_SIZE + 1, RECORD_SIZE):
         record = ExtraRecord(payload[at : at + RECORD_SIZE])
-        if not record.is_known or record.dtype.itemsize > left:
+        if record.code > 30 or not 0 < record.dtype.itemsize <= left:
             break
         records.append(record)
         left -= record.dtype.itemsize

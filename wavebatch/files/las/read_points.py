@@ -73,7 +73,12 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     records = tuple(las.read_records(payloads[0] if payloads else b"", extra))
     dtype = las.build_dtype(header.point_format, records)
     points_end = _find_points_end(path, header)
-    return CheckedHeader(path, header.file_size, header, dtype, records, points_end, _find_warnings(header))
+    legacy, count = header.counts
+    warnings: tuple[str, ...] = ()
+    if header.version >= (1, 4) and legacy and legacy != count:
+        used = "64-bit" if count else "legacy"
+        warnings = (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
+    return CheckedHeader(path, header.file_size, header, dtype, records, points_end, warnings)
 
 
 def _check_waveforms(path: Path, header: las.LasHeader) -> None:
@@ -101,14 +106,6 @@ def _check_format(path: Path, header: las.LasHeader) -> None:
     least = las.STANDARD_DTYPES[number].itemsize
     if header.point_length < least:
         raise damaged(path, f"point records of {header.point_length} bytes are too short for format {number} ({least})")
-
-
-def _find_warnings(header: las.LasHeader) -> tuple[str, ...]:
-    legacy, count = header.counts
-    if header.version < (1, 4) or not legacy or legacy == count:
-        return ()
-    used = "64-bit" if count else "legacy"
-    return (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
 
 
 def _find_points_end(path: Path, header: las.LasHeader) -> int:
