@@ -74,8 +74,10 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
         modern = las.MODERN.get(target, target)
         wkt = convert_geotiff(path, header.vlrs, asked=False) if only_keys else None
         if only_keys and wkt is None:
-            why = "its CRS is given by GeoTIFF keys that wavebatch cannot turn into WKT, which point formats 6 to 10 need"
-            note = f"{why}: PDAL will not read the cloud unless readers.las gets nosrs=true; add a WKT record to the strip"
+            why = "its CRS is given by GeoTIFF keys that wavebatch cannot turn into WKT, "
+            why += "which point formats 6 to 10 need"
+            note = f"{why}: PDAL will not read the cloud unless readers.las gets nosrs=true; "
+            note += "add a WKT record to the strip"
             if target < 6:
                 note = f"written in point format {target} of LAS 1.4 in place of {modern}: {why}; "
                 note += f"--point-format {modern} tries"
