@@ -123,20 +123,16 @@ def compare(
 def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
     if (b is None) == (truth is None):
         raise click.UsageError("give either B or --truth FILE.npz")
-    for side in (a, b):
-        if side is not None and _is_chain(side):
+    from wavebatch.tools.compare_chains import find_contender
+
+    for side in filter(None, (a, b)):
+        if side.suffix.lower() == ".toml" or (not side.is_file() and not find_contender(str(side)).is_cloud):
             raise click.UsageError(f"{side} is a chain; give the strip to run it on with --strip STRIP")
     if b is not None and b.suffix.lower() == ".npz":
         raise click.UsageError(f"{b} looks like a truth file; give it with --truth")
     how = {} if options["within"] is None else {"tolerance_ns": options["within"]}
     how["chosen"] = PointFilter(where=options["where"])
     return compare_truth(a, truth, **how) if truth else compare_clouds(a, b, **how)
-
-
-def _is_chain(side: Path) -> bool:
-    from wavebatch.tools.compare_chains import find_contender
-
-    return side.suffix.lower() == ".toml" or (not side.is_file() and not find_contender(str(side)).is_cloud)
 
 
 def _match(a: Path, b: Path | None, strip: Path, options: dict) -> Matchup:

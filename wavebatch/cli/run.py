@@ -237,7 +237,14 @@ def run(**options: Any) -> None:
         os.environ.setdefault(name, "1")
     _check_options(options)
     try:
-        _start_processes(options)
+        # The processes that will surely be needed start before this one imports what it needs itself. A limit of memory
+        # may allow fewer, and resume may find nothing to do.
+        wanted = options["jobs"] or os.cpu_count() or 1
+        if wanted > 1 and not (options["memory"] or options["resume"] or options["dry_run"]):
+            from wavebatch.batch.workers.spawned import end_early, start_early
+
+            click.get_current_context().call_on_close(end_early)  # where an option is wrong, no run takes them
+            start_early(wanted)
         with importing():
             from wavebatch.tools.api import plan_run
 
@@ -253,17 +260,6 @@ def run(**options: Any) -> None:
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
         raise messages.Interrupted(text) from None
-
-
-def _start_processes(options: dict[str, Any]) -> None:
-    """Start the worker processes that will surely be needed, before this process imports what it needs itself."""
-    jobs = options["jobs"] or os.cpu_count() or 1
-    # A limit of memory may allow fewer processes, and resume may find nothing to do.
-    if jobs > 1 and not (options["memory"] or options["resume"] or options["dry_run"]):
-        from wavebatch.batch.workers.spawned import end_early, start_early
-
-        click.get_current_context().call_on_close(end_early)  # where an option is wrong, no run takes them
-        start_early(jobs)
 
 
 def _check_options(options: dict[str, Any]) -> None:

@@ -56,7 +56,12 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
       wavebatch import archive/ -o strips --resume
     """  # fmt: skip
     paths = shared.find_inputs(files, recursive=recursive, kinds=(SUFFIXES,))
-    targets = _name_strips(paths, output)
+    if output is None:
+        targets = {path: path.with_suffix(".las") for path in paths}
+    else:
+        if output.suffix.lower() not in (".las", ".laz"):
+            output.mkdir(parents=True, exist_ok=True)
+        targets = shared.name_outputs(paths, output, (".las", ".laz"), ".las")
     chosen = shared.from_options(ImportOptions, options)
 
     def work(path: Path) -> ImportSummary:
@@ -69,14 +74,6 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
     results, failed = shared.for_each(paths, work, debug=options["debug"], alone=True)
     answer({"files": [asdict(one) for one in results], "failed": failed})
     sys.exit(0 if not failed else EXIT_SOME if results else EXIT_NONE)
-
-
-def _name_strips(paths: list[Path], output: Path | None) -> dict[Path, Path]:
-    if output is None:
-        return {path: path.with_suffix(".las") for path in paths}
-    if output.suffix.lower() not in (".las", ".laz"):
-        output.mkdir(parents=True, exist_ok=True)
-    return shared.name_outputs(paths, output, (".las", ".laz"), ".las")
 
 
 def _say(summary: ImportSummary) -> None:

@@ -400,17 +400,15 @@ def find_frame(reader: PulseReader) -> Frame:
         code = keys.sure_code
         scales = tuple(min(abs(float(scale)), SCALE) for scale in header.scales)
         wkt = build_utm(code) if code else None
-        notes = _note_crs(keys) or (() if wkt else (_NO_WKT,))
+        notes = () if wkt else (_NO_WKT,)
+        if keys.kind == "geocentric":
+            notes = ("coordinates are geocentric and stay so: project the strip before steps that need heights",)
+        elif keys.kind == "geographic":
+            notes = ("coordinates are degrees of a datum that wavebatch does not project; packets need metres",)
+        elif not keys.keys:
+            notes = ("the file names no CRS",)
         frame = Frame(0, False, scales, (0.0,) * 3, wkt, header.projection, notes)
     return replace(frame, offsets=tuple(float(value) for value in np.floor(first[0] / ROUND) * ROUND))
-
-
-def _note_crs(keys: GeoKeys) -> tuple[str, ...]:
-    if keys.kind == "geocentric":
-        return ("coordinates are geocentric and stay so: project the strip before steps that need heights",)
-    if keys.kind == "geographic":
-        return ("coordinates are degrees of a datum that wavebatch does not project; packets need metres",)
-    return () if keys.keys else ("the file names no CRS",)
 
 
 _AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257222101
@@ -471,16 +469,6 @@ STEP = 1e-4
 PEAK = 6.0
 """Height of a detected echo, in noise of the smoothed waveform; detectors of runs use 4, but noise is rougher here."""
 MOST_RETURNS = 15
-
-
-def list_extra_bytes(plan: Plan) -> list[ExtraRecord]:
-    """Return the extra dimensions of a strip that is imported by this plan."""
-    records = [ExtraRecord.build(FACET, "u1", "mirror facet of the pulse")]
-    if plan.outgoing is not None:
-        texts = ("energy sent / mean of the strip", "height sent / mean of the strip", "std of pulse_energy",
-                 "std of pulse_amplitude")  # fmt: skip
-        records += [ExtraRecord.build(name, "<f4", text) for name, text in zip(SENT, texts, strict=True)]
-    return records
 
 
 @dataclass(slots=True)
@@ -760,10 +748,15 @@ def _open_writer(
 ) -> FullwaveWriter:
     by_index = {one.index: one for one in plan.digitizers.values()}
     digitizers = [by_index[index] for index in sorted(by_index)]
+    extra_bytes = [ExtraRecord.build(FACET, "u1", "mirror facet of the pulse")]
+    if plan.outgoing is not None:
+        texts = ("energy sent / mean of the strip", "height sent / mean of the strip", "std of pulse_energy",
+                 "std of pulse_amplitude")  # fmt: skip
+        extra_bytes += [ExtraRecord.build(name, "<f4", text) for name, text in zip(SENT, texts, strict=True)]
     record = Vlr(USER_ID, 1, json.dumps(account, sort_keys=True).encode(), b"what the strip was imported from")
     return FullwaveWriter(
         target, point_format=9, internal=options.internal, digitizers=digitizers,
-        scales=frame.scales, offsets=frame.offsets, wkt=frame.wkt, extra_bytes=list_extra_bytes(plan),
+        scales=frame.scales, offsets=frame.offsets, wkt=frame.wkt, extra_bytes=extra_bytes,
         records=(*frame.records, record), overwrite=overwrite, week=plan.week, system=header.system,
         source=header.source & 0xFFFF,
     )  # fmt: skip

@@ -288,7 +288,7 @@ def _zeroed(values: np.ndarray) -> np.ndarray:
 
 
 def _read_facts(path: Path) -> dict:
-    """The record that voxelize wrote."""
+    """The record that voxelize wrote; ConfigError for none, and for one that it cannot have written."""
     records = (vlr for vlr in read_header(path).vlrs if vlr.user == "wavebatch" and vlr.record_id == 1)
     for vlr in records:
         try:
@@ -296,19 +296,14 @@ def _read_facts(path: Path) -> dict:
         except ValueError:
             continue
         if isinstance(facts, dict) and facts.get("forest"):
-            return _check_facts(facts, path)
+            ratio = facts.get("reflectance_ratio")
+            ratio = ratio if isinstance(ratio, dict) else {}
+            numbers = facts.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
+            if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
+                raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it "
+                                  "anew with wavebatch voxelize --forest")  # fmt: skip
+            return facts
     raise ConfigError(f"{path}: --forest needs voxels: wavebatch voxelize STRIP --size 1 --forest -o voxels.laz")
-
-
-def _check_facts(facts: dict, path: Path) -> dict:
-    """The record, with a size and a ratio of reflectances that voxelize can have written; ConfigError for others."""
-    ratio = facts.get("reflectance_ratio")
-    ratio = ratio if isinstance(ratio, dict) else {}
-    numbers = facts.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
-    if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
-        raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it anew with "
-                          "wavebatch voxelize --forest")  # fmt: skip
-    return facts
 
 
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000

@@ -349,19 +349,14 @@ def find_segments(piece: Slice, options: SliceOptions) -> list[Segment]:
         return []
     x, y = piece.x[rows], piece.y[rows]
     weight, sigma = piece.line.value[rows].astype(np.float64), options.sigma / piece.line.spacing
-    gap = _choose_gap(piece)
+    gap = _GAP  # the largest hole in a segment [pixels]: ten, or three pulses if they lie farther apart
+    if piece.geometry != "time":
+        step = np.diff(piece.line.origin @ piece.axis) / piece.pixel
+        gap = max(_GAP, _PULSES_PER_GAP * float(np.median(np.abs(step))))
     # A flat surface is no straight line over time, so bends mean ridges in a plane only.
     pulse = piece.line.row[rows] if piece.geometry == "plane" else None
     lines = find_lines(x, y, weight, sigma=sigma, gap=gap, shortest=options.shortest, most=options.most, pulse=pulse)
     return [_describe(piece, found, rows[found.rows], number) for number, found in enumerate(lines)]
-
-
-def _choose_gap(piece: Slice) -> float:
-    """Largest hole in a segment [pixels]: ten, or three pulses if they lie farther apart."""
-    if piece.geometry == "time":
-        return _GAP
-    step = np.diff(piece.line.origin @ piece.axis) / piece.pixel
-    return max(_GAP, _PULSES_PER_GAP * float(np.median(np.abs(step))))
 
 
 def _describe(piece: Slice, found: HoughLine, rows: np.ndarray, number: int) -> Segment:

@@ -125,12 +125,12 @@ def choose_cheapest(rows: Sequence[Mapping], tolerance_cm: float) -> Mapping | N
 
     rows: as in the document of the benchmark.
     """
-
-    def is_good(row: Mapping) -> bool:
+    good = []
+    for row in rows:
         error = row["figures"]["rmse_isolated_cm"]
-        return error["value"] is not None and error["value"] + (error["error"] or 0) <= tolerance_cm
-
-    good = [row for row in rows if row["kernels"]["median"] is not None and is_good(row)]
+        known = row["kernels"]["median"] is not None and error["value"] is not None
+        if known and error["value"] + (error["error"] or 0) <= tolerance_cm:
+            good.append(row)
     return min(good, key=lambda row: (row["kernels"]["median"], row["name"]), default=None)
 
 
@@ -174,7 +174,11 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     if not len(truth):
         return np.empty((0, 3))
     columns, painted = _differentiate(recording, truth)
-    weight = _weigh(recording, truth, painted, n)
+    # Samples count by their inverse standard deviation; clipped ones do not.
+    signal = np.zeros((n, recording.n_samples))
+    np.add.at(signal, truth.waveform, painted)
+    variance = effective_noise(recording) ** 2 + recording.noise_gain * np.maximum(signal, 0)
+    weight = np.where(signal + recording.baseline < recording.clip, 1 / np.sqrt(variance), 0.0)
     columns *= weight[truth.waveform][:, None, :]
     bounds = np.full((len(truth), 3), np.inf)
     count = truth.count(n)
@@ -200,14 +204,6 @@ def _differentiate(recording: Recording, truth: EchoTable) -> tuple[np.ndarray, 
     grown = _measure(recording.pulse, wider) - _measure(recording.pulse, narrower)
     by_sigma = (paint(truth.time, wider) - paint(truth.time, narrower)) / np.maximum(grown, 1e-9)[:, None]
     return np.stack([by_time, echo / amplitude[:, None], by_sigma], axis=1).astype(np.float64), echo
-
-
-def _weigh(recording: Recording, truth: EchoTable, painted: np.ndarray, n: int) -> np.ndarray:
-    """Inverse standard deviation of every sample, 0 where it is clipped, (n, s)."""
-    signal = np.zeros((n, recording.n_samples))
-    np.add.at(signal, truth.waveform, painted)
-    variance = effective_noise(recording) ** 2 + recording.noise_gain * np.maximum(signal, 0)
-    return np.where(signal + recording.baseline < recording.clip, 1 / np.sqrt(variance), 0.0)
 
 
 def _invert(columns: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The benchmark as a whole: measures chains on scenes, and returns one document of plain values; its sheet and files.
 
-`wavebatch bench` calls `run_bench`, prints `bench_sheet` and calls `write_outputs`. In go scenes and chains; out comes a
-document whose keys are the format of bench.json: change SCHEMA when they change. All but times and memory is the same
+`wavebatch bench` calls `run_bench`, prints `bench_sheet` and calls `write_outputs`. In go scenes and chains; out comes
+a document whose keys are the format of bench.json: change SCHEMA when they change. All but times and memory is the same
 for the same options. `_measure_scene` has the order of the parts below it: which chains, on what echoes, how exact, how
 fast. A scene may be shaped like a strip: it draws whole waveforms of a sample of it with small changes. `auto` is the
 chain that a survey of a group chooses.

@@ -199,7 +199,13 @@ class LightModel:
 
         Raises InputError for shares that are none, and for points above the sensor.
         """
-        sigma = self._measure_sigma(rows["echo_width"] if self._read_width is None else self._read_width(records))
+        width = rows["echo_width"] if self._read_width is None else self._read_width(records)
+        known = width > 0
+        measured = np.where(known, width, 0.0) / FWHM_PER_SIGMA
+        limited = np.clip(measured, 0.5 * self.options.spacing, WIDEST)
+        self.counts.own_width += int(np.count_nonzero(known))
+        self.counts.limited_width += int(np.count_nonzero(known & (limited != measured)))
+        sigma = np.where(known, limited, self.options.sigma)
         intensity = rows["intensity"].astype(np.float64)
         if self.options.radar is None:
             return ReturnLight(intensity, sigma)
@@ -219,14 +225,6 @@ class LightModel:
                 f"{self.path}: --widths {self.options.widths}: {counts.limited_width} of {counts.own_width} values are "
                 f"outside of {least:.2g} to {most:.0f} ns; give a column with the width of each echo in ns"
             )
-
-    def _measure_sigma(self, width: np.ndarray) -> np.ndarray:
-        known = width > 0
-        measured = np.where(known, width, 0.0) / FWHM_PER_SIGMA
-        limited = np.clip(measured, 0.5 * self.options.spacing, WIDEST)
-        self.counts.own_width += int(np.count_nonzero(known))
-        self.counts.limited_width += int(np.count_nonzero(known & (limited != measured)))
-        return np.where(known, limited, self.options.sigma)
 
     def _measure_shares(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> np.ndarray:
         known = over = 0
@@ -359,7 +357,14 @@ class DiscreteReceiver:
         m = len(pulse)
         first = np.searchsorted(pulse, pulse, side="left")
         end = np.searchsorted(pulse, pulse, side="right")
-        reach = _end_of_dead_zone(distance, distance + self.dead_zone, end)
+        # End of the dead zone: the first row of the same pulse at or beyond it, else the row after the pulse.
+        limit = distance + self.dead_zone
+        reach = np.arange(m)
+        moving = reach.copy()
+        while len(moving):
+            reach[moving] += 1
+            moving = moving[reach[moving] < end[moving]]
+            moving = moving[distance[reach[moving]] < limit[moving]]
         sums = np.concatenate([[0.0], np.cumsum(amplitude, dtype=np.float64)])
         energy = sums[reach] - sums[:m]
         loud = np.where(energy > self.threshold, np.arange(m), m)
@@ -375,17 +380,6 @@ class DiscreteReceiver:
         row = np.concatenate(rows)
         order = np.argsort(row, kind="stable")
         return row[order], np.concatenate(numbers)[order], energy[row[order]]
-
-
-def _end_of_dead_zone(distance: np.ndarray, limit: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """First row of the same pulse at or beyond the limit, else the row after the pulse, i8 (m,)."""
-    reach = np.arange(len(distance))
-    moving = reach.copy()
-    while len(moving):
-        reach[moving] += 1
-        moving = moving[reach[moving] < end[moving]]
-        moving = moving[distance[reach[moving]] < limit[moving]]
-    return reach
 
 
 def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, keep_empty: bool) -> Returns:
