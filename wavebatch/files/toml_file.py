@@ -377,15 +377,14 @@ def describe_record(value: Any) -> dict[str, Any]:
             lost = part is None or isinstance(part, float) and math.isinf(part)
             values[key] = None if lost else one.kinds[0](part)
         elif part or one.key.blank:
-            lists[key] = list(map(describe_record, part)) if one.shape == "records" else _describe_rows(part, one)
+            rows = sorted(part.items()) if isinstance(part, Mapping) else part
+            if one.shape == "records":
+                lists[key] = list(map(describe_record, rows))
+            elif len(one.kinds) == 1:
+                lists[key] = list(map(one.kinds[0], rows))
+            else:
+                lists[key] = [[kind(number) for kind, number in zip(one.kinds, row, strict=True)] for row in rows]
     return {**values, **tables, **lists}
-
-
-def _describe_rows(rows: Any, one: Entry) -> list[Any]:
-    rows = sorted(rows.items()) if isinstance(rows, Mapping) else rows
-    if len(one.kinds) == 1:
-        return list(map(one.kinds[0], rows))
-    return [[kind(number) for kind, number in zip(one.kinds, row, strict=True)] for row in rows]
 
 
 def read_record(

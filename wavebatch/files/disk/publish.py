@@ -258,12 +258,6 @@ class Draft(contextlib.AbstractContextManager):
             os.unlink(self.path)
         _open.discard(self)
 
-    def withdraw(self) -> None:
-        """Remove the published file again, because a file that belongs to it could not be published."""
-        if self.published and not self.overwrite:
-            with contextlib.suppress(OSError):
-                os.unlink(self.target)
-
 
 _cleared: set[Path] = set()
 """Folders from which this process has removed what killed ones had left."""
@@ -326,7 +320,9 @@ def publish_together(drafts: Sequence[Draft]) -> None:
                 done.append(draft)
         except BaseException as error:
             for draft in done:
-                draft.withdraw()
+                if draft.published and not draft.overwrite:
+                    with contextlib.suppress(OSError):
+                        os.unlink(draft.target)
             for draft in drafts:
                 draft.discard()
             kept = ", ".join(str(draft.target) for draft in done if draft.published and draft.overwrite)
