@@ -13,7 +13,7 @@ interception: leaves of .5 over ground of .15 hide a gap probability of .61 as o
 `deconvolve_block` makes profiles of the waveforms: deconvolved, noise removed, placed by the returns of their packets.
 A profile does not depend on the other waveforms of its block.
 
-`Floor` and `find_ceiling` are maps of the lowest and of the highest returns of a strip. The floor divides the signal of
+`Floor` and `Ceiling` are maps of the lowest and of the highest returns of a strip. The floor divides the signal of
 a ray into ground and canopy, without any classification: light of a ray is shared between them, so signal that is
 wrongly taken for ground changes gap probabilities by the ratio of both reflectances only. Above the ceiling rays cross
 only air; without --headroom each ray is counted from there, so that voxels near the surface get all light that crossed
@@ -351,16 +351,6 @@ class Ceiling(CellMap):
         return headroom
 
 
-def find_ceiling(reader: StripReader, scan: StripScan, middle: np.ndarray, size: float, floor: Floor) -> Ceiling:
-    """The ceiling of a strip; reads all of its points, and adds them to `floor` too."""
-    ceiling = Ceiling(middle, size)
-    for begin, end in zip(scan.borders[:-1].tolist(), scan.borders[1:].tolist(), strict=True):
-        xyz = locate(reader.read_points(begin, end), reader.facts.header)
-        ceiling.add(xyz)
-        floor.add(xyz)
-    return ceiling.finish()
-
-
 BATCH_SAMPLES = 1 << 20
 """Samples read at a time."""
 
@@ -415,7 +405,15 @@ def read_batches(
         group = group_times(time)
         here = np.flatnonzero(group < len(rows[0]))
         taken = owner[here[here >= len(rows[0])]]
-        known = _match_lost(np.concatenate(list(lost.values())), time, owner)
+        # Lost returns of equal time with packets, with their group.
+        known = np.concatenate(list(lost.values()))
+        values, first, count = np.unique(time, return_index=True, return_counts=True)
+        at = np.minimum(np.searchsorted(values, known["time"]), max(len(values) - 1, 0))
+        if len(values):
+            known["group"] = owner[first[at]]
+            known = known[(values[at] == known["time"]) & (known["time"] != 0) & (count[at] < LONGEST_PULSE)]
+        else:
+            known = known[:0]
         kept = np.ones(len(owner), bool)
         if keep is not None:
             kept = np.concatenate([_choose_packets(unit, keep)[some] for unit, some in tables])
@@ -435,16 +433,6 @@ def read_batches(
                 parts.append((unit, mine[some[inside] - shift], groups[inside], kept[some[inside]]))
             if len(some):
                 yield Batch(parts, known[np.isin(known["group"], groups)])
-
-
-def _match_lost(lost: np.ndarray, time: np.ndarray, owner: np.ndarray) -> np.ndarray:
-    """Those of equal time with packets, with their group."""
-    values, first, count = np.unique(time, return_index=True, return_counts=True)
-    if not len(values):
-        return lost[:0]
-    at = np.minimum(np.searchsorted(values, lost["time"]), len(values) - 1)
-    lost["group"] = owner[first[at]]
-    return lost[(values[at] == lost["time"]) & (lost["time"] != 0) & (count[at] < LONGEST_PULSE)]
 
 
 def _choose_packets(unit: Unit, keep: PlannedFilter) -> np.ndarray:
