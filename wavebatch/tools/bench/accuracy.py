@@ -339,9 +339,10 @@ def describe_found(found: EchoTable) -> EchoTable:
 class AccuracyTally:
     """Collects the echoes found in groups; `figures` summarises them."""
 
+    waveforms: int = 0
+    """Number of waveforms added."""
     _waveforms: list[dict[str, np.ndarray]] = field(default_factory=list)
     _echoes: list[dict[str, np.ndarray]] = field(default_factory=list)
-    _offset: int = 0
 
     def add(self, group: Group, found: EchoTable) -> None:
         """Adds the echoes found in the waveforms of a group."""
@@ -356,7 +357,7 @@ class AccuracyTally:
             counts[f"{kind}_matched"] = np.bincount(truth.waveform[rows & matched], minlength=n)
         self._waveforms.append(counts)
         part = {
-            "waveform": truth.waveform[match.truth].astype(np.int64) + self._offset,
+            "waveform": truth.waveform[match.truth].astype(np.int64) + self.waveforms,
             "group": np.full(len(match.truth), group.number),
             "isolated": group.isolated[match.truth],
             "clear": group.clear[match.truth],
@@ -370,22 +371,15 @@ class AccuracyTally:
             part[f"{name}_ratio"] = error / group.bounds[match.truth, place]
             part[f"{name}_scaled"] = error / np.where(reported > 0, reported, np.nan)
         self._echoes.append(part)
-        self._offset += n
+        self.waveforms += n
 
     def figures(self) -> dict[str, Figure]:
         """Every figure by name: shares as fractions, lengths in cm of range, the others without unit."""
-        return {**self._shares(), **self._errors()}
-
-    @property
-    def waveforms(self) -> int:
-        """Number of waveforms added."""
-        return self._offset
-
-    def _shares(self) -> dict[str, Figure]:
-        w = _join(self._waveforms)
+        w, e = ({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+                for parts in (self._waveforms, self._echoes))  # fmt: skip
         group, true, found = w["group"], w["true"], w["found"]
         one, none = true == 1, true == 0
-        return {
+        figures = {
             "completeness": share_figure(w["matched"], true, group),
             "correctness": share_figure(w["matched"], found * true.any(), group),
             "exact_count": share_figure(found == true, np.ones(len(true)), group),
@@ -395,11 +389,7 @@ class AccuracyTally:
             "found_overlapped": share_figure(w["overlapped_matched"], w["overlapped"], group),
             "wrong": share_figure(true + found - 2 * w["matched"], (true + found) * true.any(), group),
         }
-
-    def _errors(self) -> dict[str, Figure]:
-        e = _join(self._echoes)
         every = np.ones(len(e["time"]), bool)
-        figures = {}
         for kind, rows in (("all", every), ("isolated", e["isolated"]), ("overlapped", ~e["isolated"])):
             figures[f"rmse_{kind}_cm"] = _spread(e, "time", rows).scale(CM_PER_NS)
             if kind == "all":
@@ -422,7 +412,3 @@ class AccuracyTally:
 
 def _spread(echoes: Mapping[str, np.ndarray], name: str, rows: np.ndarray) -> Figure:
     return root_mean_square(echoes[name][rows], echoes["waveform"][rows], echoes["group"][rows])
-
-
-def _join(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
