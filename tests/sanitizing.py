@@ -19,8 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
+from wavebatch.core.echoes import EchoTable
 from wavebatch.kernels import library
 from wavebatch.kernels.build_kernels import compile_library, find_compiler
+from wavebatch.kernels.fit import neighbours
 from wavebatch.kernels.fit.decompose import (
     Candidates,
     Clusters,
@@ -29,6 +31,7 @@ from wavebatch.kernels.fit.decompose import (
     decompose_clusters,
     promise_echoes,
 )
+from wavebatch.kernels.fit.neighbours import Faintness, Flagging, Unexplained
 from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable
 from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.filters import find_maxima, quiet_levels
@@ -193,6 +196,24 @@ def look_for(samples: Samples, candidates: Candidates, rng: np.random.Generator)
     margin, reach, most = int(rng.integers(0, 99)), int(rng.integers(0, 99)), int(rng.integers(1, 9))
     clusters = cluster_candidates(samples, ordered, margin=margin, reach=reach, most=most, tail=tail)
     assert clusters.number.sum() == len(order)
+    judge(samples, ordered, rng)
+
+
+def judge(samples: Samples, echoes: Candidates, rng: np.random.Generator) -> None:
+    """The functions of tables of echoes, with any laws."""
+    m, s = len(echoes.time), samples.counts.shape[1]
+    values = {name: rng.normal(0, 10, m) for name in ("time_err", "amplitude_err", "sigma_err", "residual")}
+    columns = echoes.waveform, echoes.time, echoes.amplitude, echoes.width
+    with np.errstate(over="ignore"):
+        table = EchoTable.build(*columns, **values, flags=rng.choice([0, 16], m))
+    width, level = 10 ** rng.uniform(-3, 3, 2)
+    curve = tuple(zip(np.sort(rng.normal(0, 9, rng.integers(0, 4))), rng.random(3), strict=False))
+    assert len(neighbours.find_faint(table, Faintness(0.1, 0, 9, True, level, 0.1, curve, 1, 5, 9, 2, 2, 2))) == m
+    law = Unexplained(5.0, 0.1, level, 9.0, 1.0, curve, 1.0, 1.0, level, 0.1, width, 1.0)
+    assert (neighbours.weigh_fits(table, law, others=True)[0] >= 1).all()
+    flagging = Flagging(0.5, 0.5 * s, width, width, level, 1.5, 0.1)
+    assert len(neighbours.set_flags(table, samples._replace(baseline=samples.std), flagging)) == m
+    assert len(neighbours.find_pairs(table, width, rng.choice([0.0, 1.0]))) <= m
 
 
 def damage_strips(folder: Path, cases: int, seed: int) -> list[str]:

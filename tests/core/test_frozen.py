@@ -10,7 +10,7 @@ from dataclasses import KW_ONLY, FrozenInstanceError, asdict, dataclass, field, 
 import numpy as np
 import pytest
 
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import changeable, frozen
 
 
 @frozen
@@ -158,3 +158,22 @@ def test_values_have_an_order_where_it_is_asked_for():
     assert Size(1) < Size(2) and Size(2) > Size(1) and Size(1) <= Size(1) and Size(2) >= Size(2)
     with pytest.raises(TypeError):
         assert Size(1) < 2
+
+
+@changeable
+class Tally:
+    """Counts."""
+
+    number: int = 0
+    names: list[str] = field(default_factory=list)
+
+
+def test_fields_of_a_changeable_class_may_be_set():
+    one, other = Tally(1), Tally(names=["a"])
+    other.number += 1
+    assert one != other and one == replace(other, names=[]) == pickle.loads(pickle.dumps(one))
+    assert repr(other) == "Tally(number=1, names=['a'])" and Tally().names is not Tally().names
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(one)
+    with pytest.raises(AttributeError):
+        one.other = 1

@@ -22,6 +22,26 @@ def test_time_zero_says_nothing():
     assert find_pulses(np.array([0.0, 0.0, 1.0, 1.0])).tolist() == [0, 1, 2, 2]
 
 
+def _pulses_by_loop(time):
+    found = []
+    for i, own in enumerate(time):
+        first, last = i, i
+        while first and time[first - 1] == own:
+            first -= 1
+        while last + 1 < len(time) and time[last + 1] == own:
+            last += 1
+        found.append(i if own == 0 or last - first + 1 >= LONGEST_PULSE else first)
+    return found
+
+
+def test_pulses_are_those_of_a_loop(rng):
+    """Times of records lie apart in memory; one is no number."""
+    for _ in range(20):
+        length = rng.choice([1, 2, LONGEST_PULSE - 1, LONGEST_PULSE], 40)
+        time = np.repeat(rng.choice([0.0, 1.0, 2.0, np.nan], 40), length)
+        assert find_pulses(np.stack([time, time], axis=1)[:, 0]).tolist() == _pulses_by_loop(time)
+
+
 def _nearest_by_loop(echo_waveform, echo_time, return_waveform, return_time):
     found = []
     for waveform, time in zip(echo_waveform, echo_time, strict=True):

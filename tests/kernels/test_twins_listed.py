@@ -26,13 +26,18 @@ COMPILED = {
     "interpolate_columns": ("interpolate", "np.interp"), "fit_stack": ("refine_gaussians", "naive_fit.fit_stack"),
     "describe_echoes": ("describe_whole", "naive_fit.describe_whole"), "keep_echoes": ("keep_echoes", "naive_fit.keep"),
     "match_returns": ("match_returns", "naive.match_returns"),
+    "find_faint": ("drop_unproven", "test_flags.pairs"), "weigh_fits": ("cover_misfit", "test_flags.pairs"),
+    "set_flags": ("flag_echoes", "test_flags.pairs"), "find_pairs": ("merge_unresolved", "test_flags._unresolved"),
+    "find_pulses": ("find_pulses", "test_group_returns._pulses_by_loop"),
+    "find_nearest": ("find_nearest", "test_group_returns._nearest_by_loop"),
+    "number_returns": ("number_returns", "naive_geometry.number_returns"),
 }  # fmt: skip
 """Function of the library, the kernel that calls it, and the twin that a test compares that with."""
 
 HARD = {
     "fit_planes": "test_planes.naive_plane", "find_lines": "naive_geometry.find_lines",
     "fit_sensor": "naive_geometry.fit_sensor", "find_rays": "naive_geometry.find_rays",
-    "number_returns": "naive_geometry.number_returns", "match_returns": "naive.match_returns",
+    "match_returns": "naive.match_returns",
     "cross_voxels": "test_voxel_kernels.walk", "angles_above": "naive_physics.angle_above",
     "estimate_canopy_ratio": "naive_physics.estimate_canopy_ratio", "judge_energies": "naive_physics.judge_energies",
     "find_levels": "naive_signal.find_level", "measure_recovery": "naive_signal.measure_recovery",

@@ -218,3 +218,11 @@ def test_an_echo_whose_companions_are_gone_is_not_overlapped():
     assert clear_lone(table).flags.tolist() == [0, overlapped, overlapped, overlapped | merged, 0, 1]
     assert table.flags.tolist() == flags.tolist()
     assert len(clear_lone(EchoTable.empty())) == 0
+
+
+def test_echoes_of_no_waveform_are_refused(table):
+    block = WaveformBlock.from_samples(np.zeros((N - 1, S), np.uint8))
+    noise = Noise(np.zeros(N - 1, np.float32), np.ones(N - 1, np.float32))
+    last = replace(table, waveform=np.maximum(table.waveform, N - 1))
+    with pytest.raises(ValueError, match="lies in no waveform"):
+        flag_echoes(block, noise, SystemPulse(2.0), last)

@@ -199,7 +199,11 @@ def assemble_echoes(
     xyz = np.stack([np.append(table.attributes[name], np.nan)[rows.echo] for name in "xyz"], axis=1)
     packet = np.where(rows.echo >= 0, np.append(table.waveform, -1)[rows.echo], members.packet[rows.source])
     direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0).take(packet, axis=0)
-    places = np.where(np.isnan(xyz), locate(records, layout.source.header), xyz)
+    places, absent = xyz, np.isnan(xyz)
+    if absent.any():
+        passed = np.flatnonzero(absent.any(axis=1))
+        places = xyz.copy()
+        places[passed] = np.where(absent[passed], locate(records[passed], layout.source.header), xyz[passed])
     flags = np.append(table.flags, np.uint16(0))[rows.echo] | rows.reason
     pulse = find_pulses(unit.points["gps_time"])[rows.owner]
     number, total = _number_rows(pulse, places, direction, records, (flags & np.uint16(dropped)) == 0)
@@ -311,8 +315,8 @@ def _number_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return number and number of returns; pulses without any waveform, and rows not counted, keep the input's."""
     number, total = (given.astype(np.int64) for given in split_numbers(records))
-    rows = np.flatnonzero(counted)
-    found, count, known = number_returns(pulse[rows], xyz.take(rows, axis=0), direction.take(rows, axis=0))
+    rows: Any = slice(None) if counted.all() else np.flatnonzero(counted)
+    found, count, known = number_returns(pulse[rows], xyz[rows], direction[rows])
     number[rows] = np.where(known, found, number[rows])
     total[rows] = np.where(known, count, total[rows])
     return number, total

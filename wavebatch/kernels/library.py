@@ -22,7 +22,8 @@ FUNCTIONS = (
     "exponentials", "logarithms", "solve_equations", "decode_packets", "describe_waveforms", "describe_widths",
     "learn_pulse", "render_pulses", "measure_changes", "pair_differences", "judge_packets",
     "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes",
-    "match_returns",
+    "match_returns", "find_faint", "weigh_fits", "set_flags", "find_pairs",
+    "find_pulses", "find_nearest", "number_returns",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -189,6 +190,49 @@ class CKept(ctypes.Structure):
         _POINTER,
         "waveform time amplitude sigma time_err amplitude_err sigma_err relative_energy_err residual flags row",
     )
+
+
+class CTable(ctypes.Structure):
+    """`Table` of kernels/c/neighbours.h."""
+
+    _fields_ = [
+        *_fields(ctypes.c_int64, "m"),
+        *_fields(_POINTER, "waveform time amplitude sigma time_err amplitude_err sigma_err residual flags"),
+    ]
+
+
+class CCurve(ctypes.Structure):
+    """`Curve` of kernels/c/neighbours.h."""
+
+    _fields_ = [*_fields(ctypes.c_int64, "n"), *_fields(_POINTER, "lag value")]
+
+
+class CFaintness(ctypes.Structure):
+    """`Faintness` of kernels/c/neighbours.h."""
+
+    _fields_ = [
+        *_fields(ctypes.c_double, "share nearest furthest"),
+        *_fields(ctypes.c_int64, "after"),
+        *_fields(ctypes.c_double, "top clipped"),
+        ("tail", CCurve),
+        *_fields(ctypes.c_double, "close apart beside factor far_factor known"),
+    ]
+
+
+class CUnexplained(ctypes.Structure):
+    """`Unexplained` of kernels/c/neighbours.h."""
+
+    _fields_ = [
+        *_fields(ctypes.c_double, "core misfit clear beside energy"),
+        ("left", CCurve),
+        *_fields(ctypes.c_double, "unit spacing variance misfit2 samples limit"),
+    ]
+
+
+class CFlagging(ctypes.Structure):
+    """`Flagging` of kernels/c/neighbours.h."""
+
+    _fields_ = _fields(ctypes.c_double, "spacing last sigma_ref narrow level reach unreliable")
 
 
 class Samples(NamedTuple):

@@ -10,6 +10,9 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit import neighbours
+from wavebatch.kernels.fit.neighbours import Faintness, Flagging, Unexplained
+from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.pulse_tables import clip_level, fit_misfit
 
@@ -49,6 +52,9 @@ CLIPPED_TAIL = 0.005
 range were never measured, and 0.2 % of four times the range is many times the noise.
 """
 
+CLIPPED_REACH = 1.5
+"""Widths around the centre of an echo in which a clipped sample is its own: a third of its height is left there."""
+
 UNRELIABLE_BELOW = 0.15
 """Below this share of an echo under the digitizer's limit its amplitude is a guess (docs/algorithms.md H6)."""
 
@@ -72,20 +78,18 @@ def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: 
     EchoTable
         The same echoes with these flags.
     """
-    last = (block.samples.shape[1] - 1) * block.spacing
-    table = table.with_flags(EchoFlag.WEAK, table.amplitude < 5 * noise.std[table.waveform])
-    edge = np.minimum(table.time, last - table.time) < table.sigma
+    ref, last = system.sigma_ref, (block.samples.shape[1] - 1) * block.spacing
+    law = Flagging(block.spacing, last, ref, 0.93 * ref, clip_level(block, system), CLIPPED_REACH, UNRELIABLE_BELOW)
+    samples = Samples(block.samples, noise.baseline, noise.std, block.missing)
+    table = replace(table, flags=neighbours.set_flags(table, samples, law))
     if block.missing is not None:
         away = gap_distance(block.missing, table.waveform, table.time / block.spacing)
-        edge |= away * block.spacing < table.sigma
-    table = table.with_flags(EchoFlag.NEAR_EDGE, edge)
-    narrow = table.sigma + 3 * np.nan_to_num(table.sigma_err) < system.sigma_ref
-    table = table.with_flags(EchoFlag.NARROW, narrow & (table.sigma < 0.93 * system.sigma_ref))
+        table = table.with_flags(EchoFlag.NEAR_EDGE, away * block.spacing < table.sigma)
     if system.ringing > 0:
-        limit = RINGING_FACTOR * system.ringing
-        suspect = _faint_beside(table, limit, 2.0 * system.sigma_ref, RINGING_REACH * system.sigma_ref, before=False)
-        table = table.with_flags(EchoFlag.RINGING_SUSPECT, suspect & (table.amplitude > 0))
-    return _flag_saturated(block, noise, clip_level(block, system), table)
+        ringing = Faintness(RINGING_FACTOR * system.ringing, 2.0 * ref, RINGING_REACH * ref)
+        suspect = neighbours.find_faint(table, ringing) & (table.amplitude > 0)
+        table = table.with_flags(EchoFlag.RINGING_SUSPECT, suspect)
+    return table
 
 
 def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) -> EchoTable:
@@ -105,19 +109,18 @@ def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) ->
     EchoTable
         The remaining echoes.
     """
-    faint = np.zeros(len(table), bool)
+    ref, law = system.sigma_ref, Faintness()
     if system.components:
         delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
-        faint = _faint_beside(table, system.faint_share, 0.0, max([4 * system.sigma_ref, *delays]), before=True)
-        clipped = np.where(table.amplitude >= top, CLIPPED_TAIL * table.amplitude, 0)
-        for row, other, _ in list_neighbours(table) if clipped.any() else ():
-            faint[row] |= table.amplitude[row] < clipped[other]
+        law = Faintness(system.faint_share, 0.0, max([4 * ref, *delays]), after=True, top=top, clipped=CLIPPED_TAIL)
     if system.tail_misfit:
-        for row, other, lag in list_neighbours(table):
-            factor = np.where(np.abs(lag) < BESIDE * system.sigma_ref, TAIL_FACTOR, FAR_TAIL_FACTOR)
-            tail = _tail_share(system, lag) * table.amplitude[other]
-            noise = np.where(tail > 0, KNOWN * np.nan_to_num(table.amplitude_err[row]), 0)
-            faint[row] |= table.amplitude[row] < np.maximum(factor * tail, tail + noise)
+        # It was measured in steps of the pulse's width: a line between two lags at most two steps apart, as a step on a
+        # flank may not be told from neighbours; elsewhere nothing is left.
+        law = law._replace(
+            tail=system.tail_misfit, close=0.6 * ref, apart=2.5 * ref, beside=BESIDE * ref, factor=TAIL_FACTOR,
+            far_factor=FAR_TAIL_FACTOR, known=KNOWN, after=True,
+        )  # fmt: skip
+    faint = neighbours.find_faint(table, law)
     return table.take(np.flatnonzero(~faint)) if faint.any() else table
 
 
@@ -148,15 +151,8 @@ def cover_misfit(table: EchoTable, system: SystemPulse, spacing: float) -> EchoT
 
 def misfit_factor(table: EchoTable, system: SystemPulse, spacing: float) -> np.ndarray:
     """Return by how much errors (m,) are larger than those of noise alone; arguments as for `cover_misfit`."""
-    variance = np.zeros(len(table))
-    lags, beside = np.array(system.beside or ((0.0, 0.0),)).T
-    energy = SQRT_PI * system.sigma_ref / spacing / system.noise.std**2
-    for row, other, lag in list_neighbours(table) if system.misfit or system.beside else ():
-        core = np.where(np.abs(lag) < CORE * system.sigma_ref, CORE_STD * system.misfit * table.amplitude[other], 0.0)
-        strong = (table.amplitude[other] > CLEAR * system.noise.std) & (np.abs(lag) < BESIDE * system.sigma_ref)
-        more = energy * core**2 + np.where(strong, np.interp(lag, lags, beside), 0.0)
-        variance[row] = np.maximum(variance[row], more)
-    return np.sqrt(find_unexplained(table, system, spacing) * (1 + variance))
+    unexplained, variance = _find_unexplained(table, system, spacing, others=bool(system.misfit or system.beside))
+    return np.sqrt(unexplained * (1 + variance))
 
 
 def use_noise_errors(table: EchoTable, system: SystemPulse, spacing: float) -> EchoTable:
@@ -197,27 +193,21 @@ def find_unexplained(table: EchoTable, system: SystemPulse, spacing: float) -> n
     float64 array, shape (m,)
         chi2 per sample of the echo's fit, over what is expected; 1 where chance explains it.
     """
-    samples = SPAN * system.sigma_ref / spacing
-    energy = table.amplitude.astype(np.float64) ** 2 * table.sigma
-    energy = np.bincount(table.waveform, energy)[table.waveform] * SQRT_PI / spacing / system.noise.std**2
-    expected = 1 + fit_misfit(system, spacing) ** 2 * energy / samples
-    chi2 = np.nan_to_num(table.residual).astype(np.float64) ** 2 / expected
-    return np.where(chi2 > 1 + BEYOND_CHANCE * np.sqrt(2 / samples), chi2, 1.0)
+    return _find_unexplained(table, system, spacing, others=False)[0]
 
 
-def _tail_share(system: SystemPulse, lag: np.ndarray) -> np.ndarray:
-    """Share of an echo (k,) that its tail leaves unexplained at these lags [ns].
-
-    It was measured in steps of the pulse's width: a line between two lags at most two steps apart, as a step on a flank
-    may not be told from neighbours; elsewhere nothing is left.
-    """
-    if not system.tail_misfit:
-        return np.zeros(len(lag))
-    lags, shares = np.array(system.tail_misfit).T
-    near = np.abs(lag[:, None] - lags).min(axis=1) <= 0.6 * system.sigma_ref
-    after = np.searchsorted(lags, lag)
-    between = np.diff(lags, prepend=-np.inf, append=np.inf)[after] < 2.5 * system.sigma_ref
-    return np.where(near | between, np.interp(lag, lags, shares), 0.0)
+def _find_unexplained(
+    table: EchoTable, system: SystemPulse, spacing: float, *, others: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same, and what others leave beside each echo, in its variance."""
+    ref, std, samples = system.sigma_ref, system.noise.std, SPAN * system.sigma_ref / spacing
+    law = Unexplained(
+        core=CORE * ref, misfit=CORE_STD * system.misfit, clear=CLEAR * std, beside=BESIDE * ref,
+        energy=SQRT_PI * ref / spacing / std**2, left=system.beside, unit=SQRT_PI, spacing=spacing, variance=std**2,
+        misfit2=fit_misfit(system, spacing) ** 2, samples=samples,
+        limit=1 + BEYOND_CHANCE * float(np.sqrt(2 / samples)),
+    )  # fmt: skip
+    return neighbours.weigh_fits(table, law, others=others)
 
 
 def list_neighbours(table: EchoTable) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -260,42 +250,3 @@ def clear_lone(table: EchoTable) -> EchoTable:
     number = np.bincount(table.waveform[overlapped], minlength=int(table.waveform.max(initial=0)) + 1)
     lone = overlapped & ~merged & (number[table.waveform] == 1)
     return replace(table, flags=np.where(lone, table.flags & ~np.uint16(EchoFlag.OVERLAPPED), table.flags))
-
-
-def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: float, *, before: bool) -> np.ndarray:
-    """Find echoes below `ratio` of an echo of their waveform that lies nearest..furthest ns before them.
-
-    before: also of an echo that follows within this distance.
-    """
-    faint = np.zeros(len(table), bool)
-    for row, other, lag in list_neighbours(table):
-        gap = np.abs(lag) if before else lag
-        near = (gap >= nearest) & (gap <= furthest)
-        faint[row] |= near & (table.amplitude[row] < ratio * table.amplitude[other])
-    return faint
-
-
-def _flag_saturated(block: WaveformBlock, noise: Noise, level: float, table: EchoTable) -> EchoTable:
-    """Flag echoes with clipped samples within 1.5 widths of their centre, and amplitudes that are guesses."""
-    clipped = block.samples >= level
-    if block.missing is not None:
-        clipped &= ~block.missing
-    s = block.samples.shape[1]
-    place = np.flatnonzero(clipped)
-    is_clipped = np.zeros(len(clipped), bool)
-    is_clipped[place // s] = True
-    rows = np.flatnonzero(is_clipped[table.waveform])
-    if not len(rows):
-        return table
-    # The first clipped sample after the beginning of an echo must lie before its end. Looked up in the list of clipped
-    # samples: echoes x samples would be 4e8 for one waveform of 65,535 samples with spikes.
-    place = np.append(place, len(clipped) * s)
-    time, reach = table.time[rows], 1.5 * table.sigma[rows]
-    low = np.ceil(np.clip((time - reach) / block.spacing, 0, s)).astype(np.int64)
-    high = np.floor(np.clip((time + reach) / block.spacing, -1, s - 1)).astype(np.int64)
-    start = table.waveform[rows].astype(np.int64) * s
-    saturated = np.zeros(len(table), bool)
-    saturated[rows] = place[np.searchsorted(place, start + low)] <= start + high
-    guess = saturated & (UNRELIABLE_BELOW * table.amplitude > level - noise.baseline[table.waveform])
-    table = table.with_flags(EchoFlag.SATURATED, saturated)
-    return table.with_flags(EchoFlag.AMPLITUDE_UNRELIABLE, guess)

@@ -303,12 +303,14 @@ def error_factors(
         return np.ones((len(width), 4))
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
     widths, factors, by_level = _factor_table(shape, limits, noise.correlation, noise.whitening)
-    found = interpolate(width, widths, factors)
     if level_err is None:
-        return found
+        return interpolate(width, widths, factors)
     if noise.whitening:
         level_err = level_err * noise.std / noise.quiet
-    return np.hypot(found, level_err[:, None] * interpolate(width, widths, by_level))
+    found = interpolate(width, widths, np.hstack([factors, by_level]))
+    found[:, 4:] *= level_err[:, None]
+    found *= found
+    return np.sqrt(found[:, :4] + found[:, 4:])
 
 
 @lru_cache(maxsize=16)

@@ -376,12 +376,24 @@ def _lock(path: Path) -> int | None:
     return descriptor if held else None
 
 
+def list_names(folder: Path, begins: tuple[str, ...], end: str = "") -> list[Path]:
+    """What a folder holds whose name begins with one of these and ends so; a glob compiles a pattern for each.
+
+    Nothing where the folder cannot be read.
+    """
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        return []
+    return [folder / name for name in names if name.startswith(begins) and name.endswith(end)]
+
+
 def remove_stale(folder: Path) -> list[Path]:
     """Remove the temporary files of ended processes from `folder` and return their names.
 
     A locked file is still being written and stays. On systems without file locks nothing is removed.
     """
-    found = Path(folder).glob(f"{_PREFIX}*{_SUFFIX}")
+    found = list_names(folder, (_PREFIX,), _SUFFIX)
     return remove_unlocked(found, lambda path: os.open(path, LOCK_FLAGS), os.unlink)
 
 

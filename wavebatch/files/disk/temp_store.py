@@ -25,7 +25,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.publish import LOCK_FLAGS, Draft, make_locked, remove_unlocked, reporting
+from wavebatch.files.disk.publish import LOCK_FLAGS, Draft, list_names, make_locked, remove_unlocked, reporting
 from wavebatch.files.disk.raw_bytes import Closing, in_one_line, read_exactly, take_whole_records
 
 _LOCK = "lock"
@@ -88,7 +88,7 @@ def remove_orphans(parent: Path) -> list[Path]:
     Only folders of this user and this machine: a locked folder is in use, and whether a process of another machine is
     alive cannot be known. On systems without file locks nothing is removed.
     """
-    found = [*parent.glob(f"{_prefix()}*"), *parent.glob(f".{_prefix()}*")]
+    found = list_names(parent, (_prefix(), f".{_prefix()}"))
     return remove_unlocked(found, _open_lock, functools.partial(shutil.rmtree, ignore_errors=True))
 
 

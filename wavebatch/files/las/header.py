@@ -17,7 +17,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Container, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,7 +25,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import changeable, frozen
 from wavebatch.files.disk.raw_bytes import damaged, open_regular, reporting_reads, widen_integers
 
 _XYZ = [("X", "<i4"), ("Y", "<i4"), ("Z", "<i4"), ("intensity", "<u2"), ("bit_fields", "u1")]
@@ -137,7 +137,7 @@ class Evlr:
     record_id: int
 
 
-@dataclass(slots=True)
+@changeable
 class LasHeader:
     """Every field of a LAS header; `vlrs` has a "laszip encoded" record only if it was read from a LAZ file."""
 

@@ -21,13 +21,13 @@ decided by the scan once per descriptor, from packets spread over the strip, bec
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from enum import IntEnum
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import changeable, frozen
 from wavebatch.core.order import distinct, even_places, median, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
@@ -74,7 +74,7 @@ class VectorDecision:
     problems: tuple[str, ...]
 
 
-@dataclass(slots=True)
+@changeable
 class DirectionTally:
     """Votes for both directions, collected in parts; each part counts with at most a few hundred points."""
 
@@ -549,7 +549,7 @@ def unpack_samples(rows: np.ndarray, n_samples: int, bits: int, little: bool) ->
     return ((value >> shift.astype(np.uint32)) & np.uint32((1 << bits) - 1)).astype(np.uint16)
 
 
-@dataclass(slots=True)
+@changeable
 class FormSample:
     """Packets spread over a strip: for each its key (see `Judged.keys`), samples and whether they are packed."""
 
@@ -586,7 +586,7 @@ class FormSample:
         return found
 
 
-@dataclass(slots=True)
+@changeable
 class _Votes:
     """Waveforms whose signal goes up, and down; moments of all deviations from the medians."""
 
@@ -620,7 +620,7 @@ class _Votes:
 
     def join(self, other: _Votes) -> _Votes:
         """Return both together."""
-        return _Votes(*(getattr(self, name) + getattr(other, name) for name in _Votes.__slots__))
+        return _Votes(*(getattr(self, name) + getattr(other, name) for name in _Votes.__annotations__))
 
     @property
     def skewness(self) -> float:

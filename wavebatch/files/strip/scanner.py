@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import changeable, frozen
 from wavebatch.core.order import distinct
 from wavebatch.files.disk.raw_bytes import Closing, take_whole_records
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
@@ -375,7 +375,7 @@ def cut_scan(units: int, unit_points: int, parts: int, sizes: ScanSizes = SCAN_S
     return list(itertools.pairwise(units * part // parts for part in range(parts + 1)))
 
 
-@dataclass(slots=True)
+@changeable
 class _Tally:
     reasons: np.ndarray = field(default_factory=lambda: np.zeros(len(check.Reason), np.int64))
     first: np.ndarray = field(default_factory=lambda: np.full(len(check.Reason), -1, np.int64))

@@ -18,6 +18,7 @@
 #include "signal.h"
 #include "elementary.h"
 #include "echoes.h"
+#include "neighbours.h"
 #include "returns.h"
 #include "stack.h"
 #include "wdz.h"

@@ -1,4 +1,6 @@
-/* Pairs of echoes and returns of one waveform: mutual nearest neighbours, then again among the rest, until none is left.
+/* Points of one pulse and of one waveform: which they are, return numbers, the nearest return.
+
+   Pairs of echoes and returns of one waveform: mutual nearest neighbours, then again among the rest, until none is left.
 
    A lone echo beside a lone return, the usual case, needs no search. */
 
@@ -61,4 +63,60 @@ EXPORT int64_t match_returns(int64_t m, const int64_t *echo_waveform, const doub
     }
     free(echoes);
     return 0;
+}
+
+/* First point of the pulse of each of n points: a run of equal times, but for time 0 and for runs of `longest` and more. */
+EXPORT int64_t find_pulses(int64_t n, const double *time, int64_t longest, int64_t *first) {
+    for (int64_t i = 0, end; i < n; i = end) {
+        for (end = i + 1; end < n && time[end] == time[i];) end++;
+        const int is_pulse = end - i < longest && time[i] != 0;
+        for (int64_t j = i; j < end; j++) first[j] = is_pulse ? i : j;
+    }
+    return 0;
+}
+
+/* Nearest return of each of m echoes; both sorted by waveform. -1 without one; of two equally near ones the earlier. */
+EXPORT int64_t find_nearest(int64_t m, const int64_t *echo_waveform, const double *echo_time, int64_t k, const int64_t *return_waveform,
+                            const double *return_time, int64_t *nearest) {
+    for (int64_t i = 0, first = 0; i < m; i++) {
+        double least = INFINITY;
+        nearest[i] = -1;
+        while (first < k && return_waveform[first] < echo_waveform[i]) first++;
+        for (int64_t j = first; j < k && return_waveform[j] == echo_waveform[i]; j++) {
+            const double gap = fabs(return_time[j] - echo_time[i]);
+            const int is_nearer = gap < least || (gap == least && return_time[j] <= echo_time[i]);
+            if (nearest[i] < 0 || is_nearer) { nearest[i] = j; least = gap; }
+        }
+    }
+    return 0;
+}
+
+/* Return number and number of returns of m points, sorted by pulse, by their order along the first ray that is known of
+   the pulse; `ordered` where there is one. */
+EXPORT int64_t number_returns(int64_t m, const int64_t *pulse, const double *xyz, const double *direction, int64_t *number, int64_t *count,
+                              uint8_t *ordered) {
+    int64_t *rows = malloc((m + 1) * sizeof *rows);
+    double *along = malloc((m + 1) * sizeof *along);
+    int64_t done = rows && along ? 0 : -1;
+    for (int64_t i = 0, end; i < m && done == 0; i = end) {
+        int64_t head = -1;
+        for (end = i; end < m && pulse[end] == pulse[i]; end++) {
+            const double *ray = direction + 3 * end;
+            if (head < 0 && (ray[0] != 0 || ray[1] != 0 || ray[2] != 0)) head = end;
+        }
+        const double *from = xyz + 3 * (head < 0 ? i : head), *ray = direction + 3 * (head < 0 ? i : head);
+        for (int64_t j = i; j < end; j++) {
+            const double *to = xyz + 3 * j;
+            along[j] = (to[0] - from[0]) * ray[0] + (to[1] - from[1]) * ray[1] + (to[2] - from[2]) * ray[2];
+            rows[j] = j;
+        }
+        sort_by_time(end - i, rows + i, along);
+        for (int64_t j = i; j < end; j++) {
+            number[rows[j]] = j - i + 1;
+            count[j] = end - i;
+            ordered[j] = head >= 0;
+        }
+    }
+    free(rows); free(along);
+    return done;
 }

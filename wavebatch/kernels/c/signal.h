@@ -19,7 +19,7 @@ static void free_rows(Rows *r) { free(r->signal); free(r->smoothed); free(r->eve
 
 static int reserve_rows(Rows *r, int64_t s) {
     return enlarge(&r->signal, s * sizeof(float)) && enlarge(&r->smoothed, s * sizeof(float)) && enlarge(&r->even, s * sizeof(float))
-        && enlarge(&r->marks, s);
+        && enlarge(&r->marks, s + 8);
 }
 
 /* [1 2 1]/4 along the samples; the end samples are repeated outwards. */
@@ -79,33 +79,43 @@ static int read_signal(const Block *b, int64_t waveform, float *signal) {
     return varies;
 }
 
+/* Sum of the recorded samples from .. to - 1 of a waveform, in four parts; adds their number to `found`. */
+static double sum_recorded(const float *signal, const uint8_t *missing, int64_t from, int64_t to, int64_t *found) {
+    wide sum = {0};
+    int64_t i = from;
+    for (; i + LANES <= to && !missing; i += LANES) {
+        lanes four;
+        memcpy(&four, signal + i, sizeof four);
+        sum += __builtin_convertvector(four, wide);
+        *found += LANES;
+    }
+    for (; i < to; i++)
+        if (!missing || !missing[i]) { sum[0] += signal[i]; ++*found; }
+    return (sum[0] + sum[2]) + (sum[1] + sum[3]);
+}
+
 /* Samples that are far from any signal: neither within `reach` of a smoothed sample beyond +-limit, nor within `recovery`
    after one beyond three times that. Their mean above the baseline and their number, H10. */
 EXPORT int64_t quiet_levels(const Block *b, int64_t n, double limit, int64_t reach, int64_t recovery, float *mean, int32_t *number) {
-    const int64_t s = b->length;
+    const int64_t s = b->length, after = recovery > reach ? recovery : reach;
     const float busy = limit, strong = 3 * busy;
     Rows r = {0};
     int good = reserve_rows(&r, s);
     for (int64_t w = 0; w < n && good; w++) {
+        const uint8_t *missing = b->missing ? b->missing + w * s : NULL;
+        int64_t from = 0, found = 0; /* the first sample that no signal before it reaches */
+        double total = 0;
         read_counts(b, w * s, s, r.signal);
         take_level(b, w, w * s, s, r.signal);
         smooth_121(s, r.signal, r.smoothed);
-        int64_t blocked = -1, found = 0;
-        double total = 0;
         for (int64_t i = 0; i < s; i++) {
-            float height = fabsf(r.smoothed[i]);
-            int64_t until = height > busy ? i + reach : -1;
-            if (height > strong && i + recovery > until) until = i + recovery;
-            blocked = until > blocked ? until : blocked;
-            r.marks[i] = i <= blocked || (b->missing && b->missing[w * s + i]);
+            const float height = fabsf(r.smoothed[i]);
+            if (!(height > busy)) continue;
+            if (i - reach > from) total += sum_recorded(r.signal, missing, from, i - reach, &found);
+            const int64_t next = i + 1 + (height > strong ? after : reach);
+            from = next > from ? next : from;
         }
-        blocked = s + reach;
-        for (int64_t i = s - 1; i >= 0; i--) {
-            if (fabsf(r.smoothed[i]) > busy) blocked = i;
-            if (r.marks[i] || i >= blocked - reach) continue;
-            total += r.signal[i];
-            found++;
-        }
+        if (from < s) total += sum_recorded(r.signal, missing, from, s, &found);
         mean[w] = found ? total / found : 0;
         number[w] = found;
     }
@@ -161,6 +171,24 @@ INLINE int is_peak(int64_t s, const float *y, int64_t i) {
     return y[i] > y[i - 1] && (ahead == s || y[ahead] < y[i]);
 }
 
+/* Next local maximum above `least` from sample i on, s without one; `marks` has where one may begin, and zeros after it. */
+INLINE int64_t next_peak(int64_t s, const float *y, const uint8_t *marks, int64_t i) {
+    for (uint64_t eight; i < s; i++) {
+        memcpy(&eight, marks + i, sizeof eight);
+        if (!eight) i += 7;
+        else if (marks[i] && is_peak(s, y, i)) return i;
+    }
+    return s;
+}
+
+/* Marks samples above `least` at which a local maximum may begin, without branches. */
+static void mark_peaks(int64_t s, const float *restrict y, float least, uint8_t *restrict marks) {
+    for (int64_t i = 1; i + 1 < s; i++) marks[i] = (y[i] > least) & (y[i] > y[i - 1]) & (y[i] >= y[i + 1]);
+    marks[0] = y[0] > least;
+    marks[s - 1] = y[s - 1] > least;
+    memset(marks + s, 0, 8);
+}
+
 /* Local maxima of smoothed waveforms `from` to n - 1 with starts for the fit, until their room ends: 1.1, max-detection.
    Returns the first waveform that is not done, and in `found` the number of maxima; -1 where there is no memory. */
 EXPORT int64_t find_maxima(const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found) {
@@ -179,8 +207,11 @@ EXPORT int64_t find_maxima(const Block *b, int64_t n, const Detector *d, int64_t
         if (!is_high) continue; /* one more pass only lowers it */
         if (d->broad > 0) memcpy(r.even, r.smoothed, s * sizeof(float));
         else smooth_121(s, r.smoothed, r.even);
-        for (int64_t i = 0; i < s && here < out->room; i++)
-            if (r.even[i] > least && is_peak(s, r.even, i)) { out->waveform[here] = w; out->time[here++] = i; }
+        mark_peaks(s, r.even, least, r.marks);
+        for (int64_t i = next_peak(s, r.even, r.marks, 0); i < s && here < out->room; i = next_peak(s, r.even, r.marks, i + 1)) {
+            out->waveform[here] = w;
+            out->time[here++] = i;
+        }
         if (here == out->room) break;
         double after = INFINITY;
         for (int64_t j = here - 1; j >= total; j--) {

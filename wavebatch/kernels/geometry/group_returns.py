@@ -8,10 +8,11 @@ nearest in time (kernels/c/returns.h). `fit_rays` gives the rays of discrete ret
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
-from wavebatch.core.order import find_order
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.kernels.library import call
 
@@ -34,11 +35,10 @@ def find_pulses(gps_time: np.ndarray) -> np.ndarray:
     -------
     int64 (n,)
     """
-    n = len(gps_time)
-    start = np.flatnonzero(np.append(True, gps_time[1:] != gps_time[:-1])[:n])
-    length = np.diff(np.append(start, n))
-    alone = np.repeat((length >= LONGEST_PULSE) | (gps_time[start] == 0), length)
-    return np.where(alone, np.arange(n), np.repeat(start, length))
+    time = np.ascontiguousarray(gps_time, np.float64)
+    first = np.empty(len(time), np.int64)
+    call("find_pulses", ctypes.c_int64(len(time)), time, ctypes.c_int64(LONGEST_PULSE), first)
+    return first
 
 
 ALIGNED = 1e-4
@@ -128,45 +128,32 @@ def find_nearest(
     int64 (m,)
         Row of the return, -1 without one; of two equally near ones the earlier.
     """
-    if not len(return_waveform) or not len(echo_waveform):
-        return np.full(len(echo_waveform), -1, np.int64)
-    number = np.bincount(return_waveform, minlength=int(echo_waveform.max()) + 1)
-    last = np.full(len(number), -1, np.int64)
-    last[return_waveform] = np.arange(len(return_waveform))
-    nearest = last[echo_waveform]
-    # Most waveforms have one return: only the others need an order.
-    echoes = np.flatnonzero(number[echo_waveform] > 1)
-    if len(echoes):
-        asked = np.zeros(len(number), bool)
-        asked[echo_waveform[echoes]] = True
-        returns = np.flatnonzero(asked[return_waveform])
-        found = _find_nearest_of_many(
-            echo_waveform[echoes], echo_time[echoes], return_waveform[returns], return_time[returns]
-        )
-        nearest[echoes] = np.where(found >= 0, returns[found], -1)
-    return nearest
+    echo_order, echo_waveform, echo_time = _by_group(echo_waveform, echo_time)
+    return_order, return_waveform, return_time = _by_group(return_waveform, return_time)
+    m, k = ctypes.c_int64(len(echo_waveform)), ctypes.c_int64(len(return_waveform))
+    row = np.empty(m.value, np.int64)
+    call("find_nearest", m, echo_waveform, echo_time, k, return_waveform, return_time, row)
+    if return_order is not None:
+        row = np.where(row >= 0, np.append(return_order, -1)[row], -1)
+    (row,) = _put_back(echo_order, row)
+    return row
 
 
-def _find_nearest_of_many(
-    echo_waveform: np.ndarray, echo_time: np.ndarray, return_waveform: np.ndarray, return_time: np.ndarray
-) -> np.ndarray:
-    """As `find_nearest`, with any number of returns in each waveform."""
-    k, m = len(return_waveform), len(echo_waveform)
-    first = np.lexsort((return_time, return_waveform))
-    waveform, time = return_waveform[first], return_time[first]
-    is_echo = np.repeat([False, True], [k, m])
-    order = np.lexsort((is_echo, np.concatenate([time, echo_time]), np.concatenate([waveform, echo_waveform])))
-    returns_before = np.empty(k + m, np.int64)
-    returns_before[order] = np.cumsum(~is_echo[order])
-    after = returns_before[k:]
-    before = after - 1
-    gaps = []
-    for rows in (before, after):
-        clipped = np.clip(rows, 0, k - 1)
-        same = (rows >= 0) & (rows < k) & (waveform[clipped] == echo_waveform)
-        gaps.append(np.where(same, np.abs(time[clipped] - echo_time), np.inf))
-    nearest = first[np.clip(np.where(gaps[0] <= gaps[1], before, after), 0, k - 1)]
-    return np.where(np.isinf(np.minimum(*gaps)), -1, nearest)
+def _by_group(group: np.ndarray, *columns: np.ndarray) -> tuple[Any, ...]:
+    """The order that sorts rows by group, None where they are; the group, int64, and float64 columns in that order."""
+    order = np.argsort(group, kind="stable") if np.any(group[1:] < group[:-1]) else slice(None)
+    given = [np.ascontiguousarray(column[order], np.float64) for column in columns]
+    if any(len(column) != len(group) for column in given):
+        raise ValueError("columns of points or echoes differ in length")
+    return None if isinstance(order, slice) else order, np.ascontiguousarray(group[order], np.int64), *given
+
+
+def _put_back(order: np.ndarray | None, *columns: np.ndarray) -> Iterator[np.ndarray]:
+    """Columns of rows in the order that they had before `_by_group`."""
+    for column in columns:
+        if order is not None:
+            column[order] = column.copy()
+        yield column
 
 
 def number_returns(
@@ -190,23 +177,14 @@ def number_returns(
     ordered : bool (m,)
         False for pulses without a ray: their numbers mean nothing.
     """
+    order, pulse, xyz, direction = _by_group(pulse, xyz, direction)
     m = len(pulse)
-    has_ray = np.any(direction != 0, axis=1)
-    grouped = np.argsort(pulse, kind="stable")
-    is_first = np.append(True, pulse[grouped][1:] != pulse[grouped][:-1])[:m]
-    first = np.flatnonzero(is_first)
-    group = np.empty(m, np.int64)
-    group[grouped] = np.cumsum(is_first) - 1
-    with_ray = np.minimum.reduceat(np.where(has_ray[grouped], np.arange(m), m), first) if m else first
-    head = grouped[np.where(with_ray < m, with_ray, first)][group]
-    away = xyz - xyz.take(head, axis=0)
-    ray = direction.take(head, axis=0)
-    along = away[:, 0] * ray[:, 0] + away[:, 1] * ray[:, 1] + away[:, 2] * ray[:, 2]
-    order = find_order(group, along)
-    order = np.arange(m) if order is None else order
-    number = np.empty(m, np.int64)
-    number[order] = np.arange(m) - first[group[order]] + 1
-    return number, np.bincount(group)[group], has_ray[head]
+    if xyz.shape != (m, 3) or direction.shape != (m, 3):
+        raise ValueError("positions and directions have three columns")
+    number, count, ordered = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m, np.bool_)
+    call("number_returns", ctypes.c_int64(m), pulse, xyz, direction, number, count, ordered)
+    number, count, ordered = _put_back(order, number, count, ordered)
+    return number, count, ordered
 
 
 def match_returns(

@@ -11,6 +11,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.kernels.elementary import interpolate
+from wavebatch.kernels.fit.neighbours import find_pairs
 
 UNRESOLVED = 0.25
 """Distance, in its errors, below which two echoes are one, as in kernels/c/decompose.h."""
@@ -36,12 +38,7 @@ def drop_twins(table: EchoTable) -> EchoTable:
     EchoTable
         The remaining echoes.
     """
-    if len(table) < 2:
-        return table
-    same = np.diff(table.waveform) == 0
-    near = np.diff(table.time) < TWINS * np.minimum(table.sigma[1:], table.sigma[:-1])
-    apart = (table.flags[1:] & table.flags[:-1] & np.uint16(EchoFlag.OVERLAPPED)) == 0
-    twin = np.flatnonzero(same & near & apart)
+    twin = find_pairs(table, TWINS)
     if not len(twin):
         return table
     keep = np.ones(len(table), bool)
@@ -70,7 +67,7 @@ def merge_unresolved(table: EchoTable) -> EchoTable:
         Resolved and merged echoes.
     """
     while True:
-        first = _unresolved(table)
+        first = find_pairs(table, OVERLAP, UNRESOLVED)
         if not len(first):
             return table
         table = _merge(table, first)
@@ -101,8 +98,7 @@ def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
         return table
     excess, lone, others = np.array(system.hidden).T
     wider = np.maximum(excess_variance(table, system), 0.0)
-    alone = table.alone(n)
-    share = np.where(alone, np.interp(wider, excess, lone), np.interp(wider, excess, others))
+    share = np.where(table.alone(n), *interpolate(wider, excess, np.stack([lone, others], axis=1)).T)
     error = np.sqrt(table.time_err**2 + share * wider * system.sigma_ref**2)
     return replace(table, time_err=error.astype(np.float32))
 
@@ -123,21 +119,6 @@ def excess_variance(table: EchoTable, system: SystemPulse) -> np.ndarray:
     """
     sigma, error = table.sigma.astype(np.float64), np.nan_to_num(table.sigma_err.astype(np.float64))
     return (sigma * sigma - 2.0 * sigma * error) / system.sigma_ref**2 - 1.0
-
-
-def _unresolved(table: EchoTable) -> np.ndarray:
-    """Rows that are not resolved from the next row, of the same waveform; no row is in two pairs."""
-    if len(table) < 2:
-        return np.empty(0, np.int64)
-    gap = np.diff(table.time)
-    error = np.hypot(table.time_err[1:], table.time_err[:-1])
-    near = gap < OVERLAP * np.minimum(table.sigma[1:], table.sigma[:-1])
-    together = (table.flags[1:] & table.flags[:-1] & np.uint16(EchoFlag.OVERLAPPED)) != 0
-    close = (np.diff(table.waveform) == 0) & together & near & (gap < UNRESOLVED * error)
-    rows = np.flatnonzero(close)
-    run = np.cumsum(np.r_[True, np.diff(rows) > 1]) if len(rows) else rows
-    start = rows[np.r_[True, np.diff(rows) > 1]] if len(rows) else rows
-    return rows[(rows - start[run - 1]) % 2 == 0] if len(rows) else rows
 
 
 def _merge(table: EchoTable, first: np.ndarray) -> EchoTable:

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Annotated, Any
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.frozen import frozen
+from wavebatch.core.frozen import changeable, frozen
 from wavebatch.core.schema import Key, Range
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse
@@ -67,7 +67,7 @@ class Kind:
     """Of count 0 [V]."""
 
 
-@dataclass(slots=True)
+@changeable
 class Figures:
     """Figures of a survey, None where they are not known; the fields are the keys of the file, in its order."""
 
