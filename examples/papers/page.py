@@ -58,13 +58,13 @@ class Paper:
 _WAVES = "--profile balanced --echoes"
 
 PAPERS = (
-    Paper("s0_wagner", "Wagner, Roncat, Melzer, Ullrich (2007)", "1, 3, 5", (
+    Paper("s0_wagner", "Wagner, Roncat, Melzer, Ullrich (2007)", "1, 2, 3, 5", (
         Picture("Figure 1: ground and roofs of a village as voxels of 1 m, with the energy that came back from each.",
                 "draw_voxels", ""),
-        Picture("A waveform with its echoes: samples, fitted Gaussians and residual.",
+        Picture("Figure 2: a waveform as a sum of Gaussians: samples, echoes and residual.",
                 f"plot waveform forest.laz --packet 19 {_WAVES} --show detector"),
-        Picture("The square difference to a reference pulse of the waveform's height (ASDF), with the paper's rule of "
-                "30 %: the bars are the depth that a minimum needs.",
+        Picture("Figures 3 and 5: the square difference to a reference pulse of the waveform's height (ASDF), with "
+                "the paper's rule of 30 %: the bars are the depth that a minimum needs.",
                 "plot waveform forest.laz --packet 19 --show asdf --chain asdf.toml"),
         Picture("Echoes of the forest from the side.", "plot section out/forest.laz --column amplitude --aspect 3"),
     )),
@@ -81,10 +81,10 @@ PAPERS = (
     Paper("s2_jutzi", "Jutzi, Stilla (2005)", "6, 8", (
         Picture("The waveform deconvolved with the system pulse: the signal of the surfaces along the ray.",
                 "plot waveform forest.laz --packet 17:21 --profile balanced --show deconvolved"),
-        Picture("Slices of the data cube of a village: x across the scan lines, y one scan line over a row of roofs, t "
-                "one time, at which the roofs are missing in the ground.",
+        Picture("Figure 6: slices of the data cube of a village: x across the scan lines, y one scan line over a row "
+                "of roofs, t one time, at which the roofs are missing in the ground.",
                 "plot cube cube.npz --x 980 --y 5 --t 154.5"),
-        Picture("Straight segments of the ground and of the roofs in all scan lines, in plan and in 3D.",
+        Picture("Figure 8: straight segments of the ground and of the roofs in all scan lines, in plan and in 3D.",
                 "slice village.laz --most 60", "--overview"),
         Picture("Length of the segments per height: the ground at 120 m, flat roofs at 124 m, slopes above.",
                 "plot profile segments.csv --column length --log"),

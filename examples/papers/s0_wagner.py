@@ -139,7 +139,7 @@ def table_of_counts(strips: dict[str, Strip]) -> Table:
     for name, share in shares["no ringing"].items():
         for echoes in range(1, 6):
             more = " or more" * (echoes == 5)
-            table.add(f"{name}: {echoes}{more}", share[echoes], paper=PRINTED.get(name, ("",) * 5)[echoes - 1])
+            table.add(f"{name}: {echoes}{more}", share[echoes], paper=PRINTED.get(name, (None,) * 5)[echoes - 1])
     for (key, name, echoes), (expected, within, spec) in COUNTS.items():
         table.near(f"{name}: {echoes}, {key}", shares[key][name][echoes], expected, within=within, spec=spec)
     return table

@@ -48,8 +48,8 @@ FALSE_ALARMS = {
 """Expected share [%] of waveforms of 200 samples of noise with an echo, and how far FULL of them may be off."""
 PULSES = {"1": (20.4, 0.216), "2": (12.0, 0.207), "3": (30.6, 0.236), "4": (21.4, 0.232)}
 """Table 1: maximum [mV], here in noise of 1 mV, and sigma [m] of its pulses, sampled every 50 ps."""
-APART = (9.908, 6.164, 2.440)
-"""Table 1: distances of its pulses one after the other [m]."""
+RANGES = (83.884, 93.792, 99.956, 102.396)
+"""Table 1: ranges of its pulses [m]."""
 FULL = 4000
 """Waveforms that the bands hold for."""
 BASIN = {0.5: (99.9, 100), 1.0: (99.9, 100), 1.5: (15, 19), 2.0: (0, 0.1), 3.0: (0, 0.1)}
@@ -131,8 +131,7 @@ def table_of_profile(number: int, seed: int) -> Table:
     """Table 1 as one waveform: its four pulses at their distances, every 50 ps, and what comes back of each."""
     table = Table("table 1, the profile of four pulses: paper, and what comes back", 3, scatter(number, FULL))
     spacing = 0.05
-    range_of = np.r_[0.0, np.cumsum(APART)]
-    time = 10 + range_of / HALF_C
+    time = 10 + np.subtract(RANGES, RANGES[0]) / HALF_C
     heights, wide = np.array(list(PULSES.values())).T
     sigma = wide / HALF_C
     recording = fine_recording(1.0, float(sigma.mean()), n_samples=int(time[-1] / spacing) + 200, spacing=spacing)
@@ -144,11 +143,13 @@ def table_of_profile(number: int, seed: int) -> Table:
     rows = found.take(np.isin(found.waveform, np.flatnonzero(found.count(n) == 4)))
     table.add("  waveforms with four [%]", 25 * len(rows) / n, 99)
     mean = {name: getattr(rows, name).reshape(-1, 4).mean(axis=0) for name in ("time", "amplitude", "sigma")}
-    for pulse, (height, apart, width) in enumerate(zip(heights, np.r_[np.nan, APART], wide, strict=True)):
+    for pulse, (height, width) in enumerate(zip(heights, wide, strict=True)):
         # The errors of one waveform are 1.5 to 3.5 mm, the paper rounds to millimetres and tenths of a millivolt.
         if pulse:
             ours = HALF_C * (mean["time"][pulse] - mean["time"][pulse - 1])
-            table.near(f"pulse {pulse + 1}: distance from the one before [m]", ours, apart, within=0.0015, paper=apart)
+            printed, before = RANGES[pulse], RANGES[pulse - 1]
+            name, paper = f"pulse {pulse + 1}: range less that of pulse {pulse} [m]", f"{printed:.3f} - {before:.3f}"
+            table.near(name, ours, printed - before, within=0.0015, paper=paper)
         ours = mean["amplitude"][pulse] / FINE
         table.near(f"pulse {pulse + 1}: maximum [mV]", ours, height, within=0.1, paper=height, digits=1)
         ours = HALF_C * mean["sigma"][pulse]

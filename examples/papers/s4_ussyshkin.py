@@ -82,7 +82,7 @@ def table_of_numbers(number: int, seed: int) -> Table:
         per_pulse = np.dot((1, 2, 3, 4), exact) / 100
         table.near(f"{stand} m, returns per pulse", stats.returns_per_pulse, per_pulse, within=0.04)
         more = 100 * sum(share for number_of, share in stats.by_number.items() if number_of > 4)
-        table.add(f"{stand} m, numbers above 4", more, 0.0, 0.0, paper=0)
+        table.add(f"{stand} m, numbers above 4", more, 0.0, 0.0)
         # Low thin trees have few pairs close to the dead zone.
         within = 0.03 if stand == "gemini-6" else 0.002
         table.near(f"{stand} m, dead zone [m]", stats.separations["all"].least, dead_zone, within=within, digits=3)
@@ -104,7 +104,7 @@ def table_of_separations(number: int, seed: int) -> Table:
             name, middle = f"{dead_zone:g} m, miss of the mean of {pair}", (low + high) / 2
             table.near(name, found.mean - middle, miss, within=0.025, spec=spec - middle)
         four = 100 * stats.by_count.get(4, 0.0)
-        table.near_share(f"{dead_zone:g} m, pulses of four returns [%]", four, 0.05, within=0.09, paper=0, spec=0.05)
+        table.near_share(f"{dead_zone:g} m, pulses of four returns [%]", four, 0.05, within=0.09, spec=0.05)
     for dead_zone, third, spec in ((1.5, 3, 0.0), (2.5, 2, 0.5)):
         share = 100 * fly("corn", dead_zone, number, seed).by_number.get(third, 0.0)
         # With a dead zone above its height our field has one return; why the specification has more is not known.

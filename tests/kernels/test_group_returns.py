@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, find_nearest, find_pulses, number_returns
+from wavebatch.kernels.geometry.group_returns import (
+    LONGEST_PULSE,
+    find_nearest,
+    find_pulses,
+    number_returns,
+    share_offsets,
+)
 
 
 def test_runs_of_equal_time_are_pulses():
@@ -86,3 +92,29 @@ def test_numbers_follow_the_ray_of_the_pulse(rng):
 
 def test_numbers_of_nothing():
     assert [len(part) for part in number_returns(np.empty(0, int), np.empty((0, 3)), np.empty((0, 3)))] == [0, 0, 0]
+
+
+def _offset_by_loop(difference, error):
+    """Weighted mean, its error where the differences contradict each other, and whether there is one."""
+    weight = [1.0 / max(spread if np.isfinite(spread) else 1.0, 1e-3) ** 2 for spread in map(float, error)]
+    if not weight:
+        return 0.0, 0.0, False
+    mean = sum(w * d for w, d in zip(weight, difference, strict=True)) / sum(weight)
+    scatter, others = sum(w * (d - mean) ** 2 for w, d in zip(weight, difference, strict=True)), len(weight) - 1
+    return mean, np.sqrt(scatter / others / sum(weight)) if scatter > others > 0 else 0.0, True
+
+
+def test_offsets_are_those_of_a_loop(rng):
+    waveform = np.sort(rng.integers(0, 40, 90)).astype(np.int32)
+    time, match = rng.uniform(0, 80, 90), np.where(rng.random(90) < 0.8, rng.permutation(90), -1)
+    error = rng.choice([0.0, 0.02, 0.3, np.nan, np.inf], 90).astype(np.float32)
+    return_time, matched = np.empty(90), match >= 0
+    return_time[match[matched]] = (time + 0.4 + rng.choice([0.0, 0.5], 90))[matched]
+    found = share_offsets(41, waveform, time, error, match, return_time)
+    for w in range(41):
+        rows = np.flatnonzero((waveform == w) & (match >= 0))
+        expected = _offset_by_loop(time[rows] - return_time[match[rows]], error[rows])
+        assert [column[w] for column in found] == pytest.approx(expected, rel=1e-9)
+    assert 3 < np.count_nonzero(found[1]) < np.count_nonzero(found[2]) < 41
+    with pytest.raises(ValueError, match="no return or waveform"):
+        share_offsets(41, waveform, time, error, match, return_time[:1])

@@ -330,15 +330,19 @@ def test_noise_that_grows_with_the_light_names_a_gain_over_another_landscape(tmp
 
 
 @pytest.mark.parametrize("fade", [0.0, -0.35, 0.5])
-def test_light_that_changes_evenly_along_a_strip_is_told_from_its_fields(rng, fade):
-    time = np.sort(rng.uniform(0.0, 1.0, 2048))
-    fields = np.exp(rng.normal(0.0, 0.5, (1000, 6)))
-    light = fields[(1000 * time).astype(int), rng.integers(0, 6, 2048)] * (1.0 + fade * time)
-    found = _find_fading(time, light)
+@pytest.mark.parametrize("number", [1000, 3])
+def test_light_that_changes_evenly_along_a_strip_is_told_from_its_fields(rng, fade, number):
+    """By many fields, or within few large ones: these hid it, and 15 to 18 % of error held that in honest strips."""
+    time, up = np.sort(rng.uniform(0.0, 1.0, 2048)), rng.uniform(0.0, 6.0, 2048)
+    fields = np.exp(rng.normal(0.0, 0.5, (number, 6)))
+    light = fields[(number * time).astype(int), up.astype(int)] * (1.0 + fade * time) * rng.normal(1.0, 0.03, 2048)
+    place = np.stack([100.0 * time, 100.0 * up])
+    found = _find_fading(time, light, place)
     assert (found.chance > 0.5) == bool(fade)
     assert found.shift == pytest.approx(0.5 * np.log1p(fade), abs=0.06)
+    assert fade or found.error < 0.05
     forest = np.where(np.abs(time - 0.4) < 0.2, 0.5 * light, light)
-    assert fade or _find_fading(time, forest).chance < 0.5
+    assert fade or _find_fading(time, forest, place).chance < 0.5
 
 
 def test_parts_of_one_field_count_as_few(rng):
@@ -359,7 +363,7 @@ def test_a_laser_that_fades_along_a_strip_is_named_and_in_the_error(tmp_path, ca
     assert "the second half of the strip is -16 % brighter" in run(calibrated, tmp_path / "out", tmp_path / "fades.las")
     cloud = wb.read_cloud(tmp_path / "out" / "fades.laz")
     stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
-    assert 0.17 < stated < 0.4
+    assert 0.17 < stated < 0.45
 
 
 FAST = Sensor(light=LIGHT, rate=250_000.0, line_rate=800.0, half_angle=20.0, height=911.0)
@@ -546,7 +550,7 @@ def test_a_chance_of_zero_in_the_file_takes_the_check_away(tmp_path, calibrated)
     found = {}
     for chance in (0.3, 0.0):
         (tmp_path / "cal.toml").write_text(text.replace("change_chance = 0.3", f"change_chance = {chance}"))
-        said = run(tmp_path, tmp_path / "out", "s.las")
+        said = run(tmp_path, tmp_path / "out", "s.las", "--attenuation", 0.22)
         cloud = wb.read_cloud(tmp_path / "out" / "s.laz")
         stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
         found[chance] = stated, "an assumed chance of 30% (change_chance)" in said
@@ -710,6 +714,22 @@ def test_other_air_on_the_day_of_the_calibration_is_named_and_in_the_error(tmp_p
     cloud = wb.read_cloud(tmp_path / "a.laz")
     stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
     assert stated == pytest.approx(np.hypot(0.031, 4.6e-4 * 703 * (given - 0.22)), abs=0.004)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("air", [0.05, 0.1, 0.35])
+def test_other_air_within_a_day_has_an_error_that_holds(tmp_path, calibrated, air):
+    """Where calibrated ground shows it, and where it does not: 5.7 % off had an error of 3.7 %."""
+    columns = "level_reflectance,backscatter_coefficient,backscatter_coefficient_err"
+    for start in ((0.0, 30.0), (3000.0, 900.0)):
+        other = replace(SENSOR, air=air, start=start, time=START + 900)
+        write_strip(tmp_path / "b.las", [Facet(fields)], other, 10_000, seed=91)
+        run(calibrated, tmp_path, tmp_path / "b.las", "--columns", columns)
+        cloud = wb.read_cloud(tmp_path / "b.laz")
+        x, y = cloud["x"] - EAST, cloud["y"] - NORTH
+        off = (cloud["level_reflectance"] / fields(x, y) - 1)[(np.abs(x % 20 - 10) < 8) & (np.abs(y % 20 - 10) < 8)]
+        stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
+        assert abs(np.nanmedian(off)) > 0.03 and np.mean(np.abs(off) < stated) > 0.6 and stated < 0.1
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ FUNCTIONS = (
     "learn_pulse", "render_pulses", "measure_changes", "pair_differences", "judge_packets",
     "interpolate_columns", "fit_stack", "describe_echoes", "keep_echoes",
     "match_returns", "find_faint", "weigh_fits", "set_flags", "find_pairs",
-    "find_pulses", "find_nearest", "number_returns",
+    "find_pulses", "find_nearest", "number_returns", "share_offsets",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -190,6 +190,12 @@ class CKept(ctypes.Structure):
         _POINTER,
         "waveform time amplitude sigma time_err amplitude_err sigma_err relative_energy_err residual flags row",
     )
+
+
+class COffsets(ctypes.Structure):
+    """`Offsets` of kernels/c/returns.h."""
+
+    _fields_ = _fields(_POINTER, "offset doubt known")
 
 
 class CTable(ctypes.Structure):

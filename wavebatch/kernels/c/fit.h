@@ -97,7 +97,7 @@ INLINE double add_prior(int64_t k, int64_t per, const Prior *prior, double std, 
     const int64_t rows = per * k + 1;
     double cost = 0;
     for (int64_t j = 0; j < k; j++) {
-        double height = fmax(p[j], 0.5 * std), lack = prior->width - p[2 * k + j];
+        double height = at_least(p[j], 0.5 * std), lack = prior->width - p[2 * k + j];
         if (prior->spread > 0 && lack > 0) {
             double unit = p[2 * k + j] / height, weight = std * std / (prior->spread * prior->spread);
             int64_t at = 2 * k + j;
@@ -129,19 +129,28 @@ INLINE void factor(int64_t n, double *matrix, double *pivot, double least) {
     }
 }
 
-INLINE void solve(int64_t n, const double *lower, const double *pivot, double *right) {
-    for (int64_t i = 0; i < n; i++)
-        for (int64_t j = 0; j < i; j++) right[i] -= lower[i * n + j] * right[j];
-    for (int64_t i = 0; i < n; i++) right[i] /= pivot[i];
-    for (int64_t i = n - 1; i >= 0; i--)
-        for (int64_t j = i + 1; j < n; j++) right[i] -= lower[j * n + i] * right[j];
+/* Solves the equations for a right side of zeros before row `from`, down to row `to` of the solution; above it is no result. */
+INLINE void solve_part(int64_t n, const double *lower, const double *pivot, double *right, int64_t from, int64_t to) {
+    for (int64_t i = from + 1; i < n; i++) {
+        double value = right[i];
+        for (int64_t j = from; j < i; j++) value -= lower[i * n + j] * right[j];
+        right[i] = value;
+    }
+    for (int64_t i = from; i < n; i++) right[i] /= pivot[i];
+    for (int64_t i = n - 1; i >= to; i--) {
+        double value = right[i];
+        for (int64_t j = i + 1; j < n; j++) value -= lower[j * n + i] * right[j];
+        right[i] = value;
+    }
 }
+
+INLINE void solve(int64_t n, const double *lower, const double *pivot, double *right) { solve_part(n, lower, pivot, right, 0, 0); }
 
 /* What one unit of a row's coefficient means: 1 for amplitudes, width / amplitude for times and widths, 1 / amplitude
    for skews. Amplitudes below half of the noise count as that. */
 INLINE double unit_of(int64_t k, int64_t i, const double *p, double std) {
     int64_t kind = i / k, j = i - kind * k;
-    double height = fmax(p[j], 0.5 * std);
+    double height = at_least(p[j], 0.5 * std);
     return kind == 0 ? 1 : kind == 3 ? 1 / height : p[2 * k + j] / height;
 }
 
@@ -170,7 +179,7 @@ INLINE int take_step(int64_t k, int64_t per, const Work *work, const double *p, 
     int is_long = 0;
     for (int64_t i = 0; i < per * k; i++) {
         int64_t kind = i / k, j = i - kind * k;
-        after[i] = fmin(fmax(p[i] + work->step[i] * unit_of(k, i, p, std), limits->low[kind]), limits->high[kind]);
+        after[i] = at_most(at_least(p[i] + work->step[i] * unit_of(k, i, p, std), limits->low[kind]), limits->high[kind]);
         double scale = kind == 0 ? p[j] + std : kind == 3 ? 1 : p[2 * k + j];
         is_long |= fabs(after[i] - p[i]) > LONG_STEP * scale;
     }
@@ -191,7 +200,7 @@ INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *
     Fit *fit = &work->fit;
     double *trial = work->kept, damping = DAMPING, promised = INFINITY, raise = RAISE;
     int idle = 0;
-    for (int64_t i = 0; i < n; i++) trial[i] = fmin(fmax(fit->parameters[i], limits->low[i / k]), limits->high[i / k]);
+    for (int64_t i = 0; i < n; i++) trial[i] = at_most(at_least(fit->parameters[i], limits->low[i / k]), limits->high[i / k]);
     fit->cost = INFINITY; fit->converged = fit->hopeless = 0;
     for (int64_t iteration = 0;; iteration++) {
         evaluate_rows(k, per, s, work, trial);
@@ -266,7 +275,7 @@ INLINE int invert(int64_t k, int64_t per, Work *work, const double *gram, double
     for (int64_t c = 0; c < n; c++) {
         memset(column, 0, n * sizeof(double));
         column[c] = 1;
-        solve(n, matrix, work->pivot, column);
+        solve_part(n, matrix, work->pivot, column, c, c / k == 2 ? c - 2 * k : c);
         variance[c] = column[c];
         is_flat &= column[c] * gram[c * rows + c] < STEEP && column[c] > 0;
         if (c / k == 2) { shared[c - 2 * k] = column[c - 2 * k]; shared[c - k] = column[c - k]; }
@@ -289,7 +298,7 @@ INLINE void find_errors(int64_t k, int64_t per, Work *work, Solution *out) {
         add_prior(k, per, &work->fit.prior, std, p, work->products);
         invert(k, per, work, work->products, out->errors, out->shared);
     }
-    for (int64_t i = 0; i < n; i++) out->errors[i] = sqrt(fmax(out->errors[i], 0)) * unit_of(k, i, p, std) * std;
+    for (int64_t i = 0; i < n; i++) out->errors[i] = sqrt(at_least(out->errors[i], 0)) * unit_of(k, i, p, std) * std;
     for (int64_t i = 0; i < 2 * k; i++) out->shared[i] *= unit_of(k, i, p, std) * unit_of(k, 2 * k + i % k, p, std) * std * std;
 }
 

@@ -23,6 +23,10 @@ INLINE lanes pick(lane_bits on, lanes yes, lanes no) { return (lanes)((on & (lan
 INLINE lanes least_of(lanes a, lanes b) { return pick(a < b, a, b); }
 INLINE lanes most_of(lanes a, lanes b) { return pick(a > b, a, b); }
 
+/* As fmax and fmin of a value, which may be no number, and a bound: those are calls. */
+INLINE double at_least(double value, double bound) { return value > bound ? value : bound; }
+INLINE double at_most(double value, double bound) { return value < bound ? value : bound; }
+
 INLINE float sum_lanes(lanes v) { return (v[0] + v[2]) + (v[1] + v[3]); }
 
 /* ln a for a > 0, error 1e-7: a = 2^n m with m near 1, ln m = 2 atanh((m - 1) / (m + 1)) as its series. */

@@ -144,7 +144,10 @@ static int is_misfit(const Settings *s, Work *work, const Fit *fit) {
     const float *residual = (const float *)(work->rows + 3 * fit->k * w->vectors);
     double shape = 0;
     float highest = 0;
-    for (int64_t i = 1; i + 1 < w->n; i++) highest = fmaxf(highest, residual[i - 1] + residual[i + 1] + 2 * residual[i]);
+    for (int64_t i = 1; i + 1 < w->n; i++) {
+        const float height = residual[i - 1] + residual[i + 1] + 2 * residual[i];
+        highest = height > highest ? height : highest;
+    }
     for (int64_t j = 0; j < fit->k; j++) shape = fmax(shape, work->h3[j] * work->h3[j] + work->h4[j] * work->h4[j]);
     return 0.25 * highest > s->gate_residual * SMOOTH_GAIN * w->std || shape > s->gate_hermite;
 }
@@ -266,7 +269,7 @@ static double propose_echo(const Settings *s, Work *work, const Fit *fit, const 
     if (w->is_whitened) memcpy(work->energy, work->new_energy, n * sizeof(lanes));
     else correlate(work, work->rows, work->taps + work->reach + 1, work->energy);
     float most = 0, *left = (float *)work->energy;
-    for (int64_t i = 0; i < w->n; i++) most = fmaxf(most, left[i]);
+    for (int64_t i = 0; i < w->n; i++) most = left[i] > most ? left[i] : most;
     project_out(work, fit, work->energy, onto);
     int64_t place = 0;
     double best = 0, amplitude = 0;

@@ -120,3 +120,31 @@ EXPORT int64_t number_returns(int64_t m, const int64_t *pulse, const double *xyz
     free(rows); free(along);
     return done;
 }
+
+typedef struct { double *offset, *doubt; uint8_t *known; } Offsets;
+
+/* Offset of m fitted times, sorted by waveform, from the returns at `matched` (-1: none) that a waveform shares, weighted
+   by their errors; its error by the scatter of the returns, 0 where their errors explain it; and where it is known. */
+EXPORT int64_t share_offsets(int64_t m, const int64_t *waveform, const double *time, const double *error, const int64_t *matched,
+                             const double *return_time, Offsets *out) {
+    for (int64_t i = 0, end; i < m; i = end) {
+        double total = 0, sum = 0, scatter = 0;
+        int64_t others = -1;
+        for (int pass = 0; pass < 2; pass++) {
+            for (end = i; end < m && waveform[end] == waveform[i]; end++) {
+                if (matched[end] < 0) continue;
+                const double spread = at_least(isfinite(error[end]) ? error[end] : 1, 1e-3), weight = 1 / (spread * spread);
+                const double difference = time[end] - return_time[matched[end]], rest = difference - sum;
+                if (pass) scatter += weight * (rest * rest);
+                else { total += weight; sum += weight * difference; others++; }
+            }
+            if (others < 0) break;
+            if (!pass) sum /= total;
+        }
+        if (others < 0) continue;
+        out->offset[waveform[i]] = sum;
+        out->known[waveform[i]] = 1;
+        if (others > 0 && scatter > others) out->doubt[waveform[i]] = sqrt(scatter / (others * total));
+    }
+    return 0;
+}

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD
+from wavebatch.kernels import library
 from wavebatch.kernels.library import call
 
 LONGEST_PULSE = 64
@@ -222,6 +223,42 @@ def match_returns(
     call("match_returns", ctypes.c_int64(m), echo_waveform, echo_time, ctypes.c_int64(k), return_waveform, return_time,
          ctypes.c_double(tolerance), matched)  # fmt: skip
     return matched
+
+
+def share_offsets(
+    n: int, waveform: np.ndarray, time: np.ndarray, error: np.ndarray, match: np.ndarray, return_time: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offset of fitted times from return locations, which all returns of a waveform share.
+
+    Parameters
+    ----------
+    n : int
+        Number of waveforms.
+    waveform, time, error : int (m,), float (m,), float (m,), ns
+        Echoes, sorted by waveform; an error that is no number counts as 1.
+    match : int64 (m,)
+        Row of each echo's return, -1 without one.
+    return_time : float64 (k,), ns
+
+    Returns
+    -------
+    offset : float64 (n,), ns
+        Weighted by the errors.
+    doubt : float64 (n,), ns
+        Its error by the scatter of the returns; 0 where their errors explain it, and for single returns.
+    known : bool (n,)
+        Where a return is matched; elsewhere both are 0.
+    """
+    waveform, match = (np.ascontiguousarray(rows, np.int64) for rows in (waveform, match))
+    time, error, return_time = (np.ascontiguousarray(part, np.float64) for part in (time, error, return_time))
+    if not len(waveform) == len(time) == len(error) == len(match):
+        raise ValueError("columns of echoes differ in length")
+    if len(match) and not (match.max() < len(return_time) and 0 <= waveform.min() <= waveform.max() < n):
+        raise ValueError("an echo has no return or waveform of this number")
+    found = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_)
+    offsets = library.COffsets(*map(library.address, found))
+    call("share_offsets", ctypes.c_int64(len(time)), waveform, time, error, match, return_time, offsets)
+    return found
 
 
 OWN = 0.5

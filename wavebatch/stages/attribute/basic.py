@@ -19,7 +19,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, LEAST_PULSE_WIDTH, SQRT
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, residual_moments
 from wavebatch.kernels.fit.render import render_echoes
-from wavebatch.kernels.geometry.group_returns import match_returns
+from wavebatch.kernels.geometry.group_returns import match_returns, share_offsets
 from wavebatch.kernels.geometry.normals import measure_normals
 from wavebatch.kernels.physics import incidence
 from wavebatch.stages.attribute.radiometry import area_factor, light_error, sensor_distance
@@ -202,19 +202,20 @@ def position(
     point = np.full(len(echoes), -1, np.int64)
     returns = block.returns
     if returns is not None and len(returns):
-        reach = tolerance + 0.5 * block.spacing
+        reach, own = tolerance + 0.5 * block.spacing, (len(block), waveform, echoes.time, echoes.time_err)
         match = match_returns(waveform, echoes.time, returns.waveform, returns.time, reach)
-        offset, doubt, known = _shared_offset(len(block), echoes, match, returns.time)
+        offset, doubt, known = share_offsets(*own, match, returns.time)
         shifted = returns.time + offset[returns.waveform]
         again = match_returns(waveform, echoes.time, returns.waveform, shifted, reach)
         if not np.array_equal(again, match):
             match = again
-            offset, doubt, known = _shared_offset(len(block), echoes, match, returns.time)
+            offset, doubt, known = share_offsets(*own, match, returns.time)
         point = np.where(match >= 0, returns.point[match], -1)
     along = echoes.time - offset[waveform]
     # `take` copies whole rows: a tenth of the time of an index.
     xyz = block.origin.take(waveform, axis=0) + block.direction.take(waveform, axis=0) * along[:, None]
-    speed = np.sqrt(np.sum(block.direction**2, axis=1))
+    east, north, up = block.direction.T
+    speed = np.sqrt(east**2 + north**2 + up**2)
     # In strips in feet or degrees the vectors are no speeds in m/ns, but the error is always in metres.
     speed = np.where(np.abs(speed / HALF_C - 1.0) < 0.5, speed, HALF_C)
     shared = np.where(known, np.maximum(doubt * speed, system.radiometry.returns), system.radiometry.phase)
@@ -228,27 +229,6 @@ def position(
     if returns is None:
         return echoes
     return echoes.with_flags(EchoFlag.ADDED, point < 0).with_flags(EchoFlag.UNANCHORED, ~known[waveform])
-
-
-def _shared_offset(
-    n: int, echoes: EchoTable, match: np.ndarray, return_time: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Offset of the fits from the return locations per waveform [ns], weighted by the errors, and where it is known.
-
-    Between them its error [ns] by the scatter of the returns; 0 where their errors explain it, and for single returns.
-    """
-    rows = np.flatnonzero(match >= 0)
-    error = echoes.time_err[rows].astype(np.float64)
-    weight = 1.0 / np.maximum(np.where(np.isfinite(error), error, 1.0), 1e-3) ** 2
-    difference = echoes.time[rows] - return_time[match[rows]]
-    waveform = echoes.waveform[rows]
-    total = np.bincount(waveform, weight, minlength=n)
-    offset = np.bincount(waveform, weight * difference, minlength=n) / np.where(total > 0, total, 1.0)
-    others = np.bincount(waveform, minlength=n) - 1
-    scatter = np.bincount(waveform, weight * (difference - offset[waveform]) ** 2, minlength=n)
-    contradict = (others > 0) & (scatter > others)
-    doubt = np.sqrt(np.where(contradict, scatter, 0.0) / (np.maximum(others, 1) * np.where(total > 0, total, 1.0)))
-    return offset, doubt, total > 0
 
 
 NARROW_ERRORS = 3.0

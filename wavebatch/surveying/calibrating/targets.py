@@ -56,7 +56,7 @@ class Compression(NamedTuple):
     """What a channel loses of strong light."""
 
     factor: float
-    """Share of its light that an echo loses per DN of its amplitude [1/DN]."""
+    """Share of its light that an echo loses per DN of its amplitude [1/DN]; 0 where no shape of an echo shows it."""
     amplitude: np.ndarray
     """Of the strip's lone echoes, f8 (k,) [DN]."""
 
@@ -78,7 +78,7 @@ def find_compression(reader: StripReader, scan: StripScan, system: SystemPulse) 
     Returns
     -------
     dict of int to Compression
-        By the number of the channel; without those whose echoes do not show that they compress.
+        By the number of the channel; without those of few clear echoes.
 
     Notes
     -----
@@ -125,7 +125,7 @@ def _describe(block: WaveformBlock, system: SystemPulse) -> Iterator[tuple[int, 
 
 
 def _judge(amplitude: np.ndarray, share: np.ndarray, light: np.ndarray) -> Compression | None:
-    """The compression by echoes as from `_describe`; None where they show none.
+    """The compression by echoes as from `_describe`; None where they are few.
 
     What the pulse misses of all echoes alike is no compression: only what grows with the amplitude.
     """
@@ -140,7 +140,7 @@ def _judge(amplitude: np.ndarray, share: np.ndarray, light: np.ndarray) -> Compr
     slope = float((weight * apart) @ middle) / max(squares, 1e-30)
     rest = middle - np.average(middle, weights=weight) - slope * apart
     error = (max(float(weight @ rest**2) / (SHAPE_CLASSES - 2), 1.0) / max(squares, 1e-30)) ** 0.5
-    return Compression(slope * float(np.median(light)), amplitude) if slope > SURE * error else None
+    return Compression(slope * float(np.median(light)) * (slope > SURE * error), amplitude)
 
 
 LEAST_ECHOES = 10
@@ -426,6 +426,10 @@ def combine_targets(results: Sequence[TargetResult], light_err: np.ndarray, chan
     )
 
 
+MOST, UNLIKE_TARGETS = (0.05, 0.95), 2.0
+"""Quantiles of the amplitudes of targets and of the strip; and how many times darker or brighter than targets echoes
+are for which these do not prove a linear receiver: what one loses grows with the amplitude."""
+
 LEAST_BENT = 0.01
 """Error by a compressing receiver from which it is said: a third of that of a target's reflectance."""
 
@@ -527,21 +531,29 @@ def measure_ranging(sensor: SensorSource, distance: np.ndarray, attenuation: flo
 
 def _compare_compression(source: EchoSource, used: np.ndarray) -> tuple[float, list[str]]:
     """By how much constants are off for echoes that a compressing receiver makes darker or brighter than the targets,
-    relative, and the lines about it; used: array of ECHO."""
+    relative, and the lines about it, or about targets that do not show it; used: array of ECHO."""
     most, lines = 0.0, []
     for channel, found in find_compression(source.reader, source.scan, source.system).items():
         targets = used["amplitude"][used["channel"] == channel]
-        growth = found.compare(targets) if len(targets) else 0.0
+        if not len(targets):
+            continue
+        growth = found.compare(targets)
         most = max(most, growth)
+        (low, high), (dark, bright) = (np.quantile(one, MOST).tolist() for one in (found.amplitude, targets))
+        which = f"digitizer {channel // SCANNERS}"
+        which += f", scanner channel {channel % SCANNERS}," if channel % SCANNERS else ""
         if growth > LEAST_BENT:
-            low, high = np.quantile(found.amplitude, [0.05, 0.95]).tolist()
             off = [found.factor * (float(np.mean(targets)) - amplitude) for amplitude in (low, high)]
             lines.append(
-                f"the receiver of digitizer {channel // SCANNERS}"
-                + (f", scanner channel {channel % SCANNERS}," if channel % SCANNERS else "")
-                + " compresses, by the shape of its echoes: those of "
+                f"the receiver of {which} compresses, by the shape of its echoes: those of "
                 f"{low:.0f} to {high:.0f} DN are {off[0]:+.1%} to {off[1]:+.1%} off against the targets': the error of "
                 f"the constant grows by {growth:.1%}; take targets as bright as the surfaces that you measure"
+            )
+        elif max(dark / low, high / bright) > UNLIKE_TARGETS:
+            lines.append(
+                f"the targets of {which} are {dark:.0f} to {bright:.0f} DN bright, its echoes {low:.0f} to {high:.0f} "
+                "DN: that its receiver weakens no strong light is assumed, and not in the error; take a dark and a "
+                "bright target"
             )
     return most, lines
 

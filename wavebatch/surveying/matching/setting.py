@@ -6,7 +6,7 @@ makes another sensor of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
@@ -45,6 +45,10 @@ PLACES, NEAR, LEAST_COMMON, SPAN, BORDER = 256, 20.0, 20, 0.25, 4.0
 fields are larger; fewest of these that show a change; how far they spread along the strip to show that it fades
 (standard deviation, in half of its time); and standard deviations of their differences from which they lie apart."""
 
+SAME_GROUND = 0.02
+"""By how much ground changes its brightness between two strips, by moisture and the direction of their light (standard
+deviation of the logarithm; assumed): a third of what whole scenes do, and less than air over 500 m."""
+
 LIKE_GROUND = 0.5
 """Scatter of the differences of neighbours, over that of surfaces that have nothing to do with each other, up to which
 they are the same surfaces: even ground looks like all even ground, and ground may have changed."""
@@ -80,6 +84,10 @@ FADING_PARTS, LEAST_OF_PART = 16, 50
 
 FEW_PARTS = 1.3
 """Factor of an error that so few parts tell, for surfaces that lie in no order."""
+
+CELLS, LEAST_OF_CELL, LEAST_CELLS = (8, 32), 4, 50
+"""Mean numbers of sampled waveforms of the cells in which light is compared with time; fewest of one that counts, and
+fewest such cells."""
 
 BRIGHT = 0.95
 """Quantile of the light of waveforms: above it lie few metal roofs and signs."""
@@ -119,6 +127,8 @@ class Change(NamedTuple):
     """Of another gain or energy, from 0 to 1."""
     error: float
     """Root mean square of the logarithm of that change, as far as the light shows it."""
+    spread: float = np.inf
+    """How much surfaces change the ratio (standard deviation)."""
 
 
 NO_CHANGE = Change(0.0, 0.0, 0.0)
@@ -155,7 +165,9 @@ class Setting(NamedTuple):
     """None where there is no rate."""
 
 
-def weigh_change(shift: float, spread: float, noise: float | None = None, *, chance: float) -> Change:
+def weigh_change(
+    shift: float, spread: float, noise: float | None = None, *, chance: float, usual: float = 0.0
+) -> Change:
     """Weigh whether light differs by its surfaces, or by another energy or gain.
 
     Parameters
@@ -168,6 +180,8 @@ def weigh_change(shift: float, spread: float, noise: float | None = None, *, cha
         Logarithm of the ratio of the noise: a gain changes it as it changes light, an energy does not.
     chance : float
         Of another energy or gain before light and noise are seen.
+    usual : float
+        By how much air and laser change light in any case (standard deviation of the logarithm).
 
     Returns
     -------
@@ -181,29 +195,28 @@ def weigh_change(shift: float, spread: float, noise: float | None = None, *, cha
     known = np.diag([spread**2, 1e6 if noise is None else SUNLIGHT**2])
     chances, squares = [], []
     for prior, moves in [(1.0 - chance, (0.0, 0.0)), *((chance / len(CHANGES), moves) for moves in CHANGES)]:
-        covariance = known + USUAL_CHANGE**2 * np.outer(moves, moves)
-        inner = np.linalg.solve(covariance, np.stack([seen, moves], axis=1)).T @ np.stack([seen, moves], axis=1)
-        chances.append(prior * np.exp(-0.5 * inner[0, 0]) / np.sqrt(np.linalg.det(covariance)))
-        mean = USUAL_CHANGE**2 * inner[0, 1]
-        squares.append((mean**2 + USUAL_CHANGE**2 * (1.0 - USUAL_CHANGE**2 * inner[1, 1])) * any(moves))
+        light = USUAL_CHANGE**2 * np.outer(moves, moves) + np.diag([usual**2, 0.0])
+        inverse = np.linalg.inv(known + light)
+        chances.append(prior * np.exp(-0.5 * seen @ inverse @ seen) * np.sqrt(np.linalg.det(inverse)))
+        squares.append((light[0] @ inverse @ seen) ** 2 + light[0, 0] - light[0] @ inverse @ light[0])
     share = np.array(chances) / max(sum(chances), 1e-300)
-    return Change(shift, float(1.0 - share[0]), float(np.sqrt(share @ squares)))
+    return Change(shift, float(1.0 - share[0]), float(np.sqrt(share @ squares)), spread)
 
 
 def compare_scenes(
-    one: Sequence[float], other: Sequence[float], noise: float | None = None, *, chance: float
+    one: Sequence[float], other: Sequence[float], noise: float | None = None, *, chance: float, usual: float = 0.0
 ) -> Change:
-    """Weigh by how much one scene is brighter than another; noise, chance: as `weigh_change`.
+    """Weigh by how much one scene is brighter than another; noise, chance, usual: as `weigh_change`.
 
     Another energy or gain shifts the logarithms of all quantiles alike; other surfaces shift each in its own way.
     """
     off = np.subtract(one, other)
     spread = float(np.hypot(UNLIKE * np.std(off), LEAST_UNLIKE))
-    return weigh_change(float(np.median(off)), spread, noise, chance=chance)
+    return weigh_change(float(np.median(off)), spread, noise, chance=chance, usual=usual)
 
 
 def compare_ground(
-    places: np.ndarray, known: np.ndarray, noise: float | None = None, *, chance: float
+    places: np.ndarray, known: np.ndarray, noise: float | None = None, *, chance: float, usual: float = 0.0
 ) -> tuple[Change, Change | None] | None:
     """Weigh by how much the ground that a calibrated strip saw too is brighter, and how that grows along the strip.
 
@@ -214,7 +227,7 @@ def compare_ground(
     known : float array, shape (m, 3)
         East, north and logarithm of the light of places of the calibration.
     noise : float, optional
-    chance : float
+    chance, usual : float
         As for `weigh_change`.
 
     Returns
@@ -239,12 +252,12 @@ def compare_ground(
     same = np.abs(off - np.median(off)) <= BORDER * robust_std(off)
     off, time, number = off[same], time[same], len(np.unique(near[rows[same]]))
     error, spread = float(np.std(off)) / number**0.5, float(np.std(time))
-    doubt = float(np.hypot(MEDIAN_ERROR * error, LEAST_UNLIKE))
-    level = weigh_change(float(np.median(off)), doubt, noise, chance=chance)
+    doubt = float(np.hypot(MEDIAN_ERROR * error, SAME_GROUND))
+    level = weigh_change(float(np.median(off)), doubt, noise, chance=chance, usual=usual)
     if spread < SPAN:
         return level, None
     slope = float(np.polyfit(time, off, 1)[0])
-    return level, weigh_change(slope, float(np.hypot(error / spread, LEAST_UNLIKE)), chance=chance)
+    return level, weigh_change(slope, float(np.hypot(error / spread, SAME_GROUND)), chance=chance)
 
 
 def measure_setting(
@@ -280,7 +293,7 @@ def measure_setting(
     brightest = {channel: float(np.quantile(rows[1], BRIGHT)) for channel, rows in known.items()}
     scenes = {channel: _describe_scene(rows[1]) for channel, rows in known.items()}
     places = {channel: _list_places(*rows[[2, 3, 1, 0]]) for channel, rows in known.items()}
-    fading = [NO_CHANGE, *(_find_fading(*rows[:2], chance=chance) for rows in known.values())]
+    fading = [NO_CHANGE, *(_find_fading(rows[0], rows[1], rows[2:4], chance=chance) for rows in known.values())]
     fades = max(fading, key=lambda one: one.error)
     return Setting(rate, brightest, scenes, places, _find_right(every), fades, zone)
 
@@ -364,24 +377,51 @@ def _describe_scene(light: np.ndarray) -> tuple[float, ...]:
     return tuple(np.log(np.quantile(light, QUANTILES)).tolist())
 
 
-def _find_fading(time: np.ndarray, light: np.ndarray, *, chance: float) -> Change:
-    """How light grows from the first half of a strip to the second, by a line through the scenes of its parts.
+def _find_fading(time: np.ndarray, light: np.ndarray, place: np.ndarray, *, chance: float) -> Change:
+    """How light grows from the first half of a strip to the second; place: east and north, f8 (2, n).
 
-    What parts scatter about the line is their surfaces' doing. Fields, forests and towns reach over several parts: such
-    neighbours scatter alike, and raise the error by what they share.
+    By a line through the scenes of its parts: what parts scatter about the line is their surfaces' doing. Fields,
+    forests and towns reach over several parts: such neighbours scatter alike, and raise the error by what they share.
+    Or by how it grows within small cells of the ground, most of which lie in one field. What shows it best counts.
     """
     parts = np.array_split(np.argsort(time, kind="stable"), FADING_PARTS)
     if len(time) < FADING_PARTS * LEAST_OF_PART or time.min() == time.max():
         return NO_CHANGE
-    place = np.array([time[part].mean() for part in parts])
-    place -= place.mean()
+    middle = np.array([time[part].mean() for part in parts])
+    middle -= middle.mean()
+    half = 2.0 * np.abs(middle).mean()
     scenes = np.array([_describe_scene(light[part]) for part in parts])
-    half = 2.0 * np.abs(place).mean() / (place @ place)
-    slopes, middle = half * (place @ scenes), np.median(scenes, axis=1)
-    rest = middle - middle.mean() - place * (place @ middle) / (place @ place)
-    error = weigh_alike(rest) * half * float(np.sqrt(rest @ rest / (FADING_PARTS - 2) * (place @ place)))
-    spread = np.sqrt(LEAST_UNLIKE**2 + np.var(slopes) + error**2)
-    return weigh_change(float(np.median(slopes)), float(spread), chance=chance)
+    slopes, levels = half * (middle @ scenes) / (middle @ middle), np.median(scenes, axis=1)
+    rest = levels - levels.mean() - middle * (middle @ levels) / (middle @ middle)
+    error = weigh_alike(rest) * half * float(np.sqrt(rest @ rest / (FADING_PARTS - 2) / (middle @ middle)))
+    found = [(float(np.sqrt(LEAST_UNLIKE**2 + np.var(slopes) + error**2)), float(np.median(slopes)))]
+    for error, slope in _find_growth_in_cells(time, np.log(light), place):
+        found.append((float(np.hypot(SAME_GROUND, half * error)), half * slope))
+    spread, shift = min(found)
+    return weigh_change(shift, spread, chance=chance)
+
+
+def _find_growth_in_cells(time: np.ndarray, light: np.ndarray, place: np.ndarray) -> Iterator[tuple[float, float]]:
+    """Yield errors and slopes over time of light in cells of the ground of two sizes: medians over the cells, since a
+    field's border in some of them says nothing."""
+    low, high = place.min(axis=1), place.max(axis=1)
+    for number in CELLS:
+        size = max(float(np.sqrt(np.prod(high - low) * number / len(time))), 1e-3)
+        across, up = ((place - low[:, None]) // size).astype(np.int64)
+        _, first, cell, count = np.unique(
+            across * (up.max() + 1) + up, return_index=True, return_inverse=True, return_counts=True
+        )
+        off, bright = (one - (np.bincount(cell, one) / count)[cell] for one in (time, light))
+        weight = np.bincount(cell, off * off)
+        good = (count >= LEAST_OF_CELL) & (weight > 0.0)
+        if good.sum() >= LEAST_CELLS:
+            slope = np.bincount(cell, off * bright)[good] / weight[good]
+            middle, scatter = float(np.median(slope)), robust_std(slope)
+            rest = np.clip(slope - middle, -BORDER * scatter, BORDER * scatter)
+            # Cells beside each other, in either direction, tell the same where brightness runs smoothly.
+            turned = np.lexsort((across[first[good]], up[first[good]]))
+            alike = weigh_alike(rest) * weigh_alike(rest[turned]) / FEW_PARTS**2
+            yield MEDIAN_ERROR * scatter * (alike / len(slope)) ** 0.5, middle
 
 
 def weigh_alike(rest: np.ndarray) -> float:

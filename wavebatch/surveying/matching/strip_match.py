@@ -59,6 +59,9 @@ LIKE_FEET = 0.35
 LIKELY, HIDDEN = 0.5, 0.05
 """Chance from which another gain or energy is named; and error from which it is said that one would not show."""
 
+FROM_START = 2.0 / 3.0**0.5
+"""Root mean square over a strip of light that changes evenly from its start, over the change from half to half."""
+
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
 one, other surfaces the other."""
@@ -84,37 +87,41 @@ def _least_error(calibration: Calibration) -> float:
 
 
 def find_growth(
-    calibration: Calibration, reader: StripReader, sensor: SensorSource, attenuation: float | None
-) -> tuple[float, list[str]]:
-    """Error that day, air, distance and sensor add to the constant, relative, and the warnings.
+    calibration: Calibration, reader: StripReader, sensor: SensorSource, attenuation: float | None, *, other: bool
+) -> tuple[float, bool, list[str]]:
+    """Error that day, air, distance and sensor add to the constant, relative, whether it is of another day, the lines.
 
-    attenuation: of the strip's air [dB/km], where it is given. Air that is not given is known to AIR_DOUBT: over the
-    whole way on another day than that of the calibration, over what the ways differ on the same.
+    attenuation: of the strip's air [dB/km], where it is given. Air that is not given is known to AIR_DOUBT: over both
+    ways on another day than that of the calibration. Within a day half of the variance of air and laser is common
+    (assumed), so that air counts over the way of the strip, and over what the ways differ. other: a strip that was not
+    calibrated.
     """
-    parts, lines = [UNSTATED if not _least_error(calibration) else 0.0], []
+    usual, lines = OTHER_DAY * 0.5**0.5 * other, []
     day = settings.read_day(reader)
+    later = bool(day and calibration.flight and day != calibration.flight)
     slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
     haze = sensor.haze / calibration.haze if calibration.haze and attenuation is None else 1.0
-    if day and calibration.flight and day != calibration.flight:
+    if later:
         apart = abs((date.fromisoformat(day) - date.fromisoformat(calibration.flight)).days)
         own = haze * (sensor.distance or 0.0) if attenuation is None else 0.0
         air = slope * math.hypot(own, calibration.distance or 0.0)
-        parts.append(math.hypot(OTHER_MONTH if apart > 30 else OTHER_DAY, air))
+        usual = math.hypot(OTHER_MONTH if apart > 30 else OTHER_DAY, air)
         lines.append(
             f"calibration: measured on {calibration.flight}, this strip was flown on {day}: the error of the constant "
-            f"grows by {100 * parts[-1]:.0f} %, {100 * air:.0f} % of it for the air"
+            f"grows by {100 * usual:.0f} %, {100 * air:.0f} % of it for the air"
         )
     elif calibration.distance and sensor.distance:
         more, less = haze * sensor.distance - calibration.distance, 0.0
         if haze != 1.0 and calibration.haze:
             # What heights above sea take off the air is known to a half as well.
             less = (sensor.distance - calibration.distance) / calibration.haze - more
-        parts.append(slope * math.hypot(more, less))
+        within = slope * haze * sensor.distance if other and attenuation is None else 0.0
+        usual = math.hypot(usual, slope * math.hypot(more, less), within)
         ratio = sensor.distance / calibration.distance
         if max(ratio, 1 / ratio) > FAR:
             lines.append(
                 f"calibration: measured at {calibration.distance:.0f} m, this strip is {sensor.distance:.0f} m away: "
-                f"the air between adds {100 * parts[-1]:.1f} % to the error of the constant"
+                f"the air adds {100 * usual:.1f} % to the error of the constant"
             )
     name = settings.read_sensor_name(reader.facts)
     if calibration.sensor and name and name != calibration.sensor:
@@ -125,7 +132,7 @@ def find_growth(
     software = decode_text(reader.facts.header.generating_software).strip()
     if calibration.software and software and software != calibration.software:
         lines.append(f"calibration: measured on a file of {calibration.software!r}, this one is of {software!r}")
-    return float(np.sqrt(np.sum(np.square(parts)))), lines
+    return usual, later, lines
 
 
 def refuse_zone(calibration: Calibration, found: settings.Setting, distance: float | None, path: Path) -> None:
@@ -149,10 +156,14 @@ def refuse_zone(calibration: Calibration, found: settings.Setting, distance: flo
 
 
 def compare_setting(
-    calibration: Calibration, found: settings.Setting, system: SystemPulse
+    calibration: Calibration, found: settings.Setting, system: SystemPulse, usual: float = 0.0
 ) -> tuple[float, list[str], list[str]]:
-    """Error that another pulse rate or gain adds to the constant, relative, the warnings, and what would not show."""
+    """Error that another pulse rate, gain or air adds to the constant, relative, the warnings, and what would not show.
+
+    usual: what `find_growth` knows of air and day; ground in common shows it, too.
+    """
     growth, lines, notes = 0.0, [], []
+    unseen = usual
 
     def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
         nonlocal growth
@@ -176,34 +187,42 @@ def compare_setting(
         if not scene or len(row.scene) != len(scene):
             continue
         louder = math.log(noise / row.noise_dn) if noise and row.noise_dn else None
-        ground = _compare_places(calibration, found, row, louder)
+        ground = _compare_places(calibration, found, row, louder, usual)
         seen, change = ("ground in common is", ground[0]) if ground else ("scenes are", None)
-        change = change or settings.compare_scenes(scene, row.scene, louder, chance=calibration.change_chance)
-        more = math.expm1(abs(change.shift) if change.chance > LIKELY else change.error)
-        growth = max(growth, more)
+        chance = calibration.change_chance
+        change = change or settings.compare_scenes(scene, row.scene, louder, chance=chance, usual=usual)
+        # What common ground shows is in the error, whatever changed it.
+        more = math.expm1(max(change.error, abs(change.shift) * bool(ground or change.chance > LIKELY)))
+        growth, unseen = max(growth, more), 0.0
         if change.chance <= LIKELY and more > HIDDEN:
-            known = f"ground in common {which} scatters" if ground else f"surfaces {which} differ, no ground is common"
+            brighter = f"{100 * math.expm1(change.shift):+.0f} % brighter, which its scatter and moisture may do"
+            known = f"ground in common {which} is {brighter}" if ground else f"surfaces {which} differ, none is common"
             notes.append(
-                f"calibration: {known}, so that another energy under the same "
-                f"header would not show: {100 * more:.0f} % of error hold it, by an assumed chance of "
-                f"{calibration.change_chance:.0%} (change_chance); calibrate a strip that overlaps this one"
+                f"calibration: {known}, so that another energy under the same header, or other air, would not show: "
+                f"{100 * more:.0f} % of error hold it, by an assumed chance of {chance:.0%} (change_chance); calibrate "
+                "a strip that overlaps this one"
             )
         elif change.chance > LIKELY:
             lines.append(
-                f"calibration: another gain or energy under the same header: all echoes {which} are brighter by a "
-                f"factor of {math.exp(change.shift):.2f}, "
+                f"calibration: another gain or energy under the same header, or haze: all echoes {which} are brighter "
+                f"by a factor of {math.exp(change.shift):.2f}, "
                 + ("and noise with them" if abs(louder or 0.0) > settings.SUNLIGHT else f"though {seen} alike")
             )
+    growth = math.hypot(growth, unseen)
     return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines], notes
 
 
 def _compare_places(
-    calibration: Calibration, found: settings.Setting, row: ChannelConstant, noise: float | None = None
+    calibration: Calibration,
+    found: settings.Setting,
+    row: ChannelConstant,
+    noise: float | None = None,
+    usual: float = 0.0,
 ) -> tuple[settings.Change, settings.Change | None] | None:
     known = np.reshape(calibration.places[: len(calibration.places) // 4 * 4], (-1, 4))
     seen = found.places.get((row.digitizer, row.scanner), np.empty((4, 0)))
     mine = known[known[:, 0] == settings.number_channel(row.digitizer, row.scanner), 1:]
-    return settings.compare_ground(seen, mine, noise, chance=calibration.change_chance)
+    return settings.compare_ground(seen, mine, noise, chance=calibration.change_chance, usual=usual)
 
 
 def judge_fading(
@@ -216,18 +235,18 @@ def judge_fading(
     """
     fades, hidden = found.fades, "surfaces in large patches hide"
     compared = [_compare_places(calibration, found, row) for row in calibration.channels if other]
-    seen = [ground[1] for ground in compared if ground and ground[1]]
-    if seen:
-        # One laser that fades is enough.
-        fades, hidden = max(seen, key=lambda one: (one.chance, one.error)), "the scatter of the ground in common hides"
+    # One laser that fades is enough.
+    seen = max((ground[1] for ground in compared if ground and ground[1]), key=lambda one: one[1:3], default=fades)
+    if seen.spread < fades.spread:
+        fades, hidden = seen, "the scatter of the ground in common hides"
     if fades.chance > LIKELY:
-        growth = math.expm1(abs(fades.shift))
+        growth = math.expm1(FROM_START * abs(fades.shift))
         return growth, [
             f"calibration: the second half of the strip is {100 * math.expm1(fades.shift):+.0f} % brighter, though "
             "both are like one scene: a laser that fades, or haze? The error of the constant grows by "
             f"{100 * growth:.0f} %; calibrate shorter strips"
         ], []
-    growth = math.expm1(fades.error)
+    growth = math.expm1(FROM_START * fades.error)
     if growth < HIDDEN or not other and len(calibration.strips) > 1:
         return 0.0, [], []
     return growth, [], [
@@ -324,7 +343,6 @@ def match_strip(
     warnings = list(doubt_calibration(calibration))
     if not any(row.is_described for row in calibration.channels):
         return calibration, tuple(warnings)
-    growth, reasons = find_growth(calibration, reader, sensor, attenuation)
     if calibration.haze and attenuation is None:
         calibration = replace(calibration, attenuation=calibration.attenuation / calibration.haze * sensor.haze)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
@@ -333,9 +351,12 @@ def match_strip(
     refuse_zone(calibration, setting, sensor.distance, reader.facts.path)
     notes: list[str] = []
     measured = {calibration.fingerprint.get("sha256_sampled"), *(row.sha256 for row in calibration.strips)}
-    if own_strip not in measured:
-        more, lines, notes = compare_setting(calibration, setting, system)
-        growth, reasons = math.hypot(growth, more), [*reasons, *lines]
+    other = own_strip not in measured
+    growth, later, reasons = find_growth(calibration, reader, sensor, attenuation, other=other)
+    if other:
+        more, lines, notes = compare_setting(calibration, setting, system, growth)
+        # Ground of another day may have changed as well: it proves no air.
+        growth, reasons = math.hypot(more, growth * later), [*reasons, *lines]
         if not (calibration.flight and settings.read_day(reader)):
             which = "the calibration" if not calibration.flight else "this strip"
             notes.append(
@@ -343,10 +364,13 @@ def match_strip(
                 "counts as the same day; lasers, receivers and air of another day would add to the error"
             )
     if energy is None:
-        more, lines, hidden = judge_fading(calibration, setting, other=own_strip not in measured)
-        growth, reasons, notes = math.hypot(growth, more), [*reasons, *lines], [*notes, *hidden]
+        more, lines, hidden = judge_fading(calibration, setting, other=other)
+        # Light that is seen to fade from the calibrated level on also moves the mean, which the first error holds.
+        growth = max(growth, more) if lines else math.hypot(growth, more)
+        reasons, notes = [*reasons, *lines], [*notes, *hidden]
     warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
+    growth = math.hypot(growth, 0.0 if _least_error(calibration) else UNSTATED)
     rows: list[ChannelConstant] = []
     missing: dict[int, str] = {}
     pulses = _find_pulses(calibration, reader, scan, system, sensor)
