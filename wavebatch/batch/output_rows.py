@@ -200,10 +200,11 @@ def assemble_echoes(
     packet = np.where(rows.echo >= 0, np.append(table.waveform, -1)[rows.echo], members.packet[rows.source])
     direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0).take(packet, axis=0)
     places, absent = xyz, np.isnan(xyz)
-    if absent.any():
-        passed = np.flatnonzero(absent.any(axis=1))
+    passed = np.flatnonzero(absent[:, 0] | absent[:, 1] | absent[:, 2])  # `any` of short rows takes ten times as long
+    if len(passed):
         places = xyz.copy()
-        places[passed] = np.where(absent[passed], locate(records[passed], layout.source.header), xyz[passed])
+        given = locate(take_whole_records(records, passed), layout.source.header)
+        places[passed] = np.where(absent[passed], given, xyz[passed])
     flags = np.append(table.flags, np.uint16(0))[rows.echo] | rows.reason
     pulse = find_pulses(unit.points["gps_time"])[rows.owner]
     number, total = _number_rows(pulse, places, direction, records, (flags & np.uint16(dropped)) == 0)
@@ -300,7 +301,7 @@ def _place_rows(
     owner = owner[np.concatenate([table.waveform, members.packet[passed]])]
     source = np.concatenate([members.find(point), passed])
     owner = np.where(owner < 0, source, owner)
-    order: Any = find_order(owner, np.concatenate([table.time, _locations(members.source[passed])]))
+    order: Any = find_order(owner, np.concatenate([table.time, _locations(members.source, passed)]))
     order = slice(None) if order is None else order
     return _Rows(
         echo=np.concatenate([np.arange(len(table)), np.full(len(passed), -1)])[order],
@@ -322,9 +323,9 @@ def _number_rows(
     return number, total
 
 
-def _locations(records: np.ndarray) -> np.ndarray:
-    """Return locations [ns], which order points that share a packet; NaN comes first."""
-    return np.nan_to_num(widen_integers(records["return_point_wave_location"]) / PS_PER_NS, nan=-np.inf)
+def _locations(records: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return locations of the records at `rows` [ns], which order points that share a packet; NaN comes first."""
+    return np.nan_to_num(widen_integers(records["return_point_wave_location"][rows]) / PS_PER_NS, nan=-np.inf)
 
 
 def _columns(

@@ -270,8 +270,8 @@ class OutputLayout:
         return list(zip(self.extra_fields[len(self.carried) :], self.written, strict=True))
 
     def _set_coordinates(self, rows: np.ndarray, xyz: np.ndarray) -> None:
-        new = ~np.isnan(xyz).all(axis=1)
-        header = self.source.header
+        header, absent = self.source.header, np.isnan(xyz)
+        new = ~(absent[:, 0] & absent[:, 1] & absent[:, 2])
         for axis, (name, scale, offset) in enumerate(zip("XYZ", header.scales, header.offsets, strict=True)):
             with np.errstate(all="ignore"):
                 counts = np.rint((xyz[:, axis] - offset) / np.float64(scale))

@@ -358,8 +358,8 @@ class _Geometry:
         used = np.flatnonzero(packet_of >= 0)
         self._entry = used[np.lexsort((index[used], packet_of[used]))]
         self._index = index[self._entry]
-        edges = np.searchsorted(packet_of[self._entry], np.arange(len(unit.packets) + 1))
-        self._starts, self._counts = edges[:-1], np.diff(edges)
+        self._counts = np.bincount(packet_of[used], minlength=len(unit.packets))
+        self._starts = np.cumsum(self._counts) - self._counts
 
     def build_block(
         self, rows: np.ndarray, digitizer: Digitizer, samples: np.ndarray, missing: np.ndarray | None

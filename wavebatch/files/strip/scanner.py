@@ -69,8 +69,11 @@ class PacketGroups:
 
 def group_keys(keys: np.ndarray) -> PacketGroups:
     """Return the groups of equal keys (n,)."""
-    order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
+    if np.all(keys[1:] >= keys[:-1]):  # as most vendors write them
+        order, ordered = np.arange(len(keys)), keys
+    else:
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
     new = np.ones(len(keys), bool)
     new[1:] = ordered[1:] != ordered[:-1]
     starts = np.flatnonzero(new)
