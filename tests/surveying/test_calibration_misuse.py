@@ -490,6 +490,7 @@ def test_one_bright_target_and_a_receiver_that_compresses(tmp_path, most, pulse)
     found, said = calibrate(tmp_path, strips=["a.las"])
     if np.isinf(most):
         assert "compresses" not in said and all(row.relative_error < 0.031 for row in found.channels)
+        assert "that its receiver weakens no strong light is assumed" in said
         return
     assert "the receiver of digitizer 1 compresses, by the shape of its echoes" in said
     assert "take targets as bright as the surfaces that you measure" in said
@@ -516,6 +517,7 @@ def test_a_dark_and_a_bright_target_hold_a_receiver_that_weakens_whole_pulses(tm
     found, told = calibrate(tmp_path, "--report", tmp_path / "cal.json", strips=["a.las"])
     dark, bright = (row["constant"] for row in json.loads((tmp_path / "cal.json").read_text())["targets"])
     assert bright > 1.15 * dark and "a receiver that weakens strong light does that too" in told
+    assert "is assumed" not in told
     for constant in (dark, bright):
         assert abs(found.constant / constant - 1) < 1.2 * found.relative_error
 

@@ -9,7 +9,7 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
-from wavebatch.surveying.systems.known_systems import Trial, draw_pulse, find_source, limit_surveys
+from wavebatch.surveying.systems.known_systems import Trial, draw_pulse, find_source, known_systems, limit_surveys
 
 NUMBER, LENGTH, NOISE = 600, 90, 1.2
 
@@ -84,3 +84,10 @@ def test_parts_of_a_stranger_have_one_width(part):
     with StripReader(data_file("lvis/lvis1.las")) as reader, reader.scan() as scan, limit_surveys(Trial("nasa-lvis")):
         half = [block.rows(slice(part, None, 2)) for block in read_sample(reader, scan)]
         assert _half_width(survey_blocks(half).system) == pytest.approx(6.68, rel=0.05)
+
+
+def test_surveys_can_do_without_a_known_sensor():
+    lvis = next(known for known in known_systems() if known.name == "nasa-lvis")
+    with limit_surveys(Trial("nasa-lvis")):
+        assert lvis not in known_systems() and find_source(lvis.system) is None
+    assert lvis in known_systems() and find_source(lvis.system) == lvis

@@ -151,19 +151,15 @@ def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
         raise ConfigError(
             f"--columns: '+{added[0]}' adds, but {chosen[0]!r} has no +; write +{chosen[0]} to add it too"
         )
-    for name in [*chosen, *added]:
-        _check_column(name, (*computed, *WITHOUT_STAGE))
-    return tuple(dict.fromkeys([*(chosen or default), *added]))
-
-
-def _check_column(name: str, available: tuple[str, ...]) -> None:
     known = [column.name for column in COLUMNS.values() if column.extra_bytes]
-    if name not in known:
-        raise ConfigError(f"--columns: column {name!r} does not exist; {nearest(name, known)}")
-    if name not in available:
-        makers = [stage.name for stage in STAGES.values() if name in stage.makes]
-        remedy = f"add stage {' or '.join(makers)} to it" if makers else "no stage of this version does"
-        raise ConfigError(f"--columns: the chain does not compute {name!r}; {remedy}")
+    for name in [*chosen, *added]:
+        if name not in known:
+            raise ConfigError(f"--columns: column {name!r} does not exist; {nearest(name, known)}")
+        if name not in (*computed, *WITHOUT_STAGE):
+            makers = [stage.name for stage in STAGES.values() if name in stage.makes]
+            remedy = f"add stage {' or '.join(makers)} to it" if makers else "no stage of this version does"
+            raise ConfigError(f"--columns: the chain does not compute {name!r}; {remedy}")
+    return tuple(dict.fromkeys([*(chosen or default), *added]))
 
 
 def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:

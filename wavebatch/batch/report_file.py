@@ -102,23 +102,18 @@ def describe_strip_result(prepared: Prepared, described: Mapping[str, Any]) -> d
     seen = describe_survey(prepared.choice, prepared.job.request, fingerprint)
     if prepared.job.request.flight:
         seen["survey"]["flight"] = {"fits": not prepared.stranger, "reason": prepared.stranger or None}
+    # Attenuation that the columns of light use, its error, and where it comes from.
+    air, job = prepared.system.radiometry, prepared.job
+    source = "the default, for which there is no source" if job.calibration is None else "the calibration"
+    source = source if job.attenuation is None else "--attenuation or --visibility"
     return {
         "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
-        "air": _describe_air(prepared),
+        "air": {"attenuation_db_km": air.attenuation, "error_db_km": air.attenuation_error, "from": source},
         "pulse_energy": None if prepared.pulse_energy is None else prepared.pulse_energy.describe(),
         "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
         **seen,
     }
-
-
-def _describe_air(prepared: Prepared) -> dict[str, Any]:
-    """Attenuation that the columns of light use, its error, and where it comes from."""
-    job, system = prepared.job, prepared.system
-    given = "the default, for which there is no source" if job.calibration is None else "the calibration"
-    source = given if job.attenuation is None else "--attenuation or --visibility"
-    air = system.radiometry
-    return {"attenuation_db_km": air.attenuation, "error_db_km": air.attenuation_error, "from": source}
 
 
 def describe_chain(prepared: Prepared) -> dict[str, Any]:
@@ -280,16 +275,6 @@ MOST_GAPS = 3
 """Most gaps of a trajectory that a remark lists."""
 
 
-def _name_model(prepared: Prepared) -> list[str]:
-    """The pulse that a residual loop takes from the survey where the chain names none."""
-    step = prepared.job.chain.steps[2]
-    model = step.effective().get("model")
-    if model != "auto":
-        return []
-    fitted = loop_model(prepared.system, model)
-    return [f'{step.stage.name} fits the pulse of the survey: model = "{fitted}"']
-
-
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     """Find what a user should know about a strip that is written.
 
@@ -311,8 +296,17 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += prepared.job.calibration.notes if prepared.job.calibration else ()
     lines += _find_gaps(prepared.sensor, report.no_data)
     lines += _doubt_units(prepared)
-    lines += _name_height(prepared)
-    lines += [*_name_model(prepared), *_name_raised(prepared)]
+    height, sensor = prepared.job.sensor.height, prepared.sensor
+    if height is not None and sensor.height is None:
+        seen = dict(sensor.facts).get("height_m")
+        where = f": {seen:.0f} m above the points" if seen else ""
+        lines.append(f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}")
+    # The pulse that a residual loop takes from the survey where the chain names none.
+    step = prepared.job.chain.steps[2]
+    if step.effective().get("model") == "auto":
+        fitted = loop_model(prepared.system, "auto")
+        lines.append(f'{step.stage.name} fits the pulse of the survey: model = "{fitted}"')
+    lines += _name_raised(prepared)
     last, lost = report.last_left_out, report.left_out.get("where", 0)
     if last:
         lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
@@ -349,12 +343,37 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
         does not fit the strip's pulse. Then what the files, the calibration and the records of the input have.
     """
     choice, echoes, warn = prepared.choice, report.count("echoes"), StripWarning.of
-    found = [*warn("forced-system", _name_forced(prepared)), *warn("nothing-selected", _miss_all(prepared, report))]
+    found: list[StripWarning] = []
+    if prepared.forced:
+        line = f"the survey given by --system is of another sensor, or this is a hillside: {prepared.forced}"
+        if prepared.job.request.force:
+            line = f"--force: the survey given by --system is not of this sensor: {prepared.forced}"
+        found += warn("forced-system", [line])
+    left_out = sum(report.left_out.values())
+    if left_out and not report.count("points_out"):
+        reasons = ", ".join(f"{n} {LEFT_OUT[name]}" for name, n in report.left_out.items() if n)
+        place = prepared.chosen.chosen.describe_extent(prepared.facts.header)
+        line = f"no point is written: of {left_out}, {reasons}{place and '; ' + place}"
+        found += warn("nothing-selected", [line])
     found += warn("empty", _find_nothing(prepared, report))
-    found += warn("foreign-packets", _doubt_waveforms(prepared, report))
+    # Packets of another strip, by --force, and return locations that fit no echo.
+    if prepared.scan.stranger:
+        found += warn("foreign-packets", [f"--force: {prepared.scan.stranger}"])
+    else:
+        matched = report.count("matched_returns")
+        lines = doubt_packets(prepared.facts, matched, matched + report.count("unmatched_returns"))
+        found += warn("foreign-packets", lines)
     found += doubt_survey(choice.survey.system, choice.survey.figures, choice.survey.waveforms) if echoes else ()
     found += () if choice.doubted else warn("failed-fits", _doubt_fits(prepared, report))
-    found += warn("reflectance", _doubt_reflectance(report))
+    # More reflectances above 1 than metal, signs and wet roofs explain.
+    known = max(report.no_data.get(name, {}).get(NoData.KNOWN.name, 0) for name in ("level_reflectance", "reflectance"))
+    if report.above_one > MOST_ABOVE_ONE * known > 0:
+        line = (
+            f"{100 * report.above_one / known:.0f} % of the reflectances exceed 1, that of a white matt surface: the "
+            "calibration is of another sensor or setting, a target's reflectance is wrong, or coordinates are not in "
+            "metres"
+        )
+        found += warn("reflectance", [line])
     if choice.doubted and echoes:
         share, (_, best) = choice.false_share, choice.predictions
         line = (
@@ -365,14 +384,6 @@ def find_warnings(prepared: Prepared, report: RunReport, dropped: Mapping[str, s
         found += warn("false-echoes", [line])
     found += [*doubt_files(prepared.facts, prepared.scan), *prepared.doubts]
     return (*found, *warn("dropped-records", map(": ".join, dropped.items())))
-
-
-def _name_forced(prepared: Prepared) -> Iterator[str]:
-    """A survey of another sensor, or of other ground."""
-    if prepared.forced and prepared.job.request.force:
-        yield f"--force: the survey given by --system is not of this sensor: {prepared.forced}"
-    elif prepared.forced:
-        yield f"the survey given by --system is of another sensor, or this is a hillside: {prepared.forced}"
 
 
 def _name_raised(prepared: Prepared) -> Iterator[str]:
@@ -403,15 +414,6 @@ def _doubt_fits(prepared: Prepared, report: RunReport) -> Iterator[str]:
             )
 
 
-def _miss_all(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """A selection that leaves no point."""
-    number = sum(report.left_out.values())
-    if number and not report.count("points_out"):
-        reasons = ", ".join(f"{n} {LEFT_OUT[name]}" for name, n in report.left_out.items() if n)
-        place = prepared.chosen.chosen.describe_extent(prepared.facts.header)
-        yield f"no point is written: of {number}, {reasons}{place and '; ' + place}"
-
-
 def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
     """A strip without any point, waveform or echo: its cloud is empty, or has no attributes."""
     points, waveforms, echoes = (report.count(name) for name in ("points_in", "waveforms", "echoes"))
@@ -430,26 +432,6 @@ def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
         yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` shows what the strip records"
 
 
-def _doubt_reflectance(report: RunReport) -> Iterator[str]:
-    """More reflectances above 1 than metal, signs and wet roofs explain."""
-    known = max(report.no_data.get(name, {}).get(NoData.KNOWN.name, 0) for name in ("level_reflectance", "reflectance"))
-    if report.above_one > MOST_ABOVE_ONE * known > 0:
-        share = f"{100 * report.above_one / known:.0f} %"
-        yield (
-            f"{share} of the reflectances exceed 1, that of a white matt surface: the calibration is of another sensor "
-            "or setting, a target's reflectance is wrong, or coordinates are not in metres"
-        )
-
-
-def _name_height(prepared: Prepared) -> Iterator[str]:
-    """A flight height that was not needed."""
-    height, sensor = prepared.job.sensor.height, prepared.sensor
-    if height is not None and sensor.height is None:
-        seen = dict(sensor.facts).get("height_m")
-        where = f": {seen:.0f} m above the points" if seen else ""
-        yield f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}"
-
-
 def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
     """Extra bytes of the input that added echoes share with the nearest return."""
     added = report.count("added_echoes")
@@ -466,15 +448,6 @@ def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
             f"{', '.join(marked)}: what {added} added echoes have for no-data; PDAL and QGIS take it for a "
             "value: leave these points out before a mean (flag ADDED)"
         )
-
-
-def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """Packets of another strip, by --force, and return locations that fit no echo."""
-    if prepared.scan.stranger:
-        yield f"--force: {prepared.scan.stranger}"
-        return
-    matched = report.count("matched_returns")
-    yield from doubt_packets(prepared.facts, matched, matched + report.count("unmatched_returns"))
 
 
 def _doubt_units(prepared: Prepared) -> Iterator[str]:

@@ -157,16 +157,11 @@ def run_batch(
         with contextlib.closing(_Batch(jobs, options, workers, on_event)) as batch:
             batch.run()
         result = BatchResult(tuple(batch.outcomes[job.path] for job in jobs), time.perf_counter() - start)
-        if saved is None and result.failed == len(jobs):
-            _drop_flight(options.folder)
+        if saved is None and result.failed == len(jobs) and not any(options.folder.glob("*.report.json")):
+            # No cloud was written: the next run, perhaps of other strips, would use the survey of this flight.
+            with contextlib.suppress(OSError):
+                flight_path(options.folder).unlink(missing_ok=True)
     return result
-
-
-def _drop_flight(folder: Path) -> None:
-    """Remove the survey of a flight if no cloud was written: the next run, perhaps of other strips, would use it."""
-    if not any(folder.glob("*.report.json")):
-        with contextlib.suppress(OSError):
-            flight_path(folder).unlink(missing_ok=True)
 
 
 def _survey_flight(

@@ -114,13 +114,9 @@ class StripTask:
         self._described = report_file.describe_job(job, take_fingerprint(job.path, packet_file))
         if options.resume and (report := report_file.read_current(job, options.folder, self._described)) is not None:
             return report
-        self._check_targets()
-        return None
-
-    def _check_targets(self) -> None:
-        options = self._options
         for target in (report_file.cloud_path, report_file.report_path):
-            check_target(target(self.job, options.folder), overwrite=options.overwrite or options.resume)
+            check_target(target(job, options.folder), overwrite=options.overwrite or options.resume)
+        return None
 
     @property
     def ready(self) -> Prepared:
@@ -260,7 +256,11 @@ class StripTask:
         options, job, prepared, writer = self._options, self.job, self.ready, _given(self._writer)
         start = Seconds.now()
         self._report.check(job.options.points, str(job.path))
-        self._report += RunReport(remarks=(*_name_stranger(prepared), *find_remarks(prepared, self._report)))
+        remarks = find_remarks(prepared, self._report)
+        if prepared.stranger:
+            words = "does not belong to the flight that was surveyed"
+            remarks = (f"{words}: {prepared.stranger}; it was surveyed alone", *remarks)
+        self._report += RunReport(remarks=remarks)
         if self._stat() != self._state:
             raise InputError(f"{job.path}: changed while it was read; run it again once it is complete")
         cloud = report_file.cloud_path(job, options.folder)
@@ -309,13 +309,6 @@ def _given(value: T | None) -> T:
     if value is None:
         raise StageError("a step of the strip was called too early; please report it as a bug")
     return value
-
-
-def _name_stranger(prepared: Prepared) -> tuple[str, ...]:
-    """The line about a strip that does not belong to its flight."""
-    if not prepared.stranger:
-        return ()
-    return (f"does not belong to the flight that was surveyed: {prepared.stranger}; it was surveyed alone",)
 
 
 def _close_result(future: Future) -> None:

@@ -40,7 +40,7 @@ from wavebatch.stages.chain import Chain, Solved, Step
 from wavebatch.surveying.choose_chain import ChainChoice, try_chain, without_columns
 from wavebatch.surveying.flat_ground import angle_parameters, choose_radius, measure_slope, sample_reference
 from wavebatch.surveying.prepare import prepare
-from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, judge_scale, refuse_units
+from wavebatch.surveying.sensor import UNKNOWN, SensorSource, judge_scale, refuse_units
 
 SolvedBlocks = list[tuple[np.ndarray, Solved]]
 """Per block of a unit: row of unit.packets of each waveform, i8 (n,), and what the chain found, without the samples."""
@@ -192,7 +192,14 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
                 refuse_units(reader, scan)
             if job.options.points == "echoes":
                 doubts += StripWarning.of("units", judge_scale(reader, scan))
-            _hold_height(reader, job.sensor, sensor)
+            # A flight height that contradicts the packet vectors, which are more exact and are used in its place.
+            given, seen = job.sensor.height, dict(sensor.facts).get("height_m")
+            off = 0.0 if given is None or sensor.height is not None or not seen else np.log(given / max(seen, 1e-9))
+            if abs(off) > LARGEST_HEIGHT_ERROR:
+                raise InputError(
+                    f"{facts.path}: --flight-height {given:g} m contradicts the strip: by its {sensor.kind} the sensor "
+                    f"flew {seen:.0f} m above the points; leave --flight-height out"
+                )
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += StripWarning.of("beam", more)
             job = replace(job, chain=_set_parameters(reader, scan, job.chain))
@@ -222,19 +229,6 @@ def _set_parameters(reader: StripReader, scan: StripScan, chain: Chain) -> Chain
             step = replace(step, parameters={"slope": min(slope, STEEP)})
         steps.append(step)
     return replace(chain, steps=tuple(steps))
-
-
-def _hold_height(reader: StripReader, request: SensorRequest, sensor: SensorSource) -> None:
-    """Refuse a flight height that contradicts the packet vectors, which are more exact and are used in its place."""
-    seen = dict(sensor.facts).get("height_m")
-    if request.height is None or sensor.height is not None or not seen:
-        return
-    if abs(np.log(request.height / max(seen, 1e-9))) > LARGEST_HEIGHT_ERROR:
-        where = f"by its {sensor.kind} the sensor flew {seen:.0f} m above the points"
-        raise InputError(
-            f"{reader.facts.path}: --flight-height {request.height:g} m contradicts the strip: {where}; leave "
-            "--flight-height out"
-        )
 
 
 def _see_level(

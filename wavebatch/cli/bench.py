@@ -63,9 +63,13 @@ def bench(
         tolerance_cm=100.0 * tolerance if tolerance else None,
     )
     document = command.run_bench(settings, say)
+    sheet = command.bench_sheet(document)
     for line in command.write_outputs(document, command.format_document(document), output) if output else []:
         talk(line)
     if html_file is not None:
-        command.write_bench_page(html_file, document)
+        from wavebatch.tools.sheets.page import write_page
+
+        names = ", ".join(section["scene"] for section in document["scenes"])
+        write_page(html_file, f"wavebatch bench: {names}", sheet.parts)
         talk(f"{html_file}: written")
-    print_result(options["as_json"], document, command.bench_sheet(document))
+    print_result(options["as_json"], document, sheet)

@@ -70,16 +70,6 @@ _INPUTS = ("strips", "strip", "clouds", "files", "cloud", "a")
 """Names of the arguments that are files to read; settings lie beside the first."""
 
 
-def add_variables(command: click.Command, title: str) -> None:
-    """Let each option of a command be given by a variable: WAVEBATCH_RUN_JOBS counts before WAVEBATCH_JOBS."""
-    for option in command.params:
-        if isinstance(option, click.Option) and option.name not in NO_VARIABLE:
-            words = re.sub("[- ]", "_", f"{title} {_option_name(option)}").upper()
-            general = _option_name(option).replace("-", "_").upper()
-            known = [option.envvar] if isinstance(option.envvar, str) else []
-            option.envvar = [*known, f"{PREFIX}{words}", f"{PREFIX}{general}"]
-
-
 def read_settings(command: click.Command, title: str, context: click.Context, arguments: list[str]) -> None:
     """Take the command's tables of the settings files as defaults; click's errors for a wrong one.
 
@@ -454,7 +444,13 @@ def dress(command: click.Command, title: str) -> click.Command:
     lines = [line.strip() for line in last.splitlines()]
     dressed.help = text.rstrip()
     dressed.examples = tuple((line, why.removeprefix("# ")) for why, line in zip(lines[::2], lines[1::2], strict=True))
-    add_variables(dressed, title)
+    # Each option may be given by a variable: WAVEBATCH_RUN_JOBS counts before WAVEBATCH_JOBS.
+    for option in dressed.params:
+        if isinstance(option, click.Option) and option.name not in NO_VARIABLE:
+            words = re.sub("[- ]", "_", f"{title} {_option_name(option)}").upper()
+            general = _option_name(option).replace("-", "_").upper()
+            known = [option.envvar] if isinstance(option.envvar, str) else []
+            option.envvar = [*known, f"{PREFIX}{words}", f"{PREFIX}{general}"]
     return dressed
 
 

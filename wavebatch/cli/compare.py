@@ -97,7 +97,7 @@ def compare(
     if output is not None:
         write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
     chains = _list_match(result) if strip else ()
-    parts = [*_list_echoes(between), *_list_differences(between), *_list_alone(between), *chains]
+    parts = [*_list_parts(between), *chains]
     print_result(as_json, result.to_json(), Sheet("compare", parts), "chains" if strip else "")
     fewer = min(between.echoes_a, between.echoes_b)
     if fewer and between.matched <= fewer * (FEW_COMMON if options["within"] is None else 0.0):
@@ -123,20 +123,16 @@ def compare(
 def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
     if (b is None) == (truth is None):
         raise click.UsageError("give either B or --truth FILE.npz")
-    for side in (a, b):
-        if side is not None and _is_chain(side):
+    from wavebatch.tools.compare_chains import find_contender
+
+    for side in filter(None, (a, b)):
+        if side.suffix.lower() == ".toml" or (not side.is_file() and not find_contender(str(side)).is_cloud):
             raise click.UsageError(f"{side} is a chain; give the strip to run it on with --strip STRIP")
     if b is not None and b.suffix.lower() == ".npz":
         raise click.UsageError(f"{b} looks like a truth file; give it with --truth")
     how = {} if options["within"] is None else {"tolerance_ns": options["within"]}
     how["chosen"] = PointFilter(where=options["where"])
     return compare_truth(a, truth, **how) if truth else compare_clouds(a, b, **how)
-
-
-def _is_chain(side: Path) -> bool:
-    from wavebatch.tools.compare_chains import find_contender
-
-    return side.suffix.lower() == ".toml" or (not side.is_file() and not find_contender(str(side)).is_cloud)
 
 
 def _match(a: Path, b: Path | None, strip: Path, options: dict) -> Matchup:
@@ -184,8 +180,8 @@ _SPREAD = ("number", "median", "mean", "rms", "nmad")
 """What the tables show of a difference."""
 
 
-def _list_echoes(one: Comparison) -> Iterator[Part]:
-    """How many echoes both sides have, and how many are the same."""
+def _list_parts(one: Comparison) -> Iterator[Part]:
+    """How many echoes both sides have, their differences, and the classes of echoes without a partner."""
     yield Later(partial(_draw, one))
     yield from (Fact("A", one.a), Fact("B", one.b))
     yield Fact("matched by", f"{one.matched_by}, within {one.tolerance_ns:g} ns")
@@ -202,26 +198,7 @@ def _list_echoes(one: Comparison) -> Iterator[Part]:
     numbers = sorted({*one.counts_a, *one.counts_b}) if one.pulses else ()
     rows = [(str(n), one.counts_a.get(n, 0), one.counts_b.get(n, 0)) for n in numbers]
     yield Sheet("Echoes per pulse", [Table(("echoes per pulse", "A", "B"), rows), Later(lambda: [_sums(one)])])
-
-
-def _draw(one: Comparison) -> Iterator[Picture]:
-    from wavebatch.tools.plots.charts import draw_counts
-
-    found = {"in both": one.matched, "only in A": one.extra, "only in B": one.missed}
-    yield from draw_counts(found, title="Echoes", label="")
-    for side, counts in (("A", one.counts_a), ("B", one.counts_b)) if one.pulses else ():
-        shown = {str(number): counts.get(number, 0) for number in range(min(max(counts, default=0), 16) + 1)}
-        yield from draw_counts(shown, title=f"Echoes per pulse, {side}", label="echoes")
-
-
-def _sums(one: Comparison) -> Table:
-    sides = (("echoes of A", one.echoes_a, one.extra, "extra"), ("echoes of B", one.echoes_b, one.missed, "missed"))
-    return sum_table((title, whole, f"{one.matched:,} identical + {rest:,} {name}", one.matched + rest == whole)
-                     for title, whole, rest, name in sides)  # fmt: skip
-
-
-def _list_differences(one: Comparison) -> Iterator[Sheet]:
-    """Differences of the echoes of both sides, also by class and by number of echoes where there are several."""
+    # Differences of the echoes of both sides, also by class and by number of echoes where there are several.
     spread = lambda of: tuple(getattr(of, name) for name in _SPREAD)  # noqa: E731
     rows = [(_UNITS[name], *spread(of)) for name, of in one.differences.items()]
     tables = [Table(("A - B", *_SPREAD), rows, ".4f")]
@@ -239,16 +216,28 @@ def _list_differences(one: Comparison) -> Iterator[Sheet]:
         words = "time: of positions, which the strip's returns anchor; `run --columns +echo_time` adds that of the fits"
         notes = [] if "echo_time" in one.differences else [Note(words)]
         yield Sheet("Errors against the truth", [Table(head, rows, ".4f", sortable=True), *notes])
-
-
-def _list_alone(one: Comparison) -> Iterator[Sheet]:
-    """The classes of echoes in which some have no partner."""
-    for title, tables in (("missed, of B's", one.missed_by), ("extra, of A's", one.extra_by)):
+    for title, classes_by in (("missed, of B's", one.missed_by), ("extra, of A's", one.extra_by)):
         rows = [(kind, str(name), alone, of, alone / of)
-                for kind, classes in tables.items() for name, (alone, of) in classes.items() if alone]  # fmt: skip
+                for kind, classes in classes_by.items() for name, (alone, of) in classes.items() if alone]  # fmt: skip
         if rows:
             head = (title, "", "number", "of", "share")
             yield Sheet(f"Echoes {title}", [Table(head, rows, ".2%", sortable=True)])
+
+
+def _draw(one: Comparison) -> Iterator[Picture]:
+    from wavebatch.tools.plots.charts import draw_counts
+
+    found = {"in both": one.matched, "only in A": one.extra, "only in B": one.missed}
+    yield from draw_counts(found, title="Echoes", label="")
+    for side, counts in (("A", one.counts_a), ("B", one.counts_b)) if one.pulses else ():
+        shown = {str(number): counts.get(number, 0) for number in range(min(max(counts, default=0), 16) + 1)}
+        yield from draw_counts(shown, title=f"Echoes per pulse, {side}", label="echoes")
+
+
+def _sums(one: Comparison) -> Table:
+    sides = (("echoes of A", one.echoes_a, one.extra, "extra"), ("echoes of B", one.echoes_b, one.missed, "missed"))
+    return sum_table((title, whole, f"{one.matched:,} identical + {rest:,} {name}", one.matched + rest == whole)
+                     for title, whole, rest, name in sides)  # fmt: skip
 
 
 def _list_match(result: Matchup) -> Iterator[Sheet]:

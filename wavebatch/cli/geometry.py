@@ -178,9 +178,6 @@ def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[st
     return {"strip": str(strip), **counts}
 
 
-_SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
-
-
 @click.command()
 @shared.strips_argument
 @shared.output_option("Voxels to write: .npz, or .las or .laz with a point at the centre of each; or a folder, which "
@@ -247,7 +244,9 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     from wavebatch.surveying.system_file import load_survey
     from wavebatch.tools.api import read_sensor
 
-    _check_options(options)
+    for name in ("trajectory", "lever_arm", "crs", "flight_height"):
+        if options[name] is not None and options["calibration"] is None:
+            raise click.UsageError(f"--{name.replace('_', '-')} is of no use without --calibration")
     settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options),
                                    chosen=PointFilter(where=options["where"]))  # fmt: skip
     names = ("direction", "headerless", "overwrite", "force", "profiles")
@@ -283,13 +282,6 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     sys.exit(EXIT_SOME_FAILED if failed else 0)
 
 
-def _check_options(options: dict[str, Any]) -> None:
-    """Refuses options that would have no effect."""
-    for name in _SENSOR:
-        if options[name] is not None and options["calibration"] is None:
-            raise click.UsageError(f"--{name.replace('_', '-')} is of no use without --calibration")
-
-
 def _list_lines(summary: VoxelSummary) -> Iterator[str]:
     x, y, z = summary.shape
     yield (
@@ -318,11 +310,6 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
             f"note: {count(summary.several_packets, 'pulse')} of several packets; between them nothing was recorded: "
             f"it counts as empty{hidden}"
         )
-    yield from _tell_ratio(summary)
-
-
-def _tell_ratio(summary: VoxelSummary) -> Iterator[str]:
-    """The reflectance ratio by which light is shared."""
     if summary.reflectance_ratio_source == "strip":
         measure = format_measure(summary.reflectance_ratio, summary.reflectance_ratio_err or 0.0)
         yield f"reflectance of canopy over ground: {measure}"

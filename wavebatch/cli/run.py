@@ -58,6 +58,8 @@ class Progress:
 
     def show(self, event: dict[str, Any]) -> None:
         """Shows one event of `run_batch`."""
+        from wavebatch.core.no_data import REASONS, NoData
+
         error = event.get("error")
         if self._json:
             plain = event if error is None else {**event, "error": messages.one_line(error)}
@@ -81,7 +83,11 @@ class Progress:
                 say(messages.printable(f"{strip}: warning: {one['text']}"))
             chosen = [f"{one['part']}: {'kept' if one['needed'] else 'left out'}: {one['reason']}"
                       for one in event["decisions"]]  # fmt: skip
-            more = [*chosen, *_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])]
+            more = [*chosen, *_sensor_lines(event["sensor"])]
+            for column, counts in sorted(event["counts"]["no_data"].items()):
+                total = sum(counts.values())
+                more += [f"{column}: no-data for {number} of {total} echoes: {REASONS[NoData[name]][0]}"
+                         for name, number in counts.items() if name != NoData.KNOWN.name]  # fmt: skip
             for line in [*more * (self._level > 0), *event["remarks"]]:
                 self._tell(f"{strip}: {line}")
         elif kind == "skipped":
@@ -141,17 +147,6 @@ def _sensor_lines(sensor: dict[str, Any]) -> Iterator[str]:
             f"returns were placed to {returns['scatter_m']:.3f} m, by {returns['from']}; an echo without a return is "
             f"off by {returns['phase_m']:.3f} m"
         )
-
-
-def _reasons(no_data: dict[str, dict[str, int]]) -> Iterator[str]:
-    """For each column and reason: how many echoes have no value."""
-    from wavebatch.core.no_data import REASONS, NoData
-
-    for column, counts in sorted(no_data.items()):
-        total = sum(counts.values())
-        for name, number in counts.items():
-            if name != NoData.KNOWN.name:
-                yield f"{column}: no-data for {number} of {total} echoes: {REASONS[NoData[name]][0]}"
 
 
 _COUNTED = {"points_in": "point", "waveforms": "waveform", "echoes": "echo"}
@@ -235,9 +230,24 @@ def run(**options: Any) -> None:
     """  # fmt: skip
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    _check_options(options)
+    report, output = options["report"], os.path.abspath(options["output"])
+    for name, target in (("--report", None if report == "-" else report), ("--html", options["html_file"])):
+        folder = None if target is None else Path(os.path.abspath(target)).parent
+        if folder and not folder.is_dir() and not folder.is_relative_to(output):  # folders in the output are made
+            raise ConfigError(f"{name}: folder {Path(target).parent} does not exist; make it first")
+    on_stdout = [*["--report -"][: report == "-"], *["--json"][: options["as_json"]]]
+    on_stdout += ["--progress json"][: options["progress"] == "json"]
+    if len(on_stdout) > 1:
+        raise ConfigError(f"{' and '.join(on_stdout)} would both write to stdout; give the report a file")
     try:
-        _start_processes(options)
+        # The processes that will surely be needed start before this one imports what it needs itself. A limit of memory
+        # may allow fewer, and resume may find nothing to do.
+        wanted = options["jobs"] or os.cpu_count() or 1
+        if wanted > 1 and not (options["memory"] or options["resume"] or options["dry_run"]):
+            from wavebatch.batch.workers.spawned import end_early, start_early
+
+            click.get_current_context().call_on_close(end_early)  # where an option is wrong, no run takes them
+            start_early(wanted)
         with importing():
             from wavebatch.tools.api import plan_run
 
@@ -253,31 +263,6 @@ def run(**options: Any) -> None:
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
         raise messages.Interrupted(text) from None
-
-
-def _start_processes(options: dict[str, Any]) -> None:
-    """Start the worker processes that will surely be needed, before this process imports what it needs itself."""
-    jobs = options["jobs"] or os.cpu_count() or 1
-    # A limit of memory may allow fewer processes, and resume may find nothing to do.
-    if jobs > 1 and not (options["memory"] or options["resume"] or options["dry_run"]):
-        from wavebatch.batch.workers.spawned import end_early, start_early
-
-        click.get_current_context().call_on_close(end_early)  # where an option is wrong, no run takes them
-        start_early(jobs)
-
-
-def _check_options(options: dict[str, Any]) -> None:
-    report = options["report"]
-    for name, target in (("--report", None if report == "-" else report), ("--html", options["html_file"])):
-        if target is None:
-            continue
-        folder, output = Path(os.path.abspath(target)).parent, os.path.abspath(options["output"])
-        if not folder.is_dir() and not folder.is_relative_to(output):  # folders in the output are made
-            raise ConfigError(f"{name}: folder {Path(target).parent} does not exist; make it first")
-    on_stdout = [*["--report -"][: report == "-"], *["--json"][: options["as_json"]]]
-    on_stdout += ["--progress json"][: options["progress"] == "json"]
-    if len(on_stdout) > 1:
-        raise ConfigError(f"{' and '.join(on_stdout)} would both write to stdout; give the report a file")
 
 
 def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str = "--report") -> None:

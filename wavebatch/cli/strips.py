@@ -56,7 +56,12 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
       wavebatch import archive/ -o strips --resume
     """  # fmt: skip
     paths = shared.find_inputs(files, recursive=recursive, kinds=(SUFFIXES,))
-    targets = _name_strips(paths, output)
+    if output is None:
+        targets = {path: path.with_suffix(".las") for path in paths}
+    else:
+        if output.suffix.lower() not in (".las", ".laz"):
+            output.mkdir(parents=True, exist_ok=True)
+        targets = shared.name_outputs(paths, output, (".las", ".laz"), ".las")
     chosen = shared.from_options(ImportOptions, options)
 
     def work(path: Path) -> ImportSummary:
@@ -69,14 +74,6 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
     results, failed = shared.for_each(paths, work, debug=options["debug"], alone=True)
     answer({"files": [asdict(one) for one in results], "failed": failed})
     sys.exit(0 if not failed else EXIT_SOME if results else EXIT_NONE)
-
-
-def _name_strips(paths: list[Path], output: Path | None) -> dict[Path, Path]:
-    if output is None:
-        return {path: path.with_suffix(".las") for path in paths}
-    if output.suffix.lower() not in (".las", ".laz"):
-        output.mkdir(parents=True, exist_ok=True)
-    return shared.name_outputs(paths, output, (".las", ".laz"), ".las")
 
 
 def _say(summary: ImportSummary) -> None:
@@ -183,7 +180,15 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
       # a strip with known echoes
       wavebatch simulate forest -o forest.laz --pulses 50000 --truth truth.npz
     """  # fmt: skip
-    receiver = _build_receiver(truth, options)
+    receiver = None
+    if options["sensor"] == "discrete":
+        if truth:
+            raise click.UsageError("--truth holds the echoes of waveforms; simulate them with --sensor waveform")
+        if not options["internal"]:
+            raise click.UsageError("--external is about packets; --sensor discrete writes none")
+        receiver = shared.from_options(simulation.DiscreteReceiver, options)
+    elif shared.given_options(options, declared_options(simulation.DiscreteReceiver)):
+        raise click.UsageError("--dead-zone, --threshold and --most-returns need --sensor discrete")
     found = simulation.find_scene(scene)
     given = shared.given_options(options, declared_options(Recording))  # the others are those of the scene
     shape = {name: options[name] for name in ("pulse", "sigma", "kappa", "ringing")}
@@ -206,19 +211,6 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
             rest = f"{count(summary.packets, 'packet')} with {count(summary.echoes, 'echo')}"
     points = f"{count(summary.points, 'point')} of {count(summary.pulses, 'pulse')}"
     print_summary(summary, [f"{output}: {points}, {rest}"])
-
-
-def _build_receiver(truth: Path | None, options: dict[str, Any]) -> simulation.DiscreteReceiver | None:
-    """The discrete receiver of the options; None for a sensor that records waveforms."""
-    if options["sensor"] == "discrete":
-        if truth:
-            raise click.UsageError("--truth holds the echoes of waveforms; simulate them with --sensor waveform")
-        if not options["internal"]:
-            raise click.UsageError("--external is about packets; --sensor discrete writes none")
-        return shared.from_options(simulation.DiscreteReceiver, options)
-    if shared.given_options(options, declared_options(simulation.DiscreteReceiver)):
-        raise click.UsageError("--dead-zone, --threshold and --most-returns need --sensor discrete")
-    return None
 
 
 @click.command()
@@ -245,22 +237,18 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
       # by the lidar equation, with partial footprints
       wavebatch synthesize cloud.laz -o strip.las --intensity reflectance --sensor-height 1200 --shares equal
     """  # fmt: skip
-    settings = shared.from_options(SynthesisOptions, options, radar=_build_radar(options))
+    radar = None
+    if options["intensity"] != "peak":  # by the lidar equation
+        if options["height"] is None:
+            raise click.UsageError("--intensity reflectance needs --sensor-height")
+        radar = shared.from_options(Radar, options)
+    elif shared.given_options(options, (*declared_options(Radar), "shares")):
+        raise click.UsageError("the options of the lidar equation and --shares need --intensity reflectance")
+    settings = shared.from_options(SynthesisOptions, options, radar=radar)
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
     lines = _list_lines(output, summary, settings)
     print_summary(summary.to_json() if options["as_json"] else summary, lines)
-
-
-def _build_radar(options: dict[str, Any]) -> Radar | None:
-    """The figures of the lidar equation; None if intensities are peaks."""
-    if options["intensity"] == "peak":
-        if shared.given_options(options, (*declared_options(Radar), "shares")):
-            raise click.UsageError("the options of the lidar equation and --shares need --intensity reflectance")
-        return None
-    if options["height"] is None:
-        raise click.UsageError("--intensity reflectance needs --sensor-height")
-    return shared.from_options(Radar, options)
 
 
 def _list_lines(output: Path, summary: SynthesisSummary, settings: SynthesisOptions) -> Iterator[str]:
@@ -281,14 +269,9 @@ def _list_lines(output: Path, summary: SynthesisSummary, settings: SynthesisOpti
             f"{settings.baseline:g} DN: about {summary.energy_of_level:+.2g} DN ns in the samples are not of echoes; "
             "give a whole --baseline of 3 times --noise or more"
         )
-    yield from _list_light(summary, settings)
-
-
-def _list_light(summary: SynthesisSummary, settings: SynthesisOptions) -> Iterator[str]:
-    """What was assumed about widths and shares."""
-    light, points = summary.light, summary.points
+    light = summary.light
     if light.own_width:
-        yield f"widths: {light.own_width} of the cloud, {points - light.own_width} of the pulse"
+        yield f"widths: {light.own_width} of the cloud, {summary.points - light.own_width} of the pulse"
     if light.assumed_unit:
         yield f"note: column {settings.widths} states no unit; its values were taken as nanoseconds"
     if light.limited_width:

@@ -18,7 +18,6 @@ from wavebatch.cli.messages import one_line, print_result, talk, tell
 from wavebatch.core.units import count
 
 if TYPE_CHECKING:
-    from wavebatch.surveying.flight import Flight
     from wavebatch.surveying.system_file import SavedSurvey
 
 EXIT_PROBLEMS = 1
@@ -162,14 +161,8 @@ def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[Sa
     if options["divergence"] is not None:
         system = saved.survey.system.with_radiometry(divergence=options["divergence"])
         saved = replace(saved, survey=replace(saved.survey, system=system))
-    return saved, _describe_flight(flight, paths, failed)
-
-
-def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Path]) -> dict[str, Any]:
-    """The strips in the order in which they were given."""
-    order = {path: number for number, path in enumerate(paths)}
-    strips = sorted(flight.strips, key=lambda strip: order[strip.path])
-    return {
+    strips = sorted(flight.strips, key=lambda strip: paths.index(strip.path))
+    return saved, {
         "strips": [strip.to_json() for strip in strips],
         "points": sum(strip.facts["points"] for strip in strips if strip.fits),
         "packets": sum(strip.facts["packets"] for strip in strips if strip.fits),
@@ -182,35 +175,25 @@ def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
     from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import SYSTEM_SCHEMA
     from wavebatch.surveying.systems.figures import describe_figures, describe_system
-    from wavebatch.surveying.systems.known_systems import doubt_survey
+    from wavebatch.surveying.systems.known_systems import doubt_survey, find_likeness, find_source
 
-    doubts = doubt_survey(saved.survey.system, saved.survey.figures, saved.survey.waveforms)
+    survey = saved.survey
+    doubts = doubt_survey(survey.system, survey.figures, survey.waveforms)
+    like = find_likeness(survey.system, survey.figures.spacing_ns or 0.0)
     return {
         "schema": SYSTEM_SCHEMA,
         "version": saved.version,
         **facts,
         "warnings": [*facts.get("warnings", ()), *map(asdict, doubts)],
         "fingerprint": dict(saved.fingerprint),
-        "waveforms": saved.survey.waveforms,
-        "system": describe_system(saved.survey.system),
-        "figures": describe_figures(saved.survey.figures),
-        "decisions": [
-            {"part": one.part, "needed": bool(one.needed), "reason": one.reason} for one in saved.survey.decisions
-        ],
-        "candidates": [one._asdict() for one in saved.survey.candidates],
-        "chain": chain_text(saved.survey),
-        "looks_like": _find_likeness(saved),
-    }
-
-
-def _find_likeness(saved: SavedSurvey) -> dict[str, Any] | None:
-    """The known sensor whose pulse this one looks like."""
-    from wavebatch.surveying.systems.known_systems import find_likeness, find_source
-
-    survey = saved.survey
-    found = find_likeness(survey.system, survey.figures.spacing_ns or 0.0)
-    if found is None:
-        return None
-    taken = find_source(survey.system) is not None
-    return {"sensor": found.known.sensor, "name": found.known.name, "difference": found.difference, "taken": taken,
-            "sentence": found.describe()}  # fmt: skip
+        "waveforms": survey.waveforms,
+        "system": describe_system(survey.system),
+        "figures": describe_figures(survey.figures),
+        "decisions": [{"part": one.part, "needed": bool(one.needed), "reason": one.reason} for one in survey.decisions],
+        "candidates": [one._asdict() for one in survey.candidates],
+        "chain": chain_text(survey),
+        "looks_like": like and {
+            "sensor": like.known.sensor, "name": like.known.name, "difference": like.difference,
+            "taken": find_source(survey.system) is not None, "sentence": like.describe(),
+        },
+    }  # fmt: skip

@@ -124,9 +124,20 @@ def place_rings(
         Without pyproj.
     """
     rings = [np.asarray(ring, np.float64) for ring in rings]
-    source = None if file is None or not rings else _find_source(file, header)
-    if file is None or source is None:
+    if file is None or not rings:
         return rings
+    source = file.crs
+    if source is None:
+        # Areas of a file without a CRS that lie in the strip are in its coordinates, be they small ones: the strip may
+        # have a local grid. All areas of a file are in the same CRS, so its whole extent counts.
+        sides = [high - low for low, high in zip(header.mins[:2], header.maxs[:2], strict=True)]
+        inside = file.extent is not None and max(sides) <= _LONGEST_STRIP and _overlaps(file.extent, header)
+        # Degrees fit a strip that is in degrees itself, or in local metres near the origin.
+        values = [*header.mins[:2], *header.maxs[:2]]
+        fits = all(abs(value) <= most for value, most in zip(values, (180, 90, 180, 90), strict=True))
+        if not file.maybe_degrees or inside or fits:
+            return rings
+        source = WGS84
     definition = read_crs_definition(strip, header)
     if definition is None:
         if not file.maybe_degrees:
@@ -140,22 +151,6 @@ def place_rings(
     if source in (definition, code) or (source in _SAME_DEGREES and code in _SAME_DEGREES):
         return rings
     return _project(file, rings, source, strip, definition)
-
-
-def _find_source(file: AreaFile, header: LasHeader) -> str | None:
-    """The CRS of a file of areas; None: that of the strip.
-
-    Areas of a file without a CRS that lie in the strip are in its coordinates, be they small ones: the strip may have a
-    local grid. All areas of a file are in the same CRS, so its whole extent counts.
-    """
-    if file.crs is not None:
-        return file.crs
-    sides = [high - low for low, high in zip(header.mins[:2], header.maxs[:2], strict=True)]
-    inside = file.extent is not None and max(sides) <= _LONGEST_STRIP and _overlaps(file.extent, header)
-    # Degrees fit a strip that is in degrees itself, or in local metres near the origin.
-    values = [*header.mins[:2], *header.maxs[:2]]
-    fits = all(abs(value) <= most for value, most in zip(values, (180, 90, 180, 90), strict=True))
-    return WGS84 if file.maybe_degrees and not inside and not fits else None
 
 
 def _project(

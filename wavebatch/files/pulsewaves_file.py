@@ -157,43 +157,34 @@ def _read(file: BinaryIO, path: Path, front: bytes) -> PulseHeader:
     sizes, shifts = np.abs(np.append(scales, time_scale)), np.abs(np.append(offsets, time_offset))
     if not ((sizes >= LEAST_SCALE) & (sizes <= LARGEST_SCALE) & (shifts <= LARGEST_OFFSET)).all():
         raise damaged(path, "scales or offsets of coordinates or time that no survey has")
-    found = [*_list_records(file, path, header_size, start, records)]
+    found, at = [], header_size
+    for number in range(records):
+        file.seek(at)
+        user, record, _, size_of_record, _ = _RECORD.unpack(file.read(_RECORD.size).ljust(_RECORD.size, b"\0"))
+        if size_of_record < 0 or at + _RECORD.size + size_of_record > start:
+            raise damaged(path, f"record {number} of {records} runs into the pulses")
+        found.append((decode_text(user), record, file.read(size_of_record)))
+        at += _RECORD.size + size_of_record
     found += _list_appended(file, size, start + count * length, appended)
     descriptors: dict[int, Any] = {}
     for user, number, payload in found:
         if user == _SPEC and 200_000 < number <= 200_255:
             descriptors.setdefault(number - 200_000, _read_descriptor(path, number - 200_000, payload))
+    # The attributes that 0.3 defines are sources of points of 2 and of 4 bytes.
+    pulse, at = list(PULSE), 48
+    for bit, kind in _POINT_SOURCE.items():
+        if attributes & bit and at + int(kind[2]) <= length and "point_source" not in [field[0] for field in pulse]:
+            pulse.append(("point_source", kind))
+            at += int(kind[2])
+    pulse += [("rest", f"V{length - at}")] * (length > at)
     waves = find_waves(path)
     return PulseHeader(
         path, waves, _check_waves(path, waves), decode_text(front[40:104]), decode_text(front[104:168]),
-        struct.unpack_from("<I", front, 20)[0], start, count, _build_dtype(attributes, length), time_scale, time_offset,
+        struct.unpack_from("<I", front, 20)[0], start, count, np.dtype(pulse), time_scale, time_offset,
         scales, offsets, descriptors,
         tuple(Vlr(PROJECTION.encode(), number, payload) for user, number, payload in found
               if user == _PROJ and number in (34735, 34736, 34737) and len(payload) < 65536),
     )  # fmt: skip
-
-
-def _build_dtype(attributes: int, length: int) -> np.dtype:
-    """The pulse record; the attributes that 0.3 defines are sources of points of 2 and of 4 bytes."""
-    fields, at = list(PULSE), 48
-    for bit, kind in _POINT_SOURCE.items():
-        if attributes & bit and at + int(kind[2]) <= length and "point_source" not in [field[0] for field in fields]:
-            fields.append(("point_source", kind))
-            at += int(kind[2])
-    return np.dtype([*fields, ("rest", f"V{length - at}")] if length > at else fields)
-
-
-def _list_records(
-    file: BinaryIO, path: Path, at: int, end: int, count: int
-) -> Iterator[tuple[str, int, bytes]]:
-    for number in range(count):
-        file.seek(at)
-        head = file.read(_RECORD.size)
-        user, record, _, length, _ = _RECORD.unpack(head.ljust(_RECORD.size, b"\0"))
-        if length < 0 or at + _RECORD.size + length > end:
-            raise damaged(path, f"record {number} of {count} runs into the pulses")
-        yield decode_text(user), record, file.read(length)
-        at += _RECORD.size + length
 
 
 def _list_appended(file: BinaryIO, end: int, least: int, count: int) -> Iterator[tuple[str, int, bytes]]:

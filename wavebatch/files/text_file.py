@@ -9,6 +9,7 @@ arguments is kept, because outputs are made in it.
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import io
 import os
@@ -183,11 +184,22 @@ def find_strips(
 
 def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequence[str]]) -> Iterator[Path]:
     if argument.startswith("@"):
-        yield from _read_list(folder / argument[1:], recursive, kinds)
+        path, empty = folder / argument[1:], True
+        protect([path])
+        for number, line in enumerate(read_text(path, "the list", MOST_LIST).splitlines(), 1):
+            entry = line.strip()
+            if entry and not entry.startswith("#"):
+                if entry.startswith("@"):
+                    raise ConfigError(f"{path}: line {number}: a list cannot name another list")
+                empty = False
+                yield from _expand(entry, path.parent, recursive, kinds)
+        if empty:
+            raise ConfigError(f"{path}: the list names no file; write one file, folder or pattern per line")
         return
     path = folder / argument
     if argument.startswith("~") and not os.path.lexists(path):  # shells expand it, but neither in quotes nor in lists
-        path = folder / _expand_home(argument)
+        with contextlib.suppress(ValueError):  # no user can have this name
+            path = folder / os.path.expanduser(argument)
     if os.path.isdir(path):
         try:
             names = _walk(path) if recursive else os.listdir(path)
@@ -218,24 +230,3 @@ def _walk(folder: Path) -> list[str]:
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         found += [os.path.relpath(os.path.join(place, name), folder) for name in files]
     return found
-
-
-def _expand_home(name: str) -> str:
-    try:
-        return os.path.expanduser(name)
-    except ValueError:  # no user can have this name
-        return name
-
-
-def _read_list(path: Path, recursive: bool, kinds: Sequence[Sequence[str]]) -> Iterator[Path]:
-    protect([path])
-    empty = True
-    for number, line in enumerate(read_text(path, "the list", MOST_LIST).splitlines(), 1):
-        entry = line.strip()
-        if entry and not entry.startswith("#"):
-            if entry.startswith("@"):
-                raise ConfigError(f"{path}: line {number}: a list cannot name another list")
-            empty = False
-            yield from _expand(entry, path.parent, recursive, kinds)
-    if empty:
-        raise ConfigError(f"{path}: the list names no file; write one file, folder or pattern per line")

@@ -141,21 +141,17 @@ def parse_toml(text: str, name: str) -> TomlTable:
         raise ConfigError(f"{name}: a number has more than {MOST_DIGITS} digits")
     try:
         document = tomllib.loads(text)
-        if _is_deep(document):
+        level: list[Any] = [document]
+        for _ in range(MOST_NESTED):
+            tables = [value.values() if isinstance(value, dict) else value for value in level]
+            level = [item for items in tables for item in items if isinstance(item, dict | list)]
+        if level:
             raise RecursionError
     except RecursionError as error:
         raise ConfigError(f"{name}: keys or values are nested more than {MOST_NESTED} deep") from error
     except ValueError as error:
         raise ConfigError(f"{name}: not valid TOML: {_one_line(str(error))}") from error
     return TomlTable(document, name)
-
-
-def _is_deep(document: dict[str, Any]) -> bool:
-    level: list[Any] = [document]
-    for _ in range(MOST_NESTED):
-        tables = [value.values() if isinstance(value, dict) else value for value in level]
-        level = [item for items in tables for item in items if isinstance(item, dict | list)]
-    return bool(level)
 
 
 KINDS = {"chain": "a chain file", "system": "a survey", "calibration": "a calibration"}
@@ -381,15 +377,14 @@ def describe_record(value: Any) -> dict[str, Any]:
             lost = part is None or isinstance(part, float) and math.isinf(part)
             values[key] = None if lost else one.kinds[0](part)
         elif part or one.key.blank:
-            lists[key] = list(map(describe_record, part)) if one.shape == "records" else _describe_rows(part, one)
+            rows = sorted(part.items()) if isinstance(part, Mapping) else part
+            if one.shape == "records":
+                lists[key] = list(map(describe_record, rows))
+            elif len(one.kinds) == 1:
+                lists[key] = list(map(one.kinds[0], rows))
+            else:
+                lists[key] = [[kind(number) for kind, number in zip(one.kinds, row, strict=True)] for row in rows]
     return {**values, **tables, **lists}
-
-
-def _describe_rows(rows: Any, one: Entry) -> list[Any]:
-    rows = sorted(rows.items()) if isinstance(rows, Mapping) else rows
-    if len(one.kinds) == 1:
-        return list(map(one.kinds[0], rows))
-    return [[kind(number) for kind, number in zip(one.kinds, row, strict=True)] for row in rows]
 
 
 def read_record(

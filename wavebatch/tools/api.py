@@ -330,6 +330,12 @@ def plan_run(
     """
     options.check()
     widest_chain, request = find_request(options)
+    air, attenuation = None, options.attenuation
+    if options.visibility is not None:
+        attenuation = attenuation_of_visibility(options.visibility, options.wavelength or 1064.0)
+    if attenuation is not None:
+        check_attenuation(attenuation)
+        air = (float(attenuation), float(options.attenuation_error or 0.0))  # [dB/km] and its error
     template = StripJob(
         Path(),
         widest_chain,
@@ -338,7 +344,7 @@ def plan_run(
         request,
         read_sensor(options),
         None if options.calibration is None else load_calibration(Path(options.calibration)),
-        read_air(options),
+        air,
         PointFilter.build(drop_flags=options.drop_flags, classes=options.classes, bbox=options.bbox,
                           polygon=options.polygon, where=options.where),
     )
@@ -392,16 +398,6 @@ def read_sensor(options: RunOptions) -> SensorRequest:
     if arm is not None and not sum(map(abs, arm)) < 1000:
         raise ConfigError(f"--lever-arm: {','.join(map(str, arm))} is too long; a lever arm has a few metres")
     return SensorRequest(None if file is None else Path(file), options.crs, arm, options.flight_height)
-
-
-def read_air(options: RunOptions) -> tuple[float, float] | None:
-    """Return attenuation and error by --attenuation or --visibility [dB/km]; None without them."""
-    given = options.attenuation
-    if options.visibility is not None:
-        given = attenuation_of_visibility(options.visibility, options.wavelength or 1064.0)
-    if given is not None:
-        check_attenuation(given)
-    return None if given is None else (float(given), float(options.attenuation_error or 0.0))
 
 
 def _check_use(chain: Chain, job: StripJob) -> None:

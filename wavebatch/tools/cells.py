@@ -579,8 +579,14 @@ def choose_grid(
     extent = max(east - west, north - south)
     if not extent <= LARGEST_EXTENT:
         raise InputError(f"{where}: points lie {extent:g} m apart, which must be damage; give --bbox to draw a part")
-    if size is None:
-        size = _choose_size(places, sample.seen, (west, south), extent, most)
+    if size is None and not extent:
+        size = 1.0
+    elif size is None:  # from the area that holds points: the filled cells of a coarse grid
+        side = extent / _SIDE
+        coarse = np.floor((places - (west, south)) / side)
+        inside = coarse[((coarse >= -1) & (coarse <= _SIDE + 1)).all(axis=1)].astype(np.int64)
+        area = len(np.unique(inside[:, 0] * 4 * _SIDE + inside[:, 1])) * side**2
+        size = round_up(max(math.sqrt(POINTS_PER_CELL * area / sample.seen), extent / most))
     grid = Grid.cover((west, south, east, north), size)
     if grid.columns * grid.rows > MOST_CELLS:
         least = round_up(math.sqrt((east - west) * (north - south) / MOST_CELLS) + 4 * extent / MOST_CELLS)
@@ -589,15 +595,3 @@ def choose_grid(
             "will do"
         )
     return grid
-
-
-def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], extent: float, most: int) -> float:
-    """Side of a cell [m], from the area that holds points: the filled cells of a coarse grid."""
-    if not extent:
-        return 1.0
-    side = extent / _SIDE
-    coarse = np.floor((places - corner) / side)
-    inside = coarse[((coarse >= -1) & (coarse <= _SIDE + 1)).all(axis=1)].astype(np.int64)
-    filled = len(np.unique(inside[:, 0] * 4 * _SIDE + inside[:, 1]))
-    area = filled * side**2
-    return round_up(max(math.sqrt(POINTS_PER_CELL * area / seen), extent / most))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,31 +78,29 @@ def export_strip(
         raise ConfigError(f"{target}: an output's name must end in .las, .laz or .npz")
     write = _write_arrays if target.suffix.lower() == ".npz" else _write_strip
     with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
-        repaired = tuple(_list_repairs(reader, scan))
-        waveforms = write(reader, scan, target, repaired, overwrite, progress)
-    return ExportSummary(str(path), str(target), scan.points, waveforms, repaired)
-
-
-def _list_repairs(reader: StripReader, scan: StripScan) -> Iterator[str]:
-    facts = reader.facts
-    if facts.compressed & set(scan.by_descriptor):
-        yield "packets were compressed"
-    if scan.vectors.form == "range":
-        yield "packet vectors were whole paths; they are metres per picosecond"
-    elif scan.vectors.direction == "away":
-        yield "packet vectors pointed away from the sensor; they point toward it"
-    if scan.broken:
-        yield f"{scan.broken} points had packets that cannot be used; they have none"
-    if scan.short:
-        yield f"{scan.short} points had packets shorter than their descriptor; they have descriptors of their length"
-    yield from (*scan.notes, *facts.warnings)
-    yield from audit_header(reader, scan)
+        facts, repaired = reader.facts, []
+        if facts.compressed & set(scan.by_descriptor):
+            repaired.append("packets were compressed")
+        if scan.vectors.form == "range":
+            repaired.append("packet vectors were whole paths; they are metres per picosecond")
+        elif scan.vectors.direction == "away":
+            repaired.append("packet vectors pointed away from the sensor; they point toward it")
+        if scan.broken:
+            repaired.append(f"{scan.broken} points had packets that cannot be used; they have none")
+        if scan.short:
+            repaired.append(
+                f"{scan.short} points had packets shorter than their descriptor; they have descriptors of their length"
+            )
+        repaired += [*scan.notes, *facts.warnings, *audit_header(reader, scan)]
+        source = {"file": facts.path.name, **take_fingerprint(facts.path, facts.packets.file)}
+        account = json.dumps({"export": source, "repaired": repaired, "version": __version__}, sort_keys=True)
+        waveforms = write(reader, scan, target, account, overwrite, progress)
+    return ExportSummary(str(path), str(target), scan.points, waveforms, tuple(repaired))
 
 
 def _write_arrays(
-    reader: StripReader, scan: StripScan, target: Path, repaired: tuple[str, ...], overwrite: bool,
-    progress: Callable[[int], Any],
-) -> int:  # fmt: skip
+    reader: StripReader, scan: StripScan, target: Path, account: str, overwrite: bool, progress: Callable[[int], Any]
+) -> int:
     """All waveforms of a strip as one .npz; their samples stand behind each other."""
     columns = {
         "point": "<i8", "gps_time": "<f8", "origin": np.dtype(("<f8", (3,))), "direction": np.dtype(("<f8", (3,))),
@@ -127,24 +125,26 @@ def _write_arrays(
             })  # fmt: skip
             done, at = done + n, at + n * s
             progress(n)
-        account = _describe(reader, repaired)
-        writer.publish({"crs": reader.facts.crs or "", "meta": json.dumps(account, sort_keys=True)})
+        writer.publish({"crs": reader.facts.crs or "", "meta": account})
     return done
 
 
-def _describe(reader: StripReader, repaired: tuple[str, ...]) -> dict[str, Any]:
-    facts = reader.facts
-    source = {"file": facts.path.name, **take_fingerprint(facts.path, facts.packets.file)}
-    return {"export": source, "repaired": list(repaired), "version": __version__}
-
-
 def _write_strip(
-    reader: StripReader, scan: StripScan, target: Path, repaired: tuple[str, ...], overwrite: bool,
-    progress: Callable[[int], Any],
-) -> int:  # fmt: skip
+    reader: StripReader, scan: StripScan, target: Path, account: str, overwrite: bool, progress: Callable[[int], Any]
+) -> int:
     """The strip with plain packets, one descriptor per kind and length, and vectors toward the sensor."""
     digitizers, done = _list_digitizers(reader, scan), 0
-    with _open_writer(reader, target, list(digitizers.values()), _describe(reader, repaired), overwrite) as writer:
+    facts, header = reader.facts, reader.facts.header
+    dropped = [("LASF_Spec", number) for number in (*range(100, 355), EXTRA_BYTES_RECORD_ID)]
+    records = [vlr for vlr in header.vlrs if not any(has_record([vlr], *one) for one in dropped)]
+    records.append(Vlr(USER_ID, 1, account.encode(), b"what was exported and repaired"))
+    with FullwaveWriter(
+        target, version="{}.{}".format(*header.version), point_format=header.point_format, internal=False,
+        digitizers=list({one.index: one for one in digitizers.values()}.values()), scales=header.scales,
+        offsets=header.offsets, wkt=None if any(map(is_projection, header.vlrs)) else facts.crs,
+        extra_bytes=facts.records, records=records, week=not header.global_encoding & STANDARD_TIME,
+        system=decode_text(header.system_identifier), source=header.file_source_id, overwrite=overwrite,
+    ) as writer:  # fmt: skip
         for unit in reader.read_units(scan):
             offset, size, index = (np.zeros(len(unit.packets), kind) for kind in (np.uint64, np.uint32, np.uint8))
             # Packets that points of several units share are written in each of them.
@@ -179,22 +179,6 @@ def _list_digitizers(reader: StripReader, scan: StripScan) -> dict[tuple[int, in
     if len(names) <= MOST_DESCRIPTORS:
         return {name: replace(found[name], index=number) for number, name in enumerate(names, 1)}
     return {name: replace(found[name], n_samples=reader.facts.digitizers[name[0]].n_samples) for name in names}
-
-
-def _open_writer(
-    reader: StripReader, target: Path, digitizers: list[Digitizer], account: dict[str, Any], overwrite: bool
-) -> FullwaveWriter:
-    facts, header = reader.facts, reader.facts.header
-    dropped = [("LASF_Spec", number) for number in (*range(100, 355), EXTRA_BYTES_RECORD_ID)]
-    records = [vlr for vlr in header.vlrs if not any(has_record([vlr], *one) for one in dropped)]
-    records.append(Vlr(USER_ID, 1, json.dumps(account, sort_keys=True).encode(), b"what was exported and repaired"))
-    return FullwaveWriter(
-        target, version="{}.{}".format(*header.version), point_format=header.point_format, internal=False,
-        digitizers=list({one.index: one for one in digitizers}.values()), scales=header.scales, offsets=header.offsets,
-        wkt=None if any(map(is_projection, header.vlrs)) else facts.crs, extra_bytes=facts.records,
-        records=records, week=not header.global_encoding & STANDARD_TIME,
-        system=decode_text(header.system_identifier), source=header.file_source_id, overwrite=overwrite,
-    )  # fmt: skip
 
 
 def _build_points(

@@ -22,9 +22,7 @@ from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import name_units, read_crs
 from wavebatch.files.las.read_points import CheckedHeader, read_checked_header
-from wavebatch.files.strip.packets import StripFacts
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.files.strip.scanner import StripScan
 from wavebatch.surveying.inspect_strip import describe_samples
 
 _GPS_EPOCH = datetime(1980, 1, 6)
@@ -64,13 +62,36 @@ def _describe_waveforms(path: Path, direction: str, headerless: bool) -> dict[st
             StripReader(path, direction=direction, headerless=headerless) as reader,
             reader.scan(tolerant=True) as scan,
         ):
-            facts = reader.facts
+            facts, packets = reader.facts, reader.facts.packets
+            descriptors = []
+            for index, points in scan.by_descriptor.items():
+                if index in facts.digitizers:
+                    digitizer, form = facts.digitizers[index], scan.forms.get(index)
+                    descriptors.append({
+                        "index": index,
+                        "points": points,
+                        "bits": digitizer.bits,
+                        "samples": digitizer.n_samples,
+                        "spacing_ns": digitizer.spacing,
+                        "gain": digitizer.gain,
+                        "offset": digitizer.offset,
+                        "inverted": form is not None and form.inverted,
+                    })  # fmt: skip
             return {
                 "points_with_waveform": scan.with_waveform,
                 "points_without_waveform": scan.without_waveform,
                 "points_broken": scan.broken,
                 "share_with_waveform": scan.with_waveform / scan.points if scan.points else None,
-                "packets": _describe_packets(facts, scan),
+                "packets": {
+                    "count": scan.packets,
+                    "where": None if packets.file is None else "internal" if packets.internal else "external",
+                    "file": None if packets.file is None else str(packets.file),
+                    "bytes": packets.end - packets.start,
+                    "shorter_than_descriptor": scan.short,
+                    "farthest_shared": scan.reach,
+                    "descriptors": descriptors,
+                    "descriptors_unused": len(facts.digitizers) - len(descriptors),
+                },
                 "samples": describe_samples(reader, scan),
                 "vectors": {
                     "direction": scan.vectors.direction,
@@ -84,35 +105,6 @@ def _describe_waveforms(path: Path, direction: str, headerless: bool) -> dict[st
             }
     except InputError as error:
         return {"problems": [" ".join(str(error).split()).removeprefix(f"{path}: ")]}
-
-
-def _describe_packets(facts: StripFacts, scan: StripScan) -> dict[str, Any]:
-    used = {index: count for index, count in scan.by_descriptor.items() if index in facts.digitizers}
-    return {
-        "count": scan.packets,
-        "where": None if facts.packets.file is None else "internal" if facts.packets.internal else "external",
-        "file": None if facts.packets.file is None else str(facts.packets.file),
-        "bytes": facts.packets.end - facts.packets.start,
-        "shorter_than_descriptor": scan.short,
-        "farthest_shared": scan.reach,
-        "descriptors": [_describe_descriptor(facts, scan, index, count) for index, count in used.items()],
-        "descriptors_unused": len(facts.digitizers) - len(used),
-    }
-
-
-def _describe_descriptor(facts: StripFacts, scan: StripScan, index: int, points: int) -> dict[str, Any]:
-    digitizer = facts.digitizers[index]
-    form = scan.forms.get(index)
-    return {
-        "index": index,
-        "points": points,
-        "bits": digitizer.bits,
-        "samples": digitizer.n_samples,
-        "spacing_ns": digitizer.spacing,
-        "gain": digitizer.gain,
-        "offset": digitizer.offset,
-        "inverted": form is not None and form.inverted,
-    }
 
 
 def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
@@ -141,7 +133,13 @@ def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
               for one in evlrs),
         ],
         "extra_dimensions": [record.name for record in checked.records],
-        "extra_bytes": [_describe_extra(record) for record in checked.records],
+        "extra_bytes": [
+            {"name": record.name,
+             "type": record.dtype.base.name + (f"[{record.dtype.shape[0]}]" if record.dtype.shape else ""),
+             "description": record.description, "scale": None if record.scaling is None else record.scaling[0],
+             "no_data": None if record.no_data is None else [str(value) for value in record.no_data.tolist()]}
+            for record in checked.records
+        ],
     }  # fmt: skip
 
 
@@ -164,87 +162,55 @@ def _table(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _describe_extra(record: las.ExtraRecord) -> dict[str, Any]:
-    dtype, no_data = record.dtype, record.no_data
-    return {
-        "name": record.name,
-        "type": dtype.base.name + (f"[{dtype.shape[0]}]" if dtype.shape else ""),
-        "description": record.description,
-        "scale": None if record.scaling is None else record.scaling[0],
-        "no_data": None if no_data is None else [str(value) for value in no_data.tolist()],
-    }
-
-
-class _Totals:
-    """Sums over the points of a file."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.extremes: dict[str, tuple[float, float]] = {}
-        self.returns, self.totals = np.zeros(16, np.int64), np.zeros(16, np.int64)
-        self.classes: Counter[int] = Counter()
-        self.sources: Counter[int] = Counter()
-        self.flags: Counter[str] = Counter()
-        self.passed = 0
-
-    def widen(self, name: str, values: np.ndarray) -> None:
-        values = values[np.isfinite(values)] if values.dtype.kind == "f" else values
-        if len(values):
-            least, largest = self.extremes.get(name, (np.inf, -np.inf))
-            self.extremes[name] = min(least, float(values.min())), max(largest, float(values.max()))
-
-    def add(self, raw: np.ndarray, header: las.LasHeader, flags: np.ndarray | None) -> None:
-        self.count += len(raw)
-        for name, values in zip("xyz", las.locate(raw, header).T, strict=True):
-            self.widen(name, values)
-        self.widen("scan_angle_deg", las.read_angles(raw))
-        self.widen("intensity", raw["intensity"])
-        if "gps_time" in las.field_names(raw.dtype):
-            self.widen("gps_time", raw["gps_time"])
-        number, total = las.split_numbers(raw)
-        self.returns += np.bincount(number, minlength=16)
-        self.totals += np.bincount(total, minlength=16)
-        kinds = las.read_classes(raw)
-        _count(self.classes, kinds)
-        _count(self.sources, raw["point_source_id"])
-        if flags is not None:
-            found = {name: int(np.count_nonzero(flags & np.uint16(one))) for name, one in EchoFlag.__members__.items()}
-            self.flags.update(found)
-            self.passed += int(np.count_nonzero(flags & np.uint16(PASSED_THROUGH)))
-
-
-def _count(counter: Counter[int], values: np.ndarray) -> None:
-    found, numbers = np.unique(values, return_counts=True)
-    counter.update(dict(zip(found.tolist(), numbers.tolist(), strict=True)))
-
-
 def _describe_points(path: Path, header: las.LasHeader, is_ours: bool) -> dict[str, Any]:
     """Sums over all points; counts of echoes only of a cloud with provenance, whose flags are known to be ours."""
-    totals = _Totals()
+    points = passed = 0
+    found: dict[str, tuple[float, float]] = {}  # extremes by name
+    returns, totals = np.zeros(16, np.int64), np.zeros(16, np.int64)
+    classes: Counter[int] = Counter()
+    sources: Counter[int] = Counter()
+    flags: Counter[str] = Counter()
     with CloudReader(path, np.dtype([("flags", "<u2")])) as reader:
         has_flags = reader.has_flags and is_ours
         for rows in reader.read_pieces():
-            totals.add(reader.records, header, rows["flags"] if has_flags else None)
-    found = totals.extremes
+            raw: np.ndarray = reader.records
+            points += len(raw)
+            columns = dict(zip("xyz", las.locate(raw, header).T, strict=True))
+            columns |= {"scan_angle_deg": las.read_angles(raw), "intensity": raw["intensity"]}
+            if "gps_time" in las.field_names(raw.dtype):
+                columns["gps_time"] = raw["gps_time"]
+            for name, values in columns.items():
+                values = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+                if len(values):
+                    least, largest = found.get(name, (np.inf, -np.inf))
+                    found[name] = min(least, float(values.min())), max(largest, float(values.max()))
+            number, total = las.split_numbers(raw)
+            returns += np.bincount(number, minlength=16)
+            totals += np.bincount(total, minlength=16)
+            for counter, values in ((classes, las.read_classes(raw)), (sources, raw["point_source_id"])):
+                kinds, numbers = np.unique(values, return_counts=True)
+                counter.update(dict(zip(kinds.tolist(), numbers.tolist(), strict=True)))
+            if has_flags:
+                for name, one in EchoFlag.__members__.items():
+                    flags[name] += int(np.count_nonzero(rows["flags"] & np.uint16(one)))
+                passed += int(np.count_nonzero(rows["flags"] & np.uint16(PASSED_THROUGH)))
     bounds = {}
     if found:
         bounds = {name: [found[axis][end] for axis in "xyz"] for end, name in enumerate(("least", "largest"))}
     echoes = {}
     if has_flags:
-        flags = {name: number for name, number in totals.flags.items() if number}
-        number = totals.count - totals.passed
-        added = totals.flags[EchoFlag.ADDED.name]
-        echoes = {"counts": {"echoes": number, "added": added, "passed_through": totals.passed, "flags": flags}}
-    sources = totals.sources.most_common(_MOST_SOURCES)
+        seen = {name: number for name, number in flags.items() if number}
+        added = flags[EchoFlag.ADDED.name]
+        echoes = {"counts": {"echoes": points - passed, "added": added, "passed_through": passed, "flags": seen}}
     return {
         "bounds": bounds or None,
         "gps_time": _describe_time(header, found.get("gps_time")),
         "scan_angle_deg": list(found["scan_angle_deg"]) if found else None,
         "intensity": list(found["intensity"]) if found else None,
-        "returns": {str(k): int(n) for k, n in enumerate(totals.returns) if n},
-        "numbers_of_returns": {str(k): int(n) for k, n in enumerate(totals.totals) if n},
-        "classes": {str(k): n for k, n in sorted(totals.classes.items())},
-        "point_sources": {str(k): n for k, n in sorted(sources)},
+        "returns": {str(k): int(n) for k, n in enumerate(returns) if n},
+        "numbers_of_returns": {str(k): int(n) for k, n in enumerate(totals) if n},
+        "classes": {str(k): n for k, n in sorted(classes.items())},
+        "point_sources": {str(k): n for k, n in sorted(sources.most_common(_MOST_SOURCES))},
         **echoes,
     }
 

@@ -1,8 +1,8 @@
 """One PulseWaves file as a LAS 1.4 strip of point format 9, with what its outgoing pulses say; `wavebatch import`.
 
-Two passes: the first reads everything and learns lengths of segments, channels, and the outgoing pulses of a sample;
-the second writes. A file that cannot be read to its end leaves no output behind. Memory holds one piece of the file.
-The strip, its packets and its system file appear together or not at all.
+`import_file` makes two passes: the first (`make_plan`) reads everything and learns lengths of segments, channels, and
+the outgoing pulses of a sample; the second (`build_points`, piece by piece) writes. Memory holds one piece of the file.
+The strip, its packets and its system file appear together or not at all, also where the file cannot be read to its end.
 
 Packets need metres in all three directions, so pulses in degrees are projected to UTM: by the transverse Mercator
 projection of GRS80 and WGS 84. Others stay as they are.
@@ -41,138 +41,181 @@ from wavebatch.kernels.signal.signal import find_peaks, smooth_121, transpose_sa
 from wavebatch.surveying.outgoing import STACKED, SYSTEM_SUFFIX, OutgoingShape, learn_shape, save_outgoing
 from wavebatch.surveying.system_file import format_survey
 
-SATURATED = 0.8
-"""Share of the sensitive channel's largest counts from which the other channel is used: receivers bend before they
-clip. RIEGL records its second channel from about this share on."""
-LINEAR = (0.05, 0.4)
-"""Shares of the largest counts between which a receiver is linear: heights that teach the ratio of the gains."""
-LEAST_SAMPLES = 30
-"""Samples that teach a ratio."""
-MOST_PAIRS = 20_000
-"""Pairs of segments that teach it."""
+SUFFIXES = (".pls",)
+USER_ID = b"wavebatch_import"
+"""User id of the record in a strip that says what it was imported from."""
+
+
+@frozen
+class ImportOptions:
+    """How files are imported."""
+
+    returns: Literal["strongest", "detect"] = option(
+        "strongest", "strongest: one point per recorded segment, at its strongest sample; detect: one at each maximum "
+        "that stands out of the noise.",
+    )  # fmt: skip
+    internal: bool = option(
+        False, "Store packets in the strip or in a .wdp file beside it.", opposite="external", unset="external"
+    )
+    overwrite: bool = False
+    resume: bool = option(False, "Skip files whose strip is there and up to date.")
+
+    def describe(self) -> dict[str, Any]:
+        """Return what changes the strip."""
+        return {"internal": self.internal, "returns": self.returns}
 
 
 @dataclass(slots=True)
-class Overlaps:
-    """What pairs of segments of two channels say, summed up."""
+class ImportSummary:
+    """What was made of a file, and what became of its segments."""
 
-    top: float = 0.0
-    """Largest count of the sensitive channel [count]."""
-    products: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-    """Heights of the sensitive and of the other channel at the same time [count]."""
-    pairs: int = 0
-
-    def add(self, piece: PulsePiece, first: np.ndarray, second: np.ndarray) -> None:
-        """Add pairs of segments: rows of the sensitive and of the other channel."""
-        self.pairs += len(first)
-        if self.pairs > MOST_PAIRS and self.products:
-            return
-        segments = piece.segments
-        for a, b in group_rows(segments, first, second):
-            x, y = (piece.samples(rows).astype(np.float64) for rows in (a, b))
-            self.top = max(self.top, float(x.max(initial=0)))
-            x -= np.percentile(x, 25, axis=1, keepdims=True)
-            y -= np.percentile(y, 25, axis=1, keepdims=True)
-            shift = (segments.start[b] - segments.start[a]) * segments.unit[a] / segments.spacing[a]
-            other = _interpolate(y, np.arange(x.shape[1]) - shift[:, None])
-            inside = np.isfinite(other)
-            self.products.append((x[inside], other[inside]))
-
-    def find_ratio(self) -> float | None:
-        """Gain of the sensitive channel over that of the other; None where it is not known."""
-        if not self.products:
-            return None
-        x, y = (np.concatenate(values) for values in zip(*self.products, strict=True))
-        used = (x > LINEAR[0] * self.top) & (x < LINEAR[1] * self.top) & (y > 0)
-        if np.count_nonzero(used) < LEAST_SAMPLES:
-            return None
-        return float((x[used] * y[used]).sum() / (y[used] ** 2).sum())
+    file: str
+    output: str
+    pulses: int
+    skipped: bool = False
+    """The strip was there already and is up to date."""
+    points: int = 0
+    packets: int = 0
+    descriptors: int = 0
+    without_returns: int = 0
+    """Pulses without any returning segment: LAS has no place for them."""
+    replaced: int = 0
+    """Segments of the sensitive channel that are saturated, and whose packet is that of another channel."""
+    covered: int = 0
+    """Segments of other channels that the sensitive one recorded as well, unsaturated."""
+    outgoing: dict[str, float] | None = None
+    """Of the outgoing pulses: fwhm_ns, energy_scatter, energy_error, width_scatter (relative), and unknown: pulses
+    whose outgoing recording shows no pulse."""
+    system_file: str | None = None
+    notes: tuple[str, ...] = ()
 
 
-def _interpolate(values: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Values (n, s) at places (n, k) between samples, by Lagrange's cubic; NaN outside.
-
-    A straight line would lift flanks, and with them the other channel: by 5 % for pulses of two samples.
-    """
-    at = np.floor(place).astype(np.int64)
-    part = place - at
-    inside = (at >= 1) & (at < values.shape[1] - 2)
-    at = np.clip(at, 1, max(values.shape[1] - 3, 1))
-    weights = (
-        -part * (part - 1) * (part - 2) / 6,
-        (part + 1) * (part - 1) * (part - 2) / 2,
-        -(part + 1) * part * (part - 2) / 2,
-        (part + 1) * part * (part - 1) / 6,
-    )
-    rows, last = np.arange(len(values))[:, None], values.shape[1] - 1
-    found = sum(weight * values[rows, np.minimum(at + k - 1, last)] for k, weight in enumerate(weights))
-    return np.where(inside, found, np.nan)
-
-
-def find_partners(segments: Segments, primary: int, returning: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of segments that recorded the same time in the sensitive channel and in another one.
+def import_file(
+    path: Path, target: Path, options: ImportOptions, progress: Callable[[int], Any] = lambda pulses: None
+) -> ImportSummary:
+    """Import a PulseWaves file.
 
     Parameters
     ----------
-    segments : Segments
-        Sorted by pulse.
-    primary : int
-        The sensitive channel.
-    returning : int64 (k,)
-        Rows of returning segments.
+    path : Path
+        The .pls, with its .wvs beside it.
+    target : Path
+        The strip to write; its suffix selects LAS or LAZ.
+    options : ImportOptions
+    progress : callable
+        Called with numbers of pulses that were written.
 
     Returns
     -------
-    first, second : int64 (m,)
-        Rows of the sensitive and of the other channel.
+    ImportSummary
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be read to its end, or the strip cannot be written; nothing is left behind.
     """
-    is_primary = segments.channel[returning] == primary
-    mine, others = returning[is_primary], returning[~is_primary]
-    if not len(mine) or not len(others):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    begin = segments.start * segments.unit
-    end = begin + segments.length * segments.spacing
-    low = np.searchsorted(segments.pulse[mine], segments.pulse[others], side="left")
-    high = np.searchsorted(segments.pulse[mine], segments.pulse[others], side="right")
-    best, longest = np.full(len(others), -1), np.zeros(len(others))
-    for step in range(int((high - low).max())):
-        here = np.flatnonzero(low + step < high)
-        row = mine[low[here] + step]
-        other = others[here]
-        shared = np.minimum(end[row], end[other]) - np.maximum(begin[row], begin[other])
-        half = 0.5 * np.minimum(end[row] - begin[row], end[other] - begin[other])
-        better = (shared > longest[here]) & (shared > half)
-        best[here[better]], longest[here[better]] = row[better], shared[better]
-    return best[best >= 0], others[best >= 0]
+    header = pulsewaves_file.read_pulse_header(path)
+    source = {"file": path.name, **take_fingerprint(path, header.waves)}
+    account = {"import": source, "options": options.describe(), "version": __version__}
+    state = _find_state(target, account)
+    if options.resume and state == "same":
+        return ImportSummary(str(path), str(target), header.count, skipped=True)
+    # A killed import may have left the packets of a strip that never appeared.
+    overwrite = options.overwrite or (options.resume and state != "other")
+    refuse_existing(target, overwrite)
+    with PulseReader(header) as reader:
+        plan, frame = make_plan(reader), find_frame(reader)
+        by_index = {one.index: one for one in plan.digitizers.values()}
+        counts = ImportSummary(str(path), str(target), header.count, descriptors=len(by_index))
+        if (sent := plan.outgoing) is not None:
+            counts.outgoing = {
+                "fwhm_ns": float("nan") if sent.shape is None else sent.shape.fwhm,
+                "energy_scatter": sent.scatter,
+                "energy_error": sent.error,
+                "width_scatter": sent.width_scatter,
+                "unknown": 0,
+            }
+        digitizers = [by_index[index] for index in sorted(by_index)]
+        extra_bytes = [ExtraRecord.build(FACET, "u1", "mirror facet of the pulse")]
+        if plan.outgoing is not None:
+            texts = ("energy sent / mean of the strip", "height sent / mean of the strip", "std of pulse_energy",
+                     "std of pulse_amplitude")  # fmt: skip
+            extra_bytes += [ExtraRecord.build(name, "<f4", text) for name, text in zip(SENT, texts, strict=True)]
+        record = Vlr(USER_ID, 1, json.dumps(account, sort_keys=True).encode(), b"what the strip was imported from")
+        with FullwaveWriter(
+            target, point_format=9, internal=options.internal, digitizers=digitizers,
+            scales=frame.scales, offsets=frame.offsets, wkt=frame.wkt, extra_bytes=extra_bytes,
+            records=(*frame.records, record), overwrite=overwrite, week=plan.week, system=header.system,
+            source=header.source & 0xFFFF,
+        ) as writer:  # fmt: skip
+            system = _draft_system(writer, path, plan, source, overwrite)
+            for piece in reader.pieces():
+                points = build_points(
+                    frame.place(piece), plan, writer, header, counts, detect=options.returns == "detect"
+                )
+                writer.write_points(points)
+                progress(len(piece.pulses))
+            writer.commit()
+    counts.system_file = None if system is None else str(system)
+    counts.notes = (*frame.notes, *_note(header, plan, counts))
+    return counts
 
 
-def group_rows(segments: Segments, *rows: np.ndarray) -> list[tuple[np.ndarray, ...]]:
-    """Return the rows in groups of one kind of samples: equal bits, spacing and length, in each of the columns."""
-    if not len(rows[0]):
-        return []
-    group = np.zeros(len(rows[0]), np.int64)
-    for column in rows:
-        kinds, of_row = np.unique(code_segments(segments, column), return_inverse=True)
-        group = group * len(kinds) + of_row
-    if not group.any():
-        return [rows]
-    # NumPy sorts numbers of two bytes in one pass.
-    order = np.argsort(group.astype(np.uint16) if group.max() < 1 << 16 else group, kind="stable")
-    cuts = np.flatnonzero(np.diff(group[order])) + 1
-    return [tuple(column[part] for column in rows) for part in np.split(order, cuts)]
+def _find_state(target: Path, account: dict[str, Any]) -> str:
+    """`same`: the strip of this import is there; `mine`: that of another import, or none; `other`: another file."""
+    if not target.exists():
+        return "mine"
+    try:
+        records = [vlr for vlr in read_header(target).vlrs if vlr.user_id.rstrip(b"\0") == USER_ID]
+        found = json.loads(records[0].payload) if records else None
+    except (InputError, ValueError):
+        return "other"
+    if found is None:
+        return "other"
+    return "same" if found == account else "mine"
 
 
-def code_segments(segments: Segments, rows: np.ndarray) -> np.ndarray:
-    """Return a number per segment that says its channel, bits, spacing [ps] and length, i8 (k,): see `decode`."""
-    spacing = np.round(segments.spacing[rows] * 1000).astype(np.int64)
-    code = (segments.channel[rows].astype(np.int64) << 46) | (segments.bits[rows].astype(np.int64) << 40)
-    return code | (spacing << 18) | segments.length[rows]
+def _draft_system(
+    writer: FullwaveWriter, path: Path, plan: Plan, source: dict[str, Any], overwrite: bool
+) -> Path | None:
+    """Puts the system file beside the strip, where the outgoing pulses have a shape; returns its name."""
+    sent = plan.outgoing
+    if sent is None or sent.shape is None:
+        return None
+    channel, bits, spacing, _ = decode(sent.kind)
+    saved = save_outgoing(
+        sent.shape, sent.reference, spacing, bits, path.name, source,
+        same_receiver=channel == plan.primary, energy_scatter=sent.scatter, energy_error=sent.error,
+        width_scatter=sent.width_scatter,
+    )  # fmt: skip
+    draft = Draft(writer.target.with_suffix(SYSTEM_SUFFIX), overwrite=overwrite)
+    writer.drafts.insert(0, draft)
+    with reporting(draft.target):
+        draft.file.write(format_survey(saved).encode())
+    return draft.target
 
 
-def decode(code: int) -> tuple[int, int, float, int]:
-    """Return channel, bits, spacing [ns] and length of a code."""
-    return code >> 46, (code >> 40) & 63, ((code >> 18) & ((1 << 22) - 1)) / 1000, code & ((1 << 18) - 1)
+def _note(header: PulseHeader, plan: Plan, counts: ImportSummary) -> list[str]:
+    notes = []
+    if plan.one_time:
+        notes.append("all pulses have the same time; they get times 0.1 ms apart")
+    if plan.unknown:
+        names = ", ".join(map(str, plan.unknown))
+        notes.append(f"channel {names}: its gain over channel {plan.primary} is unknown; all of its segments are kept")
+    for channel, ratio in plan.ratios.items():
+        notes.append(
+            f"channel {channel} is {ratio:.2f} times less sensitive than channel {plan.primary}: its counts are "
+            f"multiplied by that, and it stands for {counts.replaced} segments that saturate channel {plan.primary}"
+        )
+    if counts.without_returns:
+        notes.append(f"{counts.without_returns} pulses have no returning segment, and so no point")
+    kinds = {s.kind for one in header.descriptors.values() for s in one.samplings}
+    if plan.outgoing is None and kinds - {RETURNING}:
+        notes.append("its recordings of outgoing pulses show no pulse")
+    return notes
 
+
+# The first pass: what segments and outgoing pulses there are
 
 MOST_DESCRIPTORS = 250
 """Wave packet descriptors that a strip gets: LAS has 255. With more lengths, lengths are rounded up."""
@@ -235,62 +278,49 @@ class Plan:
     """No pulse has an intensity."""
 
 
-@dataclass(slots=True)
-class _Found:
-    codes: Counter[int] = field(default_factory=Counter)
-    outgoing: dict[int, list[tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
-    """By kind: samples, and start of the first one [samples]."""
-    steps: list[np.ndarray] = field(default_factory=list)
-    overlaps: dict[int, Overlaps] = field(default_factory=dict)
-    times: tuple[int, int] = (2**63 - 1, -(2**63))
-    intensity: int = 0
-    channels: Counter[int] = field(default_factory=Counter)
-
-
 def make_plan(reader: PulseReader) -> Plan:
     """Read all pulses once; raises InputError for a file without any returning segment, or that ends too early."""
-    found, every = _Found(), max(1, reader.header.count // SAMPLED)
+    header, every = reader.header, max(1, reader.header.count // SAMPLED)
+    codes: Counter[int] = Counter()  # segments by kind, and by channel
+    channels: Counter[int] = Counter()
+    overlaps: dict[int, Overlaps] = {}  # by the channel that was the primary one so far
+    outgoing: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}  # by kind: samples, start of the first one [samples]
+    steps, first, last, intensity = [np.zeros(1)], 2**63 - 1, -(2**63), 0
     for piece in reader.pieces():
-        _add(found, piece, every)
-    if not found.codes:
-        raise InputError(f"{reader.header.path}: none of its {reader.header.count} pulses has a returning waveform")
-    primary = found.channels.most_common(1)[0][0]
-    overlap = found.overlaps.get(primary, Overlaps())
-    others = tuple(channel for channel in found.channels if channel != primary)
+        segments, pulses = piece.segments, piece.pulses
+        returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
+        for code, count in zip(*np.unique(code_segments(segments, returning), return_counts=True), strict=True):
+            codes[int(code)] += int(count)
+            channels[decode(int(code))[0]] += int(count)
+        first, last = min(first, int(pulses["time"].min())), max(last, int(pulses["time"].max()))
+        intensity = max(intensity, int(pulses["intensity"].max()))
+        if len(channels) > 1:
+            primary = channels.most_common(1)[0][0]
+            pairs = find_partners(segments, primary, returning)
+            overlaps.setdefault(primary, Overlaps()).add(piece, *pairs)
+        chosen = (piece.first + segments.pulse) % every == 0
+        sent = np.flatnonzero(chosen & (segments.kind == OUTGOING) & (segments.length > 2))
+        sent = sent[np.append(True, np.diff(segments.pulse[sent]) != 0)[: len(sent)]]
+        for (rows,) in group_rows(segments, sent):
+            start = (segments.start * segments.unit / segments.spacing)[rows]
+            outgoing.setdefault(int(code_segments(segments, rows[:1])[0]), []).append((piece.samples(rows), start))
+        for (rows,) in group_rows(segments, returning[chosen[returning] & (segments.length[returning] > 1)]):
+            steps.append(np.abs(np.diff(piece.samples(rows).astype(np.int64), axis=1)).mean(axis=1))
+    if not codes:
+        raise InputError(f"{header.path}: none of its {header.count} pulses has a returning waveform")
+    primary = channels.most_common(1)[0][0]
+    overlap = overlaps.get(primary, Overlaps())
+    others = tuple(channel for channel in channels if channel != primary)
     ratio = overlap.find_ratio() if len(others) == 1 else None  # overlaps show that of sensors with two channels
     ratios, unknown = ({}, others) if ratio is None or ratio <= 1 else ({others[0]: ratio}, ())
-    steps = np.concatenate([np.zeros(1), *found.steps])
-    noise = max(float(np.median(steps)) * MAD_TO_STD / np.sqrt(2), QUANTISATION_STD)
-    header = reader.header
-    latest = max(abs(time * header.time_scale + header.time_offset) for time in found.times)
+    noise = max(float(np.median(np.concatenate(steps))) * MAD_TO_STD / np.sqrt(2), QUANTISATION_STD)
+    latest = max(abs(time * header.time_scale + header.time_offset) for time in (first, last))
     week = latest <= SECONDS_OF_WEEK
     return Plan(
-        primary, overlap.top, ratios, unknown, noise, _list_digitizers(found.codes, ratios),
-        _learn_outgoing(found.outgoing), header.count >= ONE_TIME and found.times[0] == found.times[1], week,
-        header.time_offset - (0.0 if week else STANDARD_TIME), found.intensity == 0,
+        primary, overlap.top, ratios, unknown, noise, _list_digitizers(codes, ratios), _learn_outgoing(outgoing),
+        header.count >= ONE_TIME and first == last, week, header.time_offset - (0.0 if week else STANDARD_TIME),
+        intensity == 0,
     )  # fmt: skip
-
-
-def _add(found: _Found, piece: PulsePiece, every: int) -> None:
-    segments, pulses = piece.segments, piece.pulses
-    returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
-    for code, count in zip(*np.unique(code_segments(segments, returning), return_counts=True), strict=True):
-        found.codes[int(code)] += int(count)
-        found.channels[decode(int(code))[0]] += int(count)
-    found.times = min(found.times[0], int(pulses["time"].min())), max(found.times[1], int(pulses["time"].max()))
-    found.intensity = max(found.intensity, int(pulses["intensity"].max()))
-    if len(found.channels) > 1:
-        primary = found.channels.most_common(1)[0][0]
-        pairs = found.overlaps.setdefault(primary, Overlaps())
-        pairs.add(piece, *find_partners(segments, primary, returning))
-    chosen = (piece.first + segments.pulse) % every == 0
-    sent = np.flatnonzero(chosen & (segments.kind == OUTGOING) & (segments.length > 2))
-    sent = sent[np.append(True, np.diff(segments.pulse[sent]) != 0)[: len(sent)]]
-    for (rows,) in group_rows(segments, sent):
-        start = (segments.start * segments.unit / segments.spacing)[rows]
-        found.outgoing.setdefault(int(code_segments(segments, rows[:1])[0]), []).append((piece.samples(rows), start))
-    for (rows,) in group_rows(segments, returning[chosen[returning] & (segments.length[returning] > 1)]):
-        found.steps.append(np.abs(np.diff(piece.samples(rows).astype(np.int64), axis=1)).mean(axis=1))
 
 
 def _list_digitizers(codes: Counter[int], ratios: dict[int, float]) -> dict[int, Digitizer]:
@@ -342,126 +372,7 @@ def _beyond(values: np.ndarray, error: float) -> float:
     return float(np.sqrt(max((values.std() / values.mean()) ** 2 - error**2, 0.0)))
 
 
-SCALE = 0.001
-"""Largest unit of stored coordinates [m]: coarser ones would shift samples by as much."""
-ROUND = 1000.0
-"""Offsets of coordinates are multiples of this [m]."""
-
-_NO_WKT = (
-    "the CRS stays as GeoTIFF keys: it is no UTM zone that wavebatch writes as WKT, which programs expect in LAS 1.4: "
-    "give them the CRS by hand"
-)
-
-_ZONES = {4326: 32600, 4979: 32600, 4258: 25800, 4269: 26900}
-"""EPSG code of zone 0 north by the code of the geographic CRS."""
-
-
-@frozen
-class Frame:
-    """How coordinates of a file become those of a strip."""
-
-    zone: int
-    """UTM zone; 0: coordinates stay as they are."""
-    south: bool
-    scales: tuple[float, float, float]
-    offsets: tuple[float, float, float]
-    wkt: str | None
-    records: tuple[Vlr, ...]
-    """GeoTIFF keys that still hold."""
-    notes: tuple[str, ...]
-
-    def place(self, piece: PulsePiece) -> PulsePiece:
-        """Return the piece with its pulses in the coordinates of the strip."""
-        if not self.zone:
-            return piece
-        target = piece.anchor + 1000 * piece.direction
-        anchor, target = (self._project(one) for one in (piece.anchor, target))
-        return replace(piece, anchor=anchor, direction=(target - anchor) / 1000)
-
-    def _project(self, xyz: np.ndarray) -> np.ndarray:
-        east, north = project_utm(xyz[:, 0], xyz[:, 1], self.zone, south=self.south)
-        return np.stack([east, north, xyz[:, 2]], axis=1)
-
-
-def find_frame(reader: PulseReader) -> Frame:
-    """Decide on the coordinates of a file from its GeoTIFF keys and its first pulse."""
-    header = reader.header
-    directory = next((vlr.payload for vlr in header.projection if vlr.record_id == GEOTIFF_ID), b"")
-    keys = GeoKeys.parse(directory)
-    first = next(iter(reader.pieces())).anchor[:1] if header.count else np.zeros((1, 3))
-    zero = _ZONES.get(keys.code or 4326)
-    if keys.kind == "geographic" and zero is not None:
-        zone, south = find_utm_zone(float(first[0, 0])), bool(first[0, 1] < 0) and zero == 32600
-        code = zero + zone + (100 if south else 0)
-        note = f"coordinates are degrees; they are projected to UTM zone {zone}{'S' if south else 'N'} (EPSG:{code})"
-        frame = Frame(zone, south, (SCALE,) * 3, (0.0,) * 3, build_utm(code), (), (note,))
-        first = frame._project(first)
-    else:
-        code = keys.sure_code
-        scales = tuple(min(abs(float(scale)), SCALE) for scale in header.scales)
-        wkt = build_utm(code) if code else None
-        notes = _note_crs(keys) or (() if wkt else (_NO_WKT,))
-        frame = Frame(0, False, scales, (0.0,) * 3, wkt, header.projection, notes)
-    return replace(frame, offsets=tuple(float(value) for value in np.floor(first[0] / ROUND) * ROUND))
-
-
-def _note_crs(keys: GeoKeys) -> tuple[str, ...]:
-    if keys.kind == "geocentric":
-        return ("coordinates are geocentric and stay so: project the strip before steps that need heights",)
-    if keys.kind == "geographic":
-        return ("coordinates are degrees of a datum that wavebatch does not project; packets need metres",)
-    return () if keys.keys else ("the file names no CRS",)
-
-
-_AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257222101
-"""GRS80 [m]; WGS 84 differs by 0.1 mm."""
-_SCALE, _EASTING, _NORTHING = 0.9996, 500_000.0, 10_000_000.0
-
-
-def find_utm_zone(longitude: float) -> int:
-    """Return the UTM zone, 1 to 60, of a longitude in degrees (-180 to 360)."""
-    return int((longitude + 180) // 6) % 60 + 1
-
-
-def project_utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, *, south: bool) -> tuple[np.ndarray, ...]:
-    """Return easting and northing in a UTM zone.
-
-    Parameters
-    ----------
-    longitude, latitude : float64 (n,), degrees
-    zone : int
-    south : bool
-        With the false northing of the southern hemisphere.
-
-    Returns
-    -------
-    east, north : float64 (n,), m
-
-    References
-    ----------
-    Karney (2011), Transverse Mercator with an accuracy of a few nanometers, J. Geodesy 85: Krueger's series, equations
-    7 to 11 and 35, to the third order: 0.1 mm within 6 degrees of the central meridian.
-    """
-    n = _FLATTENING / (2 - _FLATTENING)
-    eccentricity = np.sqrt(_FLATTENING * (2 - _FLATTENING))
-    away = np.radians((longitude - (6 * zone - 183) + 180) % 360 - 180)
-    # The poles themselves have no place in the series.
-    sine = np.clip(np.sin(np.radians(latitude)), -1 + 1e-15, 1 - 1e-15)
-    conformal = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))
-    xi = np.arctan2(conformal, np.cos(away))
-    eta = np.arcsinh(np.sin(away) / np.hypot(conformal, np.cos(away)))
-    alpha = (
-        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16,
-        13 * n**2 / 48 - 3 * n**3 / 5,
-        61 * n**3 / 240,
-    )
-    north, east = xi.copy(), eta.copy()
-    for order, factor in enumerate(alpha, 1):
-        north += factor * np.sin(2 * order * xi) * np.cosh(2 * order * eta)
-        east += factor * np.cos(2 * order * xi) * np.sinh(2 * order * eta)
-    radius = _SCALE * _AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
-    return _EASTING + radius * east, (_NORTHING if south else 0.0) + radius * north
-
+# The second pass: packets and points
 
 SENT = ("pulse_energy", "pulse_amplitude", "pulse_energy_err", "pulse_amplitude_err")
 """Extra bytes of the outgoing pulse, over the mean of the strip."""
@@ -471,58 +382,6 @@ STEP = 1e-4
 PEAK = 6.0
 """Height of a detected echo, in noise of the smoothed waveform; detectors of runs use 4, but noise is rougher here."""
 MOST_RETURNS = 15
-
-
-def list_extra_bytes(plan: Plan) -> list[ExtraRecord]:
-    """Return the extra dimensions of a strip that is imported by this plan."""
-    records = [ExtraRecord.build(FACET, "u1", "mirror facet of the pulse")]
-    if plan.outgoing is not None:
-        texts = ("energy sent / mean of the strip", "height sent / mean of the strip", "std of pulse_energy",
-                 "std of pulse_amplitude")  # fmt: skip
-        records += [ExtraRecord.build(name, "<f4", text) for name, text in zip(SENT, texts, strict=True)]
-    return records
-
-
-@dataclass(slots=True)
-class ImportSummary:
-    """What was made of a file, and what became of its segments."""
-
-    file: str
-    output: str
-    pulses: int
-    skipped: bool = False
-    """The strip was there already and is up to date."""
-    points: int = 0
-    packets: int = 0
-    descriptors: int = 0
-    without_returns: int = 0
-    """Pulses without any returning segment: LAS has no place for them."""
-    replaced: int = 0
-    """Segments of the sensitive channel that are saturated, and whose packet is that of another channel."""
-    covered: int = 0
-    """Segments of other channels that the sensitive one recorded as well, unsaturated."""
-    outgoing: dict[str, float] | None = None
-    """Of the outgoing pulses: fwhm_ns, energy_scatter, energy_error, width_scatter (relative), and unknown: pulses
-    whose outgoing recording shows no pulse."""
-    system_file: str | None = None
-    notes: tuple[str, ...] = ()
-
-
-def choose_segments(piece: PulsePiece, plan: Plan, counts: ImportSummary) -> np.ndarray:
-    """Return the rows of the segments that become packets, sorted by pulse and time."""
-    segments = piece.segments
-    returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
-    first, second = find_partners(segments, plan.primary, returning)
-    drop = np.zeros(len(segments), bool)
-    known = np.isin(segments.channel[second], list(plan.ratios))
-    for a, b in group_rows(segments, first[known], second[known]):
-        over = piece.samples(a).max(axis=1) >= SATURATED * plan.top
-        drop[a[over]], drop[b[~over]] = True, True
-        counts.replaced += int(np.count_nonzero(over))
-        counts.covered += int(np.count_nonzero(~over))
-    rows = returning[~drop[returning]]
-    start = (segments.start * segments.unit)[rows]
-    return rows[np.lexsort((start, segments.pulse[rows]))]
 
 
 def build_points(
@@ -555,7 +414,16 @@ def build_points(
     chosen = segments.take(rows[owner])
     points = np.zeros(len(owner), writer.dtype)
     sent, late = (None, 0.0) if plan.outgoing is None else _measure_sent(piece, plan.outgoing, counts)
-    _fill_places(points, piece, chosen, sample, writer, late)
+    # Coordinates, location in the packet and vectors toward the sensor.
+    direction = piece.direction[chosen.pulse]
+    late = late if isinstance(late, float) else late[chosen.pulse]
+    way = chosen.start + (sample * chosen.spacing - late) / chosen.unit
+    xyz = piece.anchor[chosen.pulse] + way[:, None] * direction
+    stored = np.round((xyz - np.array(writer.offsets)) / np.array(writer.scales))
+    for axis, (name, vector) in enumerate(zip("XYZ", ("x_t", "y_t", "z_t"), strict=True)):
+        points[name] = np.clip(stored[:, axis], -(2**31), 2**31 - 1)
+        points[vector] = -direction[:, axis] / (chosen.unit * PS_PER_NS)
+    points["return_point_wave_location"] = sample * chosen.spacing * PS_PER_NS
     _fill_pulses(points, piece, chosen.pulse, plan, header)
     codes = code_segments(chosen, np.arange(len(chosen)))
     kinds, which = np.unique(codes, return_inverse=True)
@@ -570,6 +438,23 @@ def build_points(
     counts.packets += len(rows)
     counts.without_returns += len(piece.pulses) - len(np.unique(chosen.pulse))
     return points
+
+
+def choose_segments(piece: PulsePiece, plan: Plan, counts: ImportSummary) -> np.ndarray:
+    """Return the rows of the segments that become packets, sorted by pulse and time."""
+    segments = piece.segments
+    returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
+    first, second = find_partners(segments, plan.primary, returning)
+    drop = np.zeros(len(segments), bool)
+    known = np.isin(segments.channel[second], list(plan.ratios))
+    for a, b in group_rows(segments, first[known], second[known]):
+        over = piece.samples(a).max(axis=1) >= SATURATED * plan.top
+        drop[a[over]], drop[b[~over]] = True, True
+        counts.replaced += int(np.count_nonzero(over))
+        counts.covered += int(np.count_nonzero(~over))
+    rows = returning[~drop[returning]]
+    start = (segments.start * segments.unit)[rows]
+    return rows[np.lexsort((start, segments.pulse[rows]))]
 
 
 def _place_returns(samples: np.ndarray, noise: float, *, detect: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -588,26 +473,6 @@ def _place_returns(samples: np.ndarray, noise: float, *, detect: bool) -> tuple[
         return waveform, sample
     _, time, _ = estimate_starts(smoothed, waveform, sample, 1.0)
     return waveform, np.clip(time, 0, len(smoothed) - 1)
-
-
-def _fill_places(
-    points: np.ndarray,
-    piece: PulsePiece,
-    chosen: Segments,
-    sample: np.ndarray,
-    writer: FullwaveWriter,
-    late: np.ndarray | float,
-) -> None:
-    """Coordinates, location in the packet and vectors toward the sensor."""
-    direction = piece.direction[chosen.pulse]
-    late = late if isinstance(late, float) else late[chosen.pulse]
-    way = chosen.start + (sample * chosen.spacing - late) / chosen.unit
-    xyz = piece.anchor[chosen.pulse] + way[:, None] * direction
-    stored = np.round((xyz - np.array(writer.offsets)) / np.array(writer.scales))
-    for axis, (name, vector) in enumerate(zip("XYZ", ("x_t", "y_t", "z_t"), strict=True)):
-        points[name] = np.clip(stored[:, axis], -(2**31), 2**31 - 1)
-        points[vector] = -direction[:, axis] / (chosen.unit * PS_PER_NS)
-    points["return_point_wave_location"] = sample * chosen.spacing * PS_PER_NS
 
 
 def _fill_pulses(points: np.ndarray, piece: PulsePiece, pulse: np.ndarray, plan: Plan, header: PulseHeader) -> None:
@@ -658,152 +523,255 @@ def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: ImportSummary) 
     return values, late
 
 
-SUFFIXES = (".pls",)
-USER_ID = b"wavebatch_import"
-"""User id of the record in a strip that says what it was imported from."""
+# Kinds of segments, and the two channels of a sensor
+
+SATURATED = 0.8
+"""Share of the sensitive channel's largest counts from which the other channel is used: receivers bend before they
+clip. RIEGL records its second channel from about this share on."""
+LINEAR = (0.05, 0.4)
+"""Shares of the largest counts between which a receiver is linear: heights that teach the ratio of the gains."""
+LEAST_SAMPLES = 30
+"""Samples that teach a ratio."""
+MOST_PAIRS = 20_000
+"""Pairs of segments that teach it."""
 
 
-@frozen
-class ImportOptions:
-    """How files are imported."""
-
-    returns: Literal["strongest", "detect"] = option(
-        "strongest", "strongest: one point per recorded segment, at its strongest sample; detect: one at each maximum "
-        "that stands out of the noise.",
-    )  # fmt: skip
-    internal: bool = option(
-        False, "Store packets in the strip or in a .wdp file beside it.", opposite="external", unset="external"
-    )
-    overwrite: bool = False
-    resume: bool = option(False, "Skip files whose strip is there and up to date.")
-
-    def describe(self) -> dict[str, Any]:
-        """Return what changes the strip."""
-        return {"internal": self.internal, "returns": self.returns}
+def group_rows(segments: Segments, *rows: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+    """Return the rows in groups of one kind of samples: equal bits, spacing and length, in each of the columns."""
+    if not len(rows[0]):
+        return []
+    group = np.zeros(len(rows[0]), np.int64)
+    for column in rows:
+        kinds, of_row = np.unique(code_segments(segments, column), return_inverse=True)
+        group = group * len(kinds) + of_row
+    if not group.any():
+        return [rows]
+    # NumPy sorts numbers of two bytes in one pass.
+    order = np.argsort(group.astype(np.uint16) if group.max() < 1 << 16 else group, kind="stable")
+    cuts = np.flatnonzero(np.diff(group[order])) + 1
+    return [tuple(column[part] for column in rows) for part in np.split(order, cuts)]
 
 
-def import_file(
-    path: Path, target: Path, options: ImportOptions, progress: Callable[[int], Any] = lambda pulses: None
-) -> ImportSummary:
-    """Import a PulseWaves file.
+def code_segments(segments: Segments, rows: np.ndarray) -> np.ndarray:
+    """Return a number per segment that says its channel, bits, spacing [ps] and length, i8 (k,): see `decode`."""
+    spacing = np.round(segments.spacing[rows] * 1000).astype(np.int64)
+    code = (segments.channel[rows].astype(np.int64) << 46) | (segments.bits[rows].astype(np.int64) << 40)
+    return code | (spacing << 18) | segments.length[rows]
+
+
+def decode(code: int) -> tuple[int, int, float, int]:
+    """Return channel, bits, spacing [ns] and length of a code."""
+    return code >> 46, (code >> 40) & 63, ((code >> 18) & ((1 << 22) - 1)) / 1000, code & ((1 << 18) - 1)
+
+
+def find_partners(segments: Segments, primary: int, returning: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of segments that recorded the same time in the sensitive channel and in another one.
 
     Parameters
     ----------
-    path : Path
-        The .pls, with its .wvs beside it.
-    target : Path
-        The strip to write; its suffix selects LAS or LAZ.
-    options : ImportOptions
-    progress : callable
-        Called with numbers of pulses that were written.
+    segments : Segments
+        Sorted by pulse.
+    primary : int
+        The sensitive channel.
+    returning : int64 (k,)
+        Rows of returning segments.
 
     Returns
     -------
-    ImportSummary
-
-    Raises
-    ------
-    InputError
-        Where the file cannot be read to its end, or the strip cannot be written; nothing is left behind.
+    first, second : int64 (m,)
+        Rows of the sensitive and of the other channel.
     """
-    header = pulsewaves_file.read_pulse_header(path)
-    source = {"file": path.name, **take_fingerprint(path, header.waves)}
-    account = {"import": source, "options": options.describe(), "version": __version__}
-    state = _find_state(target, account)
-    if options.resume and state == "same":
-        return ImportSummary(str(path), str(target), header.count, skipped=True)
-    # A killed import may have left the packets of a strip that never appeared.
-    overwrite = options.overwrite or (options.resume and state != "other")
-    refuse_existing(target, overwrite)
-    with PulseReader(header) as reader:
-        plan, frame = make_plan(reader), find_frame(reader)
-        descriptors = len({one.index for one in plan.digitizers.values()})
-        counts = ImportSummary(str(path), str(target), header.count, descriptors=descriptors)
-        if (sent := plan.outgoing) is not None:
-            counts.outgoing = {
-                "fwhm_ns": float("nan") if sent.shape is None else sent.shape.fwhm,
-                "energy_scatter": sent.scatter,
-                "energy_error": sent.error,
-                "width_scatter": sent.width_scatter,
-                "unknown": 0,
-            }
-        with _open_writer(target, header, plan, frame, options, account, overwrite) as writer:
-            system = _draft_system(writer, path, plan, source, overwrite)
-            for piece in reader.pieces():
-                points = build_points(
-                    frame.place(piece), plan, writer, header, counts, detect=options.returns == "detect"
-                )
-                writer.write_points(points)
-                progress(len(piece.pulses))
-            writer.commit()
-    counts.system_file = None if system is None else str(system)
-    counts.notes = (*frame.notes, *_note(header, plan, counts))
-    return counts
+    is_primary = segments.channel[returning] == primary
+    mine, others = returning[is_primary], returning[~is_primary]
+    if not len(mine) or not len(others):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    begin = segments.start * segments.unit
+    end = begin + segments.length * segments.spacing
+    low = np.searchsorted(segments.pulse[mine], segments.pulse[others], side="left")
+    high = np.searchsorted(segments.pulse[mine], segments.pulse[others], side="right")
+    best, longest = np.full(len(others), -1), np.zeros(len(others))
+    for step in range(int((high - low).max())):
+        here = np.flatnonzero(low + step < high)
+        row = mine[low[here] + step]
+        other = others[here]
+        shared = np.minimum(end[row], end[other]) - np.maximum(begin[row], begin[other])
+        half = 0.5 * np.minimum(end[row] - begin[row], end[other] - begin[other])
+        better = (shared > longest[here]) & (shared > half)
+        best[here[better]], longest[here[better]] = row[better], shared[better]
+    return best[best >= 0], others[best >= 0]
 
 
-def _find_state(target: Path, account: dict[str, Any]) -> str:
-    """`same`: the strip of this import is there; `mine`: that of another import, or none; `other`: another file."""
-    if not target.exists():
-        return "mine"
-    try:
-        records = [vlr for vlr in read_header(target).vlrs if vlr.user_id.rstrip(b"\0") == USER_ID]
-        found = json.loads(records[0].payload) if records else None
-    except (InputError, ValueError):
-        return "other"
-    if found is None:
-        return "other"
-    return "same" if found == account else "mine"
+@dataclass(slots=True)
+class Overlaps:
+    """What pairs of segments of two channels say, summed up."""
+
+    top: float = 0.0
+    """Largest count of the sensitive channel [count]."""
+    products: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    """Heights of the sensitive and of the other channel at the same time [count]."""
+    pairs: int = 0
+
+    def add(self, piece: PulsePiece, first: np.ndarray, second: np.ndarray) -> None:
+        """Add pairs of segments: rows of the sensitive and of the other channel."""
+        self.pairs += len(first)
+        if self.pairs > MOST_PAIRS and self.products:
+            return
+        segments = piece.segments
+        for a, b in group_rows(segments, first, second):
+            x, y = (piece.samples(rows).astype(np.float64) for rows in (a, b))
+            self.top = max(self.top, float(x.max(initial=0)))
+            x -= np.percentile(x, 25, axis=1, keepdims=True)
+            y -= np.percentile(y, 25, axis=1, keepdims=True)
+            shift = (segments.start[b] - segments.start[a]) * segments.unit[a] / segments.spacing[a]
+            other = _interpolate(y, np.arange(x.shape[1]) - shift[:, None])
+            inside = np.isfinite(other)
+            self.products.append((x[inside], other[inside]))
+
+    def find_ratio(self) -> float | None:
+        """Gain of the sensitive channel over that of the other; None where it is not known."""
+        if not self.products:
+            return None
+        x, y = (np.concatenate(values) for values in zip(*self.products, strict=True))
+        used = (x > LINEAR[0] * self.top) & (x < LINEAR[1] * self.top) & (y > 0)
+        if np.count_nonzero(used) < LEAST_SAMPLES:
+            return None
+        return float((x[used] * y[used]).sum() / (y[used] ** 2).sum())
 
 
-def _open_writer(
-    target: Path, header: PulseHeader, plan: Plan, frame: Frame, options: ImportOptions, account: dict, overwrite: bool
-) -> FullwaveWriter:
-    by_index = {one.index: one for one in plan.digitizers.values()}
-    digitizers = [by_index[index] for index in sorted(by_index)]
-    record = Vlr(USER_ID, 1, json.dumps(account, sort_keys=True).encode(), b"what the strip was imported from")
-    return FullwaveWriter(
-        target, point_format=9, internal=options.internal, digitizers=digitizers,
-        scales=frame.scales, offsets=frame.offsets, wkt=frame.wkt, extra_bytes=list_extra_bytes(plan),
-        records=(*frame.records, record), overwrite=overwrite, week=plan.week, system=header.system,
-        source=header.source & 0xFFFF,
-    )  # fmt: skip
+def _interpolate(values: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Values (n, s) at places (n, k) between samples, by Lagrange's cubic; NaN outside.
+
+    A straight line would lift flanks, and with them the other channel: by 5 % for pulses of two samples.
+    """
+    at = np.floor(place).astype(np.int64)
+    part = place - at
+    inside = (at >= 1) & (at < values.shape[1] - 2)
+    at = np.clip(at, 1, max(values.shape[1] - 3, 1))
+    weights = (
+        -part * (part - 1) * (part - 2) / 6,
+        (part + 1) * (part - 1) * (part - 2) / 2,
+        -(part + 1) * part * (part - 2) / 2,
+        (part + 1) * part * (part - 1) / 6,
+    )
+    rows, last = np.arange(len(values))[:, None], values.shape[1] - 1
+    found = sum(weight * values[rows, np.minimum(at + k - 1, last)] for k, weight in enumerate(weights))
+    return np.where(inside, found, np.nan)
 
 
-def _draft_system(
-    writer: FullwaveWriter, path: Path, plan: Plan, source: dict[str, Any], overwrite: bool
-) -> Path | None:
-    """Puts the system file beside the strip, where the outgoing pulses have a shape; returns its name."""
-    sent = plan.outgoing
-    if sent is None or sent.shape is None:
-        return None
-    channel, bits, spacing, _ = decode(sent.kind)
-    saved = save_outgoing(
-        sent.shape, sent.reference, spacing, bits, path.name, source,
-        same_receiver=channel == plan.primary, energy_scatter=sent.scatter, energy_error=sent.error,
-        width_scatter=sent.width_scatter,
-    )  # fmt: skip
-    draft = Draft(writer.target.with_suffix(SYSTEM_SUFFIX), overwrite=overwrite)
-    writer.drafts.insert(0, draft)
-    with reporting(draft.target):
-        draft.file.write(format_survey(saved).encode())
-    return draft.target
+# Coordinates
+
+SCALE = 0.001
+"""Largest unit of stored coordinates [m]: coarser ones would shift samples by as much."""
+ROUND = 1000.0
+"""Offsets of coordinates are multiples of this [m]."""
+_NO_WKT = (
+    "the CRS stays as GeoTIFF keys: it is no UTM zone that wavebatch writes as WKT, which programs expect in LAS 1.4: "
+    "give them the CRS by hand"
+)
+_ZONES = {4326: 32600, 4979: 32600, 4258: 25800, 4269: 26900}
+"""EPSG code of zone 0 north by the code of the geographic CRS."""
 
 
-def _note(header: PulseHeader, plan: Plan, counts: ImportSummary) -> list[str]:
-    notes = []
-    if plan.one_time:
-        notes.append("all pulses have the same time; they get times 0.1 ms apart")
-    if plan.unknown:
-        names = ", ".join(map(str, plan.unknown))
-        notes.append(f"channel {names}: its gain over channel {plan.primary} is unknown; all of its segments are kept")
-    for channel, ratio in plan.ratios.items():
-        notes.append(
-            f"channel {channel} is {ratio:.2f} times less sensitive than channel {plan.primary}: its counts are "
-            f"multiplied by that, and it stands for {counts.replaced} segments that saturate channel {plan.primary}"
-        )
-    if counts.without_returns:
-        notes.append(f"{counts.without_returns} pulses have no returning segment, and so no point")
-    kinds = {s.kind for one in header.descriptors.values() for s in one.samplings}
-    if plan.outgoing is None and kinds - {RETURNING}:
-        notes.append("its recordings of outgoing pulses show no pulse")
-    return notes
+@frozen
+class Frame:
+    """How coordinates of a file become those of a strip."""
+
+    zone: int
+    """UTM zone; 0: coordinates stay as they are."""
+    south: bool
+    scales: tuple[float, float, float]
+    offsets: tuple[float, float, float]
+    wkt: str | None
+    records: tuple[Vlr, ...]
+    """GeoTIFF keys that still hold."""
+    notes: tuple[str, ...]
+
+    def place(self, piece: PulsePiece) -> PulsePiece:
+        """Return the piece with its pulses in the coordinates of the strip."""
+        if not self.zone:
+            return piece
+        target = piece.anchor + 1000 * piece.direction
+        anchor, target = (self._project(one) for one in (piece.anchor, target))
+        return replace(piece, anchor=anchor, direction=(target - anchor) / 1000)
+
+    def _project(self, xyz: np.ndarray) -> np.ndarray:
+        east, north = project_utm(xyz[:, 0], xyz[:, 1], self.zone, south=self.south)
+        return np.stack([east, north, xyz[:, 2]], axis=1)
+
+
+def find_frame(reader: PulseReader) -> Frame:
+    """Decide on the coordinates of a file from its GeoTIFF keys and its first pulse."""
+    header = reader.header
+    directory = next((vlr.payload for vlr in header.projection if vlr.record_id == GEOTIFF_ID), b"")
+    keys = GeoKeys.parse(directory)
+    first = next(iter(reader.pieces())).anchor[:1] if header.count else np.zeros((1, 3))
+    zero = _ZONES.get(keys.code or 4326)
+    if keys.kind == "geographic" and zero is not None:
+        zone, south = find_utm_zone(float(first[0, 0])), bool(first[0, 1] < 0) and zero == 32600
+        code = zero + zone + (100 if south else 0)
+        note = f"coordinates are degrees; they are projected to UTM zone {zone}{'S' if south else 'N'} (EPSG:{code})"
+        frame = Frame(zone, south, (SCALE,) * 3, (0.0,) * 3, build_utm(code), (), (note,))
+        first = frame._project(first)
+    else:
+        code = keys.sure_code
+        scales = tuple(min(abs(float(scale)), SCALE) for scale in header.scales)
+        wkt = build_utm(code) if code else None
+        notes = () if wkt else (_NO_WKT,)
+        if keys.kind == "geocentric":
+            notes = ("coordinates are geocentric and stay so: project the strip before steps that need heights",)
+        elif keys.kind == "geographic":
+            notes = ("coordinates are degrees of a datum that wavebatch does not project; packets need metres",)
+        elif not keys.keys:
+            notes = ("the file names no CRS",)
+        frame = Frame(0, False, scales, (0.0,) * 3, wkt, header.projection, notes)
+    return replace(frame, offsets=tuple(float(value) for value in np.floor(first[0] / ROUND) * ROUND))
+
+
+_AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257222101
+"""GRS80 [m]; WGS 84 differs by 0.1 mm."""
+_SCALE, _EASTING, _NORTHING = 0.9996, 500_000.0, 10_000_000.0
+
+
+def find_utm_zone(longitude: float) -> int:
+    """Return the UTM zone, 1 to 60, of a longitude in degrees (-180 to 360)."""
+    return int((longitude + 180) // 6) % 60 + 1
+
+
+def project_utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, *, south: bool) -> tuple[np.ndarray, ...]:
+    """Return easting and northing in a UTM zone.
+
+    Parameters
+    ----------
+    longitude, latitude : float64 (n,), degrees
+    zone : int
+    south : bool
+        With the false northing of the southern hemisphere.
+
+    Returns
+    -------
+    east, north : float64 (n,), m
+
+    References
+    ----------
+    Karney (2011), Transverse Mercator with an accuracy of a few nanometers, J. Geodesy 85: Krueger's series, equations
+    7 to 11 and 35, to the third order: 0.1 mm within 6 degrees of the central meridian.
+    """
+    n = _FLATTENING / (2 - _FLATTENING)
+    eccentricity = np.sqrt(_FLATTENING * (2 - _FLATTENING))
+    away = np.radians((longitude - (6 * zone - 183) + 180) % 360 - 180)
+    # The poles themselves have no place in the series.
+    sine = np.clip(np.sin(np.radians(latitude)), -1 + 1e-15, 1 - 1e-15)
+    conformal = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))
+    xi = np.arctan2(conformal, np.cos(away))
+    eta = np.arcsinh(np.sin(away) / np.hypot(conformal, np.cos(away)))
+    alpha = (
+        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16,
+        13 * n**2 / 48 - 3 * n**3 / 5,
+        61 * n**3 / 240,
+    )
+    north, east = xi.copy(), eta.copy()
+    for order, factor in enumerate(alpha, 1):
+        north += factor * np.sin(2 * order * xi) * np.cosh(2 * order * eta)
+        east += factor * np.cos(2 * order * xi) * np.sinh(2 * order * eta)
+    radius = _SCALE * _AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    return _EASTING + radius * east, (_NORTHING if south else 0.0) + radius * north

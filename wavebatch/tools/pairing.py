@@ -1,11 +1,11 @@
-"""Pairing of the echoes of two sides, within pulses or by position, and the sums over all pairs.
+"""Compares two clouds, or a cloud with the truth of its simulated strip, echo by echo.
 
-`compare_clouds`, `compare_truth` and `chains` add parts of a strip to a Pairing, `finish` gives the Comparison. A part
-must hold whole pulses (`pair_by_time`) or all neighbours of its echoes (`pair_by_place`), or pairs are lost.
-
-`wavebatch compare` calls `compare_clouds` and `compare_truth`; `chains` uses `CloudTask` for a chain and a cloud. Rows
-go to buckets on disk (by GPS time, or by x if times do not separate pulses), then bucket by bucket to `Pairing`, so
-that memory does not grow with the clouds.
+`wavebatch compare` calls `compare_clouds` and `compare_truth`: files go in, a Comparison comes out. Rows go to buckets
+on disk (CloudTask: by GPS time, or by x if times do not separate pulses), then bucket by bucket to a Pairing, so that
+memory does not grow with the clouds. A Pairing finds pairs, within pulses or by position, and adds them to Differences,
+and the echoes without a partner to Breakdowns; `finish` gives the Comparison. A part that it gets must hold whole
+pulses (`pair_by_time`) or all neighbours of its echoes (`pair_by_place`), or pairs are lost. `compare_chains` uses
+Pairing for two chains, and CloudTask for a chain and a cloud.
 """
 
 from __future__ import annotations
@@ -32,224 +32,8 @@ from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
 from wavebatch.tools.return_stats import pulses_told_apart
 from wavebatch.tools.simulate.strip import TruthReader
 
-_OCTAVES = 18
-"""Classes of amplitude: below 1, then one per doubling; the last one holds everything larger."""
-
-_NUMBERS = 16
-"""Return numbers that a LAS point can hold, 0 to 15."""
-
 Table = dict[str, tuple[int, int]]
 """Per class: echoes without a partner, and all echoes."""
-
-
-class Breakdown:
-    """Counts echoes of one side, with and without a partner on the other side, by possible reasons."""
-
-    def __init__(self) -> None:
-        self._tallies = {kind: np.zeros((len(names), 2), np.int64) for kind, names in _NAMES.items()}
-
-    def add(self, rows: np.ndarray, alone: np.ndarray, others: np.ndarray | None) -> None:
-        """Adds echoes (k,), CLOUD_DTYPE.
-
-        alone: echoes without a partner, bool (k,). others: number of echoes of the other side in the pulse of each
-        echo, (k,); None if unknown.
-        """
-        numbered = rows["number"] > 0
-        code = np.minimum(rows["total"], _NUMBERS - 1) * np.int64(_NUMBERS) + np.minimum(rows["number"], _NUMBERS - 1)
-        self._count("return", code[numbered], alone[numbered])
-        self._count("class", rows["classification"], alone)
-        known = ~np.isnan(rows["amplitude"])
-        self._count("amplitude", _octave(rows["amplitude"][known]), alone[known])
-        self._count("intensity", _octave(rows["intensity"]), alone)
-        if others is not None:
-            self._count("pulse", (others > 0).astype(np.int64), alone)
-        flags = [*((rows["flags"] & np.uint16(flag)) != 0 for flag in EchoFlag), rows["flags"] == 0]
-        for place, has in enumerate(flags):
-            self._count("flag", np.full(int(has.sum()), place), alone[has])
-
-    def _count(self, kind: str, code: np.ndarray, alone: np.ndarray) -> None:
-        tally = self._tallies[kind]
-        tally[:, 0] += np.bincount(code[alone], minlength=len(tally))
-        tally[:, 1] += np.bincount(code, minlength=len(tally))
-
-    def tables(self) -> dict[str, Table]:
-        """For each kind the classes that have an echo; kinds without data are left out.
-
-        `intensity` is there only without amplitudes and if not all are 0; `flag` and `class` only if any echo has one.
-        """
-        tables = {}
-        for kind, tally in self._tallies.items():
-            rows = np.flatnonzero(tally[:, 1]).tolist()
-            tables[kind] = {_NAMES[kind][row]: (int(tally[row, 0]), int(tally[row, 1])) for row in rows}
-        if tables["amplitude"] or set(tables["intensity"]) <= {_OCTAVE_NAMES[0]}:
-            del tables["intensity"]
-        if set(tables["flag"]) <= {"none"}:
-            del tables["flag"]
-        if set(tables["class"]) <= {name_class(0)}:
-            del tables["class"]
-        return {kind: table for kind, table in tables.items() if table}
-
-
-def _octave(values: np.ndarray) -> np.ndarray:
-    """Classes of amplitudes: 0 below 1, 1 from 1 to 2, 2 from 2 to 4 ..., i8 (k,)."""
-    return np.clip(np.frexp(np.clip(values.astype(np.float64), 0.0, 1e9))[1], 0, _OCTAVES - 1).astype(np.int64)
-
-
-def name_class(number: int) -> str:
-    """A LAS class with its name, if the standard has one."""
-    return f"{number} {CLASS_NAMES[number]}" if number in CLASS_NAMES else str(number)
-
-
-_OCTAVE_NAMES = ["below 1", *(f"{1 << n}-{2 << n}" for n in range(_OCTAVES - 2)), f"from {1 << (_OCTAVES - 2)}"]
-_NAMES = {
-    "return": [f"{number} of {total}" for total in range(_NUMBERS) for number in range(_NUMBERS)],
-    "class": [name_class(number) for number in range(256)],
-    "amplitude": _OCTAVE_NAMES,
-    "intensity": _OCTAVE_NAMES,
-    "pulse": ["nothing of the other side", "other echoes of the other side"],
-    "flag": [*(flag.name for flag in EchoFlag), "none"],
-}
-"""Per kind of class the names of its classes."""
-
-
-SPEED = 0.9997 * HALF_C
-"""Metres along the ray per ns; the factor is the refractive index of air, n = 1.0003."""
-
-_BOTH = ("echo_time", "amplitude", "echo_width")
-"""Columns that are compared if both sides have them."""
-
-GROUPS = {"class": "classification", "echoes": "total"}
-"""By what differences are grouped: the LAS class, and the number of echoes of the pulse."""
-
-
-@frozen
-class ErrorSpread:
-    """Differences a minus b of one quantity, over the echoes that both sides have."""
-
-    number: int
-    median: float
-    mean: float
-    rms: float
-    nmad: float
-
-
-class Differences:
-    """Collects pairs of echoes (CLOUD_DTYPE): sums of all pairs, and an even sample of them for medians."""
-
-    def __init__(self, limit: int | None = None) -> None:
-        self._sample = EvenSample(limit)
-        self.sums = {name: np.zeros(3) for name in ("time", *_BOTH)}
-        self._grouped = {
-            (kind, side, name): np.zeros((256, 3)) for kind in GROUPS for side in "ab" for name in self.sums
-        }
-
-    def add(self, a: np.ndarray, b: np.ndarray) -> None:
-        """Adds pairs: a[i] with b[i]."""
-        part = {name: a[name].astype(np.float64) - b[name] for name in _BOTH}
-        part["time"] = measure_lag(a, b) / SPEED
-        for name, values in part.items():
-            good = values[~np.isnan(values)]
-            self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
-            for kind, column in GROUPS.items():
-                for side, rows in (("a", a), ("b", b)):
-                    group = rows[column][~np.isnan(values)]
-                    sums = self._grouped[kind, side, name]
-                    for place, weights in enumerate((None, good, np.square(good))):
-                        sums[:, place] += np.bincount(group, weights, len(sums))
-        for name in ("amplitude_err", "echo_width_err", "range_err"):
-            part[name] = a[name]
-        for name in ("amplitude", "echo_width", "flags"):
-            part[f"true_{name}"] = b[name]
-        for kind, column in GROUPS.items():
-            part |= {f"{kind}_a": a[column], f"{kind}_b": b[column]}
-        part["isolated"] = b["isolated"] if "isolated" in b.dtype.names else np.zeros(len(b), bool)
-        self._sample.add(part)
-
-    def spreads(self) -> dict[str, ErrorSpread]:
-        """Median, mean, rms and NMAD of a minus b, for each quantity that both sides have."""
-        data = self._sample.read()
-        return {name: _spread(sums, data[name]) for name, sums in self.sums.items() if sums[0]}
-
-    def groups(self) -> dict[str, dict[int, dict[str, ErrorSpread]]]:
-        """The same by kind of GROUPS and by number: of the class, and of the echoes that the pulse has.
-
-        A pair belongs to the group of its echo of b; where b has no groups (all are 0), to that of its echo of a.
-        Kinds in which both sides have none are left out. Medians of rare groups are NaN if the sample has none of them.
-        """
-        data, result = self._sample.read(), {}
-        for kind in GROUPS:
-            side = next((side for side in "ba" if self._grouped[kind, side, "time"][1:, 0].any()), None)
-            if side is None:
-                continue
-            result[kind] = {
-                group: {
-                    name: _spread(sums[group], data[name][data[f"{kind}_{side}"] == group])
-                    for name in self.sums if (sums := self._grouped[kind, side, name])[group, 0]
-                }
-                for group in np.flatnonzero(self._grouped[kind, side, "time"][:, 0]).tolist()
-            }  # fmt: skip
-        return result
-
-    def errors(self, meta: dict) -> dict[str, dict[str, ErrorStats]]:
-        """Errors of time [ns], amplitude [DN] and sigma [ns], in units of the bound and of the reported errors."""
-        data = self._sample.read()
-        if not data:
-            return {}
-        sigma = data["true_echo_width"].astype(np.float64) / FWHM_PER_SIGMA
-        amplitude = data["true_amplitude"].astype(np.float64)
-        sigma[~(sigma > 0)] = amplitude[~(amplitude > 0)] = np.nan  # of a damaged truth: there is no bound
-        reported = {name: data[name].astype(np.float64) for name in ("range_err", "amplitude_err", "echo_width_err")}
-        bounds = crlb(amplitude, sigma, meta["noise_std"], meta["spacing"])
-        columns = {
-            "time": (data["time"], bounds[0], reported["range_err"] / SPEED),
-            "echo_time": (data["echo_time"], bounds[0], reported["range_err"] / SPEED),
-            "amplitude": (data["amplitude"], bounds[1], reported["amplitude_err"]),
-            "sigma": (data["echo_width"] / FWHM_PER_SIGMA, bounds[2], reported["echo_width_err"] / FWHM_PER_SIGMA),
-        }
-        classes = {
-            "all": np.ones(len(sigma), bool),
-            "isolated": data["isolated"],
-            "overlapped": (data["true_flags"] & np.uint16(EchoFlag.OVERLAPPED)) != 0,
-        }
-        return {
-            kind: {name: _measure(rows, *values) for name, values in columns.items()} for kind, rows in classes.items()
-        }
-
-
-def _spread(sums: np.ndarray, values: np.ndarray) -> ErrorSpread:
-    """The spread from number, sum and sum of squares of all pairs, and from the differences of a sample of them."""
-    number, total, squares = sums.tolist()
-    values = values[~np.isnan(values)]
-    median = np.median(values) if len(values) else np.nan
-    nmad = MAD_TO_STD * np.median(np.abs(values - median)) if len(values) else np.nan
-    return ErrorSpread(int(number), float(median), total / number, float(np.sqrt(squares / number)), float(nmad))
-
-
-def measure_lag(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distance of a after b along the ray [m], f8 (k,), positive away from the sensor.
-
-    The ray is the packet vector of b, or of a; without both, the lower point counts as the farther one.
-    """
-    step = a["xyz"] - b["xyz"]
-    ray = np.where(np.any(b["ray"] != 0, axis=1)[:, None], b["ray"], a["ray"]).astype(np.float64)
-    length = np.linalg.norm(ray, axis=1)
-    known = length > 0
-    down = -np.sign(ray[:, 2]) / np.where(known, length, 1.0)
-    along = np.einsum("ij,ij->i", step, ray) * down
-    by_height = np.linalg.norm(step, axis=1) * -np.sign(step[:, 2])
-    return np.where(known & (down != 0), along, by_height)
-
-
-def _measure(rows: np.ndarray, error: np.ndarray, bound: np.ndarray, reported: np.ndarray) -> ErrorStats:
-    rows = rows & ~np.isnan(error)
-    return ErrorStats.compute(error[rows], bound[rows], reported[rows])
-
-
-MOST_PER_PULSE = 64
-"""More echoes than this with one GPS time are not a pulse: such times are missing or rounded."""
-
-MOST_PAIRS = 20_000_000
-"""Most pairs of such echoes that are looked at; each needs about 100 bytes."""
 
 
 @frozen
@@ -311,6 +95,162 @@ class Comparison:
     def to_json(self) -> dict:
         """Plain numbers, lists and dictionaries for JSON."""
         return {**asdict(self), "identical": self.identical, "gain": self.gain}
+
+
+def compare_clouds(
+    a: Path, b: Path, *, tolerance_ns: float = 1.0, chosen: PointFilter = EVERY, held: int = BUCKET_ROWS
+) -> Comparison:
+    """Compares the echoes of two clouds of one strip; b may be the strip itself, with the vendor's returns.
+
+    Echoes of a pulse (equal GPS time) are the same if they are at most `tolerance_ns` apart along the ray, one to one,
+    nearest first. If GPS times do not separate pulses, mutual nearest neighbours are the same. Points passed through
+    without an echo are ignored. chosen: only these points are compared, in both clouds. held: rows in memory at a
+    time; large clouds need room in TMPDIR.
+    Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance, an unknown column, or
+    coordinates without a length.
+    """
+    with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns, held) as task:
+        for reader, side in ((first, 0), (second, 1)):
+            reader.select(chosen)
+            for rows in read_echoes(reader):
+                task.add(side, rows)
+        found = task.finish(str(a), str(b))
+    return replace(found, left_out_a=first.left_out, left_out_b=second.left_out)
+
+
+def read_echoes(reader: CloudReader) -> Iterator[np.ndarray]:
+    """Pieces of a cloud, without the points that were passed through."""
+    for rows in reader.read_pieces():
+        yield rows[(rows["flags"] & np.uint16(PASSED_THROUGH)) == 0]
+
+
+_TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
+PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
+"""A pulse that counts even if neither side has an echo in it."""
+
+
+def compare_truth(
+    a: Path, truth: Path, *, tolerance_ns: float = 1.5, chosen: PointFilter = EVERY, held: int = BUCKET_ROWS
+) -> Comparison:
+    """Compares the echoes of a cloud with the truth of its simulated strip; raises as compare_clouds does.
+
+    chosen: only these points of the cloud; the truth is whole, so that true echoes of other points are missed. held:
+    rows in memory at a time.
+    """
+    with CloudReader(a) as cloud, TruthReader(truth) as reference:
+        cloud.select(chosen)
+        points = max(cloud.point_count, reference.meta.get("packets", 0))
+        names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
+        buckets = count_buckets(points, held)
+        with CloudTask(True, check_tolerance(tolerance_ns), buckets, reference.meta) as task:
+            for rows in read_echoes(cloud):
+                task.add(0, rows)
+            for piece in reference.read_pieces(*names):
+                rows = np.zeros(len(piece["gps_time"]), _TRUTH_DTYPE)
+                rows["xyz"] = np.stack([piece[name] for name in "xyz"], axis=1)
+                for name in ("gps_time", "amplitude", "flags", "isolated"):
+                    rows[name] = piece[name]
+                rows["echo_time"], rows["echo_width"] = piece["time"], piece["sigma"] * FWHM_PER_SIGMA
+                task.add(1, rows)
+            for piece in reference.read_pieces("packet_gps_time"):
+                task.add(2, piece["packet_gps_time"].view(PACKET_DTYPE))
+            return replace(task.finish(str(a), str(truth)), left_out_a=cloud.left_out)
+
+
+def check_tolerance(tolerance_ns: float) -> float:
+    """The tolerance; ConfigError if it is not above 0, or longer than any waveform."""
+    if not 0 < tolerance_ns < 1e6:
+        raise ConfigError(f"tolerance {tolerance_ns:g} ns (--within): must be above 0 and below 1e6")
+    return tolerance_ns
+
+
+# Rows of both sides, in buckets on disk
+
+LEAST_SHARED = 0.05
+"""Share of the pulses that two clouds of one strip have in common at least; else echoes are matched by position."""
+
+
+def open_task(
+    first: CloudReader, second: CloudReader, tolerance_ns: float, held: int = BUCKET_ROWS
+) -> CloudTask:
+    """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
+    by_time = pulses_told_apart(first) and pulses_told_apart(second) and _share_times(first, second)
+    for reader in (first, second):
+        reader.measure_in_metres()
+    points = max(first.point_count, second.point_count)
+    task = CloudTask(by_time, check_tolerance(tolerance_ns), count_buckets(points, held))
+    if not by_time and task.number > 1:
+        # Borders along x, so that all buckets have about the same number of points.
+        some = np.concatenate([rows["xyz"][::100, 0] for rows in first.read_pieces()])
+        task.borders = np.quantile(some, np.arange(1, task.number) / task.number)
+    return task
+
+
+def _share_times(first: CloudReader, second: CloudReader) -> bool:
+    """Whether enough pulses of the first piece of the shorter cloud are in the other cloud.
+
+    Formats round times differently: those of one flight in two formats are equal by chance only.
+    """
+    short, long = sorted((first, second), key=lambda reader: reader.point_count)
+    rows = next(short.read_pieces(), np.empty(0, CLOUD_DTYPE))
+    times = np.unique(rows["gps_time"])
+    found = np.zeros(len(times), bool)
+    for piece in long.read_pieces():
+        found |= np.isin(times, piece["gps_time"])
+        if found.mean() > LEAST_SHARED:
+            return True
+    return not len(rows)
+
+
+class CloudTask(Closing):
+    """One comparison: `add` puts rows of both sides into buckets, `finish` compares bucket by bucket.
+
+    A context manager, because temporary files hold the rows.
+    """
+
+    def __init__(self, by_time: bool, tolerance_ns: float, buckets: int, meta: dict | None = None) -> None:
+        self.by_time, self.pairing = by_time, Pairing(tolerance_ns, meta)
+        self.number = buckets
+        dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, PACKET_DTYPE)
+        self.buckets = [Spool(self.number, dtype) for dtype in dtypes]
+        self.borders = np.empty(0)
+
+    def close(self) -> None:
+        """Removes the temporary files."""
+        for bucket in self.buckets:
+            bucket.close()
+
+    def add(self, side: int, rows: np.ndarray) -> None:
+        """Adds rows of a (side 0), of b (1) or of the truth's packets (2)."""
+        if self.by_time:
+            self.buckets[side].append(spread_times(rows["gps_time"], self.number), rows)
+        else:
+            # Each point goes to its slab, and to the neighbouring slabs that it is close to.
+            low = np.searchsorted(self.borders, rows["xyz"][:, 0] - 2 * self.pairing.tolerance)
+            high = np.searchsorted(self.borders, rows["xyz"][:, 0] + 2 * self.pairing.tolerance)
+            steps = range(int((high - low).max(initial=0)) + 1)
+            inside = [np.flatnonzero(low + step <= high) for step in steps]
+            bucket = [low[near] + step for step, near in zip(steps, inside, strict=True)]
+            self.buckets[side].append(np.concatenate(bucket), rows[np.concatenate(inside)])
+
+    def finish(self, name_a: str, name_b: str) -> Comparison:
+        """Compares bucket by bucket and sums up."""
+        for number in range(self.number):
+            a, b, packets = (bucket.read(number) for bucket in self.buckets)
+            if self.by_time:
+                self.pairing.pair_by_time(a, b, packets)
+            else:
+                inside = (np.searchsorted(self.borders, rows["xyz"][:, 0]) == number for rows in (a, b))
+                self.pairing.pair_by_place(a, b, *inside)
+        return self.pairing.finish(name_a, name_b, "gps_time" if self.by_time else "position")
+
+
+# Pairs
+
+MOST_PER_PULSE = 64
+"""More echoes than this with one GPS time are not a pulse: such times are missing or rounded."""
+MOST_PAIRS = 20_000_000
+"""Most pairs of such echoes that are looked at; each needs about 100 bytes."""
 
 
 class Pairing:
@@ -418,6 +358,14 @@ class Pairing:
         self.breakdowns[side].add(rows, alone, others)
 
 
+def _list_counts(counts: np.ndarray) -> dict[int, int]:
+    return {number: int(pulses) for number, pulses in enumerate(counts) if pulses}
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")
+
+
 def pair_echoes(
     pulse_a: np.ndarray, xyz_a: np.ndarray, pulse_b: np.ndarray, xyz_b: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -462,160 +410,210 @@ def _list_crowded(
     return left[same], right[same]
 
 
-def check_tolerance(tolerance_ns: float) -> float:
-    """The tolerance; ConfigError if it is not above 0, or longer than any waveform."""
-    if not 0 < tolerance_ns < 1e6:
-        raise ConfigError(f"tolerance {tolerance_ns:g} ns (--within): must be above 0 and below 1e6")
-    return tolerance_ns
+# Differences of pairs
+
+SPEED = 0.9997 * HALF_C
+"""Metres along the ray per ns; the factor is the refractive index of air, n = 1.0003."""
+_BOTH = ("echo_time", "amplitude", "echo_width")
+"""Columns that are compared if both sides have them."""
+GROUPS = {"class": "classification", "echoes": "total"}
+"""By what differences are grouped: the LAS class, and the number of echoes of the pulse."""
 
 
-def _list_counts(counts: np.ndarray) -> dict[int, int]:
-    return {number: int(pulses) for number, pulses in enumerate(counts) if pulses}
+@frozen
+class ErrorSpread:
+    """Differences a minus b of one quantity, over the echoes that both sides have."""
+
+    number: int
+    median: float
+    mean: float
+    rms: float
+    nmad: float
 
 
-def _share(part: int, whole: int) -> float:
-    return part / whole if whole else float("nan")
+class Differences:
+    """Collects pairs of echoes (CLOUD_DTYPE): sums of all pairs, and an even sample of them for medians."""
+
+    def __init__(self, limit: int | None = None) -> None:
+        self._sample = EvenSample(limit)
+        self.sums = {name: np.zeros(3) for name in ("time", *_BOTH)}
+        self._grouped = {
+            (kind, side, name): np.zeros((256, 3)) for kind in GROUPS for side in "ab" for name in self.sums
+        }
+
+    def add(self, a: np.ndarray, b: np.ndarray) -> None:
+        """Adds pairs: a[i] with b[i]."""
+        part = {name: a[name].astype(np.float64) - b[name] for name in _BOTH}
+        part["time"] = measure_lag(a, b) / SPEED
+        for name, values in part.items():
+            good = values[~np.isnan(values)]
+            self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
+            for kind, column in GROUPS.items():
+                for side, rows in (("a", a), ("b", b)):
+                    group = rows[column][~np.isnan(values)]
+                    sums = self._grouped[kind, side, name]
+                    for place, weights in enumerate((None, good, np.square(good))):
+                        sums[:, place] += np.bincount(group, weights, len(sums))
+        for name in ("amplitude_err", "echo_width_err", "range_err"):
+            part[name] = a[name]
+        for name in ("amplitude", "echo_width", "flags"):
+            part[f"true_{name}"] = b[name]
+        for kind, column in GROUPS.items():
+            part |= {f"{kind}_a": a[column], f"{kind}_b": b[column]}
+        part["isolated"] = b["isolated"] if "isolated" in b.dtype.names else np.zeros(len(b), bool)
+        self._sample.add(part)
+
+    def spreads(self) -> dict[str, ErrorSpread]:
+        """Median, mean, rms and NMAD of a minus b, for each quantity that both sides have."""
+        data = self._sample.read()
+        return {name: _spread(sums, data[name]) for name, sums in self.sums.items() if sums[0]}
+
+    def groups(self) -> dict[str, dict[int, dict[str, ErrorSpread]]]:
+        """The same by kind of GROUPS and by number: of the class, and of the echoes that the pulse has.
+
+        A pair belongs to the group of its echo of b; where b has no groups (all are 0), to that of its echo of a.
+        Kinds in which both sides have none are left out. Medians of rare groups are NaN if the sample has none of them.
+        """
+        data, result = self._sample.read(), {}
+        for kind in GROUPS:
+            side = next((side for side in "ba" if self._grouped[kind, side, "time"][1:, 0].any()), None)
+            if side is None:
+                continue
+            result[kind] = {
+                group: {
+                    name: _spread(sums[group], data[name][data[f"{kind}_{side}"] == group])
+                    for name in self.sums if (sums := self._grouped[kind, side, name])[group, 0]
+                }
+                for group in np.flatnonzero(self._grouped[kind, side, "time"][:, 0]).tolist()
+            }  # fmt: skip
+        return result
+
+    def errors(self, meta: dict) -> dict[str, dict[str, ErrorStats]]:
+        """Errors of time [ns], amplitude [DN] and sigma [ns], in units of the bound and of the reported errors."""
+        data = self._sample.read()
+        if not data:
+            return {}
+        sigma = data["true_echo_width"].astype(np.float64) / FWHM_PER_SIGMA
+        amplitude = data["true_amplitude"].astype(np.float64)
+        sigma[~(sigma > 0)] = amplitude[~(amplitude > 0)] = np.nan  # of a damaged truth: there is no bound
+        reported = {name: data[name].astype(np.float64) for name in ("range_err", "amplitude_err", "echo_width_err")}
+        bounds = crlb(amplitude, sigma, meta["noise_std"], meta["spacing"])
+        columns = {
+            "time": (data["time"], bounds[0], reported["range_err"] / SPEED),
+            "echo_time": (data["echo_time"], bounds[0], reported["range_err"] / SPEED),
+            "amplitude": (data["amplitude"], bounds[1], reported["amplitude_err"]),
+            "sigma": (data["echo_width"] / FWHM_PER_SIGMA, bounds[2], reported["echo_width_err"] / FWHM_PER_SIGMA),
+        }
+        classes = {
+            "all": np.ones(len(sigma), bool),
+            "isolated": data["isolated"],
+            "overlapped": (data["true_flags"] & np.uint16(EchoFlag.OVERLAPPED)) != 0,
+        }
+        found: dict[str, dict[str, ErrorStats]] = {kind: {} for kind in classes}
+        for kind, rows in classes.items():
+            for name, (error, bound, expected) in columns.items():
+                known = rows & ~np.isnan(error)
+                found[kind][name] = ErrorStats.compute(error[known], bound[known], expected[known])
+        return found
 
 
-_TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
-LEAST_SHARED = 0.05
-"""Share of the pulses that two clouds of one strip have in common at least; else echoes are matched by position."""
+def _spread(sums: np.ndarray, values: np.ndarray) -> ErrorSpread:
+    """The spread from number, sum and sum of squares of all pairs, and from the differences of a sample of them."""
+    number, total, squares = sums.tolist()
+    values = values[~np.isnan(values)]
+    median = np.median(values) if len(values) else np.nan
+    nmad = MAD_TO_STD * np.median(np.abs(values - median)) if len(values) else np.nan
+    return ErrorSpread(int(number), float(median), total / number, float(np.sqrt(squares / number)), float(nmad))
 
-PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
-"""A pulse that counts even if neither side has an echo in it."""
 
+def measure_lag(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance of a after b along the ray [m], f8 (k,), positive away from the sensor.
 
-def compare_clouds(
-    a: Path, b: Path, *, tolerance_ns: float = 1.0, chosen: PointFilter = EVERY, held: int = BUCKET_ROWS
-) -> Comparison:
-    """Compares the echoes of two clouds of one strip; b may be the strip itself, with the vendor's returns.
-
-    Echoes of a pulse (equal GPS time) are the same if they are at most `tolerance_ns` apart along the ray, one to one,
-    nearest first. If GPS times do not separate pulses, mutual nearest neighbours are the same. Points passed through
-    without an echo are ignored. chosen: only these points are compared, in both clouds. held: rows in memory at a
-    time; large clouds need room in TMPDIR.
-    Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance, an unknown column, or
-    coordinates without a length.
+    The ray is the packet vector of b, or of a; without both, the lower point counts as the farther one.
     """
-    with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns, held) as task:
-        for reader, side in ((first, 0), (second, 1)):
-            reader.select(chosen)
-            for rows in read_echoes(reader):
-                task.add(side, rows)
-        found = task.finish(str(a), str(b))
-    return replace(found, left_out_a=first.left_out, left_out_b=second.left_out)
+    step = a["xyz"] - b["xyz"]
+    ray = np.where(np.any(b["ray"] != 0, axis=1)[:, None], b["ray"], a["ray"]).astype(np.float64)
+    length = np.linalg.norm(ray, axis=1)
+    known = length > 0
+    down = -np.sign(ray[:, 2]) / np.where(known, length, 1.0)
+    along = np.einsum("ij,ij->i", step, ray) * down
+    by_height = np.linalg.norm(step, axis=1) * -np.sign(step[:, 2])
+    return np.where(known & (down != 0), along, by_height)
 
 
-def open_task(
-    first: CloudReader, second: CloudReader, tolerance_ns: float, held: int = BUCKET_ROWS
-) -> CloudTask:
-    """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
-    by_time = pulses_told_apart(first) and pulses_told_apart(second) and _share_times(first, second)
-    for reader in (first, second):
-        reader.measure_in_metres()
-    points = max(first.point_count, second.point_count)
-    task = CloudTask(by_time, check_tolerance(tolerance_ns), count_buckets(points, held))
-    if not by_time and task.number > 1:
-        # Borders along x, so that all buckets have about the same number of points.
-        some = np.concatenate([rows["xyz"][::100, 0] for rows in first.read_pieces()])
-        task.borders = np.quantile(some, np.arange(1, task.number) / task.number)
-    return task
+# Echoes without a partner, by possible reasons
+
+_OCTAVES = 18
+"""Classes of amplitude: below 1, then one per doubling; the last one holds everything larger."""
+_NUMBERS = 16
+"""Return numbers that a LAS point can hold, 0 to 15."""
 
 
-def read_echoes(reader: CloudReader) -> Iterator[np.ndarray]:
-    """Pieces of a cloud, without the points that were passed through."""
-    for rows in reader.read_pieces():
-        yield rows[(rows["flags"] & np.uint16(PASSED_THROUGH)) == 0]
+def name_class(number: int) -> str:
+    """A LAS class with its name, if the standard has one."""
+    return f"{number} {CLASS_NAMES[number]}" if number in CLASS_NAMES else str(number)
 
 
-def compare_truth(
-    a: Path, truth: Path, *, tolerance_ns: float = 1.5, chosen: PointFilter = EVERY, held: int = BUCKET_ROWS
-) -> Comparison:
-    """Compares the echoes of a cloud with the truth of its simulated strip; raises as compare_clouds does.
-
-    chosen: only these points of the cloud; the truth is whole, so that true echoes of other points are missed. held:
-    rows in memory at a time.
-    """
-    with CloudReader(a) as cloud, TruthReader(truth) as reference:
-        cloud.select(chosen)
-        points = max(cloud.point_count, reference.meta.get("packets", 0))
-        names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
-        buckets = count_buckets(points, held)
-        with CloudTask(True, check_tolerance(tolerance_ns), buckets, reference.meta) as task:
-            for rows in read_echoes(cloud):
-                task.add(0, rows)
-            for piece in reference.read_pieces(*names):
-                rows = np.zeros(len(piece["gps_time"]), _TRUTH_DTYPE)
-                rows["xyz"] = np.stack([piece[name] for name in "xyz"], axis=1)
-                for name in ("gps_time", "amplitude", "flags", "isolated"):
-                    rows[name] = piece[name]
-                rows["echo_time"], rows["echo_width"] = piece["time"], piece["sigma"] * FWHM_PER_SIGMA
-                task.add(1, rows)
-            for piece in reference.read_pieces("packet_gps_time"):
-                task.add(2, piece["packet_gps_time"].view(PACKET_DTYPE))
-            return replace(task.finish(str(a), str(truth)), left_out_a=cloud.left_out)
+_OCTAVE_NAMES = ["below 1", *(f"{1 << n}-{2 << n}" for n in range(_OCTAVES - 2)), f"from {1 << (_OCTAVES - 2)}"]
+_NAMES = {
+    "return": [f"{number} of {total}" for total in range(_NUMBERS) for number in range(_NUMBERS)],
+    "class": [name_class(number) for number in range(256)],
+    "amplitude": _OCTAVE_NAMES,
+    "intensity": _OCTAVE_NAMES,
+    "pulse": ["nothing of the other side", "other echoes of the other side"],
+    "flag": [*(flag.name for flag in EchoFlag), "none"],
+}
+"""Per kind of class the names of its classes."""
 
 
-def _share_times(first: CloudReader, second: CloudReader) -> bool:
-    """Whether enough pulses of the first piece of the shorter cloud are in the other cloud.
+class Breakdown:
+    """Counts echoes of one side, with and without a partner on the other side, by possible reasons."""
 
-    Formats round times differently: those of one flight in two formats are equal by chance only.
-    """
-    short, long = sorted((first, second), key=lambda reader: reader.point_count)
-    rows = next(short.read_pieces(), np.empty(0, CLOUD_DTYPE))
-    times = np.unique(rows["gps_time"])
-    found = np.zeros(len(times), bool)
-    for piece in long.read_pieces():
-        found |= np.isin(times, piece["gps_time"])
-        if found.mean() > LEAST_SHARED:
-            return True
-    return not len(rows)
+    def __init__(self) -> None:
+        self._tallies = {kind: np.zeros((len(names), 2), np.int64) for kind, names in _NAMES.items()}
+
+    def add(self, rows: np.ndarray, alone: np.ndarray, others: np.ndarray | None) -> None:
+        """Adds echoes (k,), CLOUD_DTYPE.
+
+        alone: echoes without a partner, bool (k,). others: number of echoes of the other side in the pulse of each
+        echo, (k,); None if unknown.
+        """
+        numbered = rows["number"] > 0
+        code = np.minimum(rows["total"], _NUMBERS - 1) * np.int64(_NUMBERS) + np.minimum(rows["number"], _NUMBERS - 1)
+        self._count("return", code[numbered], alone[numbered])
+        self._count("class", rows["classification"], alone)
+        known = ~np.isnan(rows["amplitude"])
+        self._count("amplitude", _octave(rows["amplitude"][known]), alone[known])
+        self._count("intensity", _octave(rows["intensity"]), alone)
+        if others is not None:
+            self._count("pulse", (others > 0).astype(np.int64), alone)
+        flags = [*((rows["flags"] & np.uint16(flag)) != 0 for flag in EchoFlag), rows["flags"] == 0]
+        for place, has in enumerate(flags):
+            self._count("flag", np.full(int(has.sum()), place), alone[has])
+
+    def _count(self, kind: str, code: np.ndarray, alone: np.ndarray) -> None:
+        tally = self._tallies[kind]
+        tally[:, 0] += np.bincount(code[alone], minlength=len(tally))
+        tally[:, 1] += np.bincount(code, minlength=len(tally))
+
+    def tables(self) -> dict[str, Table]:
+        """For each kind the classes that have an echo; kinds without data are left out.
+
+        `intensity` is there only without amplitudes and if not all are 0; `flag` and `class` only if any echo has one.
+        """
+        tables = {}
+        for kind, tally in self._tallies.items():
+            rows = np.flatnonzero(tally[:, 1]).tolist()
+            tables[kind] = {_NAMES[kind][row]: (int(tally[row, 0]), int(tally[row, 1])) for row in rows}
+        if tables["amplitude"] or set(tables["intensity"]) <= {_OCTAVE_NAMES[0]}:
+            del tables["intensity"]
+        if set(tables["flag"]) <= {"none"}:
+            del tables["flag"]
+        if set(tables["class"]) <= {name_class(0)}:
+            del tables["class"]
+        return {kind: table for kind, table in tables.items() if table}
 
 
-class CloudTask(Closing):
-    """One comparison: `add` puts rows of both sides into buckets, `finish` compares bucket by bucket.
-
-    A context manager, because temporary files hold the rows.
-    """
-
-    def __init__(self, by_time: bool, tolerance_ns: float, buckets: int, meta: dict | None = None) -> None:
-        self.by_time, self.pairing = by_time, Pairing(tolerance_ns, meta)
-        self.number = buckets
-        dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, PACKET_DTYPE)
-        self.buckets = [Spool(self.number, dtype) for dtype in dtypes]
-        self.borders = np.empty(0)
-
-    def close(self) -> None:
-        """Removes the temporary files."""
-        for bucket in self.buckets:
-            bucket.close()
-
-    def add(self, side: int, rows: np.ndarray) -> None:
-        """Adds rows of a (side 0), of b (1) or of the truth's packets (2)."""
-        if self.by_time:
-            self.buckets[side].append(spread_times(rows["gps_time"], self.number), rows)
-        else:
-            index, bucket = self._sort_by_place(rows)
-            self.buckets[side].append(bucket, rows[index])
-
-    def _sort_by_place(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The slab of each point, and the neighbouring slabs that it is close to."""
-        index, bucket = [], []
-        low = np.searchsorted(self.borders, rows["xyz"][:, 0] - 2 * self.pairing.tolerance)
-        high = np.searchsorted(self.borders, rows["xyz"][:, 0] + 2 * self.pairing.tolerance)
-        for step in range(int((high - low).max(initial=0)) + 1):
-            inside = np.flatnonzero(low + step <= high)
-            index.append(inside)
-            bucket.append(low[inside] + step)
-        return np.concatenate(index), np.concatenate(bucket)
-
-    def finish(self, name_a: str, name_b: str) -> Comparison:
-        """Compares bucket by bucket and sums up."""
-        for number in range(self.number):
-            a, b, packets = (bucket.read(number) for bucket in self.buckets)
-            if self.by_time:
-                self.pairing.pair_by_time(a, b, packets)
-            else:
-                inside = (np.searchsorted(self.borders, rows["xyz"][:, 0]) == number for rows in (a, b))
-                self.pairing.pair_by_place(a, b, *inside)
-        return self.pairing.finish(name_a, name_b, "gps_time" if self.by_time else "position")
+def _octave(values: np.ndarray) -> np.ndarray:
+    """Classes of amplitudes: 0 below 1, 1 from 1 to 2, 2 from 2 to 4 ..., i8 (k,)."""
+    return np.clip(np.frexp(np.clip(values.astype(np.float64), 0.0, 1e9))[1], 0, _OCTAVES - 1).astype(np.int64)

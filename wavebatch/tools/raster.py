@@ -21,7 +21,6 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Above, Range, check_options, option
-from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
 from wavebatch.files.las.crs import read_crs_definition
@@ -288,7 +287,7 @@ def _zeroed(values: np.ndarray) -> np.ndarray:
 
 
 def _read_facts(path: Path) -> dict:
-    """The record that voxelize wrote."""
+    """The record that voxelize wrote; ConfigError for none, and for one that it cannot have written."""
     records = (vlr for vlr in read_header(path).vlrs if vlr.user == "wavebatch" and vlr.record_id == 1)
     for vlr in records:
         try:
@@ -296,19 +295,14 @@ def _read_facts(path: Path) -> dict:
         except ValueError:
             continue
         if isinstance(facts, dict) and facts.get("forest"):
-            return _check_facts(facts, path)
+            ratio = facts.get("reflectance_ratio")
+            ratio = ratio if isinstance(ratio, dict) else {}
+            numbers = facts.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
+            if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
+                raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it "
+                                  "anew with wavebatch voxelize --forest")  # fmt: skip
+            return facts
     raise ConfigError(f"{path}: --forest needs voxels: wavebatch voxelize STRIP --size 1 --forest -o voxels.laz")
-
-
-def _check_facts(facts: dict, path: Path) -> dict:
-    """The record, with a size and a ratio of reflectances that voxelize can have written; ConfigError for others."""
-    ratio = facts.get("reflectance_ratio")
-    ratio = ratio if isinstance(ratio, dict) else {}
-    numbers = facts.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
-    if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
-        raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it anew with "
-                          "wavebatch voxelize --forest")  # fmt: skip
-    return facts
 
 
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
@@ -373,7 +367,11 @@ def write_grid(
                               "--bbox takes whole cells")  # fmt: skip
         metrics = Forest(paths, options.size, options.forest)
         options = replace(options, columns=tuple(COLUMNS))
-    _check(options)
+    cells.check_cells(options.statistic, options.bbox)
+    cells.check_statistic(next(iter(options.columns), None), options.statistic)
+    check_options(options)
+    if not (math.isnan(options.no_data) or abs(options.no_data) <= float(np.finfo(np.float32).max)):
+        raise ConfigError(f"--no-data must be nan or a number that float32 holds, got {options.no_data:g}")
     if options.bbox is not None:  # up to the next borders of cells, so that no cell holds a part of its points only
         west, south, east, north = (value / options.size for value in options.bbox)
         borders = math.floor(west), math.floor(south), math.ceil(east), math.ceil(north)
@@ -392,10 +390,15 @@ def write_grid(
                           "the clouds; --size 1e-05 gives cells of about 1 m")  # fmt: skip
     grid = _lay_out(str(paths[0]), box, options)
     west, _, _, north = grid.extent
-    dtype = _choose_dtype(facts, largest) if metrics is None else "float32"
+    # float32 where that holds neighbouring values of each column apart.
+    wide = (one.name == "gps_time" or one.step > 0 and top > _EXACT * one.step
+            for one, top in zip(facts, largest, strict=True))  # fmt: skip
+    dtype = "float64" if metrics is None and any(wide) else "float32"
     layout = RasterLayout(west, north, grid.size, grid.rows, grid.columns, dtype, options.no_data, crs, unit)
     if metrics is None:
-        bands, statistic = [_describe(one, options.statistic, unit) for one in facts], options.statistic
+        statistic = options.statistic
+        units = {"count": "", "density": f"1/{unit}2"}
+        bands = [Band(f"{statistic} of {one.name}", units.get(statistic, one.unit.strip("-"))) for one in facts]
     else:
         bands, statistic = metrics.list_bands(largest[COLUMNS.index("height")]), metrics.compute
     result = GridResult(layout=layout, bands=tuple(bands), unnamed=unnamed)
@@ -411,14 +414,6 @@ def write_grid(
         result.reasons = tuple(metrics.reasons.tolist())
         result.values = (*[result.reasons[KNOWN]] * (len(bands) - 1), result.filled)
     return result
-
-
-def _check(options: GridOptions) -> None:
-    cells.check_cells(options.statistic, options.bbox)
-    cells.check_statistic(next(iter(options.columns), None), options.statistic)
-    check_options(options)
-    if not (math.isnan(options.no_data) or abs(options.no_data) <= float(np.finfo(np.float32).max)):
-        raise ConfigError(f"--no-data must be nan or a number that float32 holds, got {options.no_data:g}")
 
 
 def _find_crs(paths: Sequence[Path], given: str | None) -> tuple[str | None, str, tuple[Path, ...]]:
@@ -459,13 +454,6 @@ def _find_extent(clouds: cells.Clouds, options: GridOptions) -> tuple[cells.Box,
     return options.bbox or (*low.tolist(), *high.tolist()), points, largest
 
 
-def _choose_dtype(facts: Sequence[ColumnFacts], largest: np.ndarray) -> str:
-    """float32, or float64 where that would not hold neighbouring values of a column apart."""
-    wide = (one.name == "gps_time" or one.step > 0 and top > _EXACT * one.step
-            for one, top in zip(facts, largest, strict=True))  # fmt: skip
-    return "float64" if any(wide) else "float32"
-
-
 def _lay_out(where: str, box: cells.Box, options: GridOptions) -> cells.Grid:
     """The cells of the raster; ConfigError for too many."""
     west, south, east, north = box
@@ -482,8 +470,3 @@ def _lay_out(where: str, box: cells.Box, options: GridOptions) -> cells.Grid:
         last = max(round(east / size) - 1, first[0]), max(round(north / size) - 1, first[1])
         return cells.Grid(size, *first, last[1] - first[1] + 1, last[0] - first[0] + 1)
     return cells.Grid.cover(box, size)
-
-
-def _describe(facts: ColumnFacts, statistic: str, length: str) -> Band:
-    unit = {"count": "", "density": f"1/{length}2"}.get(statistic, facts.unit.strip("-"))
-    return Band(f"{statistic} of {facts.name}", unit)

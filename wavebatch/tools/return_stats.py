@@ -238,7 +238,8 @@ class AreaTally:
         """Adds whole pulses: a pulse belongs, with all its returns, to the area of its first return.
 
         rows: returns sorted by pulse, then number; first: row of the first return of each pulse; pairs: rows that form
-        a pair with the next row, and their distances [m]; depths: from `measure_depths`.
+        a pair with the next row, and their distances [m]; depths: pulses with several returns, and the height of their
+        first above their last return [m].
         """
         (before, distance), (pulses, depth) = pairs, depths
         places = rows["xyz"][first]
@@ -299,19 +300,6 @@ class AreaTally:
             several=several,
             depth=float(sums["depth"]) / several if several else math.nan,
         )
-
-
-def measure_depths(rows: np.ndarray, first: np.ndarray, up: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pulses with several returns, and the height of their first above their last return [m].
-
-    rows: returns sorted by pulse, then number; first: row of the first return of each pulse; up: metres of a step of 1
-    in height.
-    """
-    last = np.append(first[1:], len(rows)) - 1
-    with np.errstate(invalid="ignore", over="ignore"):
-        depth = up * (rows["xyz"][first, 2] - rows["xyz"][last, 2])
-    pulses = np.flatnonzero((last > first) & np.isfinite(depth))
-    return pulses, depth[pulses]
 
 
 def _share_counts(counts: np.ndarray) -> dict[int, float]:
@@ -457,8 +445,13 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter,
         with Spool(number, _ROW) as buckets:
             keys = _Keys(by_time)
             for rows in reader.read_pieces(held):
-                tally.add_points(rows)
-                shaped = _shape(rows, keys.of(rows))
+                if tally.flags is not None:
+                    tally.flags += [int(np.count_nonzero(rows["flags"] & np.uint16(flag))) for flag in EchoFlag]
+                shaped = np.zeros(len(rows), _ROW)
+                shaped["key"] = keys.of(rows)
+                for name in ("xyz", "number", "total"):
+                    shaped[name] = rows[name]
+                shaped["echo"] = (rows["flags"] & np.uint16(PASSED_THROUGH)) == 0
                 buckets.append(spread_keys(shaped["key"], number), shaped)
             for bucket in range(number):
                 tally.add_pulses(buckets.read(bucket))
@@ -499,15 +492,6 @@ class _Keys:
         return pulse.astype(np.uint64)
 
 
-def _shape(rows: np.ndarray, key: np.ndarray) -> np.ndarray:
-    shaped = np.zeros(len(rows), _ROW)
-    shaped["key"] = key
-    for name in ("xyz", "number", "total"):
-        shaped[name] = rows[name]
-    shaped["echo"] = (rows["flags"] & np.uint16(PASSED_THROUGH)) == 0
-    return shaped
-
-
 @dataclass(slots=True, eq=False)
 class _Tally:
     """Sums of one cloud; tallies of several clouds can be merged."""
@@ -526,11 +510,6 @@ class _Tally:
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Of a step of 1 in x, y and z; NaN in degrees, which have no distances."""
 
-    def add_points(self, rows: np.ndarray) -> None:
-        """Adds the flags of some points."""
-        if self.flags is not None:
-            self.flags += [int(np.count_nonzero(rows["flags"] & np.uint16(flag))) for flag in EchoFlag]
-
     def add_pulses(self, rows: np.ndarray) -> None:
         """Adds counts and separations of whole pulses, in any order."""
         if not len(rows):
@@ -539,7 +518,12 @@ class _Tally:
         first = np.flatnonzero(np.concatenate([[True], rows["key"][1:] != rows["key"][:-1]]))
         counts = np.diff(np.append(first, len(rows)))
         self.incomplete += int(np.count_nonzero(counts != rows["total"][first]))
-        depths = measure_depths(rows, first, self.metres[2])
+        # Pulses with several returns, and the height of their first above their last return [m].
+        last = np.append(first[1:], len(rows)) - 1
+        with np.errstate(invalid="ignore", over="ignore"):
+            depth = self.metres[2] * (rows["xyz"][first, 2] - rows["xyz"][last, 2])
+        several = np.flatnonzero((last > first) & np.isfinite(depth))
+        depths = several, depth[several]
         self.depth += float(depths[1].sum())
         pair = (rows["key"][1:] == rows["key"][:-1]) & rows["echo"][1:] & rows["echo"][:-1]
         before = np.flatnonzero(pair & (rows["number"][1:] == rows["number"][:-1] + 1) & (rows["number"][:-1] > 0))

@@ -108,7 +108,8 @@ def read_scan_lines(
         parts = rest + [_shape(block) for block, _ in reader.read_blocks(unit, _BLOCK, True)]
         if not parts:
             continue
-        pulses = _join(parts)
+        names = [field.name for field in fields(_Pulses)]
+        pulses = _Pulses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
         pulses = _join_waveforms(pulses.take(np.argsort(pulses.point, kind="stable")))
         flat, length = pulses.direction[:, :2], np.linalg.norm(pulses.direction, axis=1)
         if axis is None:  # across the flight: where rays spread most
@@ -151,11 +152,6 @@ def _shape(block: WaveformBlock) -> _Pulses:
     place = (block.point, block.gps_time, block.origin, block.direction)
     time = np.tile(np.arange(s) * block.spacing, n)
     return _Pulses(*place, np.full(n, block.spacing), np.full(n, s), time, values.reshape(-1))
-
-
-def _join(parts: list[_Pulses]) -> _Pulses:
-    names = [field.name for field in fields(_Pulses)]
-    return _Pulses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _join_waveforms(waveforms: _Pulses) -> _Pulses:
@@ -349,19 +345,14 @@ def find_segments(piece: Slice, options: SliceOptions) -> list[Segment]:
         return []
     x, y = piece.x[rows], piece.y[rows]
     weight, sigma = piece.line.value[rows].astype(np.float64), options.sigma / piece.line.spacing
-    gap = _choose_gap(piece)
+    gap = _GAP  # the largest hole in a segment [pixels]: ten, or three pulses if they lie farther apart
+    if piece.geometry != "time":
+        step = np.diff(piece.line.origin @ piece.axis) / piece.pixel
+        gap = max(_GAP, _PULSES_PER_GAP * float(np.median(np.abs(step))))
     # A flat surface is no straight line over time, so bends mean ridges in a plane only.
     pulse = piece.line.row[rows] if piece.geometry == "plane" else None
     lines = find_lines(x, y, weight, sigma=sigma, gap=gap, shortest=options.shortest, most=options.most, pulse=pulse)
     return [_describe(piece, found, rows[found.rows], number) for number, found in enumerate(lines)]
-
-
-def _choose_gap(piece: Slice) -> float:
-    """Largest hole in a segment [pixels]: ten, or three pulses if they lie farther apart."""
-    if piece.geometry == "time":
-        return _GAP
-    step = np.diff(piece.line.origin @ piece.axis) / piece.pixel
-    return max(_GAP, _PULSES_PER_GAP * float(np.median(np.abs(step))))
 
 
 def _describe(piece: Slice, found: HoughLine, rows: np.ndarray, number: int) -> Segment:
@@ -369,6 +360,14 @@ def _describe(piece: Slice, found: HoughLine, rows: np.ndarray, number: int) -> 
     start, end = piece.locate(found.start), piece.locate(found.end)
     apart = np.subtract(end, start)
     pulses = np.unique(line.row[rows])
+    # Spread of the centroids of pulses about the line, so that the width of a pulse does not count.
+    theta = np.radians(found.theta)
+    off = piece.x[rows] * np.cos(theta) + piece.y[rows] * np.sin(theta) - found.rho
+    if piece.geometry == "time":
+        off = off / max(np.cos(theta), 1e-9)
+    weight = line.value[rows].astype(np.float64)
+    sums, moments = np.bincount(line.row[rows], weight), np.bincount(line.row[rows], weight * off)
+    centroid = moments[sums > 0] / sums[sums > 0]
     return Segment(
         line=line.number,
         segment=number,
@@ -377,7 +376,7 @@ def _describe(piece: Slice, found: HoughLine, rows: np.ndarray, number: int) -> 
         ends=(piece.scale(found.start), piece.scale(found.end)),
         length=float(np.linalg.norm(apart)),
         slope=float(np.degrees(np.arctan2(apart[2], np.hypot(apart[0], apart[1])))),
-        residual=_measure_residual(piece, found, rows),
+        residual=float(np.sqrt(np.mean(centroid**2)) * piece.pixel),
         pulses=len(pulses),
         first_pulse=int(pulses[0]),
         last_pulse=int(pulses[-1]),
@@ -386,16 +385,3 @@ def _describe(piece: Slice, found: HoughLine, rows: np.ndarray, number: int) -> 
         rho=found.rho,
         weight=found.weight,
     )
-
-
-def _measure_residual(piece: Slice, found: HoughLine, rows: np.ndarray) -> float:
-    """Spread of the centroids of pulses about the line, so that the width of a pulse does not count."""
-    theta = np.radians(found.theta)
-    off = piece.x[rows] * np.cos(theta) + piece.y[rows] * np.sin(theta) - found.rho
-    if piece.geometry == "time":
-        off = off / max(np.cos(theta), 1e-9)
-    weight = piece.line.value[rows].astype(np.float64)
-    sums = np.bincount(piece.line.row[rows], weight)
-    moments = np.bincount(piece.line.row[rows], weight * off)
-    centroid = moments[sums > 0] / sums[sums > 0]
-    return float(np.sqrt(np.mean(centroid**2)) * piece.pixel)

@@ -322,7 +322,19 @@ class SegmentWriter(Closing):
     def write(self, segments: Sequence[Segment]) -> None:
         """Appends segments."""
         for segment in segments:
-            self._put(self._feature(segment) if self._geojson else _row(segment))
+            if self._geojson:
+                ends = np.array([segment.start, segment.end])
+                feature = {
+                    "type": "Feature",
+                    "geometry": {"type": "LineString", "coordinates": self._crs.place(ends)},
+                    "properties": {name: getattr(segment, name) for name in ("line", "segment", *_FIGURES)},
+                }
+                self._put((",\n" if self._count else "\n") + json.dumps(feature))
+            else:
+                places = [f"{value:.4f}" for value in (*segment.start, *segment.end)]
+                values = [getattr(segment, name) for name in _FIGURES]
+                texts = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
+                self._put(",".join([str(segment.line), str(segment.segment), *places, *texts]) + "\n")
             self._count += 1
 
     def commit(self) -> None:
@@ -331,25 +343,9 @@ class SegmentWriter(Closing):
             self._put("\n]}\n")
         self._draft.publish()
 
-    def _feature(self, segment: Segment) -> str:
-        ends = np.array([segment.start, segment.end])
-        feature = {
-            "type": "Feature",
-            "geometry": {"type": "LineString", "coordinates": self._crs.place(ends)},
-            "properties": {name: getattr(segment, name) for name in ("line", "segment", *_FIGURES)},
-        }
-        return (",\n" if self._count else "\n") + json.dumps(feature)
-
     def _put(self, text: str) -> None:
         with reporting(self.target):
             self._draft.file.write(text.encode())
-
-
-def _row(segment: Segment) -> str:
-    ends = [f"{value:.4f}" for value in (*segment.start, *segment.end)]
-    values = [getattr(segment, name) for name in _FIGURES]
-    texts = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
-    return ",".join([str(segment.line), str(segment.segment), *ends, *texts]) + "\n"
 
 
 def draw_slice(

@@ -262,7 +262,11 @@ def style_columns(
         if not column.extra_bytes:
             continue
         naming = STYLES[style].get(key, Naming(key))
-        name = _avoid(naming.name, used)
+        name, number = naming.name, 1
+        while normalise(name) in used:
+            # Without spaces, because PDAL takes only identifiers in its expressions.
+            name = ("wb_" if number == 1 else f"wb{number}_") + naming.name.replace(" ", "_")
+            number += 1
         used.add(normalise(name))
         dtype = naming.dtype or column.dtype
         empty = column.no_data if naming.no_data is None else naming.no_data
@@ -271,15 +275,6 @@ def style_columns(
         record = las.ExtraRecord.build(name, dtype, describe(column, naming.unit), no_data=empty, scale=naming.scale)
         written.append(WrittenColumn(key, record, naming))
     return written
-
-
-def _avoid(name: str, used: Collection[str]) -> str:
-    candidate, number = name, 1
-    while normalise(candidate) in used:
-        prefix = "wb_" if number == 1 else f"wb{number}_"
-        # Without spaces, because PDAL takes only identifiers in its expressions.
-        candidate, number = prefix + name.replace(" ", "_"), number + 1
-    return candidate
 
 
 def describe_roundings(written: Sequence[WrittenColumn]) -> list[str]:

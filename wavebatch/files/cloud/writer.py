@@ -74,7 +74,14 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
         modern = las.MODERN.get(target, target)
         wkt = convert_geotiff(path, header.vlrs, asked=False) if only_keys else None
         if only_keys and wkt is None:
-            return Version(max(header.version, (1, 4)), target, notes=(_explain_keys(target, modern), *notes))
+            why = "its CRS is given by GeoTIFF keys that wavebatch cannot turn into WKT, "
+            why += "which point formats 6 to 10 need"
+            note = f"{why}: PDAL will not read the cloud unless readers.las gets nosrs=true; "
+            note += "add a WKT record to the strip"
+            if target < 6:
+                note = f"written in point format {target} of LAS 1.4 in place of {modern}: {why}; "
+                note += f"--point-format {modern} tries"
+            return Version(max(header.version, (1, 4)), target, notes=(note, *notes))
         return Version(max(header.version, (1, 4)), modern, wkt or repaired, notes)
     wkt = repaired
     if only_keys and target >= 6:
@@ -98,15 +105,6 @@ def _repair(path: Path, header: las.LasHeader, evlrs: Sequence[las.Evlr] = ()) -
     wkt = next((new.payload.rstrip(b"\0").decode() for old, new in pairs if new is not old), None)
     wrong = wkt is not None or any(repair_evlr(path, evlr) is not None for evlr in evlrs)
     return wkt, (_REPAIRED,) * wrong
-
-
-def _explain_keys(target: int, modern: int) -> str:
-    reason = "its CRS is given by GeoTIFF keys that wavebatch cannot turn into WKT, which point formats 6 to 10 need"
-    if target < 6:
-        return (
-            f"written in point format {target} of LAS 1.4 in place of {modern}: {reason}; --point-format {modern} tries"
-        )
-    return f"{reason}: PDAL will not read the cloud unless readers.las gets nosrs=true; add a WKT record to the strip"
 
 
 def _tell_crs(records: Sequence[Any]) -> tuple[bool, bool]:
@@ -243,10 +241,18 @@ class OutputLayout:
         las.copy_standard(np.ascontiguousarray(source), rows, self.source.header.point_format, self.point_format)
         if xyz is not None and len(rows):
             self._set_coordinates(rows, np.asarray(xyz, np.float64))
-        self._set_returns(rows, return_number, number_of_returns)
+        bits = 4 if self.point_format >= 6 else 3
+        for shift, values in ((0, return_number), (bits, number_of_returns)):
+            if values is not None:
+                cut = np.minimum(values, self.max_return).astype(np.uint8) << np.uint8(shift)
+                rows["bit_fields"] = (rows["bit_fields"] & np.uint8(255 ^ (self.max_return << shift))) | cut
         self._carry(rows, source, matched)
-        if self.packets is not None:
-            self._point_at_packets(self.packets, rows, None if xyz is None else xyz[:, 0], time)
+        if self.packets is not None and self.packets.shift:
+            has_packet = rows["wavepacket_index"] > 0
+            rows["wavepacket_offset"][has_packet] += np.uint64(self.packets.shift)
+        if self.packets is not None and time is not None and xyz is not None:
+            new = np.isfinite(time) & np.isfinite(xyz[:, 0])
+            rows["return_point_wave_location"][new] = np.asarray(time)[new] * 1000.0
         self.fill(rows, columns)
         for field, column in self._columns:
             if column.column not in columns:
@@ -279,14 +285,6 @@ class OutputLayout:
                 )
             rows[name] = np.where(new, counts, rows[name])
 
-    def _set_returns(self, rows: np.ndarray, number: np.ndarray | None, count: np.ndarray | None) -> None:
-        bits = 4 if self.point_format >= 6 else 3
-        limit = self.max_return
-        for shift, values in ((0, number), (bits, count)):
-            if values is not None:
-                cut = np.minimum(values, limit).astype(np.uint8)
-                rows["bit_fields"] = (rows["bit_fields"] & np.uint8(255 ^ (limit << shift))) | (cut << np.uint8(shift))
-
     def _carry(self, rows: np.ndarray, source: np.ndarray, matched: np.ndarray | None) -> None:
         if not self.carried:
             return
@@ -300,18 +298,6 @@ class OutputLayout:
             empty = carried.record.no_data
             if not (self.whole or matched is None or empty is None):
                 rows[name][~np.asarray(matched)] = empty if len(empty) > 1 else empty[0]
-
-    @staticmethod
-    def _point_at_packets(
-        packets: PacketPlace, rows: np.ndarray, x: np.ndarray | None, time: np.ndarray | None
-    ) -> None:
-        if packets.shift:
-            has_packet = rows["wavepacket_index"] > 0
-            offset = rows["wavepacket_offset"]
-            offset[has_packet] = offset[has_packet] + np.uint64(packets.shift)
-        if time is not None and x is not None:
-            new = np.isfinite(time) & np.isfinite(x)
-            rows["return_point_wave_location"][new] = np.asarray(time)[new] * 1000.0
 
 
 def plan_output(
@@ -415,8 +401,12 @@ class CloudWriter(PointFile):
         self._inputs = [layout.source.path, *([packets.file] if packets else [])]
         self._evlrs, self.dropped = _choose_evlrs(layout.source.path, layout.source.header)
         header = _build_header(layout, provenance, self._evlrs)
-        for name in _clean_ids(header.vlrs):
-            self.dropped[name] = "bytes of its id or description that are no UTF-8 text are question marks"
+        for place, vlr in enumerate(header.vlrs):  # laspy opens no file with ids that are no UTF-8
+            clean = replace(vlr, user_id=_as_text(vlr.user_id), description=_as_text(vlr.description))
+            if clean != vlr:
+                header.vlrs[place] = clean
+                name = f"VLR {clean.user} {vlr.record_id}"
+                self.dropped[name] = "bytes of its id or description that are no UTF-8 text are question marks"
         with protecting(self._inputs):
             super().__init__(target, header, layout.dtype, layout.extra_records, overwrite=overwrite)
 
@@ -503,17 +493,6 @@ def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: li
         creation=source.creation,
         gps_offset=source.gps_offset,
     )
-
-
-def _clean_ids(vlrs: list[las.Vlr]) -> list[str]:
-    """Make ids and descriptions UTF-8, in place, and name the records: laspy opens no file with others."""
-    changed = []
-    for place, vlr in enumerate(vlrs):
-        clean = replace(vlr, user_id=_as_text(vlr.user_id), description=_as_text(vlr.description))
-        if clean != vlr:
-            vlrs[place] = clean
-            changed.append(f"VLR {clean.user} {vlr.record_id}")
-    return changed
 
 
 def _as_text(field: bytes) -> bytes:

@@ -241,7 +241,13 @@ class Draft(contextlib.AbstractContextManager):
                     raise InputError(_exists(self.target)) from None
             else:
                 self.published = True
-            _sync_folder(self.target.parent)
+            # The new name survives a power cut; Windows cannot open folders, some file systems cannot sync them.
+            with contextlib.suppress(OSError):
+                descriptor = os.open(self.target.parent, os.O_RDONLY)
+                try:
+                    os.fsync(descriptor)
+                finally:
+                    os.close(descriptor)
         self.discard()
 
     def discard(self) -> None:
@@ -251,12 +257,6 @@ class Draft(contextlib.AbstractContextManager):
         with contextlib.suppress(OSError):
             os.unlink(self.path)
         _open.discard(self)
-
-    def withdraw(self) -> None:
-        """Remove the published file again, because a file that belongs to it could not be published."""
-        if self.published and not self.overwrite:
-            with contextlib.suppress(OSError):
-                os.unlink(self.target)
 
 
 _cleared: set[Path] = set()
@@ -320,7 +320,9 @@ def publish_together(drafts: Sequence[Draft]) -> None:
                 done.append(draft)
         except BaseException as error:
             for draft in done:
-                draft.withdraw()
+                if draft.published and not draft.overwrite:
+                    with contextlib.suppress(OSError):
+                        os.unlink(draft.target)
             for draft in drafts:
                 draft.discard()
             kept = ", ".join(str(draft.target) for draft in done if draft.published and draft.overwrite)
@@ -421,13 +423,3 @@ def _link(path: Path, target: Path) -> None:
         # No hard links here: only one process can create this empty file, so it reserves the name.
         os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         os.replace(path, target)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes the new name survive a power cut; Windows cannot open folders, some file systems cannot sync them."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

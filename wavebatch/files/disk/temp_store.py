@@ -399,14 +399,12 @@ class KeyedSums(Closing):
             yield from self._parts
             return
         self._spill()
-        for low, high in self._cut_ranges():
-            yield _sum([self._read_range(run, low, high) for run in self._runs if run.touches(low, high)])
-
-    def _cut_ranges(self) -> Iterator[tuple[int, int]]:
-        """Ascending ranges of keys with about `held` rows each; none is empty."""
+        # Ascending ranges of keys with about `held` rows each; none is empty.
         marks = np.sort(np.concatenate([run.marks for run in self._runs]))
         borders = np.unique(marks[:: max(self._held // self._stride, 1)]).tolist()
-        yield from zip(borders, [*borders[1:], 1 << 64], strict=True)
+        for low, high in zip(borders, [*borders[1:], 1 << 64], strict=True):
+            touched = [run for run in self._runs if int(run.marks[0]) < high and run.last >= low]
+            yield _sum([self._read_range(run, low, high) for run in touched])
 
     def _shrink(self) -> None:
         """Sums up the rows in memory."""
@@ -456,10 +454,6 @@ class _Run(NamedTuple):
     """Keys of its rows 0, STRIDE, 2 STRIDE ..., u8."""
     last: int
     """The largest key."""
-
-    def touches(self, low: int, high: int) -> bool:
-        """Whether keys of the run may lie in [low, high)."""
-        return int(self.marks[0]) < high and self.last >= low
 
 
 def _sum(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -287,15 +287,7 @@ def read_header_of(file: BinaryIO, path: Path, least: tuple[int, int] = (1, 0)) 
         by_return=(*by_return, *(0,) * 10),
         maxs=tuple(numbers[6::2]), mins=tuple(numbers[7::2]),
     )  # fmt: skip
-    _read_tail(header, file.read(standard - _FRONT.size))
-    header.user_bytes = file.read(size - standard)
-    records = file.read(offset - size)
-    header.vlrs = list(_read_vlrs(records, n_vlrs, path))
-    header.padding = records[sum(_VLR.size + len(vlr.payload) for vlr in header.vlrs) :]
-    return header
-
-
-def _read_tail(header: LasHeader, tail: bytes) -> None:
+    tail = file.read(standard - _FRONT.size)
     if header.version >= (1, 3):
         (header.waveform_start,) = struct.unpack_from("<Q", tail)
     if header.version >= (1, 4):
@@ -306,17 +298,17 @@ def _read_tail(header: LasHeader, tail: bytes) -> None:
     if header.version >= (1, 5):
         largest, smallest, header.gps_offset = struct.unpack_from("<ddH", tail, 148)
         header.gps_range = (largest, smallest)
-
-
-def _read_vlrs(data: bytes, count: int, path: Path) -> Iterator[Vlr]:
-    at = 0
-    for number in range(count):
-        head = data[at : at + _VLR.size].ljust(_VLR.size, b"\0")
+    header.user_bytes = file.read(size - standard)
+    records, at = file.read(offset - size), 0
+    for number in range(n_vlrs):
+        head = records[at : at + _VLR.size].ljust(_VLR.size, b"\0")
         reserved, user_id, record_id, length, description = _VLR.unpack(head)
         at += _VLR.size + length
-        if at > len(data):
-            raise damaged(path, f"VLR {number} of {count} runs into the points")
-        yield Vlr(user_id, record_id, data[at - length : at], description, reserved)
+        if at > len(records):
+            raise damaged(path, f"VLR {number} of {n_vlrs} runs into the points")
+        header.vlrs.append(Vlr(user_id, record_id, records[at - length : at], description, reserved))
+    header.padding = records[at:]
+    return header
 
 
 def find_evlrs(path: Path, header: LasHeader, most: int = MAX_EVLRS) -> tuple[list[Evlr], int]:
@@ -416,23 +408,19 @@ def choose_format(path: Path, header: LasHeader, wanted: int | None, keep: bool)
     given = header.point_format
     if wanted is None:
         return given if keep else WITHOUT_WAVES.get(given, given)
-    legal = [number for number in STANDARD_DTYPES if _can_hold(given, number) and (number in WITHOUT_WAVES) == keep]
+    # All fields but the waveform fields have a place; never from 6-10 back to 0-5.
+    legal = []
+    for number, dtype in STANDARD_DTYPES.items():
+        have = set(field_names(STANDARD_DTYPES[given])) - _WAVE_FIELDS
+        have -= {"raw_classification", "scan_angle_rank"} if number >= 6 else set()
+        if not given >= 6 > number and have <= set(field_names(dtype)) and (number in WITHOUT_WAVES) == keep:
+            legal.append(number)
     if wanted not in legal:
         raise ConfigError(
             f"{path}: point format {given} cannot be written as {wanted}{' with its packets' if keep else ''} without "
             f"loss; possible are {', '.join(map(str, legal))}"
         )
     return wanted
-
-
-def _can_hold(old: int, new: int) -> bool:
-    """Whether format `new` has all fields of `old` except the waveform fields; never from 6-10 back to 0-5."""
-    if old >= 6 > new:
-        return False
-    have = set(field_names(STANDARD_DTYPES[old])) - _WAVE_FIELDS
-    if new >= 6:
-        have -= {"raw_classification", "scan_angle_rank"}
-    return have <= set(field_names(STANDARD_DTYPES[new]))
 
 
 def _whole(size: int, length: int) -> np.dtype:
@@ -520,11 +508,6 @@ class ExtraRecord:
     def code(self) -> int:
         """Data type of the LAS specification: 0 undocumented, 1 to 10 scalars, 11 to 30 the deprecated vectors."""
         return self.data[2]
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the size of the dimension is known."""
-        return self.code <= 30 and self.dtype.itemsize > 0
 
     @property
     def dtype(self) -> np.dtype:
@@ -625,7 +608,7 @@ def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
     left = size
     for at in range(0, len(payload) - RECORD_SIZE + 1, RECORD_SIZE):
         record = ExtraRecord(payload[at : at + RECORD_SIZE])
-        if not record.is_known or record.dtype.itemsize > left:
+        if record.code > 30 or not 0 < record.dtype.itemsize <= left:
             break
         records.append(record)
         left -= record.dtype.itemsize

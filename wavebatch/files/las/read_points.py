@@ -64,16 +64,31 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     header = las.read_header(path, (1, 3) if waveforms else (1, 0))
     if waveforms:
         _check_waveforms(path, header)
-    _check_format(path, header)
+    number = header.point_format
+    if number not in las.STANDARD_DTYPES:
+        raise damaged(path, f"point format {number} is not known")
+    if number >= 6 and header.version < (1, 4):
+        major, minor = header.version
+        raise damaged(path, f"point format {number} needs LAS 1.4, but the header has version {major}.{minor}")
+    extra = header.point_length - las.STANDARD_DTYPES[number].itemsize
+    if extra < 0:
+        raise damaged(
+            path, f"point records of {header.point_length} bytes are too short for format {number} "
+            f"({las.STANDARD_DTYPES[number].itemsize})"
+        )  # fmt: skip
     for axis, scale, offset in zip("xyz", header.scales, header.offsets, strict=True):
         if not (LEAST_SCALE <= abs(scale) <= LARGEST_SCALE and abs(offset) <= LARGEST_OFFSET):
             raise damaged(path, f"scale {scale} and offset {offset} of {axis} give no usable coordinates")
     payloads = [vlr.payload for vlr in header.vlrs if las.has_record([vlr], "LASF_Spec", las.EXTRA_BYTES_RECORD_ID)]
-    extra = header.point_length - las.STANDARD_DTYPES[header.point_format].itemsize
     records = tuple(las.read_records(payloads[0] if payloads else b"", extra))
-    dtype = las.build_dtype(header.point_format, records)
+    dtype = las.build_dtype(number, records)
     points_end = _find_points_end(path, header)
-    return CheckedHeader(path, header.file_size, header, dtype, records, points_end, _find_warnings(header))
+    legacy, count = header.counts
+    warnings: tuple[str, ...] = ()
+    if header.version >= (1, 4) and legacy and legacy != count:
+        used = "64-bit" if count else "legacy"
+        warnings = (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
+    return CheckedHeader(path, header.file_size, header, dtype, records, points_end, warnings)
 
 
 def _check_waveforms(path: Path, header: las.LasHeader) -> None:
@@ -89,26 +104,6 @@ def _check_waveforms(path: Path, header: las.LasHeader) -> None:
             f"{path}: the header claims packets both in the file and in a .wdp (global encoding bits 1 and 2); clear "
             "the wrong bit in byte 6 of the file"
         )
-
-
-def _check_format(path: Path, header: las.LasHeader) -> None:
-    number = header.point_format
-    if number not in las.STANDARD_DTYPES:
-        raise damaged(path, f"point format {number} is not known")
-    if number >= 6 and header.version < (1, 4):
-        major, minor = header.version
-        raise damaged(path, f"point format {number} needs LAS 1.4, but the header has version {major}.{minor}")
-    least = las.STANDARD_DTYPES[number].itemsize
-    if header.point_length < least:
-        raise damaged(path, f"point records of {header.point_length} bytes are too short for format {number} ({least})")
-
-
-def _find_warnings(header: las.LasHeader) -> tuple[str, ...]:
-    legacy, count = header.counts
-    if header.version < (1, 4) or not legacy or legacy == count:
-        return ()
-    used = "64-bit" if count else "legacy"
-    return (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
 
 
 def _find_points_end(path: Path, header: las.LasHeader) -> int:
@@ -267,23 +262,18 @@ class LazPoints:
         data = np.empty(end - start + 8, np.uint8)
         data[:8] = np.frombuffer(struct.pack("<q", len(data)), np.uint8)
         read_exactly(self._file.fileno(), data[8:], start)
-        self._check_layers(data[8:])
+        if self._coding.layers:
+            at = 8 + self._checked.dtype.itemsize + 4
+            sizes, total = data[at : at + 4 * self._coding.layers], at + 4 * self._coding.layers - 8
+            if len(sizes) == 4 * self._coding.layers:
+                total += int(sizes.view("<u4").sum(dtype=np.uint64))
+            if total > len(data) - 8:
+                raise damaged(self._checked.path, f"a LAZ chunk of {len(data) - 8} bytes claims {total} bytes")
         count = int(self._first[chunk + 1] - self._first[chunk])
         small = BytesIO(data.data)
         small.seek(0, 2)
         lazrs.write_chunk_table(small, [(count, end - start)], lazrs.LazVlr(self._coding.payload))
         return small
-
-    def _check_layers(self, chunk: np.ndarray) -> None:
-        if not self._coding.layers:
-            return
-        at = self._checked.dtype.itemsize + 4
-        sizes = chunk[at : at + 4 * self._coding.layers]
-        total = at + 4 * self._coding.layers
-        if len(sizes) == 4 * self._coding.layers:
-            total += int(sizes.view("<u4").sum(dtype=np.uint64))
-        if total > len(chunk):
-            raise damaged(self._checked.path, f"a LAZ chunk of {len(chunk)} bytes claims {total} bytes")
 
     def close(self) -> None:
         self._file.close()

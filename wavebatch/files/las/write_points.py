@@ -4,7 +4,7 @@ The writers of clouds, strips, returns and voxels are built on `PointFile`. The 
 it is complete; the header is written last, because counts and bounds are known only then. Workers call
 `compress_rows`, so that the process that writes only joins LAZ chunks.
 
-lazrs has defects with waveform formats (see `_check_channel` and `_patch_wave_item`), and seeks the wrong points where
+lazrs has defects with waveform formats (see `compress_rows` and `_encode_coding`), and seeks the wrong points where
 chunks have different numbers of them; test changes by reading the output with LASzip too.
 """
 
@@ -51,7 +51,13 @@ def compress_rows(rows: np.ndarray, point_format: int) -> Chunk:
         Where lazrs cannot compress them.
     """
     if point_format in (9, 10):
-        _check_channel(rows)
+        # lazrs 0.8 writes wrong packet fields of these formats after a change of scanner channel in a chunk.
+        channels = (rows["classification_flags"] >> 4) & 0b11
+        if np.any(channels != channels[0]):
+            raise InputError(
+                "points of several scanner channels with packets cannot be written as LAZ; write LAS, or leave "
+                "--keep-packets out"
+            )
     coding = lazrs.LazVlr(_encode_coding(point_format, rows.itemsize))
     file = BytesIO()
     try:
@@ -125,30 +131,16 @@ class _LazEncoder(PointEncoder):
         self._file.write(struct.pack("<q", at))
 
 
-def _check_channel(rows: np.ndarray) -> None:
-    """lazrs 0.8 writes wrong packet fields of formats 9 and 10 after a change of scanner channel in a chunk."""
-    channels = (rows["classification_flags"] >> 4) & 0b11
-    if np.any(channels != channels[0]):
-        raise InputError(
-            "points of several scanner channels with packets cannot be written as LAZ; write LAS, or leave "
-            "--keep-packets out"
-        )
-
-
 def _encode_coding(point_format: int, point_length: int) -> bytes:
     """The content of the "laszip encoded" record."""
     extra = point_length - las.STANDARD_DTYPES[point_format].itemsize
-    return _patch_wave_item(bytes(lazrs.LazVlr.new_for_compression(point_format, extra).record_data()))
-
-
-def _patch_wave_item(payload: bytes) -> bytes:
-    """Sets the version of item WAVEPACKET13 to 1: LASzip refuses version 2 of lazrs, which has the same coding."""
-    patched = bytearray(payload)
+    payload = bytearray(lazrs.LazVlr.new_for_compression(point_format, extra).record_data())
+    # The version of item WAVEPACKET13 becomes 1: LASzip refuses version 2 of lazrs, which has the same coding.
     for at in range(_ITEMS_AT, len(payload) - 5, 6):
-        kind, _, version = np.frombuffer(payload, "<u2", 3, at)
+        kind, _, version = np.frombuffer(bytes(payload), "<u2", 3, at)
         if (kind, version) == (_WAVE_ITEM, _BROKEN_VERSION):
-            patched[at + 4 : at + 6] = _READABLE_VERSION.to_bytes(2, "little")
-    return bytes(patched)
+            payload[at + 4 : at + 6] = _READABLE_VERSION.to_bytes(2, "little")
+    return bytes(payload)
 
 
 _COPY_SIZE = 1 << 22
@@ -367,14 +359,12 @@ class Statistics:
 
     def ranged(self) -> list[las.ExtraRecord]:
         """Return the records with the extremes of the written values; a column without any value declares none."""
-        return [self._range(field, record) for field, record in self._records.items()]
-
-    def _range(self, field: str, record: las.ExtraRecord) -> las.ExtraRecord:
-        found = [self._extremes.get((field, element)) for element in range(*record.dtype.shape or (1,))]
-        if None in found:
-            return record.with_range(None, None)
-        least, largest = zip(*found, strict=True)
-        return record.with_range(np.array(least), np.array(largest))
+        ranged = []
+        for field, record in self._records.items():
+            found = [self._extremes.get((field, element)) for element in range(*record.dtype.shape or (1,))]
+            ends = (None, None) if None in found else tuple(map(np.array, zip(*found, strict=True)))
+            ranged.append(record.with_range(*ends))
+        return ranged
 
 
 def copy_bytes(source: BinaryIO, start: int, end: int, target: BinaryIO) -> None:

@@ -158,7 +158,15 @@ def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) ->
         chosen = "toward" if option == "auto" else option
         return VectorDecision(chosen, tally.form, float("nan"), "no waveform to decide from", (), ())
     ratio = quantile(np.concatenate(tally.ratios), 0.5)
-    warnings, problems = list(_judge_length(ratio, tally.form, metres)), []
+    warnings, problems = [], []
+    if tally.form == "range":
+        warnings.append(
+            f"packet vectors are more than {RANGE_RATIO:g} times c/2 long; they are read as whole paths (as Optech "
+            "wrote them) and divided by minus the return location"
+        )
+    if not any(LEAST_RATIO <= length <= LARGEST_RATIO for length in (ratio, metres * ratio)):
+        odd = f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"
+        warnings.append(odd)
     (toward, away), (up, down) = tally.pairs, tally.heights
     pairs, heights = _verdict(toward, away, _MOSTLY), _verdict(up, down, _CLEAR)
     evidence = f"{toward} of {toward + away} pairs that share a packet and {up} of {up + down} heights say toward"
@@ -174,16 +182,6 @@ def decide_direction(tally: DirectionTally, option: str, metres: float = 1.0) ->
             warnings.append(f"--direction {option} overrides the evidence of the file: {evidence}")
         chosen, problems, evidence = option, [], f"given; {evidence}"
     return VectorDecision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
-
-
-def _judge_length(ratio: float, form: str, metres: float) -> Iterator[str]:
-    if form == "range":
-        yield (
-            f"packet vectors are more than {RANGE_RATIO:g} times c/2 long; they are read as whole paths (as Optech "
-            "wrote them) and divided by minus the return location"
-        )
-    if not any(LEAST_RATIO <= length <= LARGEST_RATIO for length in (ratio, metres * ratio)):
-        yield f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"
 
 
 def _verdict(toward: int, away: int, share: float) -> str:

@@ -69,7 +69,10 @@ def find_facts(path: Path, direction: str, headerless: bool) -> StripFacts:
     place = locate_packets(checked, compression, headerless)
     if place.base < 0:
         with contextlib.closing(open_points(checked)) as points:
-            place = settle_headerless(place, points.read(0, min(header.point_count, _FIRST_POINTS)))
+            first = points.read(0, min(header.point_count, _FIRST_POINTS))
+        offsets = first["wavepacket_offset"][(first["wavepacket_index"] > 0) & (first["wavepacket_size"] > 0)]
+        if len(offsets) and int(offsets.min()) < las.EVLR_HEADER_SIZE:
+            place = replace(place, base=0)  # in a .wdp without header such offsets count from its first byte
     crs, units = read_crs(path, header)
     values = {entry.name: getattr(checked, entry.name) for entry in fields(checked)}
     values["warnings"] = (*checked.warnings, *odd, *place.warnings)
@@ -151,7 +154,7 @@ def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerle
     """Return the place of the packets: in the strip itself, or in the .wdp next to it.
 
     Packets of LAStools may be compressed, in a .wdz.
-    headerless: accept a .wdp without its 60-byte header; `settle_headerless` finds how its offsets count.
+    headerless: accept a .wdp without its 60-byte header; `find_facts` finds how its offsets count.
     Raises InputError if packets are missing, compressed, or in a file that is not a .wdp.
     """
     header, path = checked.header, checked.path
@@ -237,14 +240,6 @@ def _locate_external(checked: CheckedHeader, packet_file: Path, headerless: bool
     if length not in (0, size - las.EVLR_HEADER_SIZE):
         warnings.append(f"{packet_file.name} claims {length} bytes of packets, {size - las.EVLR_HEADER_SIZE} are there")
     return PacketPlace(packet_file, False, 0, las.EVLR_HEADER_SIZE, size, tuple(warnings))
-
-
-def settle_headerless(place: PacketPlace, points: np.ndarray) -> PacketPlace:
-    """Return the place of packets in a .wdp without header; offsets below 60 count from its first byte."""
-    offsets = points["wavepacket_offset"][(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
-    if len(offsets) and int(offsets.min()) < las.EVLR_HEADER_SIZE:
-        return replace(place, base=0)
-    return place
 
 
 class PacketFile:

@@ -290,8 +290,13 @@ class StripReader(Closing):
             share = -(-left // (len(chosen) - position))
             rows = rows[even_places(len(rows), share)]
             left -= len(rows)
-            rows, taken = _thin_long(rows, unit.packets.n_samples[rows], long_samples // (len(chosen) - position))
-            long_samples -= taken
+            # Of those longer than LONG as many as have their share of the samples that are left.
+            length, room = unit.packets.n_samples[rows], long_samples // (len(chosen) - position)
+            long = np.flatnonzero(length > LONG)
+            if length[long].sum() > room:
+                long = long[even_places(len(long), room // int(length.max()))]
+                rows = rows[np.union1d(np.flatnonzero(length <= LONG), long)]
+            long_samples -= int(length[long].sum())
             yield unit, rows
             if left <= 0:
                 return
@@ -340,15 +345,6 @@ class StripReader(Closing):
                 places = table.offset[chosen]
                 samples = packet_check.read_packet_samples(self._packets, places, n_samples, stored, packed, form)
                 yield samples, digitizer, chosen
-
-
-def _thin_long(rows: np.ndarray, length: np.ndarray, room: int) -> tuple[np.ndarray, int]:
-    """Rows without so many of those longer than LONG that the others have at most `room` samples; and these samples."""
-    long = np.flatnonzero(length > LONG)
-    if length[long].sum() <= room:
-        return rows, int(length[long].sum())
-    kept = long[even_places(len(long), room // int(length.max()))]
-    return rows[np.union1d(np.flatnonzero(length <= LONG), kept)], int(length[kept].sum())
 
 
 class _Geometry:

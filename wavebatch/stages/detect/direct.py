@@ -93,7 +93,13 @@ def samples_of(block: WaveformBlock, noise: Noise) -> Samples:
 
 
 def make_table(
-    block: WaveformBlock, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
+    block: WaveformBlock,
+    waveform: np.ndarray,
+    time: np.ndarray,
+    amplitude: np.ndarray,
+    width: np.ndarray,
+    *,
+    varies: bool = False,
 ) -> EchoTable:
     """Turn candidates in samples into a table in ns.
 
@@ -109,6 +115,8 @@ def make_table(
         Centre and standard deviation [samples].
     amplitude : float array, shape (m,)
         Height above the baseline [count].
+    varies : bool
+        Whether constant waveforms have none already.
 
     Returns
     -------
@@ -119,12 +127,14 @@ def make_table(
     ----------
     docs/algorithms.md H10.
     """
-    rows, row = np.unique(waveform, return_inverse=True)
-    varies = find_varying(block.samples[rows])[row]
+    kept = np.ones(len(waveform), bool)
+    if not varies:
+        rows, row = np.unique(waveform, return_inverse=True)
+        kept = find_varying(block.samples[rows])[row]
     if block.missing is not None:
-        varies &= gap_distance(block.missing, waveform, time) > -1.0
+        kept &= gap_distance(block.missing, waveform, time) > -1.0
     columns = (waveform, time * block.spacing, amplitude, width * block.spacing)
-    return EchoTable.build(*(columns if varies.all() else (values[varies] for values in columns)))
+    return EchoTable.build(*(columns if kept.all() else (values[kept] for values in columns)))
 
 
 def find_varying(samples: np.ndarray) -> np.ndarray:
@@ -224,7 +234,7 @@ def maximum(
     ref = system.sigma_ref / block.spacing
     broad, taps, gain = choose_smoothing(ref)
     waveform, time, amplitude, width = filters.find_maxima(samples_of(block, noise), threshold * gain, ref, broad, taps)
-    return make_table(block, waveform, time, amplitude, width)
+    return make_table(block, waveform, time, amplitude, width, varies=True)
 
 
 def choose_smoothing(ref: float) -> tuple[float, np.ndarray | None, float]:

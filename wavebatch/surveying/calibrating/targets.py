@@ -426,7 +426,7 @@ def combine_targets(results: Sequence[TargetResult], light_err: np.ndarray, chan
     )
 
 
-MOST, UNLIKE_TARGETS = (0.05, 0.95), 2.0
+MOST, UNLIKE_TARGETS = (0.05, 0.95), 1.5
 """Quantiles of the amplitudes of targets and of the strip; and how many times darker or brighter than targets echoes
 are for which these do not prove a linear receiver: what one loses grows with the amplitude."""
 

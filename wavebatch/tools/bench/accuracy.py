@@ -125,12 +125,12 @@ def choose_cheapest(rows: Sequence[Mapping], tolerance_cm: float) -> Mapping | N
 
     rows: as in the document of the benchmark.
     """
-
-    def is_good(row: Mapping) -> bool:
+    good = []
+    for row in rows:
         error = row["figures"]["rmse_isolated_cm"]
-        return error["value"] is not None and error["value"] + (error["error"] or 0) <= tolerance_cm
-
-    good = [row for row in rows if row["kernels"]["median"] is not None and is_good(row)]
+        known = row["kernels"]["median"] is not None and error["value"] is not None
+        if known and error["value"] + (error["error"] or 0) <= tolerance_cm:
+            good.append(row)
     return min(good, key=lambda row: (row["kernels"]["median"], row["name"]), default=None)
 
 
@@ -174,7 +174,11 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     if not len(truth):
         return np.empty((0, 3))
     columns, painted = _differentiate(recording, truth)
-    weight = _weigh(recording, truth, painted, n)
+    # Samples count by their inverse standard deviation; clipped ones do not.
+    signal = np.zeros((n, recording.n_samples))
+    np.add.at(signal, truth.waveform, painted)
+    variance = effective_noise(recording) ** 2 + recording.noise_gain * np.maximum(signal, 0)
+    weight = np.where(signal + recording.baseline < recording.clip, 1 / np.sqrt(variance), 0.0)
     columns *= weight[truth.waveform][:, None, :]
     bounds = np.full((len(truth), 3), np.inf)
     count = truth.count(n)
@@ -200,14 +204,6 @@ def _differentiate(recording: Recording, truth: EchoTable) -> tuple[np.ndarray, 
     grown = _measure(recording.pulse, wider) - _measure(recording.pulse, narrower)
     by_sigma = (paint(truth.time, wider) - paint(truth.time, narrower)) / np.maximum(grown, 1e-9)[:, None]
     return np.stack([by_time, echo / amplitude[:, None], by_sigma], axis=1).astype(np.float64), echo
-
-
-def _weigh(recording: Recording, truth: EchoTable, painted: np.ndarray, n: int) -> np.ndarray:
-    """Inverse standard deviation of every sample, 0 where it is clipped, (n, s)."""
-    signal = np.zeros((n, recording.n_samples))
-    np.add.at(signal, truth.waveform, painted)
-    variance = effective_noise(recording) ** 2 + recording.noise_gain * np.maximum(signal, 0)
-    return np.where(signal + recording.baseline < recording.clip, 1 / np.sqrt(variance), 0.0)
 
 
 def _invert(columns: np.ndarray) -> np.ndarray:
@@ -343,9 +339,10 @@ def describe_found(found: EchoTable) -> EchoTable:
 class AccuracyTally:
     """Collects the echoes found in groups; `figures` summarises them."""
 
+    waveforms: int = 0
+    """Number of waveforms added."""
     _waveforms: list[dict[str, np.ndarray]] = field(default_factory=list)
     _echoes: list[dict[str, np.ndarray]] = field(default_factory=list)
-    _offset: int = 0
 
     def add(self, group: Group, found: EchoTable) -> None:
         """Adds the echoes found in the waveforms of a group."""
@@ -360,7 +357,7 @@ class AccuracyTally:
             counts[f"{kind}_matched"] = np.bincount(truth.waveform[rows & matched], minlength=n)
         self._waveforms.append(counts)
         part = {
-            "waveform": truth.waveform[match.truth].astype(np.int64) + self._offset,
+            "waveform": truth.waveform[match.truth].astype(np.int64) + self.waveforms,
             "group": np.full(len(match.truth), group.number),
             "isolated": group.isolated[match.truth],
             "clear": group.clear[match.truth],
@@ -374,22 +371,15 @@ class AccuracyTally:
             part[f"{name}_ratio"] = error / group.bounds[match.truth, place]
             part[f"{name}_scaled"] = error / np.where(reported > 0, reported, np.nan)
         self._echoes.append(part)
-        self._offset += n
+        self.waveforms += n
 
     def figures(self) -> dict[str, Figure]:
         """Every figure by name: shares as fractions, lengths in cm of range, the others without unit."""
-        return {**self._shares(), **self._errors()}
-
-    @property
-    def waveforms(self) -> int:
-        """Number of waveforms added."""
-        return self._offset
-
-    def _shares(self) -> dict[str, Figure]:
-        w = _join(self._waveforms)
+        w, e = ({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+                for parts in (self._waveforms, self._echoes))  # fmt: skip
         group, true, found = w["group"], w["true"], w["found"]
         one, none = true == 1, true == 0
-        return {
+        figures = {
             "completeness": share_figure(w["matched"], true, group),
             "correctness": share_figure(w["matched"], found * true.any(), group),
             "exact_count": share_figure(found == true, np.ones(len(true)), group),
@@ -399,11 +389,7 @@ class AccuracyTally:
             "found_overlapped": share_figure(w["overlapped_matched"], w["overlapped"], group),
             "wrong": share_figure(true + found - 2 * w["matched"], (true + found) * true.any(), group),
         }
-
-    def _errors(self) -> dict[str, Figure]:
-        e = _join(self._echoes)
         every = np.ones(len(e["time"]), bool)
-        figures = {}
         for kind, rows in (("all", every), ("isolated", e["isolated"]), ("overlapped", ~e["isolated"])):
             figures[f"rmse_{kind}_cm"] = _spread(e, "time", rows).scale(CM_PER_NS)
             if kind == "all":
@@ -426,7 +412,3 @@ class AccuracyTally:
 
 def _spread(echoes: Mapping[str, np.ndarray], name: str, rows: np.ndarray) -> Figure:
     return root_mean_square(echoes[name][rows], echoes["waveform"][rows], echoes["group"][rows])
-
-
-def _join(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

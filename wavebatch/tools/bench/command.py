@@ -1,9 +1,10 @@
 """The benchmark as a whole: measures chains on scenes, and returns one document of plain values; its sheet and files.
 
-`wavebatch bench` calls `run_bench`, prints `bench_sheet` and calls `write_outputs`. The keys of the document are the
-format of bench.json: change SCHEMA when they change. All but times and memory is the same for the same options. A scene
-may be shaped like a strip: it draws whole waveforms of a sample of it with small changes. `auto` is the chain that a
-survey of a group chooses.
+`wavebatch bench` calls `run_bench`, prints `bench_sheet` and calls `write_outputs`. In go scenes and chains; out comes
+a document whose keys are the format of bench.json: change SCHEMA when they change. All but times and memory is the same
+for the same options. `_measure_scene` has the order of the parts below it: which chains, on what echoes, how exact, how
+fast. A scene may be shaped like a strip: it draws whole waveforms of a sample of it with small changes. `auto` is the
+chain that a survey of a group chooses.
 
 `time_chains` measures run time and memory: kernels alone and from file to file, each chain in a process with one
 thread. The chains take turns, so that other load of the machine slows all of them alike. The process of a Worker is a
@@ -39,7 +40,7 @@ from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.unit import BLOCK_SAMPLES
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError, StageError, advise_install
 from wavebatch.core.frozen import frozen
 from wavebatch.core.process import CHILD, Seconds
@@ -66,81 +67,304 @@ from wavebatch.tools.sheets.sheet import Cell, Later, Note, Part, Picture, Sheet
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene, simulate_blocks, simulate_strip
 from wavebatch.tools.simulate.scenes import Drawn
 
-_START = "from wavebatch.tools.bench.command import serve; serve()"
+SCHEMA = "wavebatch.bench/1"
+BenchProgress = Callable[[str], None]
+BenchRows = list[dict[str, Any]]
 
 
-class BenchWorkerDied(Exception):
-    """The process ended before it answered."""
+@frozen
+class BenchOptions:
+    """What a benchmark measures."""
+
+    strip: Path | None = None
+    """Strip whose survey and echoes the simulated waveforms follow."""
+    scenes: tuple[str, ...] = ()
+    """Named scenes, in addition to the strip."""
+    chains: tuple[Path, ...] = ()
+    """Chain files, in addition to the shipped chains."""
+    all_methods: bool = option(False, "Also measure every detector and every decomposer.")
+    seed: int = 0
+    waveforms: Annotated[int, Range(1, math.inf)] = option(65_536, "Simulated waveforms per scene.", form="N")
+    repeats: Annotated[int, Range(1, math.inf)] = option(3, "Repetitions of the timing.", form="N", name="repeat")
+    pulses: Annotated[int, Range(0, math.inf)] = option(
+        50_000, "Pulses of the strip that is timed from file to file; 0: time the algorithms only.", form="N"
+    )
+    tolerance_cm: float | None = None
+    """Largest error of the range of isolated echoes for the choice of the cheapest chain."""
 
 
-class Worker(Closing):
-    """Runs functions in another Python process, one after another; a context manager."""
+def run_bench(
+    options: BenchOptions,
+    progress: BenchProgress = lambda text: None,
+    measure_others: Callable[[Scene, list[accuracy.Group]], BenchRows] = lambda scene, groups: [],
+) -> dict[str, Any]:
+    """Runs a benchmark and returns its document of plain values.
 
-    def __init__(self) -> None:
-        path = [str(Path(__file__).resolve().parents[3]), *filter(None, [os.environ.get("PYTHONPATH")]), *sys.path]
-        environment = {**os.environ, **CHILD, "PYTHONPATH": os.pathsep.join(path)}
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
-        )
+    measure_others: gives more rows of a scene, made by `make_row`, of programs that are no chains.
+    Raises ConfigError for unknown scenes and chains that cannot run, InputError for a strip that cannot be used.
+    """
+    chains = load_chains(options.chains)
+    scenes: list[Scene] = [find_scene(name) for name in options.scenes]
+    if options.strip is not None:
+        progress(f"surveying {options.strip}")
+        scenes.insert(0, shape_scene(options.strip, chains["accurate"]))
+    if not scenes:
+        raise ConfigError("nothing to measure: give a strip or --scene NAME")
+    measured = chains | (list_methods() if options.all_methods else {})
+    sections = [
+        _measure_scene(scene, measured, options, place, progress, measure_others) for place, scene in enumerate(scenes)
+    ]
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "seed": options.seed,
+        "error_means": "standard error of the difference between two runs that differ in their seed",
+        "scenes": sections,
+    }
+    if options.tolerance_cm is not None:
+        document["tolerance_cm"] = options.tolerance_cm
+    return document
 
-    def call(self, function: Callable, *arguments: Any) -> Any:
-        """`function(*arguments)` computed in the process; the function must be importable by name.
 
-        Raises WorkerDied, or whatever the function raised. A caller that cannot wait uses a thread: `close` ends it.
+def _measure_scene(
+    scene: Scene, chains: Mapping[str, Chain], options: BenchOptions, place: int, progress: BenchProgress,
+    measure_others: Callable[[Scene, list[accuracy.Group]], BenchRows],
+) -> dict[str, Any]:  # fmt: skip
+    seed = accuracy.derive_seed(options.seed, place)
+    groups = accuracy.make_groups(scene, options.waveforms, seed, progress)
+    chosen = [choose_chains(chains, group.survey) for group in groups]
+    twin = find_twin(chosen)
+    measured = {name: chain for name, chain in chosen[0].items() if name != AUTO or twin is None}
+    tallies = {name: accuracy.AccuracyTally() for name in measured}
+    for name, tally in tallies.items():
+        progress(f"{scene.name}: error of {name}")
+        for group, of_group in zip(groups, chosen, strict=True):
+            tally.add(group, accuracy.describe_found(of_group[name].run(group.block, group.system)))
+    timed = {name: (chain, groups[0].system) for name, chain in measured.items()}
+    block, strip = groups[0].block, None
+    with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as folder:
+        if options.pulses:
+            # As many waveforms as a run takes through a chain at a time.
+            n = min(options.pulses, BLOCK_SAMPLES // scene.recording.n_samples)
+            block = next(simulate_blocks(scene, n, seed=seed, size=n))[0]
+            strip = Path(folder, "strip.laz")
+            simulate_strip(scene, strip, pulses=options.pulses, seed=seed)
+        laps = time_chains(timed, block, strip, Path(folder), options.repeats, progress)
+    rows = [make_row(name, "chain", tally, laps[name]) for name, tally in tallies.items()]
+    if twin:
+        rows.append({**next(row for row in rows if row["name"] == twin), "name": AUTO, "same_as": twin})
+    rows += measure_others(scene, groups)
+    # Whether no other chain is as good in time, error and wrong echoes, and better in one of them. Peers get other and
+    # fewer waveforms: they are never on the front.
+    names = ("rmse_all_cm", "wrong")
+    costs = [(row["kernels"]["median"], *(row["figures"][name]["value"] for name in names))
+             if row["kind"] == "chain" else (None,) * 3 for row in rows]  # fmt: skip
+    for row, best in zip(rows, accuracy.find_front(costs).tolist(), strict=True):
+        row["pareto"] = best
+    section = {"scene": scene.name, "meaning": scene.meaning, "survey": _describe(groups), "rows": rows}
+    if options.tolerance_cm is not None:
+        cheapest = accuracy.choose_cheapest([row for row in rows if row["kind"] == "chain"], options.tolerance_cm)
+        section["cheapest"] = cheapest["name"] if cheapest else None
+    return section
+
+
+def make_row(name: str, kind: str, tally: accuracy.AccuracyTally, laps: Laps) -> dict[str, Any]:
+    """The row of a chain or of another program (kind: chain or peer)."""
+    figures = {key: figure.to_json() for key, figure in tally.figures().items()}
+    found = asdict(laps).items()
+    times = {key: accuracy.median_range(value) if isinstance(value, list) else value for key, value in found}
+    return {"name": name, "kind": kind, "waveforms": tally.waveforms, "figures": figures, **times}
+
+
+def _describe(groups: list[accuracy.Group]) -> dict[str, Any]:
+    """Range of the results of the groups' surveys."""
+    fields = {"noise_std": "noise.std", "noise_gain": "noise.gain"}
+    names = ("sigma_ref", "noise_std", "kappa", "noise_gain", "ringing", "acceptance")
+    values = {name: map(attrgetter(fields.get(name, name)), (group.system for group in groups)) for name in names}
+    return {
+        "groups": len(groups),
+        "waveforms_of_a_group": len(groups[0].block),
+        **{name: accuracy.median_range([float(value) for value in found]) for name, found in values.items()},
+        "components": sorted({len(group.system.components) for group in groups}),
+    }
+
+
+# Chains
+
+PROFILES = ("fast", "balanced", "accurate")
+"""Shipped chains that are always measured, cheapest first."""
+
+ATTRIBUTES = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
+"""Attributes that the shipped chains compute too, so that times can be compared."""
+
+DETECTORS = {"decompose.asdf_only": "detect.asdf", "decompose.asdf_mixed": "detect.asdf"}
+"""Detectors of decomposers that refuse `detect.maximum`."""
+
+
+def load_chains(files: Sequence[Path]) -> dict[str, Chain]:
+    """The shipped chains and those of the files, by the names that rows of the benchmark have."""
+    chains = {name: load_profile(name) for name in PROFILES}
+    for path in files:
+        name = path.stem if path.stem not in chains else str(path)
+        if name in chains:
+            raise ConfigError(f"{path}: given twice; give every chain file once")
+        chains[name] = load_chain_file(path)
+    return chains
+
+
+def choose_chains(chains: Mapping[str, Chain], survey: Survey) -> dict[str, Chain]:
+    """The given chains, and as `auto` the one that the survey chooses."""
+    return {**chains, AUTO: choose_chain(survey)}
+
+
+def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
+    """The chain that equals `auto` on every strip, so that `auto` need not be measured; None if there is none.
+
+    chosen: the chains of each strip.
+    """
+    for name in chosen[0]:
+        if name != AUTO and all(AUTO in c and effective(c[name]) == effective(c[AUTO]) for c in chosen):
+            return name
+    return None
+
+
+def list_methods() -> dict[str, Chain]:
+    """A chain per detector, without a fit, and per decomposer, after a detector that serves it; by stage."""
+    names = {kind: sorted(name for name in STAGES if STAGES[name].kind == kind) for kind in ("detect", "decompose")}
+    chains = {name: _build_chain(name, name, "decompose.none") for name in names["detect"]}
+    others = (name for name in names["decompose"] if name != "decompose.none")
+    return chains | {name: _build_chain(name, DETECTORS.get(name, "detect.maximum"), name) for name in others}
+
+
+def _build_chain(name: str, detector: str, decomposer: str) -> Chain:
+    return Chain(tuple(Step(STAGES[stage]) for stage in ("noise.pooled", detector, decomposer, *ATTRIBUTES)), name)
+
+
+# A scene like a strip
+
+LEAST_WAVEFORMS = 200
+"""Least waveforms of a strip whose echoes can be resampled."""
+
+JITTER = 0.05
+"""Relative change of the amplitudes and gaps of a resampled waveform, one standard deviation."""
+
+STRONG = 20.0
+"""Signal to noise from which measured widths show the true spread of widths."""
+
+
+@frozen(eq=False)
+class Sample:
+    """Echoes of decomposed waveforms, to draw from."""
+
+    first: np.ndarray
+    """Row of each waveform's first echo, i8 (n,)."""
+    count: np.ndarray
+    """Echoes of each waveform, i8 (n,)."""
+    time: np.ndarray
+    amplitude: np.ndarray
+    sigma: np.ndarray
+    """Of the main lobe [ns], without the scatter of its error, f8 (m,)."""
+
+
+@frozen
+class StripScene(Scene):
+    """Waveforms like those of a strip, drawn from a sample of its echoes."""
+
+    sample: Sample | None = None
+
+    def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> Drawn:
+        """Echoes of n waveforms: whole waveforms of the strip, shifted by part of a sample, with JITTER.
+
+        Echoes outside the window are dropped.
         """
-        try:
-            pickle.dump((function, arguments), self._process.stdin, pickle.HIGHEST_PROTOCOL)
-            self._process.stdin.flush()
-            kind, value = pickle.load(self._process.stdout)
-        except (EOFError, OSError, ValueError, pickle.UnpicklingError):
-            raise BenchWorkerDied("the measuring process ended") from None
-        if kind == "raised":
-            raise value
-        return value
-
-    def close(self) -> None:
-        """Kills the process."""
-        self._process.kill()
-        self._process.wait()
-        with contextlib.suppress(OSError):  # what a call had not sent yet
-            self._process.stdin.close()
-        self._process.stdout.close()
+        sample, recording = self.sample, self.recording
+        chosen = rng.integers(0, len(sample.count), n)
+        count = sample.count[chosen]
+        waveform = np.repeat(np.arange(n), count)
+        row = expand(sample.first[chosen], count)
+        start = sample.time[np.repeat(sample.first[chosen], count)]
+        stretch = np.exp(JITTER * rng.standard_normal(n))[waveform]
+        shift = rng.uniform(-0.5, 0.5, n)[waveform] * recording.spacing
+        time = start + shift + (sample.time[row] - start) * stretch
+        amplitude = sample.amplitude[row] * np.exp(JITTER * rng.standard_normal(len(row)))
+        inside = (time > 0) & (time < recording.duration)
+        return Drawn(waveform[inside], time[inside], amplitude[inside], sample.sigma[row][inside])
 
 
-def serve() -> None:
-    """Answers calls on stdin until stdin ends; other output to stdout is sent to stderr."""
-    from wavebatch.core.process import keep_freed_memory
+def shape_scene(strip: Path, chain: Chain) -> StripScene:
+    """A scene like the strip: noise, baselines and pulse of its survey, and the echoes that `chain` finds in it.
 
-    keep_freed_memory()
-    replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-    while True:
-        try:
-            function, arguments = pickle.load(sys.stdin.buffer)
-        except EOFError:
-            return
-        try:
-            answer = ("value", function(*arguments))
-        except Exception as error:
-            answer = ("raised", StageError(f"{type(error).__name__}: {error}"))
-        pickle.dump(answer, replies, pickle.HIGHEST_PROTOCOL)
-        replies.flush()
+    Raises InputError where the strip cannot be read or holds too few waveforms.
+    """
+    with StripReader(strip) as reader, reader.scan() as scan:
+        blocks = [block for block in reader.sample_blocks(scan, SAMPLE) if len(block)]
+    kinds: dict[tuple[float, int], list[WaveformBlock]] = {}
+    for block in blocks:
+        kinds.setdefault((block.spacing, block.samples.shape[1]), []).append(block)
+    chosen = max(kinds.values(), key=lambda alike: sum(block.samples.size for block in alike), default=[])
+    number = sum(map(len, chosen))
+    if number < LEAST_WAVEFORMS:
+        raise InputError(
+            f"{strip}: {number} waveforms of one length are too few to shape a benchmark like it ({LEAST_WAVEFORMS} "
+            "are needed); name a scene with --scene"
+        )
+    block = pool_blocks(chosen)
+    system = survey_blocks([block]).system
+    recording = describe_recording(system, block)
+    found = chain.run(block, system)
+    bad = int(EchoFlag.NOT_CONVERGED | EchoFlag.NEAR_EDGE | EchoFlag.AMPLITUDE_UNRELIABLE)
+    keep = ((found.flags & bad) == 0) & (found.time > 0) & (found.time < recording.duration)
+    found = found.take(np.flatnonzero(keep))
+    # Widths move towards the typical one by the share of their spread that their error explains.
+    sigma = found.sigma.astype(np.float64)
+    strong = sigma[found.amplitude > STRONG * system.noise.std]
+    if len(strong) < 2:
+        sigma[:] = system.sigma_ref
+    else:
+        typical, spread = float(np.median(strong)), float(strong.var())
+        error = np.nan_to_num(found.sigma_err.astype(np.float64), nan=0.0, posinf=1e3)
+        sigma = typical + (sigma - typical) * spread / np.maximum(spread + error**2, 1e-12)
+    lobe, count = recording.pulse.sigma, found.count(len(block))
+    sample = Sample(
+        first=np.cumsum(count) - count,
+        count=count,
+        time=found.time,
+        amplitude=np.clip(found.amplitude.astype(np.float64), 1.0, 4.0 * (1 << recording.bits)),
+        sigma=np.clip(sigma * (lobe / system.sigma_ref), 0.85 * lobe, 4.0 * lobe),
+    )
+    return StripScene(strip.name, f"like {strip.name}", recording=recording, sample=sample)
 
 
-def peak_memory() -> int | None:
-    """Peak memory of this process [bytes]; None where the system does not report it."""
-    try:
-        lines = Path("/proc/self/status").read_text("ascii").splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
-    except (OSError, StopIteration):
-        pass
-    try:
-        import resource
-    except ImportError:
-        return None
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else most * 1024
+def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
+    """The receiver that a survey found: levels, noise and its colour, clipping, learned pulse."""
+    kinds = system.noise.by_kind
+    pairs = [(kinds.get(f"{kind}_smoothed", 0.0), kinds.get(kind, 0.0)) for kind in ("tail", "quiet")]
+    ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
+    # The binomial filter whose noise changes by smoothing as the noise of the strip does.
+    color = int(np.argmin(np.abs(np.sqrt(accuracy.smoothed_power(np.arange(5)) / 6) - ratio)))
+    # Noise of one sample; `noise.std` is what coloured noise does to the amplitude of a pulse.
+    noise = kinds.get("outside") or kinds.get("quiet") or system.noise.std
+    gain = np.sqrt(accuracy.smoothed_power(color) / 6)
+    pulse = PulseModel(sigma=system.sigma_ref, kappa=system.kappa)
+    if len(system.components) > 1:
+        weight, delay, sigma = system.components[0]
+        pulse = PulseModel(sigma, 0.0, tuple((w / weight, d - delay, s) for w, d, s in system.components[1:]))
+    clip = None if system.saturation is None else int(min(system.saturation, block.digitizer.max_count))
+    return Recording(
+        n_samples=block.samples.shape[1],
+        spacing=block.spacing,
+        bits=block.digitizer.bits,
+        baseline=system.noise.baseline,
+        baseline_spread=system.noise.baseline_spread,
+        noise_std=float(np.sqrt(max(noise**2 - QUANTISATION_STD**2, 0.0))) / float(gain),
+        rho=color / (color + 1),
+        noise_gain=system.noise.gain,
+        saturation=clip,
+        pulse=pulse,
+    )
 
+
+# Run time and memory
 
 PREPARATION = ("scan", "survey")
 """Parts of a run whose time does not grow with the strip."""
@@ -224,318 +448,83 @@ def run_file(chain: Chain, strip: Path, folder: Path, jobs: int) -> FileRun:
     return FileRun(seconds, sum(timing[name].wall for name in PREPARATION), result.report.count("waveforms"))
 
 
-PROFILES = ("fast", "balanced", "accurate")
-"""Shipped chains that are always measured, cheapest first."""
-
-ATTRIBUTES = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
-"""Attributes that the shipped chains compute too, so that times can be compared."""
-
-
-def load_chains(files: Sequence[Path]) -> dict[str, Chain]:
-    """The shipped chains and those of the files, by the names that rows of the benchmark have."""
-    chains = {name: load_profile(name) for name in PROFILES}
-    for path in files:
-        name = path.stem if path.stem not in chains else str(path)
-        if name in chains:
-            raise ConfigError(f"{path}: given twice; give every chain file once")
-        chains[name] = load_chain_file(path)
-    return chains
+def peak_memory() -> int | None:
+    """Peak memory of this process [bytes]; None where the system does not report it."""
+    try:
+        lines = Path("/proc/self/status").read_text("ascii").splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        pass
+    try:
+        import resource
+    except ImportError:
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024
 
 
-def choose_chains(chains: Mapping[str, Chain], survey: Survey) -> dict[str, Chain]:
-    """The given chains, and as `auto` the one that the survey chooses."""
-    return {**chains, AUTO: choose_chain(survey)}
+_START = "from wavebatch.tools.bench.command import serve; serve()"
 
 
-def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
-    """The chain that equals `auto` on every strip, so that `auto` need not be measured; None if there is none.
-
-    chosen: the chains of each strip.
-    """
-    for name in chosen[0]:
-        if name != AUTO and all(AUTO in c and effective(c[name]) == effective(c[AUTO]) for c in chosen):
-            return name
-    return None
+class BenchWorkerDied(Exception):
+    """The process ended before it answered."""
 
 
-DETECTORS = {"decompose.asdf_only": "detect.asdf", "decompose.asdf_mixed": "detect.asdf"}
-"""Detectors of decomposers that refuse `detect.maximum`."""
+class Worker(Closing):
+    """Runs functions in another Python process, one after another; a context manager."""
 
-
-def list_methods() -> dict[str, Chain]:
-    """A chain per detector, without a fit, and per decomposer, after a detector that serves it; by stage."""
-    names = {kind: sorted(name for name in STAGES if STAGES[name].kind == kind) for kind in ("detect", "decompose")}
-    chains = {name: _build_chain(name, name, "decompose.none") for name in names["detect"]}
-    others = (name for name in names["decompose"] if name != "decompose.none")
-    return chains | {name: _build_chain(name, DETECTORS.get(name, "detect.maximum"), name) for name in others}
-
-
-def _build_chain(name: str, detector: str, decomposer: str) -> Chain:
-    return Chain(tuple(Step(STAGES[stage]) for stage in ("noise.pooled", detector, decomposer, *ATTRIBUTES)), name)
-
-
-LEAST_WAVEFORMS = 200
-"""Least waveforms of a strip whose echoes can be resampled."""
-
-JITTER = 0.05
-"""Relative change of the amplitudes and gaps of a resampled waveform, one standard deviation."""
-
-STRONG = 20.0
-"""Signal to noise from which measured widths show the true spread of widths."""
-
-
-@frozen(eq=False)
-class Sample:
-    """Echoes of decomposed waveforms, to draw from."""
-
-    first: np.ndarray
-    """Row of each waveform's first echo, i8 (n,)."""
-    count: np.ndarray
-    """Echoes of each waveform, i8 (n,)."""
-    time: np.ndarray
-    amplitude: np.ndarray
-    sigma: np.ndarray
-    """Of the main lobe [ns], without the scatter of its error, f8 (m,)."""
-
-
-@frozen
-class StripScene(Scene):
-    """Waveforms like those of a strip, drawn from a sample of its echoes."""
-
-    sample: Sample | None = None
-
-    def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> Drawn:
-        """Echoes of n waveforms: whole waveforms of the strip, shifted by part of a sample, with JITTER.
-
-        Echoes outside the window are dropped.
-        """
-        sample, recording = self.sample, self.recording
-        chosen = rng.integers(0, len(sample.count), n)
-        count = sample.count[chosen]
-        waveform = np.repeat(np.arange(n), count)
-        row = expand(sample.first[chosen], count)
-        start = sample.time[np.repeat(sample.first[chosen], count)]
-        stretch = np.exp(JITTER * rng.standard_normal(n))[waveform]
-        shift = rng.uniform(-0.5, 0.5, n)[waveform] * recording.spacing
-        time = start + shift + (sample.time[row] - start) * stretch
-        amplitude = sample.amplitude[row] * np.exp(JITTER * rng.standard_normal(len(row)))
-        inside = (time > 0) & (time < recording.duration)
-        return Drawn(waveform[inside], time[inside], amplitude[inside], sample.sigma[row][inside])
-
-
-def shape_scene(strip: Path, chain: Chain) -> StripScene:
-    """A scene like the strip: noise, baselines and pulse of its survey, and the echoes that `chain` finds in it.
-
-    Raises InputError where the strip cannot be read or holds too few waveforms.
-    """
-    with StripReader(strip) as reader, reader.scan() as scan:
-        blocks = [block for block in reader.sample_blocks(scan, SAMPLE) if len(block)]
-    kinds = {(block.spacing, block.samples.shape[1]) for block in blocks}
-    largest = max(kinds, key=lambda kind: sum(b.samples.size for b in blocks if _kind(b) == kind), default=None)
-    chosen = [block for block in blocks if _kind(block) == largest]
-    number = sum(len(block) for block in chosen)
-    if number < LEAST_WAVEFORMS:
-        raise InputError(
-            f"{strip}: {number} waveforms of one length are too few to shape a benchmark like it ({LEAST_WAVEFORMS} "
-            "are needed); name a scene with --scene"
+    def __init__(self) -> None:
+        path = [str(Path(__file__).resolve().parents[3]), *filter(None, [os.environ.get("PYTHONPATH")]), *sys.path]
+        environment = {**os.environ, **CHILD, "PYTHONPATH": os.pathsep.join(path)}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
         )
-    block = pool_blocks(chosen)
-    system = survey_blocks([block]).system
-    recording = describe_recording(system, block)
-    sample = _take_sample(chain.run(block, system), len(block), system, recording)
-    return StripScene(strip.name, f"like {strip.name}", recording=recording, sample=sample)
+
+    def call(self, function: Callable, *arguments: Any) -> Any:
+        """`function(*arguments)` computed in the process; the function must be importable by name.
+
+        Raises WorkerDied, or whatever the function raised. A caller that cannot wait uses a thread: `close` ends it.
+        """
+        try:
+            pickle.dump((function, arguments), self._process.stdin, pickle.HIGHEST_PROTOCOL)
+            self._process.stdin.flush()
+            kind, value = pickle.load(self._process.stdout)
+        except (EOFError, OSError, ValueError, pickle.UnpicklingError):
+            raise BenchWorkerDied("the measuring process ended") from None
+        if kind == "raised":
+            raise value
+        return value
+
+    def close(self) -> None:
+        """Kills the process."""
+        self._process.kill()
+        self._process.wait()
+        with contextlib.suppress(OSError):  # what a call had not sent yet
+            self._process.stdin.close()
+        self._process.stdout.close()
 
 
-def _kind(block: WaveformBlock) -> tuple[float, int]:
-    return block.spacing, block.samples.shape[1]
+def serve() -> None:
+    """Answers calls on stdin until stdin ends; other output to stdout is sent to stderr."""
+    from wavebatch.core.process import keep_freed_memory
+
+    keep_freed_memory()
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    while True:
+        try:
+            function, arguments = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        try:
+            answer = ("value", function(*arguments))
+        except Exception as error:
+            answer = ("raised", StageError(f"{type(error).__name__}: {error}"))
+        pickle.dump(answer, replies, pickle.HIGHEST_PROTOCOL)
+        replies.flush()
 
 
-def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
-    """The receiver that a survey found: levels, noise and its colour, clipping, learned pulse."""
-    kinds = system.noise.by_kind
-    pairs = [(kinds.get(f"{kind}_smoothed", 0.0), kinds.get(kind, 0.0)) for kind in ("tail", "quiet")]
-    ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
-    # The binomial filter whose noise changes by smoothing as the noise of the strip does.
-    color = int(np.argmin(np.abs(np.sqrt(accuracy.smoothed_power(np.arange(5)) / 6) - ratio)))
-    # Noise of one sample; `noise.std` is what coloured noise does to the amplitude of a pulse.
-    noise = kinds.get("outside") or kinds.get("quiet") or system.noise.std
-    gain = np.sqrt(accuracy.smoothed_power(color) / 6)
-    pulse = PulseModel(sigma=system.sigma_ref, kappa=system.kappa)
-    if len(system.components) > 1:
-        weight, delay, sigma = system.components[0]
-        pulse = PulseModel(sigma, 0.0, tuple((w / weight, d - delay, s) for w, d, s in system.components[1:]))
-    clip = None if system.saturation is None else int(min(system.saturation, block.digitizer.max_count))
-    return Recording(
-        n_samples=block.samples.shape[1],
-        spacing=block.spacing,
-        bits=block.digitizer.bits,
-        baseline=system.noise.baseline,
-        baseline_spread=system.noise.baseline_spread,
-        noise_std=float(np.sqrt(max(noise**2 - QUANTISATION_STD**2, 0.0))) / float(gain),
-        rho=color / (color + 1),
-        noise_gain=system.noise.gain,
-        saturation=clip,
-        pulse=pulse,
-    )
-
-
-def _take_sample(found: EchoTable, n: int, system: SystemPulse, recording: Recording) -> Sample:
-    bad = int(EchoFlag.NOT_CONVERGED | EchoFlag.NEAR_EDGE | EchoFlag.AMPLITUDE_UNRELIABLE)
-    keep = (found.flags & bad) == 0
-    keep &= (found.time > 0) & (found.time < recording.duration)
-    found = found.take(np.flatnonzero(keep))
-    count = found.count(n)
-    scale = recording.pulse.sigma / system.sigma_ref
-    sigma = _free_widths(found, system) * scale
-    return Sample(
-        first=np.cumsum(count) - count,
-        count=count,
-        time=found.time,
-        amplitude=np.clip(found.amplitude.astype(np.float64), 1.0, 4.0 * (1 << recording.bits)),
-        sigma=np.clip(sigma, 0.85 * recording.pulse.sigma, 4.0 * recording.pulse.sigma),
-    )
-
-
-def _free_widths(found: EchoTable, system: SystemPulse) -> np.ndarray:
-    """Widths [ns] moved towards the typical one by the share of their spread that their error explains."""
-    sigma = found.sigma.astype(np.float64)
-    strong = sigma[found.amplitude > STRONG * system.noise.std]
-    if len(strong) < 2:
-        return np.full(len(sigma), system.sigma_ref)
-    typical, spread = float(np.median(strong)), float(strong.var())
-    error = np.nan_to_num(found.sigma_err.astype(np.float64), nan=0.0, posinf=1e3)
-    return typical + (sigma - typical) * spread / np.maximum(spread + error**2, 1e-12)
-
-
-SCHEMA = "wavebatch.bench/1"
-
-BenchProgress = Callable[[str], None]
-BenchRows = list[dict[str, Any]]
-
-
-@frozen
-class BenchOptions:
-    """What a benchmark measures."""
-
-    strip: Path | None = None
-    """Strip whose survey and echoes the simulated waveforms follow."""
-    scenes: tuple[str, ...] = ()
-    """Named scenes, in addition to the strip."""
-    chains: tuple[Path, ...] = ()
-    """Chain files, in addition to the shipped chains."""
-    all_methods: bool = option(False, "Also measure every detector and every decomposer.")
-    seed: int = 0
-    waveforms: Annotated[int, Range(1, math.inf)] = option(65_536, "Simulated waveforms per scene.", form="N")
-    repeats: Annotated[int, Range(1, math.inf)] = option(3, "Repetitions of the timing.", form="N", name="repeat")
-    pulses: Annotated[int, Range(0, math.inf)] = option(
-        50_000, "Pulses of the strip that is timed from file to file; 0: time the algorithms only.", form="N"
-    )
-    tolerance_cm: float | None = None
-    """Largest error of the range of isolated echoes for the choice of the cheapest chain."""
-
-
-def run_bench(
-    options: BenchOptions,
-    progress: BenchProgress = lambda text: None,
-    measure_others: Callable[[Scene, list[accuracy.Group]], BenchRows] = lambda scene, groups: [],
-) -> dict[str, Any]:
-    """Runs a benchmark and returns its document of plain values.
-
-    measure_others: gives more rows of a scene, made by `make_row`, of programs that are no chains.
-    Raises ConfigError for unknown scenes and chains that cannot run, InputError for a strip that cannot be used.
-    """
-    chains = load_chains(options.chains)
-    scenes: list[Scene] = [find_scene(name) for name in options.scenes]
-    if options.strip is not None:
-        progress(f"surveying {options.strip}")
-        scenes.insert(0, shape_scene(options.strip, chains["accurate"]))
-    if not scenes:
-        raise ConfigError("nothing to measure: give a strip or --scene NAME")
-    measured = chains | (list_methods() if options.all_methods else {})
-    sections = [
-        _measure_scene(scene, measured, options, place, progress, measure_others) for place, scene in enumerate(scenes)
-    ]
-    document: dict[str, Any] = {
-        "schema": SCHEMA,
-        "version": __version__,
-        "seed": options.seed,
-        "error_means": "standard error of the difference between two runs that differ in their seed",
-        "scenes": sections,
-    }
-    if options.tolerance_cm is not None:
-        document["tolerance_cm"] = options.tolerance_cm
-    return document
-
-
-def _measure_scene(
-    scene: Scene, chains: Mapping[str, Chain], options: BenchOptions, place: int, progress: BenchProgress,
-    measure_others: Callable[[Scene, list[accuracy.Group]], BenchRows],
-) -> dict[str, Any]:  # fmt: skip
-    seed = accuracy.derive_seed(options.seed, place)
-    groups = accuracy.make_groups(scene, options.waveforms, seed, progress)
-    chosen = [choose_chains(chains, group.survey) for group in groups]
-    twin = find_twin(chosen)
-    measured = {name: chain for name, chain in chosen[0].items() if name != AUTO or twin is None}
-    tallies = {name: accuracy.AccuracyTally() for name in measured}
-    for name, tally in tallies.items():
-        progress(f"{scene.name}: error of {name}")
-        for group, of_group in zip(groups, chosen, strict=True):
-            tally.add(group, accuracy.describe_found(of_group[name].run(group.block, group.system)))
-    laps = _time(scene, groups[0], measured, options, seed, progress)
-    rows = [make_row(name, "chain", tally, laps[name]) for name, tally in tallies.items()]
-    if twin:
-        rows.append({**next(row for row in rows if row["name"] == twin), "name": AUTO, "same_as": twin})
-    rows += measure_others(scene, groups)
-    # Whether no other chain is as good in time, error and wrong echoes, and better in one of them. Peers get other and
-    # fewer waveforms: they are never on the front.
-    names = ("rmse_all_cm", "wrong")
-    costs = [(row["kernels"]["median"], *(row["figures"][name]["value"] for name in names))
-             if row["kind"] == "chain" else (None,) * 3 for row in rows]  # fmt: skip
-    for row, best in zip(rows, accuracy.find_front(costs).tolist(), strict=True):
-        row["pareto"] = best
-    section = {"scene": scene.name, "meaning": scene.meaning, "survey": _describe(groups), "rows": rows}
-    if options.tolerance_cm is not None:
-        cheapest = accuracy.choose_cheapest([row for row in rows if row["kind"] == "chain"], options.tolerance_cm)
-        section["cheapest"] = cheapest["name"] if cheapest else None
-    return section
-
-
-def _time(
-    scene: Scene, group: accuracy.Group, chains: Mapping[str, Chain], options: BenchOptions, seed: int,
-    progress: BenchProgress,
-) -> dict[str, Laps]:  # fmt: skip
-    timed = {name: (chain, group.system) for name, chain in chains.items()}
-    block, strip = group.block, None
-    with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:
-        if options.pulses:
-            # As many waveforms as a run takes through a chain at a time.
-            n = min(options.pulses, BLOCK_SAMPLES // scene.recording.n_samples)
-            block = next(simulate_blocks(scene, n, seed=seed, size=n))[0]
-            strip = Path(name, "strip.laz")
-            simulate_strip(scene, strip, pulses=options.pulses, seed=seed)
-        return time_chains(timed, block, strip, Path(name), options.repeats, progress)
-
-
-def make_row(name: str, kind: str, tally: accuracy.AccuracyTally, laps: Laps) -> dict[str, Any]:
-    """The row of a chain or of another program (kind: chain or peer)."""
-    figures = {key: figure.to_json() for key, figure in tally.figures().items()}
-    found = asdict(laps).items()
-    times = {key: accuracy.median_range(value) if isinstance(value, list) else value for key, value in found}
-    return {"name": name, "kind": kind, "waveforms": tally.waveforms, "figures": figures, **times}
-
-
-def _describe(groups: list[accuracy.Group]) -> dict[str, Any]:
-    """Range of the results of the groups' surveys."""
-    fields = {"noise_std": "noise.std", "noise_gain": "noise.gain"}
-    names = ("sigma_ref", "noise_std", "kappa", "noise_gain", "ringing", "acceptance")
-    values = {name: map(attrgetter(fields.get(name, name)), (group.system for group in groups)) for name in names}
-    return {
-        "groups": len(groups),
-        "waveforms_of_a_group": len(groups[0].block),
-        **{name: accuracy.median_range([float(value) for value in found]) for name, found in values.items()},
-        "components": sorted({len(group.system.components) for group in groups}),
-    }
-
+# The document as a sheet
 
 ReportColumn = tuple[str, str, float, int]
 """Head, name of the figure, factor, decimals."""
@@ -548,6 +537,7 @@ SHARES: tuple[ReportColumn, ...] = (
     ("isolated %", "found_isolated", 100, 2),
     ("overlapped %", "found_overlapped", 100, 2),
 )
+
 LENGTHS: tuple[ReportColumn, ...] = (
     ("all cm", "rmse_all_cm", 1, 2),
     ("isolated cm", "rmse_isolated_cm", 1, 2),
@@ -564,14 +554,6 @@ REPORTED: tuple[ReportColumn, ...] = (
 """Errors of times over the reported ones: echoes without and with a flag of UNCLEAN, and by what was found around."""
 
 
-NO_PLOT = f"no plot without matplotlib: {advise_install('matplotlib')}"
-
-PANELS = (
-    ("wrong", 100.0, "echoes missed or false [%]"),
-    ("rmse_all_cm", 1.0, "rms error of the range, all echoes [cm]"),
-)
-
-
 def bench_sheet(document: Mapping[str, Any]) -> Sheet:
     """The sheet of a benchmark: for each scene what was measured of every chain."""
     words = (
@@ -585,14 +567,6 @@ def bench_sheet(document: Mapping[str, Any]) -> Sheet:
 def format_document(document: Mapping[str, Any]) -> str:
     """The text of a benchmark."""
     return "\n".join(list_lines(bench_sheet(document)))
-
-
-def write_bench_page(target: Path, document: Mapping[str, Any]) -> None:
-    """Write the page of a benchmark; document: as --json prints it."""
-    from wavebatch.tools.sheets.page import write_page
-
-    names = ", ".join(section["scene"] for section in document["scenes"])
-    write_page(target, f"wavebatch bench: {names}", bench_sheet(document).parts)
 
 
 def _scene_sheet(section: Mapping[str, Any], tolerance_cm: float | None) -> Sheet:
@@ -624,14 +598,6 @@ def _span(times: Mapping[str, Any]) -> str:
     return low if low == high else f"{low}..{high}"
 
 
-def _rate(times: Mapping[str, Any]) -> Cell:
-    """Waveforms per second from times in microseconds: median and range."""
-    if not times["median"]:
-        return Cell("-", "")
-    rate = 1e6 / times["median"]
-    return Cell(f"{rate:,.0f} ({1e6 / times['max']:,.0f}..{1e6 / times['min']:,.0f})", rate)
-
-
 def _speed_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     head = ("median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front")
     lines = []
@@ -641,7 +607,10 @@ def _speed_table(rows: Sequence[Mapping[str, Any]]) -> Table:
             name += f" (is {row['same_as']})"
         if row.get("crashed_or_hung"):
             name += f" ({row['crashed_or_hung']} crashed or hung)"
-        rates = (_rate(row[kind]) for kind in ("kernels", "file", "file_with_survey"))
+        rates = []
+        for times in (row[kind] for kind in ("kernels", "file", "file_with_survey")):  # microseconds per waveform
+            rate, least, most = (1e6 / times[end] if times["median"] else 0.0 for end in ("median", "max", "min"))
+            rates.append(Cell(f"{rate:,.0f} ({least:,.0f}..{most:,.0f})", rate) if rate else Cell("-", ""))
         megabytes = None if row["peak_bytes"] is None else row["peak_bytes"] / 1e6
         lines.append((name, *rates, row["survey_seconds"]["median"], megabytes, "*" if row["pareto"] else ""))
     return Table(head, lines, ("", "", "", "", ".2f", ".0f", ""), sortable=True)
@@ -668,6 +637,15 @@ def align(lines: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     form = "  ".join(["{:<%d}", *["{:>%d}"] * (len(widths) - 1)]) % tuple(widths)
     return [form.format(*line).rstrip() for line in lines]
+
+
+# Files and pictures
+
+NO_PLOT = f"no plot without matplotlib: {advise_install('matplotlib')}"
+PANELS = (
+    ("wrong", 100.0, "echoes missed or false [%]"),
+    ("rmse_all_cm", 1.0, "rms error of the range, all echoes [cm]"),
+)
 
 
 def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[str]:

@@ -409,7 +409,12 @@ def draw_cloud_map(found: Raster, target: Path, *, overwrite: bool = False) -> N
         shown = draw_cells(axes, found, grid.extent)
         length = width if flat else height
         add_colorbar(axes, shown, found.values, found.shown, found.label, length=length, flat=flat, place=place)
-        _place_ticks(axes, width, height, found.crs.unit)
+        # As many coordinates as fit.
+        space_ticks(axes.xaxis, width, 0.4 if width < 2.0 else 1.2)
+        space_ticks(axes.yaxis, height, 0.5)
+        if width < 2.0:
+            axes.tick_params(axis="x", labelrotation=90)
+        axes.set(xlabel=f"x [{found.crs.unit}]", ylabel=f"y [{found.crs.unit}]")
 
 
 def draw_cells(axes: Axes, found: Raster, extent: tuple[float, float, float, float]) -> Any:
@@ -439,16 +444,6 @@ def add_colorbar(
     )  # fmt: skip
     bar.set_label(fit_text(axes.figure, plain_text(label, 300), max(length, 2.0), size=9.5))
     bar.outline.set_visible(False)
-
-
-def _place_ticks(axes: Axes, width: float, height: float, unit: str) -> None:
-    """Places as many coordinates on the axes as fit; width, height: of the map [inches]."""
-    narrow = width < 2.0
-    space_ticks(axes.xaxis, width, 0.4 if narrow else 1.2)
-    space_ticks(axes.yaxis, height, 0.5)
-    if narrow:
-        axes.tick_params(axis="x", labelrotation=90)
-    axes.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]")
 
 
 def _title(names: tuple[str, ...], total: Tally, column: str, rest: Sequence[str]) -> str:

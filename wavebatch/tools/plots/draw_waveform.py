@@ -84,7 +84,14 @@ def draw_waveform_panels(
         panels = []
         for number, view in enumerate(views):
             panel = _draw_panels(figure, inner[number], view, times or view.span, small=small, room=room)
-            _label_axes(panel, view, left=number % columns == 0, bottom=number + columns >= len(views))
+            if number % columns == 0:
+                panel[0].set_ylabel("signal [DN]")
+                panel[-1].set_ylabel("residual\n[noise std]")
+                if view.seen is not None:
+                    # Narrow panels: longer lines would run into the labels above and below.
+                    panel[1].set_ylabel(textwrap.fill(view.seen.label, 15))
+            if number + columns >= len(views):
+                panel[-1].set_xlabel("time after the first sample [ns]")
             panels.append(panel[0])
         figure.align_ylabels()
         if text:
@@ -102,17 +109,6 @@ def draw_waveform_panels(
         figure.draw_without_rendering()
         for axes, view in zip(panels, views, strict=True):
             _number_echoes(axes, view, small=small)
-
-
-def _label_axes(panel: Sequence[Axes], view: WaveformView, *, left: bool, bottom: bool) -> None:
-    if left:
-        panel[0].set_ylabel("signal [DN]")
-        panel[-1].set_ylabel("residual\n[noise std]")
-        if view.seen is not None:
-            # Narrow panels: longer lines would run into the labels above and below.
-            panel[1].set_ylabel(textwrap.fill(view.seen.label, 15))
-    if bottom:
-        panel[-1].set_xlabel("time after the first sample [ns]")
 
 
 def _draw_panels(
@@ -177,7 +173,11 @@ def draw_samples(
 ) -> None:
     """Draws baseline, gaps, returns, pulses, fit and samples; dot: size of a sample; thin: factor of all lines."""
     axes.axhline(view.baseline, color=GREY, linewidth=0.8 * thin, zorder=1)
-    shade_gaps(axes, view)
+    _, start, end = find_stretches(np.isnan(view.samples)[None])  # between two recordings of a packet
+    for first, last in zip(start.tolist(), end.tolist(), strict=True):
+        low, high = ((place - 0.5) * view.spacing for place in (first, last))
+        axes.axvspan(low, high, facecolor="none", edgecolor="#cccccc", hatch="//", linewidth=0.0, zorder=0,
+                     label="not recorded")  # fmt: skip
     for place in view.returns:
         axes.axvline(place, color=VENDOR, linewidth=thin, linestyle=_DASHED, zorder=1, label="returns of the file")
     # Up to the sample beyond each side: all of a long waveform would be most of a page.
@@ -195,15 +195,6 @@ def draw_samples(
     if full.any():
         axes.plot(view.time[full], view.samples[full], "^", color=CLIPPED, markeredgecolor=INK, markersize=1.6 * dot,
                   markeredgewidth=0.6 * thin, zorder=3, label="saturated samples")  # fmt: skip
-
-
-def shade_gaps(axes: Axes, view: WaveformView) -> None:
-    """Hatches the times between two recordings of a packet, at which nothing was recorded."""
-    _, start, end = find_stretches(np.isnan(view.samples)[None])
-    for first, last in zip(start.tolist(), end.tolist(), strict=True):
-        low, high = ((place - 0.5) * view.spacing for place in (first, last))
-        axes.axvspan(low, high, facecolor="none", edgecolor="#cccccc", hatch="//", linewidth=0.0, zorder=0,
-                     label="not recorded")  # fmt: skip
 
 
 def find_echo_heights(view: WaveformView) -> np.ndarray:

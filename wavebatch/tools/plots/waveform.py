@@ -1,11 +1,10 @@
 """The data of a picture of a waveform: samples, noise, fit, residual, echoes and the vendor's returns, as arrays.
 
-`wavebatch plot waveform` reads the views here and draws them with `draw_waveform`. The chain runs as in `wavebatch
-run`; only the curves of the fitted pulses are computed again here. The echoes' parameters are lines of text below a
-picture, or rows of a CSV file.
-
-`find_places` finds the waveforms: by packet, point or GPS time, by flags of their echoes, or a few spread evenly. The
-strip is read unit by unit, only as far as needed.
+`wavebatch plot waveform` calls, in the order of this module, `find_places` and `read_views`, and draws the views with
+`draw_waveform`. `find_places` finds the waveforms: by packet, point or GPS time, by flags of their echoes, or a few
+spread evenly; the strip is read unit by unit, only as far as needed. For a view the chain runs as in `wavebatch run`;
+only the curves of the fitted pulses are computed again here. The echoes' parameters are lines of text below a picture
+(`list_echoes`), or rows of a CSV file (`format_echoes`).
 
 `see_block` gives what a detector saw: the signal in which it searched for echoes, with its threshold, by the function
 that its stage names (`searches`). tests/tools/test_detector_signals.py holds that the stages find echoes exactly where
@@ -37,82 +36,14 @@ from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.sensor import SensorRequest, find_sensor
 from wavebatch.tools.sheets.sheet import format_csv
 
-
-@frozen(eq=False)
-class DetectorSignal(Searched):
-    """The signal of a detector in one waveform; its arrays have no second axis."""
-
-    time: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """Times of its values after the first sample [ns], f8 (q,)."""
-    stage: str = ""
-    """The detector, with the parameters that are not its defaults."""
-    found: EchoTable | None = None
-    """The echoes that the detector found in the one waveform."""
-
-
-def list_signals() -> dict[str, str]:
-    """Kinds of signal that --show names, and the detector of each: the first by its name."""
-    found: dict[str, str] = {}
-    for name, one in sorted(STAGES.items()):
-        if one.searches and one.searches[0]:
-            found.setdefault(one.searches[0], name)
-    return found
-
-
-def choose_step(chain: Chain, show: str) -> Step:
-    """The detector whose signal is shown: that of the chain if it searches in this kind, else the kind's first one."""
-    step, kinds = chain.steps[1], list_signals()
-    if show == "detector":
-        if step.stage.searches is None:
-            raise ConfigError(f"--show detector: {step.stage.name} has no known signal; choose {', '.join(kinds)}")
-        return step
-    if show not in kinds:
-        raise ConfigError(f"--show {show!r}: must be one of {', '.join(('detector', *kinds))}")
-    is_chains = step.stage.searches is not None and step.stage.searches[0] == show
-    return step if is_chains else Step(STAGES[kinds[show]])
-
-
-def see_block(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, step: Step, *, in_chain: bool = True
-) -> list[DetectorSignal]:
-    """What the detector of a step sees in each waveform of a block, with the echoes that it finds there.
-
-    in_chain: whether it is the detector of the chain; the title then does not say that it is another one.
-    """
-    whole: Searched = step.stage.searches[1](block, noise, system, **step.effective())
-    found = step.stage.function(block, noise, system, **step.parameters)
-    name = describe_step(step) + ("" if in_chain else ", which the chain does not use")
-    time = (whole.first + np.arange(len(whole.values))) * block.spacing
-    words = (whole.label, whole.rule)
-    rest = {"first": whole.first, "deep": whole.deep, "second_label": whole.second_label, "time": time, "stage": name}
-    return [
-        DetectorSignal(
-            *words, whole.values[:, row] / np.float32(whole.unit), whole.least[row] / whole.unit, whole.signal[:, row],
-            second=None if whole.second is None else whole.second[:, row],
-            found=found.take(np.flatnonzero(found.waveform == row)), **rest,
-        )
-        for row in range(len(block))
-    ]  # fmt: skip
-
-
-def describe_step(step: Step) -> str:
-    """The stage, with the parameters that the chain sets."""
-    given = ", ".join(f"{name} = {value}" for name, value in step.parameters.items())
-    return step.stage.name + (f" ({given})" if given else "")
-
-
 FARTHEST = 1e-3
 """Largest distance of a pulse from the wanted GPS time [s]."""
-
 FEW = 6
 """Waveforms of a picture if their number is not given."""
-
 MOST = 24
 """Most waveforms of a picture: more would be too small to read."""
-
 MOST_ON_SHEET = 100
 """Most waveforms of a contact sheet."""
-
 _BLOCK = 4096
 """Waveforms that run through the chain at once when flags are searched."""
 
@@ -189,11 +120,20 @@ def find_places(
         found |= {("packet", number): Place(unit.number, int(row), number) for number, row in rows.items()}
         for point in wanted.points:
             if 0 <= point - unit.start < len(unit.points):
-                found["point", point] = _find_point(unit, base, point, str(path))
+                row = int(unit.packet_of_point[point - unit.start])
+                if row < 0:
+                    broken = unit.point_flags[point - unit.start] & EchoFlag.BROKEN_PACKET
+                    why = "a packet that cannot be used" if broken else "no waveform"
+                    raise ConfigError(f"{path}: point {point} has {why}; name another")
+                found["point", point] = _place(unit, base, row)
         for time in wanted.times:
-            row, apart = _find_nearest(unit, time)
-            if apart < away[time]:
-                away[time], found["time", time] = apart, _place(unit, base, row)
+            points = np.flatnonzero(unit.packet_of_point >= 0)
+            with np.errstate(invalid="ignore"):
+                apart = np.abs(unit.points["gps_time"][points] - time)
+            apart[np.isnan(apart)] = np.inf
+            if len(points) and apart.min() < away[time]:
+                away[time] = float(apart.min())
+                found["time", time] = _place(unit, base, int(unit.packet_of_point[points[np.argmin(apart)]]))
         # Times need not be in order: all units are read for them.
         if not wanted.times and len(found) == len({*numbers}) + len({*wanted.points}):
             break
@@ -244,25 +184,6 @@ def _place(unit: Unit, base: int, row: int) -> Place:
     return Place(unit.number, row, base + int(np.count_nonzero(owned[:row])) if owned[row] else -1)
 
 
-def _find_point(unit: Unit, base: int, point: int, path: str) -> Place:
-    row = int(unit.packet_of_point[point - unit.start])
-    if row < 0:
-        broken = unit.point_flags[point - unit.start] & EchoFlag.BROKEN_PACKET
-        why = "a packet that cannot be used" if broken else "no waveform"
-        raise ConfigError(f"{path}: point {point} has {why}; name another")
-    return _place(unit, base, row)
-
-
-def _find_nearest(unit: Unit, time: float) -> tuple[int, float]:
-    """Packet of the unit that is nearest to a GPS time, and how far away it is [s]; infinity if none has a time."""
-    points = np.flatnonzero(unit.packet_of_point >= 0)
-    with np.errstate(invalid="ignore"):
-        away = np.abs(unit.points["gps_time"][points] - time)
-    away[np.isnan(away)] = np.inf
-    nearest = int(np.argmin(away)) if len(away) else -1
-    return (int(unit.packet_of_point[points[nearest]]), float(away[nearest])) if len(away) else (-1, np.inf)
-
-
 def _find_flagged(
     reader: StripReader, scan: StripScan, wanted: Wanted, run: Callable[[WaveformBlock], EchoTable]
 ) -> list[Place]:
@@ -304,18 +225,16 @@ def _plan(chosen: PointFilter, some: EchoTable) -> PlannedFilter:
     return chosen.plan(made, find, "echoes")
 
 
+# Views
+
 FINE = 8
 """Points of a curve per sample."""
-
 MOST_POINTS = 20_000
 """Most points of a curve: more than any picture resolves."""
-
 NEGLIGIBLE = 1e-4
 """Share of its peak below which a curve is not kept: less than any line is wide."""
-
 BEFORE, AFTER = 4.0, 8.0
 """What is shown before the first [full widths] and after the last echo [sigma] of the widest echo."""
-
 VISIBLE = 5.0
 """Samples this far above the baseline, and residuals this large, are always shown [noise std]."""
 
@@ -387,7 +306,6 @@ class WaveformView:
         nearest = np.clip(np.rint(self.fine / self.spacing).astype(np.int64), 0, len(self.time) - 1)
         return np.where(np.isnan(self.samples), np.nan, self.level)[nearest]
 
-
     @property
     def span(self) -> tuple[float, float]:
         """The part that holds all that can be seen [ns]: echoes, returns, and samples or residuals above the noise."""
@@ -431,29 +349,6 @@ def read_views(
     return [views[place.unit, place.row] for place in places]
 
 
-def add_ranges(
-    chain: Chain, reader: StripReader, scan: StripScan
-) -> tuple[Chain, Callable[[WaveformBlock], WaveformBlock] | None, float]:
-    """The chain with the distances of echoes from the sensor, the function that gives blocks their sensor, its error.
-
-    The chain as it is, None and 0, where it computes no positions or those of the sensor are not known.
-    """
-    if not {"x", "y", "z"} <= {*chain.makes}:
-        return chain, None, 0.0
-    try:
-        source = find_sensor(reader, scan, SensorRequest())
-    except InputError:  # coordinates in feet or degrees
-        return chain, None, 0.0
-    step = () if "range" in chain.makes else (Step(STAGES["attribute.range"]),)
-    return Chain((*chain.steps, *step), chain.name), source.fill, source.error
-
-
-def name_chain(chain: Chain) -> str:
-    """Name, detector and decomposer of a chain, with the parameters that it sets."""
-    detector, decomposer = (describe_step(step) for step in chain.steps[1:3])
-    return f"{chain.name.removeprefix('profile ') or 'chain'}: {detector}, {decomposer}"
-
-
 def build_views(
     block: WaveformBlock, chain: Chain, system: SystemPulse, packets: Sequence[int], show: str | None = None
 ) -> list[WaveformView]:
@@ -486,7 +381,10 @@ def build_views(
                 seen_at = np.flatnonzero(np.abs(height) > NEGLIGIBLE * np.abs(height).max())
                 first, last = (seen_at[0], seen_at[-1]) if len(seen_at) else (0, 0)
                 curves.append(Curve(int(first), height[first : last + 1].copy()))
-            residual = _residual(samples - noise.level[row], fit, clipped, std, system.noise.gain)
+            # In standard deviations of the noise at each sample (docs/algorithms.md H6, H12).
+            residual = samples - noise.level[row] - fit
+            agrees = clipped & (residual <= 0)
+            residual = np.where(agrees, np.nan, residual / np.sqrt(std**2 + system.noise.gain * np.maximum(fit, 0.0)))
         returns = np.empty(0) if block.returns is None else block.returns.time[block.returns.waveform == row]
         views.append(
             WaveformView(
@@ -498,16 +396,98 @@ def build_views(
     return views
 
 
-def _residual(signal: np.ndarray, fit: np.ndarray, clipped: np.ndarray, std: float, noise_gain: float) -> np.ndarray:
-    """Signal less fit, in standard deviations of the noise at each sample (docs/algorithms.md H6, H12), f8 (s,)."""
-    difference = signal - fit
-    noise = np.sqrt(std**2 + noise_gain * np.maximum(fit, 0.0))
-    return np.where(clipped & (difference <= 0), np.nan, difference / noise)
+def add_ranges(
+    chain: Chain, reader: StripReader, scan: StripScan
+) -> tuple[Chain, Callable[[WaveformBlock], WaveformBlock] | None, float]:
+    """The chain with the distances of echoes from the sensor, the function that gives blocks their sensor, its error.
 
+    The chain as it is, None and 0, where it computes no positions or those of the sensor are not known.
+    """
+    if not {"x", "y", "z"} <= {*chain.makes}:
+        return chain, None, 0.0
+    try:
+        source = find_sensor(reader, scan, SensorRequest())
+    except InputError:  # coordinates in feet or degrees
+        return chain, None, 0.0
+    step = () if "range" in chain.makes else (Step(STAGES["attribute.range"]),)
+    return Chain((*chain.steps, *step), chain.name), source.fill, source.error
+
+
+def name_chain(chain: Chain) -> str:
+    """Name, detector and decomposer of a chain, with the parameters that it sets."""
+    detector, decomposer = (describe_step(step) for step in chain.steps[1:3])
+    return f"{chain.name.removeprefix('profile ') or 'chain'}: {detector}, {decomposer}"
+
+
+# What a detector saw
+
+@frozen(eq=False)
+class DetectorSignal(Searched):
+    """The signal of a detector in one waveform; its arrays have no second axis."""
+
+    time: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """Times of its values after the first sample [ns], f8 (q,)."""
+    stage: str = ""
+    """The detector, with the parameters that are not its defaults."""
+    found: EchoTable | None = None
+    """The echoes that the detector found in the one waveform."""
+
+
+def list_signals() -> dict[str, str]:
+    """Kinds of signal that --show names, and the detector of each: the first by its name."""
+    found: dict[str, str] = {}
+    for name, one in sorted(STAGES.items()):
+        if one.searches and one.searches[0]:
+            found.setdefault(one.searches[0], name)
+    return found
+
+
+def choose_step(chain: Chain, show: str) -> Step:
+    """The detector whose signal is shown: that of the chain if it searches in this kind, else the kind's first one."""
+    step, kinds = chain.steps[1], list_signals()
+    if show == "detector":
+        if step.stage.searches is None:
+            raise ConfigError(f"--show detector: {step.stage.name} has no known signal; choose {', '.join(kinds)}")
+        return step
+    if show not in kinds:
+        raise ConfigError(f"--show {show!r}: must be one of {', '.join(('detector', *kinds))}")
+    is_chains = step.stage.searches is not None and step.stage.searches[0] == show
+    return step if is_chains else Step(STAGES[kinds[show]])
+
+
+def see_block(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, step: Step, *, in_chain: bool = True
+) -> list[DetectorSignal]:
+    """What the detector of a step sees in each waveform of a block, with the echoes that it finds there.
+
+    in_chain: whether it is the detector of the chain; the title then does not say that it is another one.
+    """
+    whole: Searched = step.stage.searches[1](block, noise, system, **step.effective())
+    found = step.stage.function(block, noise, system, **step.parameters)
+    name = describe_step(step) + ("" if in_chain else ", which the chain does not use")
+    time = (whole.first + np.arange(len(whole.values))) * block.spacing
+    words = (whole.label, whole.rule)
+    rest = {"first": whole.first, "deep": whole.deep, "second_label": whole.second_label, "time": time, "stage": name}
+    return [
+        DetectorSignal(
+            *words, whole.values[:, row] / np.float32(whole.unit), whole.least[row] / whole.unit, whole.signal[:, row],
+            second=None if whole.second is None else whole.second[:, row],
+            found=found.take(np.flatnonzero(found.waveform == row)), **rest,
+        )
+        for row in range(len(block))
+    ]  # fmt: skip
+
+
+def describe_step(step: Step) -> str:
+    """The stage, with the parameters that the chain sets."""
+    given = ", ".join(f"{name} = {value}" for name, value in step.parameters.items())
+    return step.stage.name + (f" ({given})" if given else "")
+
+
+# Echoes as text
 
 MOST_LISTED = 40
 """Most echoes in the table of a picture; the CSV has all."""
-
 _FLAGS_WIDE = 50
 _NAMES = {"time": "echo_time", "amplitude": "amplitude", "sigma": "echo_width"}
 
@@ -540,27 +520,6 @@ def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
     return "\n".join(lines)
 
 
-def _measures(view: WaveformView, row: int) -> Iterator[tuple[float, float]]:
-    """Time, amplitude and full width of an echo, each with its error."""
-    for name in _NAMES:
-        factor = FWHM_PER_SIGMA if name == "sigma" else 1.0
-        yield tuple(factor * float(getattr(view.echoes, name + end)[row]) for end in ("", "_err"))
-
-
-def _column(view: WaveformView, name: str) -> np.ndarray:
-    """An attribute column of the echoes; NaN if the chain does not compute it."""
-    return np.asarray(view.echoes.attributes.get(name, np.full(len(view.echoes), np.nan)), np.float64)
-
-
-def _measure(value: float, error: float) -> str:
-    return format_measure(value, error, "\N{PLUS-MINUS SIGN}")
-
-
-def _cell(value: float, digits: int) -> str:
-    """The value with so many digits; empty for no data."""
-    return f"{value:.{digits}g}" if math.isfinite(value) else ""
-
-
 def format_echoes(views: Sequence[WaveformView]) -> str:
     """CSV with one row per echo; a waveform without echoes has one row without values. Empty cells are no data."""
     extra = list(dict.fromkeys(name for view in views for name in view.echoes.attributes))
@@ -580,3 +539,24 @@ def format_echoes(views: Sequence[WaveformView]) -> str:
         if not len(view.echoes):
             table.append([*place, *[""] * (len(head) - 2)])
     return format_csv([*head, "flags"], table)
+
+
+def _measures(view: WaveformView, row: int) -> Iterator[tuple[float, float]]:
+    """Time, amplitude and full width of an echo, each with its error."""
+    for name in _NAMES:
+        factor = FWHM_PER_SIGMA if name == "sigma" else 1.0
+        yield tuple(factor * float(getattr(view.echoes, name + end)[row]) for end in ("", "_err"))
+
+
+def _column(view: WaveformView, name: str) -> np.ndarray:
+    """An attribute column of the echoes; NaN if the chain does not compute it."""
+    return np.asarray(view.echoes.attributes.get(name, np.full(len(view.echoes), np.nan)), np.float64)
+
+
+def _measure(value: float, error: float) -> str:
+    return format_measure(value, error, "\N{PLUS-MINUS SIGN}")
+
+
+def _cell(value: float, digits: int) -> str:
+    """The value with so many digits; empty for no data."""
+    return f"{value:.{digits}g}" if math.isfinite(value) else ""

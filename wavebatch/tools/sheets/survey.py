@@ -55,8 +55,8 @@ def survey_sheet(survey: Survey, document: Mapping[str, Any]) -> Sheet:
     rows = [["needed" if one["needed"] else "left out", one["part"], one["reason"]] for one in document["decisions"]]
     decisions = Table(("decisions", "part of the chain", "reason"), rows)
     chosen = [decisions] if rows else [Note("The survey did not choose the chain: the user gave it.")]
-    facts = [*_list_strip(survey, document), *_list_noise(survey), *_list_pulse(survey, document), *_list_scene(survey)]
-    return Sheet("Survey", [*facts, Later(partial(_draw_survey, survey)), Sheet("Decisions", chosen)])
+    pictures = Later(partial(_draw_survey, survey))
+    return Sheet("Survey", [*_list_survey(survey, document), pictures, Sheet("Decisions", chosen)])
 
 
 def list_doubts(document: Mapping[str, Any]) -> list[Note]:
@@ -65,8 +65,9 @@ def list_doubts(document: Mapping[str, Any]) -> list[Note]:
     return [Note(words, "warning") for words in (*strips, *(one["text"] for one in document["warnings"]))]
 
 
-def _list_strip(survey: Survey, document: Mapping[str, Any]) -> Iterator[Part]:
-    figures = survey.figures
+def _list_survey(survey: Survey, document: Mapping[str, Any]) -> Iterator[Part]:
+    """What was surveyed, noise, pulse, and what the waveforms hold; figures that an old file lacks are left out."""
+    system, figures = survey.system, survey.figures
     if "points" in document:
         size = f"{count(document['points'], 'point')}, {count(document['packets'], 'packet')}"
         strips = document.get("strips")
@@ -83,10 +84,8 @@ def _list_strip(survey: Survey, document: Mapping[str, Any]) -> Iterator[Part]:
         yield Fact("ADC range", f"counts {round(figures.least_count)} to {round(figures.largest_count)}")
     if "direction" in document:
         yield Fact("vectors", f"{document['direction']['sign']} the sensor: {document['direction']['evidence']}")
-
-
-def _list_noise(survey: Survey) -> Iterator[Part]:
-    noise, strong = survey.system.noise, survey.figures.amplitude_99
+    # Noise
+    noise, strong = system.noise, figures.amplitude_99
     yield Fact("baseline", f"{noise.baseline:.3f} DN, +-{noise.baseline_spread:.3f} DN between waveforms")
     yield Fact("noise", f"{noise.std:.3f} DN for thresholds and errors" + (", chosen from" if noise.by_kind else ""))
     for kind, value in noise.by_kind.items():
@@ -94,10 +93,7 @@ def _list_noise(survey: Survey) -> Iterator[Part]:
         yield Fact(f"  {NOISE_KINDS.get(kind, kind.replace('_', ' '))}", known)
     grown = "" if strong is None else f", {noise.gain * strong:.2f} DN2 at {strong:.0f} DN"
     yield Fact("signal noise", f"variance grows by {noise.gain:.4f} DN2 per DN{grown}" if noise.gain > 0 else "none")
-
-
-def _list_pulse(survey: Survey, document: Mapping[str, Any]) -> Iterator[Part]:
-    system, figures = survey.system, survey.figures
+    # Pulse
     width = f"s_ref {system.sigma_ref:.4f} ns, full width at half maximum {system.sigma_ref * FWHM_PER_SIGMA:.3f} ns"
     yield Fact("system pulse", f"{name_model(system)}; {width}")
     yield Table(("Gaussians: weight", "delay ns", "sigma ns"), system.components, (".4f", ".3f", ".3f"))
@@ -115,8 +111,8 @@ def _list_pulse(survey: Survey, document: Mapping[str, Any]) -> Iterator[Part]:
     yield Table(heads, rows, ("", ".2f", ".3f", ".1%", ".3f", ""))
     if figures.false_in_noise_share is not None:
         shares = figures.false_in_noise_share, figures.false_by_misfit_share
-        noise, misfit = (f"{100 * share:.2g}" for share in shares)
-        words = f"of 100 echoes about {noise} noise (in quiet); beside 100 strong ones about {misfit} of misfit"
+        by_noise, misfit = (f"{100 * share:.2g}" for share in shares)
+        words = f"of 100 echoes about {by_noise} noise (in quiet); beside 100 strong ones about {misfit} of misfit"
         yield Fact("false echoes", words)
     yield Fact("kappa", f"{figures.kappa:z.4f}" if figures.kappa is not None else "not known")
     yield Fact("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
@@ -128,13 +124,9 @@ def _list_pulse(survey: Survey, document: Mapping[str, Any]) -> Iterator[Part]:
         words = "mrad by the widths of echoes over the slopes of their surfaces, if these are plane"
         yield Fact("beam", f"{seen} {words}")
     for index, one in system.digitizers.items():
-        noise = f"baseline {one.noise.baseline:.3f} DN, noise {one.noise.std:.3f} DN"
-        yield Fact(f"digitizer {index}", f"{noise}; {name_model(one)}; s_ref {one.sigma_ref:.4f} ns")
-
-
-def _list_scene(survey: Survey) -> Iterator[Part]:
-    """Saturation, and what the waveforms hold; figures that an old file lacks are left out."""
-    system, figures = survey.system, survey.figures
+        levels = f"baseline {one.noise.baseline:.3f} DN, noise {one.noise.std:.3f} DN"
+        yield Fact(f"digitizer {index}", f"{levels}; {name_model(one)}; s_ref {one.sigma_ref:.4f} ns")
+    # Saturation and scene
     clipped = "none found"
     if system.saturation is not None:
         share = figures.saturated_share

@@ -199,11 +199,31 @@ class LightModel:
 
         Raises InputError for shares that are none, and for points above the sensor.
         """
-        sigma = self._measure_sigma(rows["echo_width"] if self._read_width is None else self._read_width(records))
+        width = rows["echo_width"] if self._read_width is None else self._read_width(records)
+        known = width > 0
+        measured = np.where(known, width, 0.0) / FWHM_PER_SIGMA
+        limited = np.clip(measured, 0.5 * self.options.spacing, WIDEST)
+        self.counts.own_width += int(np.count_nonzero(known))
+        self.counts.limited_width += int(np.count_nonzero(known & (limited != measured)))
+        sigma = np.where(known, limited, self.options.sigma)
         intensity = rows["intensity"].astype(np.float64)
         if self.options.radar is None:
             return ReturnLight(intensity, sigma)
-        power = _receive(intensity / 65535, rows, self.options.radar, self.path)
+        radar = self.options.radar
+        distance = (radar.height - rows["xyz"][:, 2]) / np.cos(np.radians(np.clip(rows["scan_angle"], -80, 80)))
+        if len(distance) and distance.min() <= 0:
+            highest = rows["xyz"][:, 2].max()
+            raise InputError(f"{self.path}: points as high as {highest:g} m lie above the sensor at {radar.height:g} m")
+        # Received power of surfaces that fill the beam [W].
+        power = receive_power(
+            spread_cross_section(intensity / 65535, distance, 1e-3 * radar.divergence),
+            distance,
+            transmitted=radar.power,
+            aperture=radar.aperture,
+            divergence=1e-3 * radar.divergence,
+            efficiency=radar.efficiency,
+            attenuation=radar.attenuation,
+        )
         # The power is that of an echo as short as the pulse: a wider one spreads the same energy over a longer time.
         power *= self.options.sigma / sigma
         if self.options.shares is not None:
@@ -219,14 +239,6 @@ class LightModel:
                 f"{self.path}: --widths {self.options.widths}: {counts.limited_width} of {counts.own_width} values are "
                 f"outside of {least:.2g} to {most:.0f} ns; give a column with the width of each echo in ns"
             )
-
-    def _measure_sigma(self, width: np.ndarray) -> np.ndarray:
-        known = width > 0
-        measured = np.where(known, width, 0.0) / FWHM_PER_SIGMA
-        limited = np.clip(measured, 0.5 * self.options.spacing, WIDEST)
-        self.counts.own_width += int(np.count_nonzero(known))
-        self.counts.limited_width += int(np.count_nonzero(known & (limited != measured)))
-        return np.where(known, limited, self.options.sigma)
 
     def _measure_shares(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> np.ndarray:
         known = over = 0
@@ -275,23 +287,6 @@ def fill_shares(share: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, int]
     rest = np.clip(1.0 - total, 0.0, 1.0) / np.maximum(unknown, 1.0)
     filled = np.where(known, share, rest[pulse]) / np.maximum(total, 1.0)[pulse]
     return filled, int(np.count_nonzero(total > 1.0 + _TOLERANCE))
-
-
-def _receive(reflectance: np.ndarray, rows: np.ndarray, radar: Radar, path: Path) -> np.ndarray:
-    """Received power of surfaces that fill the beam [W]."""
-    distance = (radar.height - rows["xyz"][:, 2]) / np.cos(np.radians(np.clip(rows["scan_angle"], -80, 80)))
-    if len(distance) and distance.min() <= 0:
-        highest = rows["xyz"][:, 2].max()
-        raise InputError(f"{path}: points as high as {highest:g} m lie above the sensor at {radar.height:g} m")
-    return receive_power(
-        spread_cross_section(reflectance, distance, 1e-3 * radar.divergence),
-        distance,
-        transmitted=radar.power,
-        aperture=radar.aperture,
-        divergence=1e-3 * radar.divergence,
-        efficiency=radar.efficiency,
-        attenuation=radar.attenuation,
-    )
 
 
 WEAKEST = 3.0
@@ -359,7 +354,14 @@ class DiscreteReceiver:
         m = len(pulse)
         first = np.searchsorted(pulse, pulse, side="left")
         end = np.searchsorted(pulse, pulse, side="right")
-        reach = _end_of_dead_zone(distance, distance + self.dead_zone, end)
+        # End of the dead zone: the first row of the same pulse at or beyond it, else the row after the pulse.
+        limit = distance + self.dead_zone
+        reach = np.arange(m)
+        moving = reach.copy()
+        while len(moving):
+            reach[moving] += 1
+            moving = moving[reach[moving] < end[moving]]
+            moving = moving[distance[reach[moving]] < limit[moving]]
         sums = np.concatenate([[0.0], np.cumsum(amplitude, dtype=np.float64)])
         energy = sums[reach] - sums[:m]
         loud = np.where(energy > self.threshold, np.arange(m), m)
@@ -375,17 +377,6 @@ class DiscreteReceiver:
         row = np.concatenate(rows)
         order = np.argsort(row, kind="stable")
         return row[order], np.concatenate(numbers)[order], energy[row[order]]
-
-
-def _end_of_dead_zone(distance: np.ndarray, limit: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """First row of the same pulse at or beyond the limit, else the row after the pulse, i8 (m,)."""
-    reach = np.arange(len(distance))
-    moving = reach.copy()
-    while len(moving):
-        reach[moving] += 1
-        moving = moving[reach[moving] < end[moving]]
-        moving = moving[distance[reach[moving]] < limit[moving]]
-    return reach
 
 
 def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, keep_empty: bool) -> Returns:
@@ -563,14 +554,29 @@ def synthesize_strip(
         gain = _choose_gain(reader, LightModel(reader.path, options)) if options.gain is None else options.gain
         summary = SynthesisSummary(gain=gain, light=light.counts, level=recordings[0].empty_level)
         rise = options.spacing * (summary.level - options.baseline)
-        with _open_writer(reader, Path(target), options, overwrite) as writer:
+        point_format = _FORMATS[reader.point_format]
+        with FullwaveWriter(
+            Path(target), version="1.3" if point_format < 6 else "1.4", point_format=point_format,
+            internal=options.internal, scales=reader.scales, offsets=reader.offsets, overwrite=overwrite,
+            digitizers=[Digitizer(i, options.bits, length, options.spacing) for i, length in enumerate(_LENGTHS, 1)],
+            records=repair_records(vlr for vlr in read_header(reader.path).vlrs if is_projection(vlr)),
+        ) as writer:  # fmt: skip
             for number, (rows, records) in enumerate(_read_pulses(reader, piece)):
                 rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(number,)))
                 pulses = _model_pulses(rows, records, gain, light, rng)
                 offset, energy = _write_packets(writer, recordings, pulses, rng)
                 summary.energy_recorded += energy
                 summary.energy_of_level += rise * float(np.append(_LENGTHS, 0)[pulses.kind].sum())
-                writer.write_points(_fill_points(writer.dtype, records, pulses, offset, options))
+                # Fields of the input, and where their packets are.
+                points = np.zeros(len(records), writer.dtype)
+                for name in set(field_names(writer.dtype)) & set(field_names(records.dtype)) - set(_PACKET_FIELDS):
+                    points[name] = records[name]
+                kind = pulses.kind[pulses.pulse]
+                index = np.where(kind < len(_LENGTHS), kind + 1, 0)
+                size = np.append(_LENGTHS, 0)[kind] * (options.bits // 8)
+                ray = pulses.ray[pulses.pulse] * HALF_C
+                fill_packets(points, index, offset[pulses.pulse], size, pulses.time, ray)
+                writer.write_points(points)
                 _count(summary, pulses, recordings[0])
                 if progress:
                     progress(len(rows))
@@ -592,22 +598,6 @@ def _read_pulses(reader: CloudReader, size: int = PIECE) -> Iterator[tuple[np.nd
             rows, records = rows[starts[-1] :], records[starts[-1] :]
     if rows is not None and records is not None and len(rows):
         yield rows, records
-
-
-def _open_writer(reader: CloudReader, target: Path, options: SynthesisOptions, overwrite: bool) -> FullwaveWriter:
-    point_format = _FORMATS[reader.point_format]
-    lengths = enumerate(_LENGTHS, 1)
-    return FullwaveWriter(
-        target,
-        version="1.3" if point_format < 6 else "1.4",
-        point_format=point_format,
-        internal=options.internal,
-        digitizers=[Digitizer(number, options.bits, length, options.spacing) for number, length in lengths],
-        scales=reader.scales,
-        offsets=reader.offsets,
-        records=repair_records(vlr for vlr in read_header(reader.path).vlrs if is_projection(vlr)),
-        overwrite=overwrite,
-    )
 
 
 def _choose_gain(reader: CloudReader, light: LightModel) -> float:
@@ -673,20 +663,6 @@ def _write_packets(
             energy += recording.spacing * (float(counts.sum(dtype=np.float64)) - recording.baseline * counts.size)
             offset[chosen] = writer.write_packets(counts, number + 1)
     return offset, energy
-
-
-def _fill_points(
-    dtype: np.dtype, records: np.ndarray, pulses: _Pulses, offset: np.ndarray, options: SynthesisOptions
-) -> np.ndarray:
-    """Output points: fields of the input, and where their packets are."""
-    points = np.zeros(len(records), dtype)
-    for name in set(field_names(dtype)) & set(field_names(records.dtype)) - set(_PACKET_FIELDS):
-        points[name] = records[name]
-    kind = pulses.kind[pulses.pulse]
-    index = np.where(kind < len(_LENGTHS), kind + 1, 0)
-    size = np.append(_LENGTHS, 0)[kind] * (options.bits // 8)
-    fill_packets(points, index, offset[pulses.pulse], size, pulses.time, pulses.ray[pulses.pulse] * HALF_C)
-    return points
 
 
 def _count(summary: SynthesisSummary, pulses: _Pulses, recording: Recording) -> None:

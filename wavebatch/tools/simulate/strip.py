@@ -85,15 +85,6 @@ class TruthWriter(NpzWriter):
         return super().complete({_META: json.dumps(meta, sort_keys=True)})
 
 
-def _check_meta(meta: Any) -> dict[str, Any]:
-    """The description, if it has the numbers that comparisons need; else ValueError."""
-    for key, least, most in (("noise_std", 0.0, 1e9), ("spacing", 1e-6, 1e6), ("packets", 0, 1 << 40)):
-        value = meta[key]
-        if type(value) not in (int, float) or not least <= value <= most:
-            raise ValueError(f"{key} of its description is {str(value)[:40]}")
-    return meta
-
-
 class TruthReader(Closing):
     """Reads a truth file; raises InputError when `path` is none."""
 
@@ -106,7 +97,12 @@ class TruthReader(Closing):
             if lacking:
                 raise InputError(f"{self.path}: no truth file of wavebatch simulate: lacks {', '.join(lacking)}")
             with self._archive.open(f"{_META}.npy") as member:
-                self.meta: dict[str, Any] = _check_meta(json.loads(self._read_text(member)))
+                self.meta: dict[str, Any] = json.loads(self._read_text(member))
+            # The numbers that comparisons need.
+            for key, least, most in (("noise_std", 0.0, 1e9), ("spacing", 1e-6, 1e6), ("packets", 0, 1 << 40)):
+                value = self.meta[key]
+                if type(value) not in (int, float) or not least <= value <= most:
+                    raise ValueError(f"{key} of its description is {str(value)[:40]}")
 
     def _reading(self) -> contextlib.AbstractContextManager[None]:
         return reading_npz(self.path, "truth file of `wavebatch simulate`", "simulate the strip again")

@@ -13,7 +13,7 @@ interception: leaves of .5 over ground of .15 hide a gap probability of .61 as o
 `deconvolve_block` makes profiles of the waveforms: deconvolved, noise removed, placed by the returns of their packets.
 A profile does not depend on the other waveforms of its block.
 
-`Floor` and `find_ceiling` are maps of the lowest and of the highest returns of a strip. The floor divides the signal of
+`Floor` and `Ceiling` are maps of the lowest and of the highest returns of a strip. The floor divides the signal of
 a ray into ground and canopy, without any classification: light of a ray is shared between them, so signal that is
 wrongly taken for ground changes gap probabilities by the ratio of both reflectances only. Above the ceiling rays cross
 only air; without --headroom each ray is counted from there, so that voxels near the surface get all light that crossed
@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -133,10 +134,22 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
     support = widen(smooth_121(signal) > np.float32(SUPPORT * SMOOTH_GAIN) * noise.std, 1)
     width = system.sigma_ref / block.spacing
     first, length = deconvolve.window_signal(support, int(np.ceil(_PULSE_REACH * width)))
-    least = options.threshold * _lone_error(taps, width, options)
+    # Standard deviation of the sum of a lone echo's profile, in units of that of a sample: of the iterations near that
+    # of the matched filter, of the linear filter by its taps.
+    error = 1.0 / np.sqrt(np.sum(taps**2))
+    if options.method == "wiener":
+        inverse = deconvolve.wiener_taps(taps, (options.snr or SNR) ** -2.0, 4 * len(taps))
+        box = np.ones(2 * max(int(round(width)), 1) + 1)
+        error = np.sqrt(np.sum(np.convolve(inverse, box) ** 2))
+    least = options.threshold * float(error)
     floor = FLOOR * max(least, 1e-3) / max(width, 1.0)
     value, seen = np.zeros((n, s)), np.zeros(n, bool)
-    for rows in _group_rows(length):
+    # Waveforms with windows of equal length together; those without signal are left out.
+    order = np.argsort(length, kind="stable")
+    edges = np.append(np.flatnonzero(np.diff(length[order], prepend=0)), n)
+    groups = (order[at : min(at + AT_A_TIME, high)] for low, high in pairwise(edges.tolist())
+              for at in range(low, high, AT_A_TIME))  # fmt: skip
+    for rows in groups:
         place = first[rows] + np.arange(length[rows[0]])[:, None]
         std = noise.std[rows].astype(np.float64)
         part = signal[place, rows]
@@ -148,30 +161,14 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
         if block.missing is not None:
             kept = np.where(block.missing[rows[:, None], place.T], 0.0, kept)
         value[rows[:, None], place.T] = kept
-    offset, anchored = _find_offsets(block, value)
+    offset, anchored = np.zeros(n), np.zeros(n, bool)
+    if block.returns is not None and len(block.returns):
+        reach = int(np.ceil(TOLERANCE / block.spacing + 0.5))
+        row = block.returns.waveform.astype(np.int64)
+        offset, anchored = deconvolve.measure_offsets(value, row, block.returns.time / block.spacing, reach)
+        offset = offset * block.spacing
     clipped = (block.samples >= clip_level(block, system)).any(axis=1)
     return Profiles(value, area, seen, offset, anchored, clipped)
-
-
-def _group_rows(length: np.ndarray) -> Iterator[np.ndarray]:
-    """Rows of waveforms with windows of equal length, AT_A_TIME at most; those without signal are left out."""
-    order = np.argsort(length, kind="stable")
-    edges = np.append(np.flatnonzero(np.diff(length[order], prepend=0)), len(order))
-    for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        for begin in range(low, high, AT_A_TIME):
-            yield order[begin : min(begin + AT_A_TIME, high)]
-
-
-def _lone_error(taps: np.ndarray, width: float, options: Deconvolution) -> float:
-    """Standard deviation of the sum of a lone echo's profile, in units of that of a sample.
-
-    That of the iterations is near the matched filter's; that of the linear filter follows from its taps.
-    """
-    if options.method != "wiener":
-        return float(1.0 / np.sqrt(np.sum(taps**2)))
-    inverse = deconvolve.wiener_taps(taps, (options.snr or SNR) ** -2.0, 4 * len(taps))
-    box = np.ones(2 * max(int(round(width)), 1) + 1)
-    return float(np.sqrt(np.sum(np.convolve(inverse, box) ** 2)))
 
 
 def _deconvolve(signal: np.ndarray, taps: np.ndarray, std: np.ndarray, options: Deconvolution) -> np.ndarray:
@@ -196,17 +193,6 @@ def _pulse_taps(system: SystemPulse, spacing: float) -> tuple[np.ndarray, float]
     lag = np.arange(len(given.taps)) - given.middle
     taps = np.where((lag >= -BEFORE * unit) & (lag <= AFTER * unit), given.taps, 0.0)
     return taps, float(np.sum(taps)) * spacing
-
-
-def _find_offsets(block: WaveformBlock, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets of the profiles from the returns of their packets [ns], and where they are known."""
-    returns = block.returns
-    if returns is None or not len(returns):
-        return np.zeros(len(block)), np.zeros(len(block), bool)
-    reach = int(np.ceil(TOLERANCE / block.spacing + 0.5))
-    row = returns.waveform.astype(np.int64)
-    offset, known = deconvolve.measure_offsets(value, row, returns.time / block.spacing, reach)
-    return offset * block.spacing, known
 
 
 MOST_CELLS = 1 << 18
@@ -365,16 +351,6 @@ class Ceiling(CellMap):
         return headroom
 
 
-def find_ceiling(reader: StripReader, scan: StripScan, middle: np.ndarray, size: float, floor: Floor) -> Ceiling:
-    """The ceiling of a strip; reads all of its points, and adds them to `floor` too."""
-    ceiling = Ceiling(middle, size)
-    for begin, end in zip(scan.borders[:-1].tolist(), scan.borders[1:].tolist(), strict=True):
-        xyz = locate(reader.read_points(begin, end), reader.facts.header)
-        ceiling.add(xyz)
-        floor.add(xyz)
-    return ceiling.finish()
-
-
 BATCH_SAMPLES = 1 << 20
 """Samples read at a time."""
 
@@ -414,7 +390,13 @@ def read_batches(
         near = [one for one in (number, number + 1) if one < reader.unit_count()]
         units = {one: units.get(one) or reader.read_unit(one, scan) for one in near}
         lost = {one: lost.get(one, np.empty(0, LOST)) for one in (number - 1, *near)}
-        lost |= {one: _list_lost(reader, unit) for one, unit in units.items() if not len(lost[one])}
+        for one, unit in units.items():
+            if not len(lost[one]):  # the returns without a packet that can be read
+                points = unit.points[unit.packet_of_point < 0]
+                lost[one] = np.zeros(len(points), LOST)
+                lost[one]["time"], lost[one]["place"] = points["gps_time"], locate(points, reader.facts.header)
+                scanner = read_scanner(points)
+                lost[one]["scanner"] = 0 if scanner is None else scanner
         rows = [np.flatnonzero(unit.packets.owned) for unit in units.values()]
         rows[0] = rows[0][~np.isin(units[number].packets.owner[rows[0]], taken)]
         tables = list(zip(units.values(), rows, strict=True))
@@ -423,7 +405,15 @@ def read_batches(
         group = group_times(time)
         here = np.flatnonzero(group < len(rows[0]))
         taken = owner[here[here >= len(rows[0])]]
-        known = _match_lost(np.concatenate(list(lost.values())), time, owner)
+        # Lost returns of equal time with packets, with their group.
+        known = np.concatenate(list(lost.values()))
+        values, first, count = np.unique(time, return_index=True, return_counts=True)
+        at = np.minimum(np.searchsorted(values, known["time"]), max(len(values) - 1, 0))
+        if len(values):
+            known["group"] = owner[first[at]]
+            known = known[(values[at] == known["time"]) & (known["time"] != 0) & (count[at] < LONGEST_PULSE)]
+        else:
+            known = known[:0]
         kept = np.ones(len(owner), bool)
         if keep is not None:
             kept = np.concatenate([_choose_packets(unit, keep)[some] for unit, some in tables])
@@ -443,26 +433,6 @@ def read_batches(
                 parts.append((unit, mine[some[inside] - shift], groups[inside], kept[some[inside]]))
             if len(some):
                 yield Batch(parts, known[np.isin(known["group"], groups)])
-
-
-def _list_lost(reader: StripReader, unit: Unit) -> np.ndarray:
-    """The returns of a unit without a packet that can be read."""
-    points = unit.points[unit.packet_of_point < 0]
-    lost = np.zeros(len(points), LOST)
-    lost["time"], lost["place"] = points["gps_time"], locate(points, reader.facts.header)
-    scanner = read_scanner(points)
-    lost["scanner"] = 0 if scanner is None else scanner
-    return lost
-
-
-def _match_lost(lost: np.ndarray, time: np.ndarray, owner: np.ndarray) -> np.ndarray:
-    """Those of equal time with packets, with their group."""
-    values, first, count = np.unique(time, return_index=True, return_counts=True)
-    if not len(values):
-        return lost[:0]
-    at = np.minimum(np.searchsorted(values, lost["time"]), len(values) - 1)
-    lost["group"] = owner[first[at]]
-    return lost[(values[at] == lost["time"]) & (lost["time"] != 0) & (count[at] < LONGEST_PULSE)]
 
 
 def _choose_packets(unit: Unit, keep: PlannedFilter) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import MISSING, asdict, dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,9 +23,10 @@ from wavebatch.core.schema import Above, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
-from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter
+from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.disk.temp_store import HELD
+from wavebatch.files.las.header import locate
 from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
@@ -176,7 +178,10 @@ def voxelize_strip(
     """
     strip, target = Path(strip), Path(target)
     voxel_grid.check_voxel_target(target, strip)
-    keep = _plan(strip, options.chosen)
+    keep = None  # the filter for the points of the strip, where it leaves any out
+    if options.chosen:
+        with CloudReader(strip) as cloud:
+            keep = cloud.plan(options.chosen)
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: the voxels are written to this file; choose another name")
@@ -197,17 +202,27 @@ def voxelize_strip(
                     "or give a --system file that has it"
                 )
         middle = _find_middle(reader, scan, options)
-        floor = rays.Floor(middle)
-        ceiling = rays.find_ceiling(reader, scan, middle, options.size, floor)
-        tracer = _Tracer(reader, source, pulse, options, floor.finish(), ceiling, energy, calibration is not None)
+        floor, ceiling = rays.Floor(middle), rays.Ceiling(middle, options.size)
+        for begin, end in pairwise(scan.borders.tolist()):
+            xyz = locate(reader.read_points(begin, end), reader.facts.header)
+            floor.add(xyz)
+            ceiling.add(xyz)
+        tracer = _Tracer(
+            reader, source, pulse, options, floor.finish(), ceiling.finish(), energy, calibration is not None
+        )
         numbers = even_places(reader.unit_count(), _SAMPLED_UNITS)
         each = -(-SAMPLED // max(len(numbers), 1))  # about SAMPLED pulses, spread evenly over the strip
         batches = rays.read_batches(
             reader, scan, numbers=numbers.tolist(), choose=lambda rows: rows[even_places(len(rows), each)]
         )
         rule = rays.find_rule(map(tracer.trace, batches), options.reflectance_ratio)
+        most_bits = max(digitizer.bits for digitizer in reader.facts.digitizers.values() if digitizer.n_samples)
         with (
-            _open_grid(reader, middle, options, calibration is not None, tracer.floor, held) as grid,
+            voxel_grid.VoxelGrid(
+                options.size, np.floor(middle / options.size).astype(np.int64), voxel_grid.energy_unit(most_bits),
+                sections=calibration is not None, everything=options.all_crossed or options.forest,
+                floor=tracer.floor if options.forest else None, held=held,
+            ) as grid,
             (
                 voxel_grid.ProfileWriter(Path(profiles), strip, sections=calibration is not None, overwrite=overwrite)
                 if profiles is not None
@@ -250,14 +265,6 @@ def voxelize_strip(
             return summary
 
 
-def _plan(strip: Path, chosen: PointFilter) -> PlannedFilter | None:
-    """The filter for the points of the strip; None where it leaves none out."""
-    if not chosen:
-        return None
-    with CloudReader(strip) as reader:
-        return reader.plan(chosen)
-
-
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
     """A position in the middle of the strip, f8 (3,) [m]; ConfigError where the voxels are too small for the strip."""
     path, size = reader.facts.path, options.size
@@ -280,21 +287,6 @@ def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) ->
     if size > options.size:
         raise ConfigError(f"--size {options.size:g}: too small for the extent of this strip; take {size:g} m or more")
     return middle
-
-
-def _open_grid(
-    reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, floor: rays.Floor, held: int
-) -> voxel_grid.VoxelGrid:
-    digitizers = reader.facts.digitizers.values()
-    return voxel_grid.VoxelGrid(
-        options.size,
-        np.floor(middle / options.size).astype(np.int64),
-        voxel_grid.energy_unit(max(digitizer.bits for digitizer in digitizers if digitizer.n_samples)),
-        sections=sections,
-        everything=options.all_crossed or options.forest,
-        floor=floor if options.forest else None,
-        held=held,
-    )
 
 
 @frozen
