@@ -153,11 +153,7 @@ def test_sums_of_gaussians_are_fitted_as_by_the_twin(rng, components, hard):
     expected = naive_fit.fit_stack(stack, start, np.ones(len(lag)))
     weight, delay, _ = expected[0]
     assert found.datum == pytest.approx(delay, abs=1e-4)
-    # Two that share a tail may differ where their sum does not.
-    assert found.components == pytest.approx(expected / [weight, 1, 1] - [0, delay, 0], abs=1e-3)
-    drawn = (sum(w * np.exp(-0.5 * ((lag - d) / s) ** 2) for w, d, s in part) for part in (
-        found.components * [weight, 1, 1] + [0, found.datum, 0], expected))  # fmt: skip
-    assert np.subtract(*drawn) == pytest.approx(0, abs=5e-5)
+    assert found.components == pytest.approx(expected / [weight, 1, 1] - [0, delay, 0], abs=3e-4)
     if hard and components > 2:
         assert (found.components[:, 0] * weight).min() == pytest.approx(-0.3, abs=1e-6), "it is held at its bound"
 

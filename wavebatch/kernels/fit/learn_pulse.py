@@ -30,7 +30,7 @@ TRIAL_EVALUATIONS = 25
 MOST_EVALUATIONS = 200
 """Evaluations after which a fit ends."""
 
-FIRST_DAMPING, MOST_DAMPING, FIT_SETTLED = 10.0, 1e8, 1e-6
+FIRST_DAMPING, MOST_DAMPING, FIT_SETTLED = 10.0, 1e8, 1e-7
 """Damping of the first step (less jumps into pairs of broad components that cancel), damping at which no step helps,
 and share by which the sum of squares falls in the last step."""
 
