@@ -20,7 +20,7 @@ INSIDE = {
         {"neighbour_pass", "report_file"}, {"strip_task"}, {"run"},
     ],
     "surveying/measuring": [
-        {"lone_echoes"}, {"noise_and_width"}, {"residuals"},
+        {"noise_and_width"}, {"residuals"},
         {"misfit", "learn_pulse", "judge", "whitening", "return_scatter"}, {"joint_pulse", "mirror"}, {"choose_pulse"},
     ],
     "batch/workers": [

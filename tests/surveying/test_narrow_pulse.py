@@ -9,7 +9,7 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
-from wavebatch.surveying.systems.known_systems import Trial, draw_pulse, find_source, known_systems, limit_surveys
+from wavebatch.surveying.systems.known_systems import draw_pulse, find_source, known_systems, leave_out
 
 NUMBER, LENGTH, NOISE = 600, 90, 1.2
 
@@ -71,7 +71,7 @@ def test_a_pulse_is_no_wider_than_the_narrowest_echoes(seed, sigma, tail, share)
 )
 def test_strangers_have_the_width_of_their_measured_pulses(strip, name, width):
     """Outgoing pulses, and an impulse response. Surveys found 7.39 and 13.5 ns; the last one of LVIS 7.02."""
-    with StripReader(data_file(strip)) as reader, reader.scan() as scan, limit_surveys(Trial(left_out=name)):
+    with StripReader(data_file(strip)) as reader, reader.scan() as scan, leave_out(name):
         survey = survey_blocks(read_sample(reader, scan))
         assert find_source(survey.system) is None
     assert _half_width(survey.system) == pytest.approx(width, rel=0.06)
@@ -81,13 +81,13 @@ def test_strangers_have_the_width_of_their_measured_pulses(strip, name, width):
 @pytest.mark.parametrize("part", [0, 1])
 def test_parts_of_a_stranger_have_one_width(part):
     """Halves of LVIS had 8.51 and 8.24 ns."""
-    with StripReader(data_file("lvis/lvis1.las")) as reader, reader.scan() as scan, limit_surveys(Trial("nasa-lvis")):
+    with StripReader(data_file("lvis/lvis1.las")) as reader, reader.scan() as scan, leave_out("nasa-lvis"):
         half = [block.rows(slice(part, None, 2)) for block in read_sample(reader, scan)]
         assert _half_width(survey_blocks(half).system) == pytest.approx(6.68, rel=0.05)
 
 
 def test_surveys_can_do_without_a_known_sensor():
     lvis = next(known for known in known_systems() if known.name == "nasa-lvis")
-    with limit_surveys(Trial("nasa-lvis")):
+    with leave_out("nasa-lvis"):
         assert lvis not in known_systems() and find_source(lvis.system) is None
     assert lvis in known_systems() and find_source(lvis.system) == lvis

@@ -2,9 +2,9 @@
 
 How a strip is surveyed:
 
-1. In the folder `measuring`, `lone_echoes` fits the echoes that are alone in their waveform. From them,
-   `noise_and_width` finds noise, baseline, pulse width and saturation, and `learn_pulse` the pulse's shape; `residuals`
-   finds the noise again from what fits leave, `misfit` what the pulse does not explain.
+1. In the folder `measuring`, `noise_and_width` fits the echoes that are alone in their waveform, and finds noise,
+   baseline, pulse width and saturation from them, `learn_pulse` the pulse's shape; `residuals` finds the noise again
+   from what fits leave, `misfit` what the pulse does not explain.
 2. `survey` runs these and decides which parts of a chain the scene needs. Its result is in `systems/survey_result`;
    `system_file` saves it. `look` is the short survey by which strips are compared with a result.
 3. `choose_chain` turns the decisions into a chain, and gives each strip its pulse and its chain; `predict_error` tries

@@ -34,8 +34,7 @@ from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_varia
 from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, MIN_SNR
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey

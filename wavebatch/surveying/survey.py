@@ -22,12 +22,12 @@ from wavebatch.surveying.measuring.learn_pulse import (
     find_strong,
     learn_pulse,
 )
-from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.misfit import MOST_FAINT, PEAK, cover_fits, limit_faint, measure_beside, measure_tail
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,
+    MIN_SNR,
     RESIDUAL_LOOK,
     SMALL,
     list_widths,

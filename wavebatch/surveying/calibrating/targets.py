@@ -38,7 +38,7 @@ from wavebatch.surveying.calibrating.calibration_files import LEAST_REFLECTANCE,
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
 from wavebatch.surveying.matching.setting import SCANNERS, keep_places, read_day, read_sensor_name
-from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
+from wavebatch.surveying.measuring.noise_and_width import MIN_SNR
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
 from wavebatch.surveying.sensor import SensorSource
 

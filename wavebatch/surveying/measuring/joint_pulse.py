@@ -17,7 +17,6 @@ from wavebatch.kernels.fit.describe import gather_pulse
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, refine_gaussians
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.judge import Explained, find_own_width, sample_noise
-from wavebatch.surveying.systems.known_systems import TRIAL
 
 BEFORE, CORE, AFTER = 5.0, 4.0, 40.0
 """Widths of the pulse before its peak where it may begin; after it up to which it is drawn in fine steps; and at which
@@ -91,7 +90,7 @@ def learn_jointly(
     if len(system.components) > 1 and not last:
         fits = [refine_gaussians(stack, np.array(system.components) / [1, spacing, spacing])]
     else:
-        fits = fit_gaussians(stack, width, min(TRIAL.get().most_components, MOST_COMPONENTS if last else 3), 0.0)
+        fits = fit_gaussians(stack, width, MOST_COMPONENTS if last else 3, 0.0)
     missed = [float(np.mean(_miss(fit, stack) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width

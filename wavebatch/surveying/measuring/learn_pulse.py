@@ -10,15 +10,13 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD, SQRT_PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
-from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
+from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
-from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, fit_lone
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, SMALL, find_edge
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, MIN_SNR, SMALL, find_edge, fit_lone
 from wavebatch.surveying.systems.figures import Figures
-from wavebatch.surveying.systems.known_systems import TRIAL
 
 MOST_STACKED = 3000
 """Isolated echoes that a stack takes; more do not make it better."""
@@ -116,27 +114,13 @@ def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figu
     signal = block.samples[main.waveform] - noise.level[main.waveform]
     if block.missing is not None:
         signal[block.missing[main.waveform]] = np.nan
-    return _learn(block, system, main, signal, figures, FIRST_COMPONENTS)
-
-
-def _learn(
-    block: WaveformBlock,
-    system: SystemPulse,
-    main: EchoTable,
-    signal: np.ndarray,
-    figures: Figures,
-    most: int = MOST_COMPONENTS,
-    first: np.ndarray | int = 0,
-) -> SystemPulse:
-    """The pulse of echoes whose signal (m, k), without baseline and other echoes, is given from the sample `first`."""
     width = system.sigma_ref / block.spacing
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
-    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
+    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = REACHED * system.noise.std / strongest
     small = len(block) < SMALL
-    most = min(most, TRIAL.get().most_components)
-    sums = fit_gaussians(stack, width, most, 0.0 if small else goal)
+    sums = fit_gaussians(stack, width, FIRST_COMPONENTS, 0.0 if small else goal)
     skewed = fit_skewed(stack, width)
     figures.misfit_goal, figures.misfit_skewed, figures.kappa = goal, skewed.rms, skewed.kappa
     figures.misfit_gaussians = {len(fit.components): fit.rms for fit in sums}
@@ -148,7 +132,7 @@ def _learn(
     if best.kappa and len(sums) > 1:
         # The same pulse on level ground, so that widened echoes alone decide.
         drawn = stack._replace(value=_draw(best, stack.lag), error=np.full(len(stack.lag), 1.0))
-        other = fit_gaussians(drawn, width, TRIAL.get().most_components)[-1]
+        other = fit_gaussians(drawn, width)[-1]
         return _fit_wide_best(block, system, (chosen, _with_pulse(system, other, stack, block.spacing)))
     return chosen
 

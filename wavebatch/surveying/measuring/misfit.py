@@ -18,8 +18,7 @@ from wavebatch.stages.flags import find_unexplained
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
-from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, find_strongest
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_strongest
 from wavebatch.surveying.measuring.residuals import decompose_sample, render_own, subtract_echoes
 
 CLIPPED = 0.1

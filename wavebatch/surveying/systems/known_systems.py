@@ -4,8 +4,7 @@
 strip's pulse looks like. Before you change it: a wrong pulse is worse than none, so the margins must keep simulated
 strips of other sensors from getting one (tests/surveying/test_known_systems.py).
 
-`doubt_survey` says for `survey` and `run` whether pulse or noise of a survey are a guess. `Trial` is what surveys must
-do without, so that `bench --real` can compare surveys of one strip.
+`doubt_survey` says for `survey` and `run` whether pulse or noise of a survey are a guess.
 """
 
 from __future__ import annotations
@@ -29,14 +28,12 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
 from wavebatch.kernels.elementary import log
-from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.flags import RINGING_REACH, list_neighbours
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
-from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
-from wavebatch.surveying.measuring.noise_and_width import FEW, HALVED
+from wavebatch.surveying.measuring.noise_and_width import FEW, HALVED, find_strongest, fit_lone
 from wavebatch.surveying.measuring.residuals import hides_noise, subtract_echoes
 from wavebatch.surveying.systems.figures import Figures, read_system
 
@@ -89,7 +86,7 @@ class KnownSystem:
 
 def known_systems() -> tuple[KnownSystem, ...]:
     """Return the shipped pulses by name, without one that surveys must do without."""
-    return tuple(known for known in _load_all() if known.name != TRIAL.get().left_out)
+    return tuple(known for known in _load_all() if known.name != LEFT_OUT.get())
 
 
 @cache
@@ -354,28 +351,15 @@ def share_repeated(echoes: EchoTable, width: float) -> float:
     return 2 * most / max(len(echoes), 1)
 
 
-@frozen
-class Trial:
-    """Limits of a survey."""
-
-    left_out: str = ""
-    """Name of a shipped pulse that is not known."""
-    most_components: int = MOST_COMPONENTS
-    """Gaussians of a learned pulse, at most."""
-
-
-ALL = Trial()
-"""What surveys obey but for comparisons."""
-
-TRIAL: ContextVar[Trial] = ContextVar("trial", default=ALL)
-"""The limits that hold now."""
+LEFT_OUT: ContextVar[str] = ContextVar("left_out", default="")
+"""Name of a shipped pulse that is not known now."""
 
 
 @contextmanager
-def limit_surveys(trial: Trial) -> Iterator[None]:
-    """Let all surveys within obey the limits."""
-    token = TRIAL.set(trial)
+def leave_out(name: str) -> Iterator[None]:
+    """Let all surveys within do without a shipped pulse."""
+    token = LEFT_OUT.set(name)
     try:
         yield
     finally:
-        TRIAL.reset(token)
+        LEFT_OUT.reset(token)

@@ -15,8 +15,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.decompose import Candidates, Clusters, Settings, decompose_clusters
 from wavebatch.stages.detect.direct import samples_of
 from wavebatch.stages.noise import pooled
-from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, find_edge
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_edge
 
 MOST_FITTED = 400
 """Echoes whose skews are measured; more do not make the skew of the strip better known."""
