@@ -7,12 +7,13 @@ of all clusters follow, and at the end the flagged table in ns.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.frozen import frozen
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.decompose import (
     Candidates,
@@ -159,7 +160,7 @@ def _explain_tails(
     return candidates, tail_reach(tail, candidates.amplitude / std[keep])
 
 
-@dataclass(frozen=True)
+@frozen
 class EchoLimits:
     """What decomposers accept as an echo: options that they share.
 
@@ -178,7 +179,7 @@ class EchoLimits:
     most_width: Annotated[float, Range(1.0, BROADEST)] = MOST_WIDTH
 
 
-@dataclass(frozen=True)
+@frozen
 class FitOptions(EchoLimits):
     """Options that decomposers with an iterative fit share.
 
