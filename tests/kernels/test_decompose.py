@@ -87,6 +87,16 @@ def test_two_strong_echoes_that_a_change_of_shape_may_be_are_one(apart, least):
     assert (plain.number == 2).all() and (known.number == 1).mean() > least
 
 
+def test_a_strong_echo_that_does_not_reach_a_pair_asks_no_more_of_it():
+    """Its shape ends where the pair begins: by the energy of the window half of such pairs of 50 noises were one."""
+    noise, x = np.random.default_rng(6).standard_normal((200, LENGTH)), np.array([10.0, 24.0, 27.0])
+    height = [3000.0, 100.0, 50.0]
+    y = np.rint(sum(bell(at, high) for at, high in zip(x, height, strict=True)) + noise)
+    start = np.tile(np.array([height, x, [2.0, 2.0, 2.0]]), (200, 1, 1))
+    known = decompose(y, start, std=1.04, prior_spread=0.2, known=3.0)
+    assert (known.number == 3).mean() > 0.95
+
+
 @pytest.mark.parametrize(("misfit", "number"), [(0.0, 2), (0.2, 1)])
 def test_what_a_misfit_of_the_pulse_may_explain_is_no_echo(misfit, number):
     noise = np.random.default_rng(3).standard_normal((100, LENGTH))

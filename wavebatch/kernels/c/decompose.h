@@ -10,6 +10,7 @@ static const double PROVEN = 2;                /* errors of an amplitude whose e
                                                   .35 to .65 of it, however much chi2 rises without the echo */
 static const double STEADY = 0.01;             /* misfit below which no pulse is known: from shot to shot those of real sensors
                                                   change by .4 to 1.2 % of the amplitude */
+static const double REACHES = 4;               /* widths from an echo at which its shape is nothing */
 static const double ROOT_PI = 1.7724538509055161;
 
 /* Amplitudes from 0, times within 3 samples of the window, widths and skews as set. */
@@ -157,9 +158,10 @@ static void renew_errors(const Settings *s, const Prior *prior, Work *work) {
    than a new echo must lower it.
 
    Errors of close echoes are those of a parabola, and the valley of chi2 is none: where they say that an amplitude may
-   as well be 0, the fit without the echo says how far chi2 rises on the way there. Of strong echoes it must be more
-   than what a pulse of another shape makes: one echo of it looks like two. An echo without which it rises enough has an amplitude of PROVEN errors at least, and those that share its light have less to share. Where one is
-   left out, the time of each other may be wrong by as much as it moves. */
+   as well be 0, the fit without the echo says how far chi2 rises on the way there. Beside strong echoes it must be more
+   than what their pulse makes with another shape: one echo of it looks like two. An echo without which it rises enough
+   has an amplitude of PROVEN errors at least, and those that share its light have less to share. Where one is left out,
+   the time of each other may be wrong by as much as it moves. */
 static void leave_out_unknown(const Settings *s, Work *work) {
     const Limits limits = limits_of(s, &work->window);
     const Prior prior = {s->width_ref, s->prior_spread, 0, 0}, none = {0};
@@ -179,8 +181,13 @@ static void leave_out_unknown(const Settings *s, Work *work) {
         for (int64_t i = 0; i < 3 * k; i++)
             if (i % k != least) work->fit.parameters[left++] = best->parameters[i];
         fit_window(k - 1, 3, s, &limits, k > 2 ? &prior : &none, INFINITY, work);
-        const double *fewer = work->fit.parameters, proof = work->fit.cost - best->cost;
-        if (!(amplitude > 0) || proof < least_fall(s, k - 1, fewer, noise) || proof < STEADY * STEADY * energy_of(k - 1, fewer, noise)) {
+        const double *fewer = work->fit.parameters, proof = work->fit.cost - best->cost, place = best->parameters[k + least];
+        double beside = 0;
+        for (int64_t j = 0; j < k - 1; j++) {
+            const double one[3] = {fewer[j], fewer[k - 1 + j], fewer[2 * (k - 1) + j]};
+            if (fabs(one[1] - place) < REACHES * one[2]) beside += energy_of(1, one, noise);
+        }
+        if (!(amplitude > 0) || proof < least_fall(s, k - 1, fewer, noise) || proof < STEADY * STEADY * beside) {
             memset(work->known, 0, k * sizeof(double));
             memmove(before + least, before + least + 1, (k - 1 - least) * sizeof(double));
             describe_fit(&limits, work, best);
