@@ -311,11 +311,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
     if given.child:
-        result = judge(given.strips, given.data, given.cache, brief=given.brief, classes=given.classes)
+        try:
+            result = judge(given.strips, given.data, given.cache, brief=given.brief, classes=given.classes)
+        except (OSError, ValueError) as error:  # also of what wavebatch refuses
+            print(f"error: {error}", file=sys.stderr)
+            return 1
         print(json.dumps(result), flush=True)
         return 0
     root, results = given.root.resolve(), []
-    for name in re.split("[ ,]+", given.strips):
+    names = [name for name in re.split("[ ,]+", given.strips) if name]
+    if not names:
+        parser.error("no strips: give their names or paths (make bench-real STRIP=...)")
+    for name in names:
         options = ["--data", str(given.data), "--cache", str(given.cache), "--strips", name]
         brief = ["--brief"] if given.brief else []
         classes = [] if given.classes is None else ["--classes", str(given.classes)]
@@ -332,7 +339,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if given.output:
                 given.output.write_text("".join(json.dumps(one) + "\n" for one in results))
     print(tabulate(results, read_lines(given.compare) if given.compare else []))
-    return 0
+    return int(len(results) < len(names))
 
 
 if __name__ == "__main__":

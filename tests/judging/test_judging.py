@@ -130,6 +130,11 @@ def test_injected_echoes_are_counted_by_height_and_separation(tmp_path):
     assert result["found_far"] > 98 and 0.8 < result["t_far"] < 1.25 and result["injected"] > 100
 
 
+def test_a_strip_that_cannot_be_judged_is_said(tmp_path, capfd):
+    assert main(["--strips", str(tmp_path / "none.las"), "--brief", "--cache", str(tmp_path)]) == 1
+    assert "none.las: cannot be read" in capfd.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_strip_is_judged_by_its_path(strip, tmp_path, capfd):
     out = tmp_path / "real.jsonl"

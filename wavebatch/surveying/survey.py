@@ -159,7 +159,7 @@ def _add_digitizers(
 ) -> Survey:
     """The survey of the main digitizer with the others: what each records otherwise, and the scene that all see.
 
-    plain: of the main one, as `measure_gaussian` finds it.
+    plain: Gaussian and noise of the main one, without its defects.
     """
     systems, counts, scenes, decisions = {}, [found.waveforms], [found.figures], []
     for block, members in others:
@@ -184,7 +184,7 @@ def _add_digitizers(
 def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock) -> bool:
     """Whether a block's digitizer has level, noise, pulse width and clipping of the main one.
 
-    plain: of the main one, as `measure_gaussian` finds it.
+    plain: Gaussian and noise of the main one, without its defects.
     """
     if block.digitizer.bits != main.digitizer.bits:
         return False
@@ -236,7 +236,7 @@ def clean_sample(block: WaveformBlock, begin: SystemPulse) -> tuple[WaveformBloc
 
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
-    """As survey_block, from noise and width by `measure_gaussian`; once more where noise grows with the signal."""
+    """As survey_block, from noise and width by `clean_sample`; once more where noise grows with the signal."""
     first, figures = system, Figures()
     candidates: tuple[Tried, ...] = ()
     if learn:
@@ -277,6 +277,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)
+        # A misfit for what fits leave allows no more faint echoes beside strong ones: that by the description does.
         misfit, left = cover_fits(system, echoes, block.spacing)
         if misfit > system.misfit:
             system = replace(system, misfit=misfit)

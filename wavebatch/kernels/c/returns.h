@@ -2,7 +2,8 @@
 
    Pairs of echoes and returns of one waveform: mutual nearest neighbours, then again among the rest, until none is left.
 
-   A lone echo beside a lone return, the usual case, needs no search. */
+   A lone echo beside a lone return, the usual case, needs no search. Groups are short (a pulse has fewer
+   than `longest` points, an echo table at most some hundred rows of a waveform), so that work may grow with their square. */
 
 static void sort_by_time(int64_t n, int64_t *rows, const double *time) { /* by insertion: nearly always in order */
     for (int64_t i = 1; i < n; i++) {

@@ -75,7 +75,7 @@ def limit_faint(system: SystemPulse, change: float, echoes: EchoTable) -> System
     Parameters
     ----------
     system : SystemPulse
-        With its final misfit.
+        With the misfit by the description.
     change : float
         Of the pulse from shot to shot or below the least misfit that is tried, as a share of the amplitude.
     echoes : EchoTable
