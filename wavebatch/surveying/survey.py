@@ -14,7 +14,7 @@ from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, Waveform
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
-from wavebatch.surveying.measuring.choose_pulse import MISFITS, choose_pulse, settle
+from wavebatch.surveying.measuring.choose_pulse import choose_pulse, settle
 from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
@@ -22,7 +22,15 @@ from wavebatch.surveying.measuring.learn_pulse import (
     find_strong,
     learn_pulse,
 )
-from wavebatch.surveying.measuring.misfit import MOST_FAINT, PEAK, cover_fits, limit_faint, measure_beside, measure_tail
+from wavebatch.surveying.measuring.misfit import (
+    LEAST_MISFIT,
+    MOST_FAINT,
+    PEAK,
+    cover_fits,
+    limit_faint,
+    measure_beside,
+    measure_tail,
+)
 from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
@@ -273,7 +281,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system = choose_whitening(part, system, choice.best.change)
         system, mirror, doubt = settle(block, system, choice.best.seen, choice.best.missed, choice.best.change)
-        system = limit_faint(system, max(choice.best.seen, float(MISFITS[0])), echoes)
+        system = limit_faint(system, max(choice.best.seen, LEAST_MISFIT), echoes)
         figures.false_in_noise_share = min(mirror.quiet / max(mirror.echoes, 1), 1.0)
         figures.false_by_misfit_share = min(mirror.beside / max(mirror.mains, 1), 1.0)
         echoes = decompose_sample(part, system)

@@ -35,6 +35,7 @@ from wavebatch.surveying.measuring.judge import (
     sample_noise,
 )
 from wavebatch.surveying.measuring.mirror import Mirror, look_in_mirror
+from wavebatch.surveying.measuring.misfit import LEAST_MISFIT
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, HALVED, spread_rows, thin_block
 from wavebatch.surveying.systems.known_systems import MOST_SPREAD
 from wavebatch.surveying.systems.survey_result import Tried
@@ -81,9 +82,8 @@ FEWEST = 48
 """Waveforms on which each candidate is judged first. By half of them pulses of some strips were learned from a worse
 start: they had 3 to 5 % of false echoes in place of 1 to 2."""
 
-MISFITS = 0.0005 * 2.0 ** np.arange(9)
-"""Misfits of the chosen pulse that are tried: half a noise at 1,000 noises up to an eighth of the pulse, beyond which
-it is no pulse of this strip."""
+MISFITS = LEAST_MISFIT * 2.0 ** np.arange(9)
+"""Misfits of the chosen pulse that are tried, up to MOST_MISFIT."""
 
 OF_ALL = "gaussian of all echoes"
 ROUNDS: dict[str, dict[str, Any]] = {"one echo per cluster": {"max_echoes": 1}, "all echoes": {}}

@@ -61,9 +61,9 @@ must be high beside the strip's strongest ones, which taught the pulse."""
 UNEXPLAINED = 0.05
 """Share of clear echoes that may miss their samples: neighbours too close to be found change the shape of some."""
 
-LEAST_MISFIT, STEP_OF_MISFITS, MOST_MISFIT = 5e-4, 2**0.5, 0.125
-"""Misfit from which, step by which, and about up to which it is raised: half a noise at 1,000 noises; beyond an eighth
-it is no pulse of this strip."""
+LEAST_MISFIT, MOST_MISFIT, STEP_OF_MISFITS = 0.0005, 0.128, 2**0.5
+"""Misfits of a pulse: half a noise at 1,000 noises up to an eighth of the pulse, beyond which it is no pulse of this
+strip; and step by which they are raised."""
 
 MOST_FAINT = SystemPulse(1.0).faint_share
 """What a pulse of which no more is known may leave beside strong echoes."""
@@ -116,7 +116,7 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
         return system.misfit, 0.0
     while True:
         left = float(np.mean(find_unexplained(echoes, system, spacing)[clear] > 1))
-        if left <= UNEXPLAINED or system.misfit > MOST_MISFIT:
+        if left <= UNEXPLAINED or system.misfit >= MOST_MISFIT:
             return system.misfit, left
         system = replace(system, misfit=max(STEP_OF_MISFITS * system.misfit, LEAST_MISFIT))
 
