@@ -205,8 +205,13 @@ class StripReader(Closing):
         """Return the number of units."""
         return -(-self.facts.header.point_count // self._unit_points)
 
-    def read_points(self, start: int, stop: int) -> np.ndarray:
-        """Return records [start, stop) of the file."""
+    def read_points(self, start: int, stop: int, scan: StripScan | None = None) -> np.ndarray:
+        """Return records [start, stop) of the file; those of one unit are not decoded again where scan keeps them."""
+        if scan is not None:
+            unit = int(np.searchsorted(scan.borders, start, "right")) - 1
+            kept = scan.decoded.read(unit)[start - scan.borders[unit] : stop - scan.borders[unit]]
+            if len(kept) == stop - start:
+                return kept
         return self._points.read(start, stop)
 
     def read_unit(self, number: int, scan: StripScan) -> Unit:
@@ -478,7 +483,7 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
     kept, pairs = [], []
 
     def take(start: int, stop: int) -> float:
-        points = reader.read_points(start, stop)
+        points = reader.read_points(start, stop, scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         pairs.append(_pair_returns(xyz, time))
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
@@ -508,7 +513,7 @@ def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
     ratios = [np.empty(0)]
     units = _choose_units(scan)
     for start, stop in units[:: max(1, -(-len(units) // SCALE_PLACES))]:
-        points = reader.read_points(start, min(start + SLICE_POINTS, stop))
+        points = reader.read_points(start, min(start + SLICE_POINTS, stop), scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         with np.errstate(all="ignore"):
             vectors = packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
