@@ -18,7 +18,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import distinct, even_places, quantile
+from wavebatch.core.order import distinct, even_places, find_order, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing, reading, take_whole_records, widen_integers
@@ -361,7 +361,8 @@ class _Geometry:
         packet_of = np.concatenate([unit.packet_of_point, unit.packet_of_context])
         index = np.concatenate([np.arange(unit.start, unit.start + len(unit.points)), unit.context_index])
         used = np.flatnonzero(packet_of >= 0)
-        self._entry = used[np.lexsort((index[used], packet_of[used]))]
+        order = find_order(packet_of[used], index[used])
+        self._entry = used if order is None else used[order]
         self._index = index[self._entry]
         self._counts = np.bincount(packet_of[used], minlength=len(unit.packets))
         self._starts = np.cumsum(self._counts) - self._counts
@@ -419,15 +420,20 @@ def _collect_packets(
     unit: tuple[int, int],
 ) -> tuple[PacketTable, np.ndarray]:
     """Packets of points (n,) in order of their owners, and the row of each point, i4 (n,)."""
-    by_index = np.argsort(index, kind="stable")
-    groups = group_keys(keys[by_index])
-    lead = by_index[groups.order[groups.starts]]
-    order = np.argsort(index[lead], kind="stable")
-    rank = np.empty(len(lead), np.int32)
-    rank[order] = np.arange(len(lead), dtype=np.int32)
     packet_of = np.empty(len(keys), np.int32)
-    packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
-    lead = lead[order]
+    if np.all(index[1:] > index[:-1]) and np.all(keys[1:] >= keys[:-1]):  # as most vendors write them
+        groups = group_keys(keys)
+        lead = groups.starts
+        packet_of[:] = np.repeat(np.arange(len(lead), dtype=np.int32), groups.counts)
+    else:
+        by_index = np.argsort(index, kind="stable")
+        groups = group_keys(keys[by_index])
+        lead = by_index[groups.order[groups.starts]]
+        order = np.argsort(index[lead], kind="stable")
+        rank = np.empty(len(lead), np.int32)
+        rank[order] = np.arange(len(lead), dtype=np.int32)
+        packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
+        lead = lead[order]
     table = PacketTable(
         digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
         offset=keys[lead] >> packet_check.INDEX_BITS,
