@@ -20,7 +20,7 @@ import numpy as np
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.files.disk.raw_bytes import Closing, damaged, open_regular, read_exactly, reporting_reads
+from wavebatch.files.disk.raw_bytes import Closing, damaged, open_regular, read_exactly, reporting_reads, undoing
 from wavebatch.files.las.header import MAX_FILE, MAX_FRONT, MAX_VLRS, PROJECTION, Vlr, decode_text
 from wavebatch.files.las.read_points import LARGEST_OFFSET, LARGEST_SCALE, LEAST_SCALE
 from wavebatch.files.strip.packet_check import MAX_SPACING
@@ -358,11 +358,8 @@ class PulseReader(Closing):
     def __init__(self, header: PulseHeader, *, pulses: int | None = None, size: int = PIECE_BYTES) -> None:
         self.header, self._size = header, size
         self._pulses = open_regular(header.path)
-        try:
+        with undoing(self._pulses.close):
             self._waves = open_regular(header.waves)
-        except BaseException:
-            self._pulses.close()
-            raise
         each = max(header.waves_size // max(header.count, 1), 1)
         self._step = int(np.clip(size // each, 1, pulses or PULSES))
 

@@ -21,7 +21,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, even_places, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
-from wavebatch.files.disk.raw_bytes import Closing, reading, take_whole_records, widen_integers
+from wavebatch.files.disk.raw_bytes import Closing, reading, take_whole_records, undoing, widen_integers
 from wavebatch.files.las.header import field_names, locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check
@@ -138,12 +138,9 @@ class StripReader(Closing):
         most = (unit_bytes or UNIT_BYTES) // facts.header.point_length
         self._unit_points = max(1, min(unit_points or UNIT_POINTS, most))
         self._points = open_points(facts)
-        try:
+        with undoing(self._points.close):
             self._judge = packet_check.Judge(facts)
             self._packets = PacketFile(facts.packets, facts.compressed)
-        except BaseException:
-            self._points.close()
-            raise
 
     def close(self) -> None:
         """Close the files; scans stay valid."""

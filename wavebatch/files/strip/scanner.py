@@ -22,7 +22,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import changeable, frozen
 from wavebatch.core.order import distinct
-from wavebatch.files.disk.raw_bytes import Closing, take_whole_records
+from wavebatch.files.disk.raw_bytes import Closing, take_whole_records, undoing
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
 from wavebatch.files.las.crs import metres_per_unit
 from wavebatch.files.las.header import locate
@@ -215,7 +215,7 @@ def find_far(
     spool = Spool(buckets, _KEY, memory=sizes.spooled)
     wants = Spool(len(borders) - 1, _WANT, memory=sizes.spooled)
     packets, reach, overfull = 0, 0, []
-    try:
+    with spool, undoing(wants.close):
         for keys, index in units:
             entries = np.empty(len(keys), _KEY)
             entries["key"], entries["index"] = keys, index
@@ -234,11 +234,6 @@ def find_far(
             asked = np.empty(len(target), _WANT)
             asked["index"], asked["unit"] = entries["index"][member], target
             wants.append(unit[member], asked)
-    except BaseException:
-        wants.close()
-        raise
-    finally:
-        spool.close()
     return wants.seal(), packets, reach, np.concatenate([np.empty(0, np.uint64), *overfull])
 
 
@@ -444,13 +439,10 @@ class Scanner:
     def scan_units(self, first: int, last: int) -> ScanPart:
         """Scan the units [first, last)."""
         self._first = first
-        try:
+        with undoing(self._found.close):
             for start, points in self._cut_units(first, last):
                 self._add_unit(start, points)
             self._try_keeping(self._found.decoded.seal)
-        except BaseException:
-            self._found.close()
-            raise
         return self._found
 
     def run(self, parts: Sequence[ScanPart]) -> StripScan:
@@ -461,7 +453,7 @@ class Scanner:
         if not parts:
             self.scan_units(0, self._units)
         near = found.near
-        try:
+        with undoing(found.close):
             suspects = near.suspects()
             packets, reach = near.count_packets(suspects), near.reach
             full = [np.empty(0, np.uint64), *near.overfull]
@@ -480,9 +472,6 @@ class Scanner:
                     tally.first[check.Reason.OVERFULL] = start + int(np.argmax(here))
                 tally.reasons[check.Reason.OVERFULL] += many
                 tally.reasons[check.Reason.USABLE] -= many
-        except BaseException:
-            found.close()
-            raise
         return self._finish(packets - len(overfull), reach, overfull, MAX_RETURNS if suspects.any() else MOST_OVERLAP)
 
     def _cut_units(self, first: int, last: int) -> Iterator[tuple[int, np.ndarray]]:
