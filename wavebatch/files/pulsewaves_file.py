@@ -424,16 +424,14 @@ class _Walk:
     def follow(self, rows: np.ndarray, offsets: np.ndarray, descriptor: Descriptor) -> Iterator[tuple]:
         """Yields the columns of `Segments`, and the order within a pulse, of each sampling and segment."""
         at = offsets + descriptor.extra
-        if offsets.min(initial=WAVES_HEADER_SIZE) < WAVES_HEADER_SIZE:
-            self._refuse(rows[np.argmin(offsets)])
+        self._refuse(offsets < WAVES_HEADER_SIZE, rows)
         number = 0
         for sampling in descriptor.samplings:
             count = np.full(len(rows), sampling.segments)
             if sampling.segment_bits:
                 count = self._integers(rows, at, sampling.segment_bits, signed=False)
                 at = at + sampling.segment_bits // 8
-            if count.max(initial=0) > MOST_SEGMENTS:
-                self._refuse(rows[np.argmax(count)])
+            self._refuse(count > MOST_SEGMENTS, rows)
             for segment in range(int(count.max(initial=0))):
                 has = np.flatnonzero(count > segment)
                 yield self._step(rows[has], at, has, sampling, descriptor.unit, number)
@@ -452,17 +450,16 @@ class _Walk:
             length = self._integers(rows, place, sampling.length_bits, signed=False)
             place = place + sampling.length_bits // 8
         at[has] = place + length * (sampling.bits // 8)
-        over = (at[has] > self._header.waves_size) | (length > MAX_SAMPLES)
-        if over.any():
-            self._refuse(rows[np.argmax(over)])
+        self._refuse((at[has] > self._header.waves_size) | (length > MAX_SAMPLES), rows)
         same = (np.full(n, value) for value in (np.uint8(sampling.kind), np.uint8(sampling.channel), sampling.bits))
         return rows, *same, np.full(n, sampling.spacing), np.full(n, unit), start, place, length, np.full(n, number)
 
     def _integers(self, rows: np.ndarray, at: np.ndarray, bits: int, *, signed: bool) -> np.ndarray:
-        over = at > self._header.waves_size - bits // 8
-        if over.any():
-            self._refuse(rows[np.argmax(over)])
+        self._refuse(at > self._header.waves_size - bits // 8, rows)
         return self._waves.take(at, bits // 8).view(f"<{'i' if signed else 'u'}{bits // 8}")[:, 0].astype(np.int64)
 
-    def _refuse(self, row: int) -> None:
-        raise damaged(self._header.waves, f"the waves of pulse {self._first + int(row)} are not inside the file")
+    def _refuse(self, wrong: np.ndarray, rows: np.ndarray) -> None:
+        """Raise InputError where something is wrong (k,) with one of the pulses `rows` (k,)."""
+        if wrong.any():
+            pulse = self._first + int(rows[np.argmax(wrong)])
+            raise damaged(self._header.waves, f"the waves of pulse {pulse} are not inside the file")
