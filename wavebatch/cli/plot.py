@@ -193,9 +193,12 @@ def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool 
     return paths
 
 
+_ENDS = "X0,Y0,X1,Y1"
+
+
 @draws_clouds(
-    shared.floats_option("--line", "X0,Y0,X1,Y1", "Ends of the section, in the coordinates of the clouds.  [default: "
-                         "along the longer extent]"),
+    click.option("--line", type=shared.Text(_ENDS, lambda text: shared.parse_floats(text, _ENDS)), metavar=_ENDS,
+                 help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]"),
     click.option("--width", type=float, metavar="W",
                  help="Show what lies within half of W from the line.  [default: a fiftieth of its length]"),
     click.option("--column", shell_complete=complete_columns,

@@ -154,13 +154,13 @@ class NearSharing:
         return groups
 
     def _mark(self, keys: np.ndarray, index: np.ndarray, own: np.ndarray, new: np.ndarray) -> None:
-        place = self._bin(keys[own])
+        place = self.bin(keys[own])
         where = index[own]
         self._last[place] = where
         fresh = place[::-1]
         unseen = self._first[fresh] < 0
         self._first[fresh[unseen]] = where[::-1][unseen]
-        fresh = self._bin(keys[new])
+        fresh = self.bin(keys[new])
         if not len(fresh):
             return
         low, high = int(fresh.min()), int(fresh.max())
@@ -169,7 +169,8 @@ class NearSharing:
         else:
             np.add.at(self._new, fresh, 1)
 
-    def _bin(self, keys: np.ndarray) -> np.ndarray:
+    def bin(self, keys: np.ndarray) -> np.ndarray:
+        """Return the bin of each key (n,)."""
         return (((keys >> check.INDEX_BITS) - self._low) // self._width).astype(np.int64)
 
     def __getstate__(self) -> dict[str, object]:
@@ -193,10 +194,6 @@ class NearSharing:
     def suspects(self) -> np.ndarray:
         """Return for each bin whether its points lie too far apart for the window."""
         return (self._last - self._first) >= self._window
-
-    def is_suspect(self, keys: np.ndarray, suspects: np.ndarray) -> np.ndarray:
-        """Return whether keys (n,) lie in suspect bins, bool (n,)."""
-        return suspects[self._bin(keys)]
 
     def count_packets(self, suspects: np.ndarray) -> int:
         """Return the number of different packets in all other bins."""
@@ -576,7 +573,7 @@ class Scanner:
     def _suspect_keys(self, suspects: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for start, judged in self._judge_again():
             rows = np.flatnonzero(judged.usable)
-            rows = rows[self._found.near.is_suspect(judged.keys[rows], suspects)]
+            rows = rows[suspects[self._found.near.bin(judged.keys[rows])]]
             yield judged.keys[rows], start + rows
 
     def _vote_far(self) -> None:
