@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -62,11 +63,6 @@ def choose_points(options: dict[str, Any]) -> Any:
 
     flags, dropped = read_flags(options["flags"]), read_flags(options["drop_flags"])
     return PointFilter(flags=flags, drop_flags=dropped, where=options["where"])
-
-
-def list_tally(tally: Any) -> dict[str, int]:
-    """How many points were drawn, and how many were not, for --json."""
-    return {name: getattr(tally, name) for name in tally.__slots__}
 
 
 def describe_tally(tally: Any, outside: int, kind: str = "value") -> str:
@@ -136,7 +132,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
 
         draw_cloud_histogram(found, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
         total, text = found.total, describe_tally(found.total, int(found.below.sum() + found.above.sum()))
-    return text, {"column": options["column"], **list_tally(total)}
+    return text, {"column": options["column"], **asdict(total)}
 
 
 @draws_clouds(
@@ -173,7 +169,7 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
             "size": grid.size, "unit": found.crs.unit}  # fmt: skip
     cells = f"{grid.columns} x {grid.rows} cells of {grid.size:g} {found.crs.unit}"
     text = f"{describe_tally(found.total, found.outside)}; {cells}"
-    return text, {"column": column, **list_tally(found.total), **more}
+    return text, {"column": column, **asdict(found.total), **more}
 
 
 def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> list[Path]:
@@ -231,7 +227,7 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     place = {"line": list(found.line), "width": found.width, "unit": found.crs.unit, "crs": found.crs.name or None}
     more = {"inside": found.inside, "drawn": len(found.value), "voxel": found.voxel or None, **place}
     text = f"{found.inside} of {describe_tally(found.total, found.outside, kind)}"
-    return text, {"column": column, **list_tally(found.total), **more, "outside": found.outside}
+    return text, {"column": column, **asdict(found.total), **more, "outside": found.outside}
 
 
 @draws_clouds(
@@ -269,7 +265,7 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]
     more = {"statistic": statistic, "outside": found.outside, "edges": found.edges.tolist(), "series": series}
     text = describe_tally(found.total, found.outside, found.noun.removesuffix("s"))
-    return text, {"column": column, **list_tally(found.total), **more, "unit": found.unit}
+    return text, {"column": column, **asdict(found.total), **more, "unit": found.unit}
 
 
 @click.command()

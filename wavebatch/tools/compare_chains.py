@@ -66,8 +66,9 @@ def measure_fit(
 ) -> tuple[np.ndarray, np.ndarray]:
     """E and E0 of each waveform, f8 (n,); NaN without an echo, or if the model of the decomposer is not known.
 
-    f is the sum of the fitted pulses, y the samples above the baseline, both of the samples of `find_residual`. E0 = n sn^2 / |f|^2 with n samples and sn of one sample: what fits and thresholds use is larger where noise
-    is coloured. Source: Wang, Wang and Tseng eq. 5; docs/algorithms.md 1.2.
+    f is the sum of the fitted pulses, y the samples above the baseline, both without what `find_residual` leaves out.
+    E0 = n sn^2 / |f|^2 with n samples and sn of one sample: what fits and thresholds use is larger where noise is
+    coloured. Source: Wang, Wang and Tseng eq. 5; docs/algorithms.md 1.2.
     """
     found = find_residual(block, noise, system, decomposer, echoes)
     if found is None:
