@@ -1,7 +1,6 @@
 """`wavebatch plot`: pictures of waveforms, histograms, maps, side views, heights, and slices of a data cube.
 
-Reads options, calls `wavebatch.tools.plots` and prints one line. The modules that draw are imported only after all
-else has succeeded: matplotlib takes long to import and may be missing.
+Reads options, calls `wavebatch.tools.plots` and prints one line.
 """
 
 from __future__ import annotations
@@ -111,7 +110,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
       wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png
     """  # fmt: skip
     from wavebatch.tools.cells import Clouds
-    from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values
+    from wavebatch.tools.plots import draw_cloud
 
     column, chosen = options["column"], choose_points(options)
     if Clouds(clouds, (column,), chosen).facts.is_flags:
@@ -119,18 +118,15 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
             if options[name]:
                 option = "--range" if name == "limits" else f"--{name}"
                 raise ConfigError(f"{option} is of no use for flags, which are counted by name")
-        flags = count_points_by_flag(clouds, column, chosen)
-        from wavebatch.tools.plots.draw_cloud import draw_flags
-
-        draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
+        flags = draw_cloud.count_points_by_flag(clouds, column, chosen)
+        draw_cloud.draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
         total, text = flags.total, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
         text += f", {total.left_out} left out" * bool(total.left_out)
     else:
         how = {name: options[name] for name in ("bins", "limits", "each", "by")}
-        found = count_values(clouds, column, chosen, **how)
-        from wavebatch.tools.plots.draw_cloud import draw_cloud_histogram
-
-        draw_cloud_histogram(found, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
+        found = draw_cloud.count_values(clouds, column, chosen, **how)
+        look = {name: options[name] for name in ("log", "counts", "overwrite")}
+        draw_cloud.draw_cloud_histogram(found, output, **look)
         total, text = found.total, describe_tally(found.total, int(found.below.sum() + found.above.sum()))
     return text, {"column": options["column"], **asdict(total)}
 
@@ -216,12 +212,10 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
       # 2 m wide, along the longer extent
       wavebatch plot section clouds/ --width 2 --column echo_width -o side.png
     """  # fmt: skip
-    from wavebatch.tools.plots.sections import cut_section
+    from wavebatch.tools.plots.sections import cut_section, draw_section
 
     column = options["column"] or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
     found = cut_section(paths, column, choose_points(options), line=options["line"], width=options["width"])
-    from wavebatch.tools.plots.sections import draw_section
-
     draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
     kind = "voxel" if found.voxel else "point"
     place = {"line": list(found.line), "width": found.width, "unit": found.crs.unit, "crs": found.crs.name or None}
@@ -286,12 +280,10 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
       # scan line 3, and all pulses at 250 ns
       wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png
     """  # fmt: skip
-    from wavebatch.tools.slice_output import cut_cube
+    from wavebatch.tools.slice_output import cut_cube, draw_cube
 
     check_picture(output, overwrite=options["overwrite"])
     slices = cut_cube(cube_file, {name: options[name] for name in "xyt"})
-    from wavebatch.tools.slice_output import draw_cube
-
     draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
     tell(f"{output}: {', '.join(one.title for one in slices)}")
     drawn = [{"title": one.title, "rows": one.image.shape[0], "columns": one.image.shape[1],
@@ -358,7 +350,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     """  # fmt: skip
     from wavebatch.core.condition import read_flags
     from wavebatch.files.cloud.point_filter import PointFilter
-    from wavebatch.tools.plots.waveform import Wanted
+    from wavebatch.tools.plots.waveform import Wanted, format_echoes
 
     tabular = output.suffix.lower() == ".csv"
     for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
@@ -369,8 +361,6 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     wanted = shared.from_options(Wanted, options, points=options["point_numbers"], chosen=chosen)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
     if tabular:
-        from wavebatch.tools.plots.waveform import format_echoes
-
         write_text(output, format_echoes(views), overwrite=options["overwrite"])
     else:
         _draw_waveforms(views, output, strip.name, chain, options)
@@ -381,6 +371,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
 
 def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, options: dict[str, Any]) -> None:
     """Draws the waveforms as small multiples or as a contact sheet."""
+    from wavebatch.tools.plots.draw_waveform import draw_waveform_panels, draw_waveform_sheet
+
     shown, more = options["shown"], {"strip": strip, "chain": chain, "overwrite": options["overwrite"]}
     if shown == "all":
         last = max(float(view.time[-1] + 0.5 * view.spacing) for view in views)
@@ -389,13 +381,9 @@ def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, opti
         end = max(view.time[-1] for view in views)
         raise ConfigError(f"--times {shown[0]:g}:{shown[1]:g}: no sample lies there; the waveforms end at {end:g} ns")
     if options["sheet"]:
-        from wavebatch.tools.plots.draw_waveform import draw_waveform_sheet
-
         draw_waveform_sheet(views, output, times=shown, **more)
-        return
-    from wavebatch.tools.plots.draw_waveform import draw_waveform_panels
-
-    draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
+    else:
+        draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
 
 
 def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) -> tuple[list[Any], str]:
