@@ -109,6 +109,12 @@ def take_whole_records(records: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return plain[rows].view(records.dtype)
 
 
+def join_records(*parts: np.ndarray) -> np.ndarray:
+    """Return structured arrays of one type behind each other, copied as plain bytes as well."""
+    plain = [np.ascontiguousarray(part).view(f"V{part.dtype.itemsize}") for part in parts]
+    return np.concatenate(plain).view(parts[0].dtype)
+
+
 def widen_integers(values: np.ndarray) -> np.ndarray:
     """Return floating-point values as f8; a signalling NaN of a damaged file becomes a plain NaN without a warning."""
     with np.errstate(invalid="ignore"):

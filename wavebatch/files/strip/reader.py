@@ -21,7 +21,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, even_places, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
-from wavebatch.files.disk.raw_bytes import Closing, reading, take_whole_records, undoing, widen_integers
+from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
 from wavebatch.files.las.header import field_names, locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check
@@ -393,7 +393,7 @@ class _Geometry:
         if not len(unit.context):
             return take_whole_records(unit.points, entries)
         if self._all is None:
-            self._all = np.concatenate([unit.points, unit.context])
+            self._all = join_records(unit.points, unit.context)
         return take_whole_records(self._all, entries)
 
 

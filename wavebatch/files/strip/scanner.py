@@ -22,7 +22,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import changeable, frozen
 from wavebatch.core.order import distinct
-from wavebatch.files.disk.raw_bytes import Closing, take_whole_records, undoing
+from wavebatch.files.disk.raw_bytes import Closing, join_records, take_whole_records, undoing
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
 from wavebatch.files.las.crs import metres_per_unit
 from wavebatch.files.las.header import locate
@@ -425,7 +425,8 @@ class Scanner:
         self._widths[list(facts.digitizers)] = [digitizer.width for digitizer in facts.digitizers.values()]
         self._first = 0
         """Number of the first unit that is scanned."""
-        self._window: list[_Part] = []
+        none = np.empty(0, np.int64)
+        self._window = _Near(none.astype(np.uint64), none, none, np.empty(0, facts.dtype), 0)
 
     def _take_first(self) -> np.ndarray:
         """Those of the first points that have packets."""
@@ -481,18 +482,19 @@ class Scanner:
             cut = _find_cut(rest, part) if at else 0
             if at == begin:
                 # The window begins with the last points before the first unit.
-                points, start = np.concatenate([rest, part[:cut]]), at - len(rest)
+                points, start = join_records(rest, part[:cut]), at - len(rest)
                 judged = self._judge.judge(points, self._form)
                 rows = np.flatnonzero(judged.usable)
-                self._window = [_Part(judged.keys[rows], start + rows, self._first - 1, points, start)]
+                unit = np.full(len(rows), self._first - 1)
+                self._window = _Near(judged.keys[rows], start + rows, unit, points, start)
             else:
-                yield borders[-1], np.concatenate([rest, part[:cut]]) if cut else rest
+                yield borders[-1], join_records(rest, part[:cut]) if cut else rest
             borders.append(at + cut)
             rest = part[cut:]
         if end > begin:
             after = self._source.read(end, min(end + LONGEST_RUN, count))
             cut = _find_cut(rest, after) if len(after) else 0
-            yield borders[-1], np.concatenate([rest, after[:cut]]) if cut else rest
+            yield borders[-1], join_records(rest, after[:cut]) if cut else rest
             borders.append(end + cut)
 
     def _keep(self, unit: int, points: np.ndarray) -> None:
@@ -515,34 +517,31 @@ class Scanner:
         judged = self._judge.judge(points, self._form)
         self._found.tally.add(points, start, judged)
         rows = np.flatnonzero(judged.usable)
-        part = _Part(judged.keys[rows], start + rows, unit, points, start)
-        tails = (old.tail(start - self._sizes.window) for old in self._window)
-        self._window = [tail for tail in tails if len(tail.keys)]
-        parts = _Parts([*self._window, part])
-        own = np.arange(len(parts.keys)) >= len(parts.keys) - len(rows)
-        groups = self._found.near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
-        first = groups.order[groups.starts] - (len(parts.keys) - len(rows))
+        near = self._window.tail(start - self._sizes.window).join(judged.keys[rows], start + rows, unit, points)
+        own = near.index >= start
+        groups = self._found.near.add(near.keys, near.index, near.unit, own, lambda rows: self._entries(near, rows))
+        first = groups.order[groups.starts] - (len(near.keys) - len(rows))
         new = rows[first[first >= 0]]
         self._found.sample.append(check.take_some(judged, new))
         width = np.take(self._widths, points["wavepacket_index"][new])
         self._found.claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
         if len(rows):
             self._found.votes.add_points(take_whole_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
-            self._vote(groups, parts, own)
-        self._window.append(part)
+            self._vote(groups, near, own)
+        self._window = near
 
-    def _entries(self, parts: _Parts, rows: np.ndarray) -> np.ndarray:
+    def _entries(self, near: _Near, rows: np.ndarray) -> np.ndarray:
         entries = np.empty(len(rows), self._found.context.dtype)
-        entries["index"], entries["record"] = parts.index[rows], parts.take(rows)
+        entries["index"], entries["record"] = near.index[rows], near.take(rows)
         return entries
 
-    def _vote(self, groups: PacketGroups, parts: _Parts, own: np.ndarray) -> None:
+    def _vote(self, groups: PacketGroups, near: _Near, own: np.ndarray) -> None:
         follows = np.ones(len(groups.order), bool)
         follows[groups.starts] = False
         place = np.flatnonzero(follows)
         place = place[own[groups.order[place]]]
         place = place[:: max(1, len(place) // _PAIRS)]
-        first, second = parts.take(groups.order[place - 1]), parts.take(groups.order[place])
+        first, second = near.take(groups.order[place - 1]), near.take(groups.order[place])
         xyz = np.stack([locate(records, self._facts.header) for records in (first, second)])
         self._found.votes.add_pairs(xyz, first, second)
 
@@ -586,8 +585,8 @@ class Scanner:
             judged = self._judge.judge(points, self._form)
             rows = np.flatnonzero(judged.usable)
             rows = rows[np.argsort(index[rows], kind="stable")]
-            parts = _Parts([_Part(judged.keys[rows], np.arange(len(rows)), unit, take_whole_records(points, rows), 0)])
-            self._vote(group_keys(parts.keys), parts, np.ones(len(rows), bool))
+            near = _Near(judged.keys[rows], np.arange(len(rows)), rows, take_whole_records(points, rows), 0)
+            self._vote(group_keys(near.keys), near, np.ones(len(rows), bool))
 
     def _finish(self, packets: int, reach: int, overfull: np.ndarray, most: int) -> StripScan:
         """most: how many times packets may claim the bytes that are there."""
@@ -626,47 +625,33 @@ class Scanner:
         )
 
 
-class _Part:
-    """Usable points of one unit that following units may share packets with."""
+@frozen(eq=False)
+class _Near:
+    """Usable points of a unit and of the window before it, in the order of the file."""
 
-    def __init__(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray, start: int) -> None:
-        self.keys, self.index, self.unit = keys, index, unit
-        self._points, self._start = points, start
+    keys: np.ndarray
+    index: np.ndarray
+    """In the file."""
+    unit: np.ndarray
+    points: np.ndarray
+    """All records from `start` on, usable or not."""
+    start: int
 
     def take(self, rows: np.ndarray) -> np.ndarray:
         """Returns the records of the usable points `rows`."""
-        return take_whole_records(self._points, self.index[rows] - self._start)
+        return take_whole_records(self.points, self.index[rows] - self.start)
 
-    def tail(self, least: int) -> _Part:
-        """The part from file index `least` on; a copy if that frees memory."""
-        at = int(np.searchsorted(self.index, least))
-        if not at:
-            return self
-        first = max(self._start, least)
-        points = self._points[first - self._start :].copy()
-        return _Part(self.keys[at:].copy(), self.index[at:].copy(), self.unit, points, first)
+    def tail(self, least: int) -> _Near:
+        """The part from file index `least` on; a copy, which frees memory."""
+        at, first = int(np.searchsorted(self.index, least)), max(self.start, least)
+        keys, index, unit = (part[at:].copy() for part in (self.keys, self.index, self.unit))
+        return _Near(keys, index, unit, self.points[first - self.start :].copy(), first)
 
-
-class _Parts:
-    """Several parts in one sequence."""
-
-    def __init__(self, parts: list[_Part]) -> None:
-        self.keys = np.concatenate([part.keys for part in parts])
-        self.index = np.concatenate([part.index for part in parts])
-        self.unit = np.concatenate([np.full(len(part.keys), part.unit) for part in parts])
-        self._starts = np.cumsum([0, *(len(part.keys) for part in parts)])
-        self._parts = parts
-
-    def take(self, rows: np.ndarray) -> np.ndarray:
-        """Returns the records at `rows` of the whole sequence."""
-        taken, places = [], []
-        for start, stop, part in zip(self._starts[:-1], self._starts[1:], self._parts, strict=True):
-            here = np.flatnonzero((rows >= start) & (rows < stop))
-            taken.append(part.take(rows[here] - start))
-            places.append(here)
-        back = np.empty(len(rows), np.int64)
-        back[np.concatenate(places)] = np.arange(len(rows))
-        return take_whole_records(np.concatenate(taken), back)
+    def join(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray) -> _Near:
+        """With the points that follow, all of one unit, of which those at `index` are usable."""
+        keys, index = np.concatenate([self.keys, keys]), np.concatenate([self.index, index])
+        units = np.append(self.unit, np.full(len(keys) - len(self.unit), unit))
+        return _Near(keys, index, units, join_records(self.points, points), self.start)
 
 
 def _find_cut(rest: np.ndarray, part: np.ndarray) -> int:
