@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import one_line, print_result, talk, tell
+from wavebatch.cli.messages import answer, one_line, talk, tell
 from wavebatch.core.units import count
 
 if TYPE_CHECKING:
@@ -45,7 +45,6 @@ def survey(
     chain_file: Path | None,
     angles: Path | None,
     html_file: Path | None,
-    as_json: bool,
     **options: Any,
 ) -> None:
     """Measure noise, pulse and scene of strips, and choose the chain that they need.
@@ -96,7 +95,7 @@ def survey(
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
     document = _document(saved, facts)
     sheet = survey_sheet(saved.survey, document)
-    print_result(as_json, document, Sheet("survey", [*sheet.parts, *list_doubts(document)]))
+    answer(document, Sheet("survey", [*sheet.parts, *list_doubts(document)]))
     if html_file is not None:
         reading = {name: options[name] for name in ("direction", "headerless")}
         failed = {*facts.get("failed", ()), *facts.get("misfits", ())}

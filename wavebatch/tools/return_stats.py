@@ -126,18 +126,6 @@ class PolygonSet(Division):
         return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
 
 
-class Whole(Division):
-    """One area without borders, which counts also where it holds no pulse."""
-
-    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """As Division.find."""
-        return np.zeros(len(x), np.int64)
-
-    def describe(self, number: int) -> Area:
-        """As Division.describe."""
-        return Area("cloud", "")
-
-
 def name_ranks(number: int) -> tuple[str, ...]:
     """Names of so many classes of pairs of consecutive returns.
 
@@ -212,16 +200,19 @@ class AreaStats(PulseStats):
 
 
 class AreaTally:
-    """Sums per area of one division; tallies of several clouds can be merged."""
+    """Sums per area of one division; tallies of several clouds can be merged.
 
-    def __init__(self, division: Division, ranks: tuple[str, ...] = RANKS) -> None:
+    always: numbers of areas that count also without a pulse.
+    """
+
+    def __init__(self, division: Division, ranks: tuple[str, ...] = RANKS, always: Sequence[int] = ()) -> None:
         self.division, self._ranks, n = division, ranks, len(ranks)
         quantities = [("by_number", "i8", (MOST_NUMBER + 1,)), ("by_count", "i8", (MOST_COUNT + 1,)),
                       ("pairs", "i8", (n,)), ("apart", "f8", (n,)), ("least", "f8", (n,)), ("several", "i8"),
                       ("depth", "f8")]  # fmt: skip
         self._dtype = np.dtype(quantities)
-        self._areas = np.zeros(int(isinstance(division, Whole)), np.int64)
-        self._sums = self._begin(len(self._areas))
+        self._areas = np.array(always, np.int64)
+        self._sums = self._begin(len(always))
 
     def __len__(self) -> int:
         return len(self._areas)
@@ -502,7 +493,8 @@ class _Tally:
     methods: set[str] = field(default_factory=set)
     distances: np.ndarray = field(default_factory=lambda: np.zeros((len(RANKS), BINS), np.int64))
     """Histograms of the distances between consecutive returns, one per class of RANKS."""
-    whole: AreaTally = field(default_factory=lambda: AreaTally(Whole(), _RANKS))
+    whole: AreaTally = field(default_factory=lambda: AreaTally(PolygonSet(()), _RANKS, (_OUTSIDE,)))
+    """All of the cloud lies outside of no polygons."""
     flags: np.ndarray | None = None
     areas: list[AreaTally] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -28,14 +28,13 @@ from wavebatch.files.strip import packet_check
 from wavebatch.files.strip.packets import PacketFile, StripFacts, block_rows, find_facts
 from wavebatch.files.strip.scanner import (
     SCAN_SIZES,
+    Scanner,
     ScanPart,
     ScanSizes,
     StripScan,
     cut_scan,
     expand,
     group_keys,
-    scan_strip,
-    scan_units,
     unique_entries,
 )
 from wavebatch.kernels.signal.signal import find_fill, quiet_fill, recorded_lengths
@@ -159,7 +158,7 @@ class StripReader(Closing):
         tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
         packets of another strip. parts: of all units, in order, where other processes have passed over the points.
         """
-        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points, parts, self._sizes)
+        scan = self._start_scan().run(parts)
         if not scan.problems and (stranger := self._find_stranger(scan)):
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
             scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
@@ -170,7 +169,10 @@ class StripReader(Closing):
 
     def scan_units(self, first: int, last: int) -> ScanPart:
         """Return what `scan` needs to know of the units [first, last), which are among those of `cut_scan`."""
-        return scan_units(self.facts, self._points, self._packets, self._unit_points, first, last, self._sizes)
+        return self._start_scan().scan_units(first, last).seal()
+
+    def _start_scan(self) -> Scanner:
+        return Scanner(self.facts, self._points, self._packets, self._unit_points, self._sizes)
 
     def cut_scan(self, parts: int) -> list[tuple[int, int]]:
         """Return at most so many runs of units that may be scanned one by one, by any processes."""

@@ -350,27 +350,6 @@ _FAR_SAMPLES = 32
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
 
 
-def scan_strip(
-    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, parts: Sequence[ScanPart] = (),
-    sizes: ScanSizes = SCAN_SIZES,
-) -> StripScan:
-    """Scan all points of a strip.
-
-    unit_points: points per unit before borders are moved to the next pulse. parts: what `scan_units` found in all
-    units, in their order; the result is the same.
-    Raises InputError if points cannot be read; other reasons against processing are in the scan's `problems`.
-    """
-    return _Scanner(facts, source, packets, unit_points, sizes).run(parts)
-
-
-def scan_units(
-    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, first: int, last: int,
-    sizes: ScanSizes = SCAN_SIZES,
-) -> ScanPart:
-    """Scan the units [first, last) of a strip; arguments and errors as for `scan_strip`."""
-    return _Scanner(facts, source, packets, unit_points, sizes).scan_units(first, last).seal()
-
-
 def cut_scan(units: int, unit_points: int, parts: int, sizes: ScanSizes = SCAN_SIZES) -> list[tuple[int, int]]:
     """Cut a strip into at most so many runs of units [first, last) that `scan_units` may take one by one."""
     most = units // sizes.part_units if unit_points >= sizes.window + LONGEST_RUN else 1
@@ -409,7 +388,8 @@ class ScanPart(Closing):
 
     def __init__(self, facts: StripFacts, form: str, units: int, sizes: ScanSizes) -> None:
         self.borders: list[int] = []
-        self.tally, self.votes, self.sample, self.claimed = _Tally(), check.DirectionTally(form), check.FormSample(), 0
+        self.tally, self.votes, self.claimed = _Tally(), check.DirectionTally(form), 0
+        self.sample: list[check.SomePackets] = []
         self.context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]), memory=sizes.spooled)
         self.decoded = Spool(units, facts.dtype, memory=sizes.spooled)
         low, high = facts.packets.offsets
@@ -422,8 +402,9 @@ class ScanPart(Closing):
     def join(self, other: ScanPart) -> None:
         """Add what was found in the units that follow."""
         self.borders += other.borders[1:] if self.borders else other.borders
-        for name in ("tally", "votes", "sample", "near", "context", "decoded"):
+        for name in ("tally", "votes", "near", "context", "decoded"):
             getattr(self, name).join(getattr(other, name))
+        self.sample += other.sample
         self.claimed += other.claimed
 
     def close(self) -> None:
@@ -432,7 +413,12 @@ class ScanPart(Closing):
         self.decoded.close()
 
 
-class _Scanner:
+class Scanner:
+    """Scans all units of a strip, or some; a new one for each scan.
+
+    unit_points: points per unit before borders are moved to the next pulse. Raises InputError if points cannot be read.
+    """
+
     def __init__(
         self, facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, sizes: ScanSizes
     ) -> None:
@@ -551,7 +537,7 @@ class _Scanner:
         groups = self._found.near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
         first = groups.order[groups.starts] - (len(parts.keys) - len(rows))
         new = rows[first[first >= 0]]
-        self._found.sample.add(judged, new)
+        self._found.sample.append(check.take_some(judged, new))
         width = np.take(self._widths, points["wavepacket_index"][new])
         self._found.claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
         if len(rows):
