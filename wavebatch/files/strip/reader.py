@@ -21,21 +21,20 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import distinct, even_places, find_order, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
-from wavebatch.files.disk.raw_bytes import Closing, reading, take_whole_records, widen_integers
+from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
 from wavebatch.files.las.header import field_names, locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check
 from wavebatch.files.strip.packets import PacketFile, StripFacts, block_rows, find_facts
 from wavebatch.files.strip.scanner import (
     SCAN_SIZES,
+    Scanner,
     ScanPart,
     ScanSizes,
     StripScan,
     cut_scan,
     expand,
     group_keys,
-    scan_strip,
-    scan_units,
     unique_entries,
 )
 from wavebatch.kernels.signal.signal import find_fill, quiet_fill, recorded_lengths
@@ -139,12 +138,9 @@ class StripReader(Closing):
         most = (unit_bytes or UNIT_BYTES) // facts.header.point_length
         self._unit_points = max(1, min(unit_points or UNIT_POINTS, most))
         self._points = open_points(facts)
-        try:
+        with undoing(self._points.close):
             self._judge = packet_check.Judge(facts)
             self._packets = PacketFile(facts.packets, facts.compressed)
-        except BaseException:
-            self._points.close()
-            raise
 
     def close(self) -> None:
         """Close the files; scans stay valid."""
@@ -159,7 +155,7 @@ class StripReader(Closing):
         tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
         packets of another strip. parts: of all units, in order, where other processes have passed over the points.
         """
-        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points, parts, self._sizes)
+        scan = self._start_scan().run(parts)
         if not scan.problems and (stranger := self._find_stranger(scan)):
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
             scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
@@ -170,7 +166,10 @@ class StripReader(Closing):
 
     def scan_units(self, first: int, last: int) -> ScanPart:
         """Return what `scan` needs to know of the units [first, last), which are among those of `cut_scan`."""
-        return scan_units(self.facts, self._points, self._packets, self._unit_points, first, last, self._sizes)
+        return self._start_scan().scan_units(first, last).seal()
+
+    def _start_scan(self) -> Scanner:
+        return Scanner(self.facts, self._points, self._packets, self._unit_points, self._sizes)
 
     def cut_scan(self, parts: int) -> list[tuple[int, int]]:
         """Return at most so many runs of units that may be scanned one by one, by any processes."""
@@ -400,7 +399,7 @@ class _Geometry:
         if not len(unit.context):
             return take_whole_records(unit.points, entries)
         if self._all is None:
-            self._all = np.concatenate([unit.points, unit.context])
+            self._all = join_records(unit.points, unit.context)
         return take_whole_records(self._all, entries)
 
 
