@@ -118,12 +118,12 @@ def test_mean_of_a_single_quiet_sample_is_that_sample():
     assert mean.tolist() == [9] and number.tolist() == [1]
 
 
-@pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4), np.array([1.0])])
-@pytest.mark.parametrize("s", [1, 4, 50])
+@pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4), np.array([1.0]), gaussian_taps(300.0)])
+@pytest.mark.parametrize("s", [1, 4, 50, 700])
 def test_symmetric_filters_equal_a_double_loop(rng, taps, s):
     signal = rng.standard_normal((s, 5)).astype(np.float32)
     expected = np.stack([naive.correlate_symmetric(column, taps) for column in signal.T], axis=1)
-    np.testing.assert_allclose(filter_symmetric(signal, taps), expected, atol=1e-5)
+    np.testing.assert_allclose(filter_symmetric(signal, taps), expected, rtol=1e-4, atol=1e-4 if s > 99 else 1e-5)
 
 
 @pytest.mark.parametrize("taps", [gaussian_taps(2.0), gaussian_taps(300.0)])
@@ -132,8 +132,6 @@ def test_symmetric_filters_give_the_same_bits_however_waveforms_lie_in_memory(rn
     filtered = filter_symmetric(signal, taps)
     np.testing.assert_array_equal(filter_symmetric(np.asfortranarray(signal), taps), filtered)
     np.testing.assert_array_equal(filter_symmetric(signal[:, 2:3], taps), filtered[:, 2:3])
-    expected = np.stack([naive.correlate_symmetric(column, taps) for column in signal.T], axis=1)
-    np.testing.assert_allclose(filtered, expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4)])
