@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import run_command as run
 from plot_tools import write_cloud
+from writer_tools import write_points
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
@@ -256,12 +257,9 @@ def test_far_points_leave_the_frame_of_a_section_and_are_counted(tmp_path, many)
     """One point 116 m below pressed the others into a line; what is near the others stays."""
     pytest.importorskip("matplotlib")
     rng = np.random.default_rng(1)
-    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
-    las.header.scales = [0.001] * 3
     height = rng.normal(350.0, 0.3, many)
     height[0], height[1] = 353.0, 234.0
-    las.x, las.y, las.z = np.linspace(0.0, 80.0, many), rng.uniform(0, 1, many), height
-    las.write(tmp_path / "c.las")
+    write_points(tmp_path / "c.las", np.stack([np.linspace(0.0, 80.0, many), rng.uniform(0, 1, many), height], axis=1))
     for most in (200_000, many // 2 + 20):
         found = cut_section([tmp_path / "c.las"], "z", line=(0, 0.5, 80, 0.5), width=2.0, most=most)
         assert (found.inside, found.outside) == (many, 1) and len(found.value) <= most
