@@ -190,6 +190,8 @@ def test_columns_are_found_by_the_account_of_the_run(tmp_path):
         assert in_db == (style in ("riegl", "pdal"))
         cloud = read_cloud(tmp_path / f"{style}.las")
         np.testing.assert_allclose(cloud["echo_width"], values["echo_width"], atol=0.051)
+        # RIEGL and ASPRS write widths as scaled integers, which no-data makes NaN.
+        assert cloud.dtype["echo_width"] == (np.float64 if style in ("asprs", "riegl") else np.float32)
 
 
 def test_a_vendors_column_of_our_name_does_not_hide_ours(tmp_path):
