@@ -164,7 +164,6 @@ def test_command_writes_what_it_prints(tmp_path, monkeypatch):
 
 
 def test_plot_is_written_where_matplotlib_is(tmp_path, document):
-    pytest.importorskip("matplotlib")
     lines = command.write_outputs(document, "text", tmp_path)
     assert lines == [f"{tmp_path}: bench.json, bench.txt, bench-flat.png"]
     assert (tmp_path / "bench-flat.png").read_bytes()[:4] == b"\x89PNG"

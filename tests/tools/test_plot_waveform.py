@@ -182,7 +182,6 @@ def test_without_a_wish_a_few_are_spread_over_the_strip(tiny_strip):
 
 
 def test_strips_without_waveforms(tmp_path, riegl, data):
-    pytest.importorskip("matplotlib")
     raw = make_raw(4)
     raw.points["wavepacket_index"] = 0
     nothing = raw.write(tmp_path / "nothing.las")
@@ -201,14 +200,12 @@ def test_strips_without_waveforms(tmp_path, riegl, data):
 @pytest.mark.quick_cases("1")
 @pytest.mark.parametrize("samples", [1, 2, 8])
 def test_short_waveforms_can_be_drawn(tmp_path, samples):
-    pytest.importorskip("matplotlib")
     strip = make_raw(5, n_samples=samples).write(tmp_path / "short.las")
     result = run(strip, "-o", tmp_path / "p.png", "--packet", 2, "--profile", "fast")
     assert result.exit_code == 0, result.output
 
 
 def test_pictures_say_what_they_show_with_the_same_bytes_each_time(tiny_strip, tmp_path):
-    pytest.importorskip("matplotlib")
     words = (tiny_strip, "-o", tmp_path / "p.svg", "--packet", 3, "--overwrite")
     assert run(*words).exit_code == 0
     first = (tmp_path / "p.svg").read_bytes()
@@ -224,7 +221,6 @@ def test_pictures_say_what_they_show_with_the_same_bytes_each_time(tiny_strip, t
     ("suffix", "start"), [(".png", b"\x89PNG"), pytest.param(".pdf", b"%PDF", marks=pytest.mark.slow)]
 )
 def test_several_waveforms_and_other_kinds_of_file(tiny_strip, tmp_path, suffix, start):
-    pytest.importorskip("matplotlib")
     target = tmp_path / f"p{suffix}"
     result = run(tiny_strip, "-o", target, "--packet", "0:2", "--point", 20, "--profile", "fast", "--times", "0:40")
     assert result.exit_code == 0 and "3 waveforms" in result.stderr, result.output
@@ -232,7 +228,6 @@ def test_several_waveforms_and_other_kinds_of_file(tiny_strip, tmp_path, suffix,
 
 
 def test_a_chain_that_fits_nothing_is_drawn_without_a_fit(tiny_strip, tmp_path):
-    pytest.importorskip("matplotlib")
     chain = tmp_path / "none.toml"
     stages = ("noise.pooled", "detect.maximum", "decompose.none", "attribute.amplitude", "attribute.position")
     chain.write_text("".join(f'[[chain]]\nstage = "{stage}"\n' for stage in stages))
@@ -244,7 +239,6 @@ def test_a_chain_that_fits_nothing_is_drawn_without_a_fit(tiny_strip, tmp_path):
 
 @pytest.mark.slow
 def test_no_display_and_no_home_are_needed(tiny_strip, tmp_path):
-    pytest.importorskip("matplotlib")
     environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "MPLCONFIGDIR")}
     environment |= {"HOME": str(tmp_path / "nowhere"), "MPLBACKEND": "TkAgg"}
     command = [sys.executable, "-m", "wavebatch", "plot", "waveform", str(tiny_strip), "-o", "p.png", "-q"]
@@ -269,7 +263,6 @@ def test_the_signal_is_shown_and_the_whole_on_request(tiny_strip):
 
 @pytest.mark.parametrize("error", [20.0, 1e5, 1e30, np.inf, np.nan])
 def test_no_error_bar_presses_the_waveform_into_a_line(tmp_path, error):
-    pytest.importorskip("matplotlib")
     block = simulate(PulseShape(), [(100.0, 30.3, 2.0)], n=1)
     (view,) = waveform.build_views(block, make_chain("decompose.gaussian"), PULSE, [0])
     table = replace(view.echoes, amplitude_err=np.array([error], np.float32))
@@ -317,7 +310,6 @@ def test_real_waveforms(riegl, leica, tmp_path):
         views, unit = waveform.read_views(reader, scan, [place], chain, PULSE), reader.read_unit(place.unit, scan)
         assert views[0].packet == 475 and unit.packet_of_point[514 - unit.start] == place.row
         assert views[0].samples.max() == pytest.approx(183, abs=20)
-    pytest.importorskip("matplotlib")
     assert run(leica, "-o", tmp_path / "l.png", "--most", 1).exit_code == 0
 
 
@@ -339,7 +331,6 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
         assert len(waveform.find_places(reader, scan, waveform.Wanted(sheet=True), None)) == 100
         with pytest.raises(ConfigError, match="100 with --sheet"):
             waveform.find_places(reader, scan, waveform.Wanted(most=30), None)
-    pytest.importorskip("matplotlib")
     target = tmp_path / "sheet.svg"
     words = (tiny_strip, "-o", target, "--random", 9, "--seed", 1, "--sheet", "--profile", "fast", "--overwrite")
     result = run(*words)
@@ -350,7 +341,6 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
 
 
 def test_titles_name_every_flag_of_many_echoes(tmp_path):
-    pytest.importorskip("matplotlib")
     peaks = [(100.0, 20.3 + 8 * k, 2.0) for k in range(3)]
     (view,) = waveform.build_views(simulate(PulseShape(), peaks, n=1), make_chain("decompose.gaussian"), PULSE, [0])
     view.echoes.flags[:] = int(EchoFlag.SATURATED | EchoFlag.OVERLAPPED | EchoFlag.AMPLITUDE_UNRELIABLE)
@@ -361,7 +351,6 @@ def test_titles_name_every_flag_of_many_echoes(tmp_path):
 
 
 def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):
-    pytest.importorskip("matplotlib")
     views = waveform.build_views(
         simulate(PulseShape(), [(400.0, 30.3, 2.0)], n=2), make_chain("decompose.gaussian"), PULSE, [0, 1]
     )
