@@ -125,11 +125,6 @@ def parse_floats(text: str, form: str) -> tuple[float, ...]:
     return numbers
 
 
-def floats_option(name: str, form: str, text: str) -> Callable:
-    """An option that takes numbers of this form; text: its help."""
-    return click.option(name, type=Text(form, lambda value: parse_floats(value, form)), metavar=form, help=text)
-
-
 def bbox_option(text: str) -> Callable:
     """`--bbox` of a picture or a raster; text: what is done with the part."""
     part = "west, south, east, north, in the coordinates of the clouds"

@@ -15,7 +15,11 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, one_line, talk, tell
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import count
+from wavebatch.files.disk.publish import check_target
+from wavebatch.files.text_file import write_text
+from wavebatch.tools.sheets.sheet import Sheet
 
 if TYPE_CHECKING:
     from wavebatch.surveying.system_file import SavedSurvey
@@ -65,13 +69,9 @@ def survey(
       # save both for `run --system` and `--chain`
       wavebatch survey strip.las -o system.toml --chain chain.toml
     """  # fmt: skip
-    from wavebatch.core.errors import ConfigError
-    from wavebatch.files.disk.publish import check_target
-    from wavebatch.files.text_file import write_text
     from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
-    from wavebatch.tools.sheets.sheet import Sheet
-    from wavebatch.tools.sheets.survey import list_doubts, survey_sheet, write_survey_page
+    from wavebatch.tools.sheets.survey import check_angles, list_doubts, survey_sheet, write_survey_page
 
     overwrite = options["overwrite"]
     paths = shared.find_inputs(strips, recursive=options["recursive"])
@@ -84,8 +84,6 @@ def survey(
         if len(paths) > 1:
             words = "is for one strip, because widths depend on the distance of the ground"
             raise ConfigError(f"--angles {angles}: {words}")
-        from wavebatch.tools.sheets.survey import check_angles
-
         check_angles(angles, overwrite=overwrite)
     options["angles"] = angles
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
@@ -113,11 +111,10 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     from wavebatch.files.disk.raw_bytes import take_fingerprint
     from wavebatch.surveying.inspect_strip import doubt_files
     from wavebatch.surveying.system_file import SavedSurvey
-    from wavebatch.tools.api import open_strip
-    from wavebatch.tools.api import survey as survey_strip
+    from wavebatch.tools import api
 
-    with open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
-        found = survey_strip(
+    with api.open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
+        found = api.survey(
             opened, waveforms=options["waveforms"], divergence=options["divergence"], find_divergence=True
         )
         scan = opened.scan
@@ -142,7 +139,6 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
 
 def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
     """The survey of a flight, and what else is shown of its strips."""
-    from wavebatch.core.errors import InputError
     from wavebatch.surveying.flight import read_samples, survey_flight
 
     failed: list[Path] = []

@@ -23,6 +23,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import EvenSample
 from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader, check_alike
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
+from wavebatch.files.disk.raw_bytes import undoing
 from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.files.las.crs import CrsWords, describe_crs
@@ -84,11 +85,8 @@ class Clouds:
     def _open(self, path: Path) -> ColumnReader:
         """A reader that gives the chosen points."""
         reader = ColumnReader(path, *self._columns)
-        try:
+        with undoing(reader.close):
             reader.select(self.chosen)
-        except BaseException:
-            reader.close()
-            raise
         return reader
 
     def _with_unit(self, facts: ColumnFacts) -> ColumnFacts:

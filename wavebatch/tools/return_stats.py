@@ -23,12 +23,15 @@ from wavebatch.core.schema import Key
 from wavebatch.core.units import HALF_C
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, spread_keys, tell_pulses_apart, time_keys
+from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, spread_keys, time_keys
 from wavebatch.files.geojson import Polygon, describe_miss, find_inside
 from wavebatch.files.las.header import read_header
 
 MOST_AREAS = 50_000
 """Most areas of all clouds together, so that memory is bounded."""
+
+MOST_RETURNS = 16
+"""Most points per GPS time on average; with more, times are not those of pulses (LAS allows 15 returns)."""
 
 MOST_NUMBER, MOST_COUNT = 15, 64
 """Largest return number of LAS; pulses with at least so many returns are counted as one class."""
@@ -415,7 +418,7 @@ def pulses_told_apart(reader: CloudReader) -> bool:
     if not reader.has_gps_time:
         return False
     rows = next(reader.read_pieces(), None)
-    return rows is None or tell_pulses_apart(rows["gps_time"])
+    return rows is None or len(np.unique(rows["gps_time"])) * MOST_RETURNS >= len(rows)
 
 
 def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter, held: int) -> _Tally:
