@@ -15,13 +15,8 @@ def smooth_121(waveform):
 
 def correlate_symmetric(waveform, taps):
     """One waveform correlated with a symmetric filter given by its half, zero outside."""
-    s = len(waveform)
-    total = np.zeros(s)
-    for i in range(s):
-        for lag in range(-len(taps) + 1, len(taps)):
-            if 0 <= i + lag < s:
-                total[i] += taps[abs(lag)] * waveform[i + lag]
-    return total
+    whole = np.convolve(np.asarray(waveform, np.float64), np.r_[taps[:0:-1], taps])
+    return whole[len(taps) - 1 :][: len(waveform)]
 
 
 def find_peaks(signal, threshold):
@@ -56,19 +51,12 @@ def widen(mask, reach):
 
 def find_runs(signal, level):
     """(waveform, first, one behind the last) of every run of signal (s, n) above level (n,)."""
-    s, n = signal.shape
-    runs = []
-    for w in range(n):
-        i = 0
-        while i < s:
-            if signal[i, w] > level[w]:
-                start = i
-                while i < s and signal[i, w] > level[w]:
-                    i += 1
-                runs.append((w, start, i))
-            else:
-                i += 1
-    return runs
+    edges = np.diff(np.pad(signal > level, ((1, 1), (0, 0))).astype(int), axis=0)
+    return [
+        (w, int(start), int(end))
+        for w, column in enumerate(edges.T)
+        for start, end in zip(np.flatnonzero(column > 0), np.flatnonzero(column < 0), strict=True)
+    ]
 
 
 def match_returns(echo_waveform, echo_time, return_waveform, return_time, tolerance):
@@ -162,28 +150,10 @@ def log_parabola(smooth, at, width):
     return np.exp(c0 - c1**2 / (4 * c2)) * np.sqrt(1 + 0.5 / width**2), at - c1 / (2 * c2), width
 
 
-def closed_form(y, fraction):
-    """Amplitude, time after the middle and width of one window by a weighted parabola through its logarithms."""
-    middle = len(y) // 2
-    low = high = middle
-    while low > 0 and y[low - 1] >= fraction * y[middle]:
-        low -= 1
-    while high < len(y) - 1 and y[high + 1] >= fraction * y[middle]:
-        high += 1
-    x = np.arange(low - middle, high - middle + 1)
-    part = y[low : high + 1]
-    c2, c1, c0 = np.polyfit(x, np.log(part), 2, w=part)
-    return np.exp(c0 - c1 * c1 / (4 * c2)), -c1 / (2 * c2), np.sqrt(-1 / (2 * c2))
-
-
 def correlate_antisymmetric(waveform, taps):
     """One waveform correlated with taps ahead and their negatives behind, zero outside."""
-    s = len(waveform)
-    total = np.zeros(s)
-    for i in range(s):
-        for lag in range(1, len(taps)):
-            total[i] += taps[lag] * ((waveform[i + lag] if i + lag < s else 0) - (waveform[i - lag] if i >= lag else 0))
-    return total
+    whole = np.convolve(waveform, np.r_[taps[:0:-1], 0.0, -taps[1:]])
+    return whole[len(taps) - 1 :][: len(waveform)]
 
 
 def walk_down(waveform, sample, level, step):
@@ -225,27 +195,18 @@ def keep_prominent(values, minima, least):
 
 
 def b3_detail(waveform, level):
-    """Detail of one waveform: the taps with holes, sample by sample, the ends repeated."""
-    last = len(waveform) - 1
-    before = list(waveform)
-    for j in range(level):
-        step = 2**j
-        after = []
-        for i in range(last + 1):
-            at = [min(max(i + k * step, 0), last) for k in (-2, -1, 0, 1, 2)]
-            after.append(sum(h * before[a] for h, a in zip((1, 4, 6, 4, 1), at, strict=True)) / 16)
-        before, smooth = after, before
-    return np.array(smooth) - np.array(before)
+    """Detail of one waveform: the taps with holes, the ends repeated."""
+    after = np.asarray(waveform, float)
+    for step in 2 ** np.arange(level):
+        before, taps = after, np.zeros(4 * step + 1)
+        taps[::step] = np.array([1, 4, 6, 4, 1]) / 16
+        after = np.convolve(np.pad(before, 2 * step, mode="edge"), taps, mode="valid")
+    return before - after
 
 
 def pulse_matrix(s, taps):
     """(s, s): column i is the pulse put at sample i, cut off at the ends."""
-    matrix = np.zeros((s, s))
-    for i in range(s):
-        for k, tap in enumerate(taps):
-            if 0 <= i + k - len(taps) // 2 < s:
-                matrix[i + k - len(taps) // 2, i] = tap
-    return matrix
+    return scipy.linalg.convolution_matrix(taps, s)[len(taps) // 2 :][:s]
 
 
 def richardson_lucy(waveform, taps, background, iterations):
@@ -288,31 +249,6 @@ def gauss_newton(y, x, start, iterations):
         if not np.isfinite(parameters).all() or (parameters[[0, 2]] <= 0).any():
             return np.full_like(parameters, np.nan)
     return parameters
-
-
-def crlb_joint(time, amplitude, sigma, noise_std, spacing, n_samples):
-    """Least standard deviations of time, amplitude and sigma, each (k, n), of k Gaussian echoes in each of n waveforms.
-
-    All 3 k parameters of a waveform are unknown together: the bound of overlapping and truncated echoes.
-    time [ns after sample 0], amplitude [count], sigma [ns]: (k, n); noise_std scalar or (n,).
-    Parameters that the samples cannot tell at all (a singular Fisher matrix) get infinity.
-    """
-    k, n = time.shape
-    x = np.arange(n_samples)[:, None, None] * spacing
-    z = (x - time) / sigma
-    pulse = np.exp(-0.5 * z * z)
-    slope = amplitude / sigma * pulse * z
-    jacobian = np.concatenate([slope, pulse, slope * z], axis=1)
-    scale = np.sqrt((jacobian**2).sum(axis=0))
-    scale = np.where(scale > 0, scale, 1.0)
-    jacobian /= scale
-    fisher = np.einsum("ipn,iqn->npq", jacobian, jacobian)
-    # Scaled columns: the diagonal is 1, so that eigenvalues say how well parameters can be told apart.
-    values, vectors = np.linalg.eigh(fisher)
-    values = np.where(values > 1e-13, values, np.nan)
-    variance = (vectors**2 / values[:, None, :]).sum(axis=2).T
-    std = np.sqrt(np.where(np.isnan(variance), np.inf, variance)) / scale * noise_std
-    return std[:k], std[k : 2 * k], std[2 * k :]
 
 
 def compare_halves(xyz):

@@ -3,6 +3,7 @@
 
 import naive
 import numpy as np
+from scipy.linalg import toeplitz
 
 from wavebatch.kernels.signal import noise
 
@@ -140,12 +141,8 @@ def residual_noise(residual, used, lost, lags):
     kept -= kept[used].mean()
     covariance = []
     for lag in range(lags + 1):
-        products = [
-            kept[w, i] * kept[w, i + lag]
-            for w in range(len(kept))
-            for i in range(kept.shape[1] - lag)
-            if used[w, i] and used[w, i + lag]
-        ]
+        first, second = slice(0, kept.shape[1] - lag), slice(lag, None)
+        products = (kept[:, first] * kept[:, second])[used[:, first] & used[:, second]]
         covariance.append(np.mean(products) + (lost[lag] if lag < len(lost) else 0.0))
     return np.sqrt(covariance[0]), np.array(covariance[1:]) / covariance[0]
 
@@ -153,18 +150,9 @@ def residual_noise(residual, used, lost, lags):
 def colour_factors(correlation, *columns):
     """Errors of a white-weighted fit in coloured noise over those in white noise: by the covariance of its result."""
     size = len(columns[0])
-    colour = np.eye(size)
-    for i in range(size):
-        for j in range(size):
-            lag = abs(i - j)
-            if lag:
-                colour[i, j] = correlation[lag - 1] if lag <= len(correlation) else 0.0
-    factors = []
-    for chosen in (columns[:1], columns):
-        inverse = np.linalg.pinv(np.stack(chosen, axis=1))
-        coloured, white = (np.diag(inverse @ matrix @ inverse.T) for matrix in (colour, np.eye(size)))
-        factors += np.sqrt(coloured / white).tolist()
-    return tuple(factors)
+    colour = toeplitz(np.r_[1.0, correlation, np.zeros(size)][:size])
+    rows = np.concatenate([np.linalg.pinv(np.stack(chosen, axis=1)) for chosen in (columns[:1], columns)])
+    return tuple(np.sqrt(np.diag(rows @ colour @ rows.T) / np.diag(rows @ rows.T)))
 
 
 def wiener(waveform, taps, noise_to_signal):

@@ -8,6 +8,7 @@ import time
 
 import pytest
 from batch_tools import is_alive, read_outputs
+from commands import run_command
 
 from wavebatch.tools.simulate import simulate_strip
 
@@ -18,22 +19,23 @@ PROFILE = ["--profile", "fast"]
 
 @pytest.fixture(scope="module", params=[300, pytest.param(56_000, marks=pytest.mark.slow)])
 def strips(request, tmp_path_factory):
-    """Three strips, the last with one unit or two."""
+    """Three strips, the last with one unit or two, and the survey of the first."""
     folder = tmp_path_factory.mktemp("strips")
     for name, pulses in (("a", 300), ("b", 300), ("c", request.param)):
         simulate_strip("flat", folder / f"{name}.las", pulses=pulses, seed=1)
+    assert run_command("survey", folder / "a.las", "-o", folder / "system.toml").exit_code == 0
     return folder
 
 
 @pytest.fixture(scope="module")
 def undisturbed(strips, tmp_path_factory):
     folder = tmp_path_factory.mktemp("undisturbed")
-    subprocess.run(_command(strips, folder), check=True)
+    assert run_command(*_words(strips, folder)).exit_code == 0
     return read_outputs(folder)
 
 
-def _command(strips, folder, *more):
-    return [sys.executable, "-m", "wavebatch", "run", str(strips), "-o", str(folder), *PROFILE, "-q", *more]
+def _words(strips, folder, *more):
+    return ["run", str(strips), "-o", str(folder), *PROFILE, "-q", "--system", str(strips / "system.toml"), *more]
 
 
 _AT = """
@@ -69,7 +71,7 @@ REPORTED = {"method": "publish", "suffix": "a.report.json"}
 def _stage(strips, folder, script, act, *more, **event):
     """The command of a run that acts at an event: nothing depends on when another process sees the event."""
     script.write_text(_AT.format(act=act, **event))
-    return [sys.executable, str(script), *_command(strips, folder, *more)[3:]]
+    return [sys.executable, str(script), *_words(strips, folder, *more)]
 
 
 def _disturb(strips, out, event, number):
@@ -99,7 +101,7 @@ def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips,
     out = tmp_path / "out"
     code, _ = _disturb(strips, out, event, signal.SIGKILL)
     assert code == -signal.SIGKILL and read_outputs(out).keys() != undisturbed.keys()
-    subprocess.run(_command(strips, out, "--resume"), check=True)
+    assert run_command(*_words(strips, out, "--resume")).exit_code == 0
     assert read_outputs(out) == undisturbed
 
 
@@ -176,13 +178,9 @@ def test_a_worker_that_is_stopped_as_soon_as_our_code_runs_in_it_dies_with_its_p
 
 
 _SHOT = """
-import os, sys
+import os
 from pathlib import Path
-sys.path.insert(0, {tests!r})
-import wavebatch.batch.strip_task, wavebatch.batch.unit
-from batch_tools import make_job
-from wavebatch.batch.options import RunOptions
-from wavebatch.batch.run import run_batch
+import wavebatch, wavebatch.batch.strip_task, wavebatch.batch.unit
 
 def prepare(job, parts):
     once = Path({once!r})
@@ -194,8 +192,7 @@ def prepare(job, parts):
 if __name__ == "__main__":
     wavebatch.batch.strip_task.prepare_strip = prepare
     folder = Path({strips!r})
-    jobs = [make_job(folder / name) for name in ("a.las", "b.las", "c.las")]
-    result = run_batch(jobs, RunOptions(Path({out!r}), jobs=2))
+    result = wavebatch.run([folder], {out!r}, chain="fast", system=folder / "system.toml", jobs=2)
     print([outcome.status for outcome in result.outcomes])
     print(result.outcomes[1].error)
 """
@@ -205,7 +202,7 @@ def test_a_strip_at_which_a_worker_dies_is_tried_once_more_and_only_then_fails(s
     script = tmp_path / "shot.py"
     out = tmp_path / "out"
     places = {"strips": str(strips), "out": str(out), "once": str(tmp_path / "once")}
-    script.write_text(_SHOT.format(tests=os.path.dirname(os.path.dirname(__file__)), **places))
+    script.write_text(_SHOT.format(**places))
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     statuses, error = done.stdout.splitlines()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 
 import pytest
 from commands import run_command
@@ -9,25 +10,33 @@ from commands import run_command
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.options import OutputPath
 from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate.strip import StripOptions
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Strips with packets next to them, a chain file and more."""
+    folder = tmp_path_factory.mktemp("files")
+    for name in ("s.las", "t.las"):
+        simulate_strip("flat", folder / name, pulses=200, seed=1, options=StripOptions(internal=False))
+    made = run_command("survey", folder / "s.las", "-o", folder / "sys.toml", "--chain", folder / "chain.toml")
+    assert made.exit_code == 0
+    (folder / "list.txt").write_text("s.las\n")
+    (folder / "targets.csv").write_text("reflectance,x,y,radius\n0.5,0,0,5\n")
+    (folder / "areas.json").write_text('{"type": "FeatureCollection", "features": []}')
+    (folder / "energy.txt").write_text("time energy\n0 1\n1e9 1\n")
+    (folder / "path.txt").write_text("time x y z\n0 0 0 900\n1e9 9 9 900\n")
+    corners = [[0, 0], [9e6, 0], [9e6, 9e6], [0, 9e6], [0, 0]]
+    (folder / "area.json").write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
+    (folder / "empty").mkdir()
+    return folder
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch):
-    """Strips with packets next to them, a chain file and more, in the folder in which commands run."""
+def place(files, tmp_path, monkeypatch):
+    """A copy of the files with links to some, in the folder in which commands run."""
     monkeypatch.chdir(tmp_path)
-    from wavebatch.tools.simulate.strip import StripOptions
-
-    for name in ("s.las", "t.las"):
-        simulate_strip("flat", tmp_path / name, pulses=200, seed=1, options=StripOptions(internal=False))
-    run_command("survey", "s.las", "-o", "sys.toml", "--chain", "chain.toml", catch_exceptions=False)
-    (tmp_path / "list.txt").write_text("s.las\n")
-    (tmp_path / "targets.csv").write_text("reflectance,x,y,radius\n0.5,0,0,5\n")
-    (tmp_path / "areas.json").write_text('{"type": "FeatureCollection", "features": []}')
-    (tmp_path / "energy.txt").write_text("time energy\n0 1\n1e9 1\n")
-    (tmp_path / "path.txt").write_text("time x y z\n0 0 0 900\n1e9 9 9 900\n")
-    corners = [[0, 0], [9e6, 0], [9e6, 9e6], [0, 9e6], [0, 0]]
-    (tmp_path / "area.json").write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
-    (tmp_path / "empty").mkdir()
+    shutil.copytree(files, tmp_path, dirs_exist_ok=True)
     os.symlink("s.las", "link.las")
     os.symlink(".", "here")
     os.link("s.las", "hard.las")

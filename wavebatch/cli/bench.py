@@ -13,7 +13,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_scenes
-from wavebatch.cli.messages import print_result, talk
+from wavebatch.cli.messages import answer, talk
 from wavebatch.tools.bench import command
 
 
@@ -72,4 +72,4 @@ def bench(
         names = ", ".join(section["scene"] for section in document["scenes"])
         write_page(html_file, f"wavebatch bench: {names}", sheet.parts)
         talk(f"{html_file}: written")
-    print_result(options["as_json"], document, sheet)
+    answer(document, sheet)

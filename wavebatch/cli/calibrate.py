@@ -14,8 +14,10 @@ import click
 from wavebatch.batch.options import RunOptions
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import answer, format_json, talk, tell
-from wavebatch.files.disk.publish import protecting, refuse_input
+from wavebatch.files.disk.publish import protecting, refuse_existing, refuse_input
+from wavebatch.files.text_file import write_text
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
+from wavebatch.tools.sheets.sheet import list_lines
 
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
@@ -72,12 +74,9 @@ def calibrate(
       # with light that falls across the swath
       wavebatch calibrate *.laz --targets targets.csv --scan-angle --html cal.html -o cal.toml
     """  # fmt: skip
-    from wavebatch.files.disk.publish import refuse_existing
-    from wavebatch.files.text_file import write_text
     from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
     from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_targets
     from wavebatch.tools.api import find_request, read_sensor
-    from wavebatch.tools.sheets.sheet import list_lines
     from wavebatch.tools.sheets.survey import calibration_sheet, write_calibrate_page
 
     if (targets is None) == (options["column"] is None):

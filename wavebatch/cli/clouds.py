@@ -17,7 +17,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_columns
-from wavebatch.cli.messages import answer, print_json, print_sheet, talk, tell
+from wavebatch.cli.messages import answer, talk, tell
 from wavebatch.cli.plot import choose_points, find_clouds
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
@@ -86,11 +86,9 @@ def stats(
     elif output is not None:
         write_text(output, _format_table(each, total), overwrite=overwrite)
     shown = [*each, total] if len(files) > 1 else each
-    if as_json:
-        print_json({"files": [_plain(one) for one in each], "total": _plain(total)})
-    elif shown:
-        first, *rest = map(_sheet, shown)
-        print_sheet(Sheet("stats", [*first.parts, *rest]))
+    document = {"files": [_plain(one) for one in each], "total": _plain(total)}
+    sheets = [_sheet(one) for one in shown]
+    answer(document, Sheet("stats", [*sheets[0].parts, *sheets[1:]]) if sheets else None)
     sys.exit(EXIT_UNREADABLE if failed else 0)
 
 

@@ -477,50 +477,37 @@ def write_man_pages(group: click.Group, folder: Path) -> list[Path]:
     from wavebatch.files.text_file import write_text
 
     folder.mkdir(parents=True, exist_ok=True)
-    top = click.Context(group, info_name="wavebatch")
-    pages = {"wavebatch": _front_page(group, top)}
-    for name in group.list_commands(top):
-        command = group.get_command(top, name)
-        if command is not None:
-            pages |= dict(_pages(command, click.Context(command, info_name=name, parent=top), name))
+    pages = dict(_pages(group, click.Context(group, info_name="wavebatch")))
     for name, text in pages.items():
         write_text(folder / f"{name}.1", text, overwrite=True)
     return [folder / f"{name}.1" for name in pages]
 
 
-def _pages(command: click.Command, ctx: click.Context, title: str) -> Iterator[tuple[str, str]]:
-    yield f"wavebatch-{title.replace(' ', '-')}", _page(command, ctx, title)
+def _pages(command: click.Command, ctx: click.Context, title: str = "") -> Iterator[tuple[str, str]]:
+    """Name and text of the page of a command, and of those of a group; title: "" for the program itself."""
+    name = "-".join(["wavebatch", *title.split()])
+    inner = {}
     if isinstance(command, click.Group):
-        for name, one in command.commands.items():
-            yield from _pages(one, click.Context(one, info_name=name, parent=ctx), f"{title} {name}")
-
-
-def _heading(name: str) -> str:
-    return f'.TH "{name.upper()}" "1" "" "wavebatch {__version__}" "wavebatch"'
-
-
-def _front_page(group: click.Group, ctx: click.Context) -> str:
-    lines = [_heading("wavebatch"), ".SH NAME", f"wavebatch \\- {roff(_first_line(group.help))}", ".SH SYNOPSIS",
-             ".B wavebatch", "COMMAND [OPTIONS] ...", ".SH DESCRIPTION", *_describe(group.help or ""), ".SH COMMANDS"]
-    for name in group.list_commands(ctx):
-        command = group.get_command(ctx, name)
-        text = _first_line(None if command is None else command.help)
-        lines += [".TP", f"\\fB{roff(f'wavebatch-{name}(1)')}\\fR", roff(text)]
-    return "\n".join([*lines, *_options(group, ctx)]) + "\n"
-
-
-def _page(command: click.Command, ctx: click.Context, title: str) -> str:
-    name = f"wavebatch-{title.replace(' ', '-')}"
-    lines = [_heading(name), ".SH NAME", f"{roff(name)} \\- {roff(_first_line(command.help))}", ".SH SYNOPSIS",
-             f"\\fB{roff(ctx.command_path)}\\fR {roff(' '.join(command.collect_usage_pieces(ctx)))}",
-             ".SH DESCRIPTION", *_describe(command.help or ""), *_options(command, ctx)]  # fmt: skip
-    examples = getattr(command, "examples", ())
-    if examples:
+        inner = {one: command.get_command(ctx, one) for one in command.list_commands(ctx)}
+    usage = f"\\fB{roff(ctx.command_path)}\\fR {roff(' '.join(command.collect_usage_pieces(ctx)))}"
+    lines = [f'.TH "{name.upper()}" "1" "" "wavebatch {__version__}" "wavebatch"',
+             ".SH NAME", f"{roff(name)} \\- {roff(_first_line(command.help))}",
+             ".SH SYNOPSIS", *([usage] if title else [".B wavebatch", "COMMAND [OPTIONS] ..."]),
+             ".SH DESCRIPTION", *_describe(command.help or "")]  # fmt: skip
+    if not title:
+        lines.append(".SH COMMANDS")
+        for one, its in inner.items():
+            lines += [".TP", f"\\fB{roff(f'wavebatch-{one}(1)')}\\fR", roff(_first_line(its.help))]
+    lines += _options(command, ctx)
+    if examples := getattr(command, "examples", ()):
         lines.append(".SH EXAMPLES")
         for line, purpose in examples:
             words = f"{purpose[:1].upper()}{purpose[1:]}:"
             lines += [".PP", roff(words), ".PP", ".nf", ".RS", roff(line), ".RE", ".fi"]
-    return "\n".join([*lines, ".SH SEE ALSO", "\\fBwavebatch\\fR(1)"]) + "\n"
+    lines += [".SH SEE ALSO", "\\fBwavebatch\\fR(1)"] if title else []
+    yield name, "\n".join(lines) + "\n"
+    for one, its in inner.items():
+        yield from _pages(its, click.Context(its, info_name=one, parent=ctx), f"{title} {one}".strip())
 
 
 def _options(command: click.Command, ctx: click.Context) -> Iterator[str]:

@@ -17,7 +17,7 @@ import click
 
 from wavebatch import __version__
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import print_result, talk, tell
+from wavebatch.cli.messages import answer, talk, tell
 from wavebatch.core.units import count
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
@@ -65,7 +65,6 @@ def compare(
     strip: Path | None,
     truth: Path | None,
     html_file: Path | None,
-    as_json: bool,
     output: Path | None,
     overwrite: bool,
     **options: Any,
@@ -98,7 +97,7 @@ def compare(
         write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
     chains = _list_match(result) if strip else ()
     parts = [*_list_parts(between), *chains]
-    print_result(as_json, result.to_json(), Sheet("compare", parts), "chains" if strip else "")
+    answer(result.to_json(), Sheet("compare", parts), "chains" if strip else "")
     fewer = min(between.echoes_a, between.echoes_b)
     if fewer and between.matched <= fewer * (FEW_COMMON if options["within"] is None else 0.0):
         common = f"{between.matched} of {fewer} echoes" if between.matched else "no echo"

@@ -6,10 +6,8 @@ Reads options, loops over strips and scan lines, and prints; the work is in `wav
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import asdict
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ import click
 
 from wavebatch import __version__
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, counting, talk, tell
+from wavebatch.cli.messages import counting, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import count, format_measure
 from wavebatch.files.disk.publish import refuse_existing, refuse_input
@@ -31,9 +29,6 @@ from wavebatch.tools.scan_slices import SliceOptions, cut_slice, find_segments, 
 from wavebatch.tools.slice_output import SEGMENT_SUFFIXES, CubeBuilder, SegmentWriter, draw_segments, draw_slice
 from wavebatch.tools.voxels.rays import Deconvolution
 from wavebatch.tools.voxels.strip import VoxelOptions, VoxelSummary, voxelize_strip
-
-EXIT_SOME_FAILED = 1
-"""Some strips failed."""
 
 _NOISE_FLOOR = 5.0
 """Standard deviations of the noise above the lower quartile of a waveform, which lies 0.7 of them below its mean: one
@@ -112,11 +107,7 @@ def slice_(
         raise ConfigError(f"{extras[0]}: one file for {len(paths)} strips; make them one by one")
     targets = {} if output is None else shared.name_outputs(paths, output, SEGMENT_SUFFIXES, ".csv")
     options |= {"lines": lines, "png": png, "overview": overview, "cube": cube, "extras": extras}
-    found, failed = shared.for_each(
-        paths, lambda strip: _slice(strip, targets.get(strip), options), debug=options["debug"]
-    )
-    answer(found[0] if len(paths) == 1 else found)
-    sys.exit(EXIT_SOME_FAILED if failed else 0)
+    shared.finish_each(paths, lambda strip: _slice(strip, targets.get(strip), options), options)
 
 
 def _slice(strip: Path, output: Path | None, options: dict[str, Any]) -> dict[str, Any]:
@@ -277,9 +268,7 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
             tell(line)
         return summary
 
-    summaries, failed = shared.for_each(paths, work, debug=options["debug"])
-    answer(summaries[0] if len(paths) == 1 else [asdict(one) for one in summaries])
-    sys.exit(EXIT_SOME_FAILED if failed else 0)
+    shared.finish_each(paths, work, options)
 
 
 def _list_lines(summary: VoxelSummary) -> Iterator[str]:

@@ -15,7 +15,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_files, complete_stages
-from wavebatch.cli.messages import answer, print_result, print_sheet, print_text, printable, talk
+from wavebatch.cli.messages import answer, print_sheet, print_text, printable, talk
 from wavebatch.cli.options import common_options
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.units import count
@@ -236,7 +236,7 @@ def _list_rest(facts: dict[str, Any]) -> Iterator[Part]:
 @click.command()
 @click.argument("name", required=False, shell_complete=complete_stages)
 @common_options("json")
-def stages(name: str | None, as_json: bool, quiet: bool, debug: bool) -> None:
+def stages(name: str | None, **options: Any) -> None:
     """List the algorithms that a chain can use, those of one kind, or explain the one called NAME.
 
     Kinds are noise, detect, decompose and attribute.
@@ -266,7 +266,7 @@ def stages(name: str | None, as_json: bool, quiet: bool, debug: bool) -> None:
     chosen = [stage for stage in chosen if name in (None, stage.name, stage.kind)]
     width = max(len(stage.name) for stage in chosen)
     lines = [_explain(STAGES[name])] if one else [f"{stage.name:<{width}}  {stage.summary}" for stage in chosen]
-    print_result(as_json, [_describe(stage) for stage in chosen], Sheet("stages", list(map(Note, lines))))
+    answer([_describe(stage) for stage in chosen], Sheet("stages", list(map(Note, lines))))
 
 
 def _types(parameter: Parameter) -> str:

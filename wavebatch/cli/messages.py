@@ -245,26 +245,26 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else " " if c.isspace() else repr(c)[1:-1] for c in text)
 
 
-def print_json(value: Any, mode: str = "") -> None:
-    """Prints `value` (plain, or a dataclass) as JSON with sorted keys; NaN becomes null, because JSON has no NaN.
+def answer(document: Any, sheet: Sheet | None = None, mode: str = "") -> None:
+    """The result of a command on stdout: with --json the document, else the lines of the sheet, if there is one.
 
-    Each document says what it is in its key `schema`, as docs/json.md has it. mode: what the command did, where its
-    documents differ.
+    document: plain values, a dataclass, or a list of these. As JSON it has sorted keys, and null for NaN, which JSON
+    does not have. Each document says what it is in its key `schema`, as docs/json.md has it. mode: what the command
+    did, where its documents differ.
     """
-    value = asdict(value) if is_dataclass(value) else value
-    path, context = [mode] if mode else [], click.get_current_context()
+    context = click.get_current_context()
+    if not context.params["as_json"]:
+        if sheet is not None:
+            print_sheet(sheet)
+        return
+    path = [mode] if mode else []
     while context.parent is not None:
         path.insert(0, str(context.info_name))
         context = context.parent
     schema = {"schema": f"wavebatch.{'-'.join(path)}/1"}
-    named = [{**schema, **one} for one in value] if isinstance(value, list) else {**schema, **value}
-    print_text(format_json(named))
-
-
-def answer(document: Any, mode: str = "") -> None:
-    """`print_json`, if --json was given."""
-    if click.get_current_context().params["as_json"]:
-        print_json(document, mode)
+    listed = document if isinstance(document, list) else [document]
+    named = [{**schema, **(asdict(one) if is_dataclass(one) else one)} for one in listed]
+    print_text(format_json(named if isinstance(document, list) else named[0]))
 
 
 def print_text(text: str) -> None:
@@ -280,10 +280,9 @@ def print_text(text: str) -> None:
 
 
 def format_json(value: Any) -> str:
-    """The value (plain, or a dataclass) as JSON text with sorted keys; NaN becomes null."""
+    """Plain values as JSON text with sorted keys; NaN becomes null."""
     from wavebatch.core.no_data import without_nan
 
-    value = asdict(value) if is_dataclass(value) else value
     text = json.dumps(without_nan(value), allow_nan=False, indent=2, sort_keys=True, ensure_ascii=False)
     return text.encode(errors="backslashreplace").decode()
 
@@ -300,14 +299,6 @@ def print_safely(text: str) -> bool:
         talk(f"error: stdout: cannot be written: {getattr(error, 'strerror', None) or error}")
         _drop_output(sys.stdout)
         return False
-
-
-def print_result(as_json: bool, document: Any, sheet: Sheet, mode: str = "") -> None:
-    """The result of a command on stdout: the document as JSON, with its mode, or the lines of the sheet."""
-    if as_json:
-        print_json(document, mode)
-    else:
-        print_sheet(sheet)
 
 
 def print_sheet(sheet: Sheet) -> None:

@@ -10,18 +10,19 @@ import functools
 import math
 import os
 import re
+import sys
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import click
 from click.core import ParameterSource
 
 from wavebatch.batch.options import OPTIONS, RunOptions, check_together
 from wavebatch.cli.command import READ, complete_files, complete_flags, complete_profiles, complete_written
-from wavebatch.cli.messages import LEVELS, LOG, begin_log, keep_level, one_line, report_errors, talk, tell
+from wavebatch.cli.messages import LEVELS, LOG, answer, begin_log, keep_level, one_line, report_errors, talk, tell
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
 from wavebatch.files.disk.publish import protecting, refuse_input
@@ -122,11 +123,6 @@ def parse_floats(text: str, form: str) -> tuple[float, ...]:
     if len(numbers) != form.count(mark) + 1:
         raise click.BadParameter(f"{text!r} is not {form}")
     return numbers
-
-
-def floats_option(name: str, form: str, text: str) -> Callable:
-    """An option that takes numbers of this form; text: its help."""
-    return click.option(name, type=Text(form, lambda value: parse_floats(value, form)), metavar=form, help=text)
 
 
 def bbox_option(text: str) -> Callable:
@@ -374,6 +370,13 @@ def for_each(
             failed += 1
             talk(f"error: {one_line(error)}")
     return results, failed
+
+
+def finish_each(paths: Sequence[Path], work: Callable[[Path], Any], options: Mapping[str, Any]) -> NoReturn:
+    """Do the work for each path, give the results as --json, and end the command: exit code 1 if one failed."""
+    results, failed = for_each(paths, work, debug=options["debug"])
+    answer(results[0] if len(paths) == 1 else results)
+    sys.exit(1 if failed else 0)
 
 
 def name_outputs(paths: Sequence[Path], output: Path, suffixes: Sequence[str], kind: str) -> dict[Path, Path]:

@@ -1,13 +1,13 @@
 """`wavebatch plot`: pictures of waveforms, histograms, maps, side views, heights, and slices of a data cube.
 
-Reads options, calls `wavebatch.tools.plots` and prints one line. The modules that draw are imported only after all
-else has succeeded: matplotlib takes long to import and may be missing.
+Reads options, calls `wavebatch.tools.plots` and prints one line.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -64,11 +64,6 @@ def choose_points(options: dict[str, Any]) -> Any:
     return PointFilter(flags=flags, drop_flags=dropped, where=options["where"])
 
 
-def list_tally(tally: Any) -> dict[str, int]:
-    """How many points were drawn, and how many were not, for --json."""
-    return {name: getattr(tally, name) for name in tally.__slots__}
-
-
 def describe_tally(tally: Any, outside: int, kind: str = "value") -> str:
     """How many points were drawn, and how many were not, for people."""
     left_out = f", {tally.left_out} left out" * bool(tally.left_out)
@@ -115,7 +110,7 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
       wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png
     """  # fmt: skip
     from wavebatch.tools.cells import Clouds
-    from wavebatch.tools.plots.draw_cloud import count_points_by_flag, count_values
+    from wavebatch.tools.plots import draw_cloud
 
     column, chosen = options["column"], choose_points(options)
     if Clouds(clouds, (column,), chosen).facts.is_flags:
@@ -123,20 +118,17 @@ def histogram(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> 
             if options[name]:
                 option = "--range" if name == "limits" else f"--{name}"
                 raise ConfigError(f"{option} is of no use for flags, which are counted by name")
-        flags = count_points_by_flag(clouds, column, chosen)
-        from wavebatch.tools.plots.draw_cloud import draw_flags
-
-        draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
+        flags = draw_cloud.count_points_by_flag(clouds, column, chosen)
+        draw_cloud.draw_flags(flags, output, log=options["log"], overwrite=options["overwrite"])
         total, text = flags.total, f"{count(flags.total.values, 'point')}, {flags.clean} without a flag"
         text += f", {total.left_out} left out" * bool(total.left_out)
     else:
         how = {name: options[name] for name in ("bins", "limits", "each", "by")}
-        found = count_values(clouds, column, chosen, **how)
-        from wavebatch.tools.plots.draw_cloud import draw_cloud_histogram
-
-        draw_cloud_histogram(found, output, **{name: options[name] for name in ("log", "counts", "overwrite")})
+        found = draw_cloud.count_values(clouds, column, chosen, **how)
+        look = {name: options[name] for name in ("log", "counts", "overwrite")}
+        draw_cloud.draw_cloud_histogram(found, output, **look)
         total, text = found.total, describe_tally(found.total, int(found.below.sum() + found.above.sum()))
-    return text, {"column": options["column"], **list_tally(total)}
+    return text, {"column": options["column"], **asdict(total)}
 
 
 @draws_clouds(
@@ -173,7 +165,7 @@ def map_(clouds: Sequence[Path], output: Path, options: dict[str, Any]) -> tuple
             "size": grid.size, "unit": found.crs.unit}  # fmt: skip
     cells = f"{grid.columns} x {grid.rows} cells of {grid.size:g} {found.crs.unit}"
     text = f"{describe_tally(found.total, found.outside)}; {cells}"
-    return text, {"column": column, **list_tally(found.total), **more}
+    return text, {"column": column, **asdict(found.total), **more}
 
 
 def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> list[Path]:
@@ -193,9 +185,12 @@ def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool 
     return paths
 
 
+_ENDS = "X0,Y0,X1,Y1"
+
+
 @draws_clouds(
-    shared.floats_option("--line", "X0,Y0,X1,Y1", "Ends of the section, in the coordinates of the clouds.  [default: "
-                         "along the longer extent]"),
+    click.option("--line", type=shared.Text(_ENDS, lambda text: shared.parse_floats(text, _ENDS)), metavar=_ENDS,
+                 help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]"),
     click.option("--width", type=float, metavar="W",
                  help="Show what lies within half of W from the line.  [default: a fiftieth of its length]"),
     click.option("--column", shell_complete=complete_columns,
@@ -217,18 +212,16 @@ def section(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
       # 2 m wide, along the longer extent
       wavebatch plot section clouds/ --width 2 --column echo_width -o side.png
     """  # fmt: skip
-    from wavebatch.tools.plots.sections import cut_section
+    from wavebatch.tools.plots.sections import cut_section, draw_section
 
     column = options["column"] or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
     found = cut_section(paths, column, choose_points(options), line=options["line"], width=options["width"])
-    from wavebatch.tools.plots.sections import draw_section
-
     draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
     kind = "voxel" if found.voxel else "point"
     place = {"line": list(found.line), "width": found.width, "unit": found.crs.unit, "crs": found.crs.name or None}
     more = {"inside": found.inside, "drawn": len(found.value), "voxel": found.voxel or None, **place}
     text = f"{found.inside} of {describe_tally(found.total, found.outside, kind)}"
-    return text, {"column": column, **list_tally(found.total), **more, "outside": found.outside}
+    return text, {"column": column, **asdict(found.total), **more, "outside": found.outside}
 
 
 @draws_clouds(
@@ -266,7 +259,7 @@ def profile(paths: Sequence[Path], output: Path, options: dict[str, Any]) -> tup
     series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]
     more = {"statistic": statistic, "outside": found.outside, "edges": found.edges.tolist(), "series": series}
     text = describe_tally(found.total, found.outside, found.noun.removesuffix("s"))
-    return text, {"column": column, **list_tally(found.total), **more, "unit": found.unit}
+    return text, {"column": column, **asdict(found.total), **more, "unit": found.unit}
 
 
 @click.command()
@@ -287,12 +280,10 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
       # scan line 3, and all pulses at 250 ns
       wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png
     """  # fmt: skip
-    from wavebatch.tools.slice_output import cut_cube
+    from wavebatch.tools.slice_output import cut_cube, draw_cube
 
     check_picture(output, overwrite=options["overwrite"])
     slices = cut_cube(cube_file, {name: options[name] for name in "xyt"})
-    from wavebatch.tools.slice_output import draw_cube
-
     draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
     tell(f"{output}: {', '.join(one.title for one in slices)}")
     drawn = [{"title": one.title, "rows": one.image.shape[0], "columns": one.image.shape[1],
@@ -359,7 +350,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     """  # fmt: skip
     from wavebatch.core.condition import read_flags
     from wavebatch.files.cloud.point_filter import PointFilter
-    from wavebatch.tools.plots.waveform import Wanted
+    from wavebatch.tools.plots.waveform import Wanted, format_echoes
 
     tabular = output.suffix.lower() == ".csv"
     for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
@@ -370,8 +361,6 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     wanted = shared.from_options(Wanted, options, points=options["point_numbers"], chosen=chosen)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
     if tabular:
-        from wavebatch.tools.plots.waveform import format_echoes
-
         write_text(output, format_echoes(views), overwrite=options["overwrite"])
     else:
         _draw_waveforms(views, output, strip.name, chain, options)
@@ -382,6 +371,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
 
 def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, options: dict[str, Any]) -> None:
     """Draws the waveforms as small multiples or as a contact sheet."""
+    from wavebatch.tools.plots.draw_waveform import draw_waveform_panels, draw_waveform_sheet
+
     shown, more = options["shown"], {"strip": strip, "chain": chain, "overwrite": options["overwrite"]}
     if shown == "all":
         last = max(float(view.time[-1] + 0.5 * view.spacing) for view in views)
@@ -390,13 +381,9 @@ def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, opti
         end = max(view.time[-1] for view in views)
         raise ConfigError(f"--times {shown[0]:g}:{shown[1]:g}: no sample lies there; the waveforms end at {end:g} ns")
     if options["sheet"]:
-        from wavebatch.tools.plots.draw_waveform import draw_waveform_sheet
-
         draw_waveform_sheet(views, output, times=shown, **more)
-        return
-    from wavebatch.tools.plots.draw_waveform import draw_waveform_panels
-
-    draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
+    else:
+        draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
 
 
 def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) -> tuple[list[Any], str]:

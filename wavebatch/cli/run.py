@@ -373,10 +373,8 @@ def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> in
     for line in () if as_json else click.get_current_context().meta.get("wavebatch.settings", ()):
         messages.print_text(f"# setting: {line}")
     by = jobs[0].request.describe(jobs[0].chain)
-    if as_json:
-        messages.print_json({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, "plan")
-        return find_exit_code(errors)
-    if by is not None:
-        click.echo(f"\n# the chain is chosen per strip ({by}); the largest possible one:", nl=False)
-    click.echo(f"\n{effective(jobs[0].chain)}", nl=False)
+    messages.answer({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, mode="plan")
+    if not as_json:
+        words = "" if by is None else f"\n# the chain is chosen per strip ({by}); the largest possible one:"
+        click.echo(f"{words}\n{effective(jobs[0].chain)}", nl=False)
     return find_exit_code(errors)

@@ -133,7 +133,7 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
         return summary
 
     summaries, failed = shared.for_each(paths, work, debug=options["debug"])
-    answer([asdict(one) for one in summaries])
+    answer(summaries)
     sys.exit(1 if failed else 0)
 
 

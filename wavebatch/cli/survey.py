@@ -14,8 +14,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import one_line, print_result, talk, tell
+from wavebatch.cli.messages import answer, one_line, talk, tell
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import count
+from wavebatch.files.disk.publish import check_target
+from wavebatch.files.text_file import write_text
+from wavebatch.tools.sheets.sheet import Sheet
 
 if TYPE_CHECKING:
     from wavebatch.surveying.system_file import SavedSurvey
@@ -45,7 +49,6 @@ def survey(
     chain_file: Path | None,
     angles: Path | None,
     html_file: Path | None,
-    as_json: bool,
     **options: Any,
 ) -> None:
     """Measure noise, pulse and scene of strips, and choose the chain that they need.
@@ -66,13 +69,9 @@ def survey(
       # save both for `run --system` and `--chain`
       wavebatch survey strip.las -o system.toml --chain chain.toml
     """  # fmt: skip
-    from wavebatch.core.errors import ConfigError
-    from wavebatch.files.disk.publish import check_target
-    from wavebatch.files.text_file import write_text
     from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
-    from wavebatch.tools.sheets.sheet import Sheet
-    from wavebatch.tools.sheets.survey import list_doubts, survey_sheet, write_survey_page
+    from wavebatch.tools.sheets.survey import check_angles, list_doubts, survey_sheet, write_survey_page
 
     overwrite = options["overwrite"]
     paths = shared.find_inputs(strips, recursive=options["recursive"])
@@ -85,8 +84,6 @@ def survey(
         if len(paths) > 1:
             words = "is for one strip, because widths depend on the distance of the ground"
             raise ConfigError(f"--angles {angles}: {words}")
-        from wavebatch.tools.sheets.survey import check_angles
-
         check_angles(angles, overwrite=overwrite)
     options["angles"] = angles
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
@@ -96,7 +93,7 @@ def survey(
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
     document = _document(saved, facts)
     sheet = survey_sheet(saved.survey, document)
-    print_result(as_json, document, Sheet("survey", [*sheet.parts, *list_doubts(document)]))
+    answer(document, Sheet("survey", [*sheet.parts, *list_doubts(document)]))
     if html_file is not None:
         reading = {name: options[name] for name in ("direction", "headerless")}
         failed = {*facts.get("failed", ()), *facts.get("misfits", ())}
@@ -114,11 +111,10 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     from wavebatch.files.disk.raw_bytes import take_fingerprint
     from wavebatch.surveying.inspect_strip import doubt_files
     from wavebatch.surveying.system_file import SavedSurvey
-    from wavebatch.tools.api import open_strip
-    from wavebatch.tools.api import survey as survey_strip
+    from wavebatch.tools import api
 
-    with open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
-        found = survey_strip(
+    with api.open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
+        found = api.survey(
             opened, waveforms=options["waveforms"], divergence=options["divergence"], find_divergence=True
         )
         scan = opened.scan
@@ -143,7 +139,6 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
 
 def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
     """The survey of a flight, and what else is shown of its strips."""
-    from wavebatch.core.errors import InputError
     from wavebatch.surveying.flight import read_samples, survey_flight
 
     failed: list[Path] = []

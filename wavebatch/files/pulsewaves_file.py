@@ -20,7 +20,7 @@ import numpy as np
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.files.disk.raw_bytes import Closing, damaged, open_regular, read_exactly, reporting_reads
+from wavebatch.files.disk.raw_bytes import Closing, damaged, open_regular, read_exactly, reporting_reads, undoing
 from wavebatch.files.las.header import MAX_FILE, MAX_FRONT, MAX_VLRS, PROJECTION, Vlr, decode_text
 from wavebatch.files.las.read_points import LARGEST_OFFSET, LARGEST_SCALE, LEAST_SCALE
 from wavebatch.files.strip.packet_check import MAX_SPACING
@@ -358,11 +358,8 @@ class PulseReader(Closing):
     def __init__(self, header: PulseHeader, *, pulses: int | None = None, size: int = PIECE_BYTES) -> None:
         self.header, self._size = header, size
         self._pulses = open_regular(header.path)
-        try:
+        with undoing(self._pulses.close):
             self._waves = open_regular(header.waves)
-        except BaseException:
-            self._pulses.close()
-            raise
         each = max(header.waves_size // max(header.count, 1), 1)
         self._step = int(np.clip(size // each, 1, pulses or PULSES))
 
@@ -427,16 +424,14 @@ class _Walk:
     def follow(self, rows: np.ndarray, offsets: np.ndarray, descriptor: Descriptor) -> Iterator[tuple]:
         """Yields the columns of `Segments`, and the order within a pulse, of each sampling and segment."""
         at = offsets + descriptor.extra
-        if offsets.min(initial=WAVES_HEADER_SIZE) < WAVES_HEADER_SIZE:
-            self._refuse(rows[np.argmin(offsets)])
+        self._refuse(offsets < WAVES_HEADER_SIZE, rows)
         number = 0
         for sampling in descriptor.samplings:
             count = np.full(len(rows), sampling.segments)
             if sampling.segment_bits:
                 count = self._integers(rows, at, sampling.segment_bits, signed=False)
                 at = at + sampling.segment_bits // 8
-            if count.max(initial=0) > MOST_SEGMENTS:
-                self._refuse(rows[np.argmax(count)])
+            self._refuse(count > MOST_SEGMENTS, rows)
             for segment in range(int(count.max(initial=0))):
                 has = np.flatnonzero(count > segment)
                 yield self._step(rows[has], at, has, sampling, descriptor.unit, number)
@@ -455,17 +450,16 @@ class _Walk:
             length = self._integers(rows, place, sampling.length_bits, signed=False)
             place = place + sampling.length_bits // 8
         at[has] = place + length * (sampling.bits // 8)
-        over = (at[has] > self._header.waves_size) | (length > MAX_SAMPLES)
-        if over.any():
-            self._refuse(rows[np.argmax(over)])
+        self._refuse((at[has] > self._header.waves_size) | (length > MAX_SAMPLES), rows)
         same = (np.full(n, value) for value in (np.uint8(sampling.kind), np.uint8(sampling.channel), sampling.bits))
         return rows, *same, np.full(n, sampling.spacing), np.full(n, unit), start, place, length, np.full(n, number)
 
     def _integers(self, rows: np.ndarray, at: np.ndarray, bits: int, *, signed: bool) -> np.ndarray:
-        over = at > self._header.waves_size - bits // 8
-        if over.any():
-            self._refuse(rows[np.argmax(over)])
+        self._refuse(at > self._header.waves_size - bits // 8, rows)
         return self._waves.take(at, bits // 8).view(f"<{'i' if signed else 'u'}{bits // 8}")[:, 0].astype(np.int64)
 
-    def _refuse(self, row: int) -> None:
-        raise damaged(self._header.waves, f"the waves of pulse {self._first + int(row)} are not inside the file")
+    def _refuse(self, wrong: np.ndarray, rows: np.ndarray) -> None:
+        """Raise InputError where something is wrong (k,) with one of the pulses `rows` (k,)."""
+        if wrong.any():
+            pulse = self._first + int(rows[np.argmax(wrong)])
+            raise damaged(self._header.waves, f"the waves of pulse {pulse} are not inside the file")

@@ -21,6 +21,7 @@ from typing import BinaryIO, cast
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import Draft, is_stream, open_stream, protect, real_name, reporting
+from wavebatch.files.disk.raw_bytes import undoing
 
 MOST_BYTES = 4 << 20
 """Largest TOML file that is read: five times a system file with 255 digitizers of 16 Gaussians each."""
@@ -61,11 +62,8 @@ def _open(path: Path | str) -> BinaryIO:
         raise OSError("it is a device; give a file")
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # else this would wait for a writer, for ever
     file = os.fdopen(descriptor, "rb")
-    try:
+    with undoing(file.close):
         begin = _read_first(descriptor)
-    except BaseException:
-        file.close()
-        raise
     os.set_blocking(descriptor, True)
     return cast(BinaryIO, _Pipe(file, begin))
 
@@ -117,13 +115,9 @@ def write_text(path: Path, text: str, *, overwrite: bool) -> None:
 def draft_text(path: Path, text: str, *, overwrite: bool) -> Draft:
     """Write a text file under a temporary name, to be published; raises InputError if it cannot be written."""
     draft = Draft(path, overwrite=overwrite)
-    try:
-        with reporting(path):
-            draft.file.write(_encode(text))
-            draft.file.flush()
-    except BaseException:
-        draft.discard()
-        raise
+    with undoing(draft.discard), reporting(path):
+        draft.file.write(_encode(text))
+        draft.file.flush()
     return draft
 
 

@@ -45,6 +45,9 @@ _DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-])(?:{_PART}[ \t]*+\.[ \t]*+){{{MOST_N
 _DEEP_VALUE = re.compile(rf"(?:[\[{{][^\[\]{{}}\"'#]*+){{{8 * MOST_NESTED}}}")
 _LONG_NUMBER = re.compile(rf"(?<![A-Za-z0-9_.\"'-])[+-]?[0-9][0-9_]{{{MOST_DIGITS},}}")
 
+_SHOWN = 60
+"""Characters of a value in a message."""
+
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "a string", dict: "a table"}
 
@@ -261,13 +264,13 @@ def check_number(value: Any, low: float, high: float, where: str) -> float:
     return number
 
 
-def shorten(value: Any, limit: int = 60) -> str:
-    """Return the value as it is shown in messages: on one line, at most `limit` characters."""
+def shorten(value: Any) -> str:
+    """Return the value as it is shown in messages: on one line, at most _SHOWN characters."""
     try:
         text = _one_line(repr(value))
     except ValueError:  # Python prints no integer of more than 4300 digits; a hexadecimal one can be read
         return "a very large number"
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
 
 MOST_ROWS = 1024

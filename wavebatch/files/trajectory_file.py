@@ -12,7 +12,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError, need
 from wavebatch.core.trajectory import Trajectory, apply_lever_arm
-from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads, widen_integers
+from wavebatch.files.disk.raw_bytes import naming, open_regular, reporting_reads, widen_integers
 
 SBET_RECORD = np.dtype([(name, "<f8") for name in (
     "time", "latitude", "longitude", "height", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch", "heading",
@@ -77,10 +77,8 @@ def read_trajectory(
         if missing:
             raise InputError(f"{path}: a lever arm needs {', '.join(_ATTITUDE)}; the file has no {', '.join(missing)}")
         xyz = apply_lever_arm(xyz, np.stack([columns[name] for name in _ATTITUDE], axis=1), lever_arm)
-    try:
+    with naming(path):
         return Trajectory.build(columns["time"], xyz)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def _read_sbet(path: Path, size: int) -> dict[str, np.ndarray]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.order import EvenSample
 from wavebatch.files.cloud.cloud_reader import ColumnFacts, ColumnReader, check_alike
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
+from wavebatch.files.disk.raw_bytes import undoing
 from wavebatch.files.disk.temp_store import Spool
 from wavebatch.files.geotiff_file import TILE
 from wavebatch.files.las.crs import CrsWords, describe_crs
@@ -76,17 +78,15 @@ class Clouds:
         for path in self.paths:
             with self._open(path) as reader:
                 found.append([(path, facts) for facts in reader.facts])
-        self.facts, *others = (self._with_unit(check_alike(column)) for column in zip(*found, strict=True))
-        self.other_facts: tuple[ColumnFacts, ...] = tuple(others)
+        self.every = tuple(self._with_unit(check_alike(column)) for column in zip(*found, strict=True))
+        """Facts of the columns."""
+        self.facts = self.every[0]
 
     def _open(self, path: Path) -> ColumnReader:
         """A reader that gives the chosen points."""
         reader = ColumnReader(path, *self._columns)
-        try:
+        with undoing(reader.close):
             reader.select(self.chosen)
-        except BaseException:
-            reader.close()
-            raise
         return reader
 
     def _with_unit(self, facts: ColumnFacts) -> ColumnFacts:
@@ -319,13 +319,13 @@ def compute_tiles(
     at a time.
     """
     number = int(np.clip(-(-points // (held // 2)), 1, MOST_BUCKETS))
-    columns = 1 + len(clouds.other_facts)
-    entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (columns,))]))
+    entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (len(clouds.every),))]))
     try:
         _fill(clouds, bounds, grid, entries, result)
         entries.seal()
+        compute = partial(_compute, statistic=statistic, area=grid.size**2)
         for bucket in range(number):
-            for tile, values in _compute_bucket(entries, bucket, statistic, grid.size**2, held):
+            for tile, values in _compute_bucket(entries, bucket, compute, held):
                 yield *divmod(tile, _across(grid)), values
     finally:
         entries.close()
@@ -346,7 +346,7 @@ def is_in_bounds(rows: np.ndarray, bounds: Box | None) -> np.ndarray:
 
 def _fill(clouds: Clouds, bounds: Box | None, grid: Grid, entries: Spool, result: Placed) -> None:
     """Put every point with a value into the bucket of its tile."""
-    counted = np.zeros(1 + len(clouds.other_facts), np.int64)
+    counted = np.zeros(len(clouds.every), np.int64)
     for _, rows, left_out in clouds.read_all():
         inside = is_in_bounds(rows, bounds)
         result.points += len(rows) + left_out
@@ -365,38 +365,29 @@ def _fill(clouds: Clouds, bounds: Box | None, grid: Grid, entries: Spool, result
 
 
 def _compute_bucket(
-    entries: Spool, bucket: int, statistic: Statistic, area: float, held: int
+    entries: Spool, bucket: int, compute: Callable[[np.ndarray], np.ndarray], held: int
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Number and values (bands, TILE, TILE) of every tile of a bucket."""
     total = sum(len(piece) for piece in entries.pieces(bucket))
-    if not total:
-        return
     if total <= held:
         rows = entries.read(bucket)
         rows = rows[np.argsort(rows["tile"], kind="stable")]
         tiles, first = np.unique(rows["tile"], return_index=True)
-        for tile, part in zip(tiles.tolist(), np.split(rows, first[1:]), strict=True):
-            yield tile, _compute(part, statistic, area)
+        for tile, part in zip(tiles.tolist(), np.split(rows, first)[1:], strict=True):
+            yield tile, compute(part)
         return
-    tiles = np.unique(np.concatenate([np.unique(piece["tile"]) for piece in entries.pieces(bucket)]))
-    for tile in tiles.tolist():
-        yield tile, _compute_dense(entries, bucket, tile, statistic, area, held)
-
-
-def _compute_dense(
-    entries: Spool, bucket: int, tile: int, statistic: Statistic, area: float, held: int
-) -> np.ndarray:
-    """A tile of a bucket that does not fit in memory: groups of cells, each of about `held` points, one by one."""
-    count = np.zeros(TILE * TILE, np.int64)
-    for piece in entries.pieces(bucket):
-        count += np.bincount(piece["cell"][piece["tile"] == tile], minlength=len(count))
-    group = np.cumsum(count) // held
-    values = np.full((TILE, TILE), np.nan)
-    for number in np.unique(group[count > 0]).tolist():
-        wanted = group == number
-        parts = [piece[(piece["tile"] == tile) & wanted[piece["cell"]]] for piece in entries.pieces(bucket)]
-        values = np.fmax(values, _compute(np.concatenate(parts), statistic, area))  # NaN in the other cells
-    return values
+    # It does not fit in memory: groups of cells of a tile, each of about `held` points, one by one.
+    for tile in np.unique(np.concatenate([np.unique(piece["tile"]) for piece in entries.pieces(bucket)])).tolist():
+        count = np.zeros(TILE * TILE, np.int64)
+        for piece in entries.pieces(bucket):
+            count += np.bincount(piece["cell"][piece["tile"] == tile], minlength=len(count))
+        group = np.cumsum(count) // held
+        values = np.full((TILE, TILE), np.nan)
+        for number in np.unique(group[count > 0]).tolist():
+            wanted = group == number
+            parts = [piece[(piece["tile"] == tile) & wanted[piece["cell"]]] for piece in entries.pieces(bucket)]
+            values = np.fmax(values, compute(np.concatenate(parts)))  # NaN in the other cells
+        yield tile, values
 
 
 def _compute(rows: np.ndarray, statistic: Statistic, area: float) -> np.ndarray:

@@ -44,23 +44,36 @@ class Goodness:
     floor_median: float
 
 
+def find_residual(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, decomposer: Step, echoes: EchoTable
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The sum of the fitted pulses and what it leaves of the samples, f8 (n, s) [DN], and which samples count.
+
+    Missing samples, and those at the digitizer's limit, do not count: both are 0 there. None without a known model.
+    """
+    model = rebuild_waveforms(block, system, decomposer, echoes)
+    if model is None:
+        return None
+    used = block.samples < clip_level(block, system)
+    if block.missing is not None:
+        used &= ~block.missing
+    model = np.where(used, model.astype(np.float64), 0.0)
+    return model, np.where(used, block.samples - noise.level.astype(np.float64) - model, 0.0), used
+
+
 def measure_fit(
     block: WaveformBlock, noise: Noise, system: SystemPulse, decomposer: Step, echoes: EchoTable
 ) -> tuple[np.ndarray, np.ndarray]:
     """E and E0 of each waveform, f8 (n,); NaN without an echo, or if the model of the decomposer is not known.
 
-    f is the sum of the fitted pulses, y the samples above the baseline; samples at the digitizer's limit are left out
-    of both. E0 = n sn^2 / |f|^2 with n samples and sn of one sample: what fits and thresholds use is larger where noise
-    is coloured. Source: Wang, Wang and Tseng eq. 5; docs/algorithms.md 1.2.
+    f is the sum of the fitted pulses, y the samples above the baseline, both without what `find_residual` leaves out.
+    E0 = n sn^2 / |f|^2 with n samples and sn of one sample: what fits and thresholds use is larger where noise is
+    coloured. Source: Wang, Wang and Tseng eq. 5; docs/algorithms.md 1.2.
     """
-    model = rebuild_waveforms(block, system, decomposer, echoes)
-    if model is None:
+    found = find_residual(block, noise, system, decomposer, echoes)
+    if found is None:
         return np.full(len(block), np.nan), np.full(len(block), np.nan)
-    used = block.samples < clip_level(block, system)
-    if block.missing is not None:
-        used &= ~block.missing
-    model = np.where(used, model.astype(np.float64), 0.0)
-    residual = np.where(used, block.samples - noise.level.astype(np.float64) - model, 0.0)
+    model, residual, used = found
     energy = np.square(model).sum(axis=1)
     energy[energy <= 0] = np.nan
     std = noise.std.astype(np.float64) * (system.noise.quiet / system.noise.std)

@@ -8,7 +8,6 @@ Formulas and sources: docs/forest.md.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Above, Range, check_options, option
+from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
 from wavebatch.files.las.crs import read_crs_definition
@@ -288,21 +288,16 @@ def _zeroed(values: np.ndarray) -> np.ndarray:
 
 def _read_facts(path: Path) -> dict:
     """The record that voxelize wrote; ConfigError for none, and for one that it cannot have written."""
-    records = (vlr for vlr in read_header(path).vlrs if vlr.user == "wavebatch" and vlr.record_id == 1)
-    for vlr in records:
-        try:
-            facts = json.loads(vlr.payload)
-        except ValueError:
-            continue
-        if isinstance(facts, dict) and facts.get("forest"):
-            ratio = facts.get("reflectance_ratio")
-            ratio = ratio if isinstance(ratio, dict) else {}
-            numbers = facts.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
-            if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
-                raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it "
-                                  "anew with wavebatch voxelize --forest")  # fmt: skip
-            return facts
-    raise ConfigError(f"{path}: --forest needs voxels: wavebatch voxelize STRIP --size 1 --forest -o voxels.laz")
+    facts = next((one for one in read_provenance(read_header(path)) if one.get("forest")), None)
+    if facts is None:
+        raise ConfigError(f"{path}: --forest needs voxels: wavebatch voxelize STRIP --size 1 --forest -o voxels.laz")
+    ratio = facts.get("reflectance_ratio")
+    ratio = ratio if isinstance(ratio, dict) else {}
+    numbers = facts.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
+    if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
+        raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it anew with "
+                          "wavebatch voxelize --forest")  # fmt: skip
+    return facts
 
 
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
@@ -381,8 +376,7 @@ def write_grid(
         raise ConfigError(f"{paths[0]}: --forest: voxels are measured in metres, and coordinates are in {unit}; "
                           "project the strip to a CRS in metres first")  # fmt: skip
     clouds = cells.Clouds(paths, options.columns or (None,), options.chosen)
-    facts = (clouds.facts, *clouds.other_facts)
-    for one in facts:
+    for one in clouds.every:
         cells.check_statistic(one.name, options.statistic, one, paths[0])
     box, points, largest = _find_extent(clouds, options)
     if unit == "degree" and options.size > max(box[2] - box[0], box[3] - box[1]):
@@ -392,13 +386,13 @@ def write_grid(
     west, _, _, north = grid.extent
     # float32 where that holds neighbouring values of each column apart.
     wide = (one.name == "gps_time" or one.step > 0 and top > _EXACT * one.step
-            for one, top in zip(facts, largest, strict=True))  # fmt: skip
+            for one, top in zip(clouds.every, largest, strict=True))  # fmt: skip
     dtype = "float64" if metrics is None and any(wide) else "float32"
     layout = RasterLayout(west, north, grid.size, grid.rows, grid.columns, dtype, options.no_data, crs, unit)
     if metrics is None:
         statistic = options.statistic
         units = {"count": "", "density": f"1/{unit}2"}
-        bands = [Band(f"{statistic} of {one.name}", units.get(statistic, one.unit.strip("-"))) for one in facts]
+        bands = [Band(f"{statistic} of {one.name}", units.get(statistic, one.unit.strip("-"))) for one in clouds.every]
     else:
         bands, statistic = metrics.list_bands(largest[COLUMNS.index("height")]), metrics.compute
     result = GridResult(layout=layout, bands=tuple(bands), unnamed=unnamed)
@@ -438,7 +432,7 @@ def _find_crs(paths: Sequence[Path], given: str | None) -> tuple[str | None, str
 def _find_extent(clouds: cells.Clouds, options: GridOptions) -> tuple[cells.Box, int, np.ndarray]:
     """The box of all points, their number, and the largest absolute value of each column."""
     low, high, points = np.full(2, np.inf), np.full(2, -np.inf), 0
-    largest = np.zeros(1 + len(clouds.other_facts))
+    largest = np.zeros(len(clouds.every))
     for _, rows, _ in clouds.read_all():
         rows = rows[cells.is_in_bounds(rows, options.bbox)]
         if len(rows):

@@ -23,12 +23,15 @@ from wavebatch.core.schema import Key
 from wavebatch.core.units import HALF_C
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
-from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, spread_keys, tell_pulses_apart, time_keys
+from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, spread_keys, time_keys
 from wavebatch.files.geojson import Polygon, describe_miss, find_inside
 from wavebatch.files.las.header import read_header
 
 MOST_AREAS = 50_000
 """Most areas of all clouds together, so that memory is bounded."""
+
+MOST_RETURNS = 16
+"""Most points per GPS time on average; with more, times are not those of pulses (LAS allows 15 returns)."""
 
 MOST_NUMBER, MOST_COUNT = 15, 64
 """Largest return number of LAS; pulses with at least so many returns are counted as one class."""
@@ -126,18 +129,6 @@ class PolygonSet(Division):
         return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
 
 
-class Whole(Division):
-    """One area without borders, which counts also where it holds no pulse."""
-
-    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """As Division.find."""
-        return np.zeros(len(x), np.int64)
-
-    def describe(self, number: int) -> Area:
-        """As Division.describe."""
-        return Area("cloud", "")
-
-
 def name_ranks(number: int) -> tuple[str, ...]:
     """Names of so many classes of pairs of consecutive returns.
 
@@ -212,16 +203,19 @@ class AreaStats(PulseStats):
 
 
 class AreaTally:
-    """Sums per area of one division; tallies of several clouds can be merged."""
+    """Sums per area of one division; tallies of several clouds can be merged.
 
-    def __init__(self, division: Division, ranks: tuple[str, ...] = RANKS) -> None:
+    always: numbers of areas that count also without a pulse.
+    """
+
+    def __init__(self, division: Division, ranks: tuple[str, ...] = RANKS, always: Sequence[int] = ()) -> None:
         self.division, self._ranks, n = division, ranks, len(ranks)
         quantities = [("by_number", "i8", (MOST_NUMBER + 1,)), ("by_count", "i8", (MOST_COUNT + 1,)),
                       ("pairs", "i8", (n,)), ("apart", "f8", (n,)), ("least", "f8", (n,)), ("several", "i8"),
                       ("depth", "f8")]  # fmt: skip
         self._dtype = np.dtype(quantities)
-        self._areas = np.zeros(int(isinstance(division, Whole)), np.int64)
-        self._sums = self._begin(len(self._areas))
+        self._areas = np.array(always, np.int64)
+        self._sums = self._begin(len(always))
 
     def __len__(self) -> int:
         return len(self._areas)
@@ -424,7 +418,7 @@ def pulses_told_apart(reader: CloudReader) -> bool:
     if not reader.has_gps_time:
         return False
     rows = next(reader.read_pieces(), None)
-    return rows is None or tell_pulses_apart(rows["gps_time"])
+    return rows is None or len(np.unique(rows["gps_time"])) * MOST_RETURNS >= len(rows)
 
 
 def _tally_cloud(path: Path, divisions: Sequence[Division], chosen: PointFilter, held: int) -> _Tally:
@@ -502,7 +496,8 @@ class _Tally:
     methods: set[str] = field(default_factory=set)
     distances: np.ndarray = field(default_factory=lambda: np.zeros((len(RANKS), BINS), np.int64))
     """Histograms of the distances between consecutive returns, one per class of RANKS."""
-    whole: AreaTally = field(default_factory=lambda: AreaTally(Whole(), _RANKS))
+    whole: AreaTally = field(default_factory=lambda: AreaTally(PolygonSet(()), _RANKS, (_OUTSIDE,)))
+    """All of the cloud lies outside of no polygons."""
     flags: np.ndarray | None = None
     areas: list[AreaTally] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -7,6 +7,7 @@ read and checked by wavebatch.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,7 +22,7 @@ from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.frozen import frozen
 from wavebatch.files.cloud.column_names import STYLES, find_written, name_standard, read_field, resolve
 from wavebatch.files.cloud.point_filter import PlannedFilter, PointFilter, ReadColumn
-from wavebatch.files.disk.raw_bytes import Closing, widen_integers
+from wavebatch.files.disk.raw_bytes import Closing, undoing, widen_integers
 from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import metres_per_unit, name_units, read_crs
 from wavebatch.files.las.read_points import open_points, read_checked_header
@@ -300,16 +301,10 @@ class ColumnReader(CloudReader):
     def __init__(self, path: Path, *columns: str | None, missing_ok: bool = False) -> None:
         super().__init__(path, _PLACE)
         found = []
-        try:
+        with undoing(self.close):
             for name in columns:
-                try:
+                with contextlib.suppress(*[ConfigError] * missing_ok):
                     found.append(self.find_column(name))
-                except ConfigError:
-                    if not missing_ok:
-                        raise
-        except BaseException:
-            self.close()
-            raise
         self.facts: tuple[ColumnFacts, ...] = tuple(facts for facts, _ in found)
         self._values = [read for _, read in found]
 
@@ -416,11 +411,8 @@ class _TableReader(ColumnReader):
         names |= {name: name for name in known if name not in names and name not in self.extra}
         names |= {ours.get(field, field): field for field in self.extra}
         chosen = names if columns is None else columns
-        try:
+        with undoing(self.close):
             found = {name: self.find_column(names.get(name, name), stored=name in names) for name in chosen}
-        except BaseException:
-            self.close()
-            raise
         self._readers = {name: read for name, (_, read) in found.items()}
         self._stored = {name: facts.name for name, (facts, _) in found.items()}
         self.dtype = np.dtype([(name, self._choose_dtype(stored)) for name, stored in self._stored.items()])

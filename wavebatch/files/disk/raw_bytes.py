@@ -37,6 +37,16 @@ class Closing:
         raise NotImplementedError
 
 
+@contextlib.contextmanager
+def undoing(undo: Callable[[], object]) -> Iterator[None]:
+    """Call `undo` where the block inside fails or is interrupted: what it has opened is closed then."""
+    try:
+        yield
+    except BaseException:
+        undo()
+        raise
+
+
 def open_regular(path: Path) -> BinaryIO:
     """Open a file for reading; raises InputError for a folder, a device or a pipe, which could block for ever."""
     try:
@@ -99,6 +109,12 @@ def take_whole_records(records: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return plain[rows].view(records.dtype)
 
 
+def join_records(*parts: np.ndarray) -> np.ndarray:
+    """Return structured arrays of one type behind each other, copied as plain bytes as well."""
+    plain = [np.ascontiguousarray(part).view(f"V{part.dtype.itemsize}") for part in parts]
+    return np.concatenate(plain).view(parts[0].dtype)
+
+
 def widen_integers(values: np.ndarray) -> np.ndarray:
     """Return floating-point values as f8; a signalling NaN of a damaged file becomes a plain NaN without a warning."""
     with np.errstate(invalid="ignore"):
@@ -117,15 +133,25 @@ def reporting_reads(path: Path, what: str = "", remedy: str = "") -> Iterator[No
 
 
 @contextlib.contextmanager
-def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
-    """Turn any error of a decoder or of the disk into one InputError line that names the wanted points."""
+def naming(path: Path, what: str = "") -> Iterator[None]:
+    """Let an InputError from inside begin with the name of the file, and what; one that names the file stays."""
     try:
-        interrupts.check()
         yield
     except InputError as error:
         if str(error).startswith(str(path)):
             raise
-        raise InputError(f"{path}: points {start} to {stop}: {error}") from error
+        raise InputError(f"{path}: {what}{error}") from error
+
+
+@contextlib.contextmanager
+def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
+    """Turn any error of a decoder or of the disk into one InputError line that names the wanted points."""
+    try:
+        interrupts.check()
+        with naming(path, f"points {start} to {stop}: "):
+            yield
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{path}: points {start} to {stop} cannot be read: {error.strerror or error}") from error
     except BaseException as error:

@@ -471,9 +471,6 @@ BUCKET_ROWS = 400_000
 MOST_BUCKETS = 72
 """With BUCKET_ROWS these hold 29 million rows; more rows make larger buckets, so that reads from disk stay long."""
 
-MOST_RETURNS = 16
-"""Most points per GPS time on average; with more, times are not those of pulses (LAS allows 15 returns)."""
-
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 divided by the golden ratio: multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
 
@@ -486,11 +483,6 @@ def count_buckets(rows: int, held: int = BUCKET_ROWS) -> int:
 def spread_times(gps_time: np.ndarray, number: int) -> np.ndarray:
     """Return the bucket i8 (n,) of GPS times f8 (n,) [s]: a pulse in one bucket, pulses spread evenly."""
     return spread_keys(time_keys(gps_time), number)
-
-
-def tell_pulses_apart(gps_time: np.ndarray) -> bool:
-    """Whether GPS times (n,) identify pulses: on average at most MOST_RETURNS points have the same time."""
-    return len(np.unique(gps_time)) * MOST_RETURNS >= len(gps_time)
 
 
 def time_keys(gps_time: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_panics, read_exactly, reading
+from wavebatch.files.disk.raw_bytes import damaged, guarded, hiding_panics, read_exactly, reading, undoing
 from wavebatch.files.las import header as las
 
 WAVEFORM_FORMATS = (4, 5, 9, 10)
@@ -215,11 +215,8 @@ class LazPoints:
     def __init__(self, checked: CheckedHeader, coding: _Coding) -> None:
         self._checked, self._coding = checked, coding
         self._file = open(checked.path, "rb", buffering=0)  # noqa: SIM115 - closed by close()
-        try:
+        with undoing(self._file.close):
             self._first, self._place = _read_chunk_table(self._file.fileno(), checked, coding)
-        except BaseException:
-            self._file.close()
-            raise
         self._chunk, self._next = -1, 0
         self._decoder: Any = None
 

@@ -25,6 +25,7 @@ from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
+from wavebatch.files.disk.raw_bytes import naming, undoing
 from wavebatch.files.las import header as las
 
 _WAVE_ITEM, _BROKEN_VERSION, _READABLE_VERSION = 9, 2, 1
@@ -181,12 +182,8 @@ class PointFile(contextlib.AbstractContextManager):
         self.draft = Draft(self.target, overwrite=overwrite)
         self.drafts = [self.draft]
         """All files that are published together, the point file last."""
-        try:
-            with self._guarded():
-                self._encoder = (_LazEncoder if header.compressed else PointEncoder)(self.draft.file, header)
-        except BaseException:
-            self.draft.discard()
-            raise
+        with undoing(self.draft.discard), self._guarded():
+            self._encoder = (_LazEncoder if header.compressed else PointEncoder)(self.draft.file, header)
 
     def __exit__(self, *error: object) -> None:
         self.abort()
@@ -250,15 +247,12 @@ class PointFile(contextlib.AbstractContextManager):
 
     def complete(self) -> int:
         """Complete the file under its temporary name, and return its size; on an error nothing of it remains."""
-        try:
+        with undoing(self.abort):
             self.finish_points()
             self._append_records()
             self.finish()
             with self._guarded():
                 return self.draft.file.seek(0, 2)
-        except BaseException:
-            self.abort()
-            raise
 
     def publish(self, *more: Draft) -> None:
         """Publish the complete file, and the drafts that belong to it after it; on an error nothing of them remains."""
@@ -287,13 +281,8 @@ class PointFile(contextlib.AbstractContextManager):
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
         """Turns errors of compressor and disk into one InputError line that names the target."""
-        try:
-            with reporting(self.target):
-                yield
-        except InputError as error:
-            if str(error).startswith(str(self.target)):
-                raise
-            raise InputError(f"{self.target}: {error}") from error
+        with naming(self.target), reporting(self.target):
+            yield
 
 
 class Statistics:

@@ -20,7 +20,7 @@ decided by the scan once per descriptor, from packets spread over the strip, bec
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from enum import IntEnum
 
@@ -428,14 +428,13 @@ class Judge:
         reason, n_samples, keys, short, packed = judge_packets(fields, self._rules, geometry)
         if overfull is not None and len(overfull):
             place = np.minimum(np.searchsorted(overfull, keys), len(overfull) - 1)
-            reason[(overfull[place] == keys) & (reason == Reason.USABLE)] = Reason.OVERFULL
+            full = (overfull[place] == keys) & (reason == Reason.USABLE)
+            reason[full], n_samples[full], short[full] = Reason.OVERFULL, 0, False
         if self._rules.packs.any():
             rows = np.flatnonzero(self._rules.packs[fields["index"]] & (reason == Reason.USABLE))
             index, offset, size = (fields[name][rows] for name in ("index", "offset", "size"))
-            whole = self._decode(index, offset, size.astype(np.int64))
-            reason[rows[~whole]] = Reason.DAMAGED
-        bad = reason != Reason.USABLE
-        n_samples[bad], short[bad] = 0, False
+            broken = rows[~self._decode(index, offset, size.astype(np.int64))]
+            reason[broken], n_samples[broken], short[broken] = Reason.DAMAGED, 0, False
         return Judged(reason, n_samples, keys, short, packed)
 
     def _decode(self, index: np.ndarray, offset: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -549,41 +548,30 @@ def unpack_samples(rows: np.ndarray, n_samples: int, bits: int, little: bool) ->
     return ((value >> shift.astype(np.uint32)) & np.uint32((1 << bits) - 1)).astype(np.uint16)
 
 
-@changeable
-class FormSample:
-    """Packets spread over a strip: for each its key (see `Judged.keys`), samples and whether they are packed."""
+SomePackets = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Packets of a unit: the key of each (see `Judged.keys`), its samples and whether they are packed."""
 
-    keys: list[np.ndarray] = field(default_factory=list)
-    n_samples: list[np.ndarray] = field(default_factory=list)
-    packed: list[np.ndarray] = field(default_factory=list)
 
-    def add(self, judged: Judged, rows: np.ndarray) -> None:
-        """Take some of the packets of a unit; rows: points with different packets, ordered by byte offset."""
-        rows = rows[even_places(len(rows), SAMPLED_PER_UNIT)]
-        self.keys.append(judged.keys[rows])
-        self.n_samples.append(judged.n_samples[rows])
-        self.packed.append(judged.packed[rows])
+def take_some(judged: Judged, rows: np.ndarray) -> SomePackets:
+    """Return some of the packets of a unit; rows: points with different packets, ordered by byte offset."""
+    rows = rows[even_places(len(rows), SAMPLED_PER_UNIT)]
+    return judged.keys[rows], judged.n_samples[rows], judged.packed[rows]
 
-    def join(self, other: FormSample) -> None:
-        """Take the packets of the units that follow."""
-        self.keys += other.keys
-        self.n_samples += other.n_samples
-        self.packed += other.packed
 
-    def by_kind(self) -> dict[tuple[int, int, bool], np.ndarray]:
-        """Return byte offsets (k,) by descriptor, number of samples and whether they are packed."""
-        if not self.keys:
-            return {}
-        keys, n_samples, packed = (np.concatenate(part) for part in (self.keys, self.n_samples, self.packed))
-        index = (keys & np.uint64(255)).astype(np.int64)
-        found: dict[tuple[int, int, bool], np.ndarray] = {}
-        for number in distinct(index).tolist():
-            rows = np.flatnonzero(index == number)
-            rows = rows[even_places(len(rows), SAMPLED)]
-            kinds, kind = np.unique(np.stack([n_samples[rows], packed[rows]], axis=1), axis=0, return_inverse=True)
-            for place, (length, is_packed) in enumerate(kinds.tolist()):
-                found[number, length, bool(is_packed)] = keys[rows[kind.ravel() == place]] >> INDEX_BITS
+def _sort_by_kind(sample: Sequence[SomePackets]) -> dict[tuple[int, int, bool], np.ndarray]:
+    """Byte offsets (k,) by descriptor, number of samples and whether they are packed."""
+    found: dict[tuple[int, int, bool], np.ndarray] = {}
+    if not sample:
         return found
+    keys, n_samples, packed = (np.concatenate(part) for part in zip(*sample, strict=True))
+    index = (keys & np.uint64(255)).astype(np.int64)
+    for number in distinct(index).tolist():
+        rows = np.flatnonzero(index == number)
+        rows = rows[even_places(len(rows), SAMPLED)]
+        kinds, kind = np.unique(np.stack([n_samples[rows], packed[rows]], axis=1), axis=0, return_inverse=True)
+        for place, (length, is_packed) in enumerate(kinds.tolist()):
+            found[number, length, bool(is_packed)] = keys[rows[kind.ravel() == place]] >> INDEX_BITS
+    return found
 
 
 @changeable
@@ -609,14 +597,15 @@ class _Votes:
                 values[fill] = np.nan
         gaps = np.isnan(values)
         values[gaps.all(axis=1)] = 0.0  # nothing but fill: no vote
-        values -= np.nanmedian(values, axis=1, keepdims=True) if gaps.any() else _medians(values)
+        values -= np.nanmedian(values, axis=1, keepdims=True) if gaps.any() else median(values, axis=1)[:, None]
         np.nan_to_num(values, copy=False)
         up, down = values.max(axis=1), -values.min(axis=1)
         self.up += int(np.count_nonzero((up >= LEAST_HEIGHT) & (up >= CLEAR * down)))
         self.down += int(np.count_nonzero((down >= LEAST_HEIGHT) & (down >= CLEAR * up)))
         self.number += values.size
-        self.squares += float(np.sum(values**2))
-        self.cubes += float(np.sum(values**3))
+        squares = values * values
+        self.squares += float(np.sum(squares))
+        self.cubes += float(np.sum(squares * values))  # a power of three takes as long as all the rest
 
     def join(self, other: _Votes) -> _Votes:
         """Return both together."""
@@ -636,11 +625,9 @@ class _Votes:
         return 0
 
 
-def _medians(values: np.ndarray) -> np.ndarray:
-    return median(values, axis=1)[:, None]
-
-
-def find_forms(digitizers: Mapping[int, Digitizer], packets: PacketFile, sample: FormSample) -> dict[int, SampleForm]:
+def find_forms(
+    digitizers: Mapping[int, Digitizer], packets: PacketFile, sample: Sequence[SomePackets]
+) -> dict[int, SampleForm]:
     """Decide how the samples of each descriptor are stored.
 
     Parameters
@@ -648,7 +635,7 @@ def find_forms(digitizers: Mapping[int, Digitizer], packets: PacketFile, sample:
     digitizers : mapping
         Descriptors by index.
     packets : PacketFile
-    sample : FormSample
+    sample : sequence of SomePackets
         Packets spread over the strip.
 
     Returns
@@ -656,7 +643,7 @@ def find_forms(digitizers: Mapping[int, Digitizer], packets: PacketFile, sample:
     dict of int to SampleForm
         Without descriptors whose counts are read as they are.
     """
-    kinds = sample.by_kind()
+    kinds = _sort_by_kind(sample)
     little = _find_orders(digitizers, packets, kinds)
     votes: dict[int, _Votes] = {}
     for (index, length, packed), offsets in kinds.items():

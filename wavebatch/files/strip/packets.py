@@ -27,7 +27,7 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.publish import Draft, list_packet_files, refuse_existing, reporting
-from wavebatch.files.disk.raw_bytes import damaged, open_regular, read_exactly, reporting_reads
+from wavebatch.files.disk.raw_bytes import damaged, open_regular, read_exactly, reporting_reads, undoing
 from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import CrsUnits, read_crs
 from wavebatch.files.las.read_points import CheckedHeader, open_points, read_checked_header
@@ -464,12 +464,9 @@ class FullwaveWriter(PointFile):
         self.scales, self.offsets = header.scales, header.offsets
         super().__init__(target, header, las.build_dtype(point_format, extra_bytes), extra_bytes, overwrite=overwrite)
         packet_file = target if internal else target.with_suffix(".wdp")
-        try:
+        with undoing(self.abort):
             refuse_existing(packet_file, internal or overwrite)
             self._packets = Draft(packet_file, overwrite=overwrite)
-        except BaseException:
-            self.abort()
-            raise
         self.drafts.insert(0, self._packets)
         with reporting(self.target):
             self._packets.file.write(waveform_head(0))

@@ -18,24 +18,23 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import distinct, even_places, quantile
+from wavebatch.core.order import distinct, even_places, find_order, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
-from wavebatch.files.disk.raw_bytes import Closing, reading, take_whole_records, widen_integers
+from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
 from wavebatch.files.las.header import field_names, locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip import packet_check
 from wavebatch.files.strip.packets import PacketFile, StripFacts, block_rows, find_facts
 from wavebatch.files.strip.scanner import (
     SCAN_SIZES,
+    Scanner,
     ScanPart,
     ScanSizes,
     StripScan,
     cut_scan,
     expand,
     group_keys,
-    scan_strip,
-    scan_units,
     unique_entries,
 )
 from wavebatch.kernels.signal.signal import find_fill, quiet_fill, recorded_lengths
@@ -139,12 +138,9 @@ class StripReader(Closing):
         most = (unit_bytes or UNIT_BYTES) // facts.header.point_length
         self._unit_points = max(1, min(unit_points or UNIT_POINTS, most))
         self._points = open_points(facts)
-        try:
+        with undoing(self._points.close):
             self._judge = packet_check.Judge(facts)
             self._packets = PacketFile(facts.packets, facts.compressed)
-        except BaseException:
-            self._points.close()
-            raise
 
     def close(self) -> None:
         """Close the files; scans stay valid."""
@@ -159,7 +155,7 @@ class StripReader(Closing):
         tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
         packets of another strip. parts: of all units, in order, where other processes have passed over the points.
         """
-        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points, parts, self._sizes)
+        scan = self._start_scan().run(parts)
         if not scan.problems and (stranger := self._find_stranger(scan)):
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
             scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
@@ -170,7 +166,10 @@ class StripReader(Closing):
 
     def scan_units(self, first: int, last: int) -> ScanPart:
         """Return what `scan` needs to know of the units [first, last), which are among those of `cut_scan`."""
-        return scan_units(self.facts, self._points, self._packets, self._unit_points, first, last, self._sizes)
+        return self._start_scan().scan_units(first, last).seal()
+
+    def _start_scan(self) -> Scanner:
+        return Scanner(self.facts, self._points, self._packets, self._unit_points, self._sizes)
 
     def cut_scan(self, parts: int) -> list[tuple[int, int]]:
         """Return at most so many runs of units that may be scanned one by one, by any processes."""
@@ -205,8 +204,13 @@ class StripReader(Closing):
         """Return the number of units."""
         return -(-self.facts.header.point_count // self._unit_points)
 
-    def read_points(self, start: int, stop: int) -> np.ndarray:
-        """Return records [start, stop) of the file."""
+    def read_points(self, start: int, stop: int, scan: StripScan | None = None) -> np.ndarray:
+        """Return records [start, stop) of the file; those of one unit are not decoded again where scan keeps them."""
+        if scan is not None:
+            unit = int(np.searchsorted(scan.borders, start, "right")) - 1
+            kept = scan.decoded.read(unit)[start - scan.borders[unit] : stop - scan.borders[unit]]
+            if len(kept) == stop - start:
+                return kept
         return self._points.read(start, stop)
 
     def read_unit(self, number: int, scan: StripScan) -> Unit:
@@ -356,7 +360,8 @@ class _Geometry:
         packet_of = np.concatenate([unit.packet_of_point, unit.packet_of_context])
         index = np.concatenate([np.arange(unit.start, unit.start + len(unit.points)), unit.context_index])
         used = np.flatnonzero(packet_of >= 0)
-        self._entry = used[np.lexsort((index[used], packet_of[used]))]
+        order = find_order(packet_of[used], index[used])
+        self._entry = used if order is None else used[order]
         self._index = index[self._entry]
         self._counts = np.bincount(packet_of[used], minlength=len(unit.packets))
         self._starts = np.cumsum(self._counts) - self._counts
@@ -394,7 +399,7 @@ class _Geometry:
         if not len(unit.context):
             return take_whole_records(unit.points, entries)
         if self._all is None:
-            self._all = np.concatenate([unit.points, unit.context])
+            self._all = join_records(unit.points, unit.context)
         return take_whole_records(self._all, entries)
 
 
@@ -414,15 +419,20 @@ def _collect_packets(
     unit: tuple[int, int],
 ) -> tuple[PacketTable, np.ndarray]:
     """Packets of points (n,) in order of their owners, and the row of each point, i4 (n,)."""
-    by_index = np.argsort(index, kind="stable")
-    groups = group_keys(keys[by_index])
-    lead = by_index[groups.order[groups.starts]]
-    order = np.argsort(index[lead], kind="stable")
-    rank = np.empty(len(lead), np.int32)
-    rank[order] = np.arange(len(lead), dtype=np.int32)
     packet_of = np.empty(len(keys), np.int32)
-    packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
-    lead = lead[order]
+    if np.all(index[1:] > index[:-1]) and np.all(keys[1:] >= keys[:-1]):  # as most vendors write them
+        groups = group_keys(keys)
+        lead = groups.starts
+        packet_of[:] = np.repeat(np.arange(len(lead), dtype=np.int32), groups.counts)
+    else:
+        by_index = np.argsort(index, kind="stable")
+        groups = group_keys(keys[by_index])
+        lead = by_index[groups.order[groups.starts]]
+        order = np.argsort(index[lead], kind="stable")
+        rank = np.empty(len(lead), np.int32)
+        rank[order] = np.arange(len(lead), dtype=np.int32)
+        packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
+        lead = lead[order]
     table = PacketTable(
         digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
         offset=keys[lead] >> packet_check.INDEX_BITS,
@@ -468,6 +478,8 @@ class RaySample(NamedTuple):
     """Away from the sensor, any length, f8 (n, 3)."""
     weight: np.ndarray
     """Relative weight (inverse variance) of the direction, f8 (n,)."""
+    vector: np.ndarray = np.empty((0, 3))
+    """Of pairs: the packet's, away from the sensor, any length, f8 (n, 3); NaN where it is no direction."""
 
 
 def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySample]:
@@ -478,11 +490,13 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
     kept, pairs = [], []
 
     def take(start: int, stop: int) -> float:
-        points = reader.read_points(start, stop)
+        points = reader.read_points(start, stop, scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
-        pairs.append(_pair_returns(xyz, time))
+        away = _read_vectors(points, scan)
+        pairs.append(_pair_returns(xyz, time, away))
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
-        kept.append(_read_vectors(points[rows], xyz[rows], time[rows], scan))
+        rows = rows[np.isfinite(time[rows]) & np.isfinite(xyz[rows]).all(axis=1) & np.isfinite(away[rows, 0])]
+        kept.append(RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)), away[rows]))
         return float(time[0])
 
     units = _choose_units(scan)
@@ -508,7 +522,7 @@ def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
     ratios = [np.empty(0)]
     units = _choose_units(scan)
     for start, stop in units[:: max(1, -(-len(units) // SCALE_PLACES))]:
-        points = reader.read_points(start, min(start + SLICE_POINTS, stop))
+        points = reader.read_points(start, min(start + SLICE_POINTS, stop), scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         with np.errstate(all="ignore"):
             vectors = packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
@@ -532,29 +546,28 @@ def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
     return [(int(borders[i]), int(borders[i + 1])) for i in chosen.tolist() if borders[i + 1] > borders[i]]
 
 
-def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> RaySample:
+def _read_vectors(points: np.ndarray, scan: StripScan) -> np.ndarray:
+    """Vectors away from the sensor, f8 (n, 3); NaN where they are no directions."""
     with np.errstate(all="ignore"):
         away = -packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
         ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
         good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
-    good &= np.isfinite(time) & np.isfinite(xyz).all(axis=1)
-    rows = np.flatnonzero(good)
-    return RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)))
+    return np.where(good[:, None], away, np.nan)
 
 
-def _pair_returns(xyz: np.ndarray, time: np.ndarray) -> RaySample:
+def _pair_returns(xyz: np.ndarray, time: np.ndarray, away: np.ndarray) -> RaySample:
     """Rays from neighbouring returns of one pulse; returns far apart get a large weight."""
     place = np.flatnonzero(time[1:] == time[:-1])
     apart = xyz[place + 1] - xyz[place]
     square = (apart * apart).sum(axis=1)
     far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
     middle = 0.5 * (xyz[place[far]] + xyz[place[far] + 1])
-    return RaySample(time[place[far]], middle, apart[far], square[far])
+    return RaySample(time[place[far]], middle, apart[far], square[far], away[place[far]])
 
 
 def _join(parts: list[RaySample]) -> RaySample:
     if not parts:
-        return RaySample(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+        return RaySample(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty((0, 3)))
     joined = [np.concatenate(values) for values in zip(*parts, strict=True)]
     order = np.argsort(joined[0], kind="stable")
     return RaySample(*(values[order] for values in joined))

@@ -22,7 +22,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import changeable, frozen
 from wavebatch.core.order import distinct
-from wavebatch.files.disk.raw_bytes import Closing, take_whole_records
+from wavebatch.files.disk.raw_bytes import Closing, join_records, take_whole_records, undoing
 from wavebatch.files.disk.temp_store import SPOOL_MEMORY, Spool, spread_keys
 from wavebatch.files.las.crs import metres_per_unit
 from wavebatch.files.las.header import locate
@@ -154,13 +154,13 @@ class NearSharing:
         return groups
 
     def _mark(self, keys: np.ndarray, index: np.ndarray, own: np.ndarray, new: np.ndarray) -> None:
-        place = self._bin(keys[own])
+        place = self.bin(keys[own])
         where = index[own]
         self._last[place] = where
         fresh = place[::-1]
         unseen = self._first[fresh] < 0
         self._first[fresh[unseen]] = where[::-1][unseen]
-        fresh = self._bin(keys[new])
+        fresh = self.bin(keys[new])
         if not len(fresh):
             return
         low, high = int(fresh.min()), int(fresh.max())
@@ -169,7 +169,8 @@ class NearSharing:
         else:
             np.add.at(self._new, fresh, 1)
 
-    def _bin(self, keys: np.ndarray) -> np.ndarray:
+    def bin(self, keys: np.ndarray) -> np.ndarray:
+        """Return the bin of each key (n,)."""
         return (((keys >> check.INDEX_BITS) - self._low) // self._width).astype(np.int64)
 
     def __getstate__(self) -> dict[str, object]:
@@ -194,10 +195,6 @@ class NearSharing:
         """Return for each bin whether its points lie too far apart for the window."""
         return (self._last - self._first) >= self._window
 
-    def is_suspect(self, keys: np.ndarray, suspects: np.ndarray) -> np.ndarray:
-        """Return whether keys (n,) lie in suspect bins, bool (n,)."""
-        return suspects[self._bin(keys)]
-
     def count_packets(self, suspects: np.ndarray) -> int:
         """Return the number of different packets in all other bins."""
         return int(self._new[~suspects].sum())
@@ -215,7 +212,7 @@ def find_far(
     spool = Spool(buckets, _KEY, memory=sizes.spooled)
     wants = Spool(len(borders) - 1, _WANT, memory=sizes.spooled)
     packets, reach, overfull = 0, 0, []
-    try:
+    with spool, undoing(wants.close):
         for keys, index in units:
             entries = np.empty(len(keys), _KEY)
             entries["key"], entries["index"] = keys, index
@@ -234,11 +231,6 @@ def find_far(
             asked = np.empty(len(target), _WANT)
             asked["index"], asked["unit"] = entries["index"][member], target
             wants.append(unit[member], asked)
-    except BaseException:
-        wants.close()
-        raise
-    finally:
-        spool.close()
     return wants.seal(), packets, reach, np.concatenate([np.empty(0, np.uint64), *overfull])
 
 
@@ -350,27 +342,6 @@ _FAR_SAMPLES = 32
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
 
 
-def scan_strip(
-    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, parts: Sequence[ScanPart] = (),
-    sizes: ScanSizes = SCAN_SIZES,
-) -> StripScan:
-    """Scan all points of a strip.
-
-    unit_points: points per unit before borders are moved to the next pulse. parts: what `scan_units` found in all
-    units, in their order; the result is the same.
-    Raises InputError if points cannot be read; other reasons against processing are in the scan's `problems`.
-    """
-    return _Scanner(facts, source, packets, unit_points, sizes).run(parts)
-
-
-def scan_units(
-    facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, first: int, last: int,
-    sizes: ScanSizes = SCAN_SIZES,
-) -> ScanPart:
-    """Scan the units [first, last) of a strip; arguments and errors as for `scan_strip`."""
-    return _Scanner(facts, source, packets, unit_points, sizes).scan_units(first, last).seal()
-
-
 def cut_scan(units: int, unit_points: int, parts: int, sizes: ScanSizes = SCAN_SIZES) -> list[tuple[int, int]]:
     """Cut a strip into at most so many runs of units [first, last) that `scan_units` may take one by one."""
     most = units // sizes.part_units if unit_points >= sizes.window + LONGEST_RUN else 1
@@ -409,7 +380,8 @@ class ScanPart(Closing):
 
     def __init__(self, facts: StripFacts, form: str, units: int, sizes: ScanSizes) -> None:
         self.borders: list[int] = []
-        self.tally, self.votes, self.sample, self.claimed = _Tally(), check.DirectionTally(form), check.FormSample(), 0
+        self.tally, self.votes, self.claimed = _Tally(), check.DirectionTally(form), 0
+        self.sample: list[check.SomePackets] = []
         self.context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]), memory=sizes.spooled)
         self.decoded = Spool(units, facts.dtype, memory=sizes.spooled)
         low, high = facts.packets.offsets
@@ -422,8 +394,9 @@ class ScanPart(Closing):
     def join(self, other: ScanPart) -> None:
         """Add what was found in the units that follow."""
         self.borders += other.borders[1:] if self.borders else other.borders
-        for name in ("tally", "votes", "sample", "near", "context", "decoded"):
+        for name in ("tally", "votes", "near", "context", "decoded"):
             getattr(self, name).join(getattr(other, name))
+        self.sample += other.sample
         self.claimed += other.claimed
 
     def close(self) -> None:
@@ -432,14 +405,23 @@ class ScanPart(Closing):
         self.decoded.close()
 
 
-class _Scanner:
+class Scanner:
+    """Scans all units of a strip, or some; a new one for each scan.
+
+    unit_points: points per unit before borders are moved to the next pulse. Raises InputError if points cannot be read.
+    """
+
     def __init__(
         self, facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int, sizes: ScanSizes
     ) -> None:
         self._facts, self._source, self._unit_points, self._sizes = facts, source, unit_points, sizes
         self._packets = packets
         self._judge = check.Judge(facts)
-        self._form = check.find_form(self._take_first())
+        most = min(_FIRST_POINTS, _FIRST_BYTES // facts.header.point_length, facts.header.point_count)
+        self._head = source.read(0, most)
+        """The first points, until they are scanned: those of a small strip take longer to decode than to scan."""
+        has_packet = (self._head["wavepacket_index"] > 0) & (self._head["wavepacket_size"] > 0)
+        self._form = check.find_form(self._head[has_packet])
         self._units = -(-facts.header.point_count // unit_points)
         self._found = ScanPart(facts, self._form, self._units, sizes)
         self._keeps = facts.header.compressed
@@ -447,24 +429,16 @@ class _Scanner:
         self._widths[list(facts.digitizers)] = [digitizer.width for digitizer in facts.digitizers.values()]
         self._first = 0
         """Number of the first unit that is scanned."""
-        self._window: list[_Part] = []
-
-    def _take_first(self) -> np.ndarray:
-        """Those of the first points that have packets."""
-        most = min(_FIRST_POINTS, _FIRST_BYTES // self._facts.header.point_length)
-        points = self._source.read(0, min(self._facts.header.point_count, most))
-        return points[(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
+        none = np.empty(0, np.int64)
+        self._window = _Near(none.astype(np.uint64), none, none, np.empty(0, facts.dtype), 0)
 
     def scan_units(self, first: int, last: int) -> ScanPart:
         """Scan the units [first, last)."""
         self._first = first
-        try:
+        with undoing(self._found.close):
             for start, points in self._cut_units(first, last):
                 self._add_unit(start, points)
             self._try_keeping(self._found.decoded.seal)
-        except BaseException:
-            self._found.close()
-            raise
         return self._found
 
     def run(self, parts: Sequence[ScanPart]) -> StripScan:
@@ -475,7 +449,7 @@ class _Scanner:
         if not parts:
             self.scan_units(0, self._units)
         near = found.near
-        try:
+        with undoing(found.close):
             suspects = near.suspects()
             packets, reach = near.count_packets(suspects), near.reach
             full = [np.empty(0, np.uint64), *near.overfull]
@@ -494,9 +468,6 @@ class _Scanner:
                     tally.first[check.Reason.OVERFULL] = start + int(np.argmax(here))
                 tally.reasons[check.Reason.OVERFULL] += many
                 tally.reasons[check.Reason.USABLE] -= many
-        except BaseException:
-            found.close()
-            raise
         return self._finish(packets - len(overfull), reach, overfull, MAX_RETURNS if suspects.any() else MOST_OVERLAP)
 
     def _cut_units(self, first: int, last: int) -> Iterator[tuple[int, np.ndarray]]:
@@ -505,23 +476,31 @@ class _Scanner:
         begin, end = first * step, min(last * step, count)
         rest = self._source.read(max(begin - self._sizes.window, 0), begin)
         for at in range(begin, end, step):
-            part = self._source.read(at, min(at + step, count))
+            part = self._read(at, min(at + step, count))
             cut = _find_cut(rest, part) if at else 0
             if at == begin:
                 # The window begins with the last points before the first unit.
-                points, start = np.concatenate([rest, part[:cut]]), at - len(rest)
+                points, start = join_records(rest, part[:cut]), at - len(rest)
                 judged = self._judge.judge(points, self._form)
                 rows = np.flatnonzero(judged.usable)
-                self._window = [_Part(judged.keys[rows], start + rows, self._first - 1, points, start)]
+                unit = np.full(len(rows), self._first - 1)
+                self._window = _Near(judged.keys[rows], start + rows, unit, points, start)
             else:
-                yield borders[-1], np.concatenate([rest, part[:cut]]) if cut else rest
+                yield borders[-1], join_records(rest, part[:cut]) if cut else rest
             borders.append(at + cut)
             rest = part[cut:]
         if end > begin:
             after = self._source.read(end, min(end + LONGEST_RUN, count))
             cut = _find_cut(rest, after) if len(after) else 0
-            yield borders[-1], np.concatenate([rest, after[:cut]]) if cut else rest
+            yield borders[-1], join_records(rest, after[:cut]) if cut else rest
             borders.append(end + cut)
+
+    def _read(self, start: int, stop: int) -> np.ndarray:
+        """Points [start, stop); the first ones are there."""
+        here, self._head = self._head[start:stop], self._head if stop < len(self._head) else self._head[:0]
+        if not len(here):
+            return self._source.read(start, stop)
+        return here if len(here) == stop - start else np.concatenate([here, self._source.read(start + len(here), stop)])
 
     def _keep(self, unit: int, points: np.ndarray) -> None:
         """Keep the points of a compressed strip: to decode them again takes twenty times as long as to read them."""
@@ -543,34 +522,31 @@ class _Scanner:
         judged = self._judge.judge(points, self._form)
         self._found.tally.add(points, start, judged)
         rows = np.flatnonzero(judged.usable)
-        part = _Part(judged.keys[rows], start + rows, unit, points, start)
-        tails = (old.tail(start - self._sizes.window) for old in self._window)
-        self._window = [tail for tail in tails if len(tail.keys)]
-        parts = _Parts([*self._window, part])
-        own = np.arange(len(parts.keys)) >= len(parts.keys) - len(rows)
-        groups = self._found.near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
-        first = groups.order[groups.starts] - (len(parts.keys) - len(rows))
+        near = self._window.tail(start - self._sizes.window).join(judged.keys[rows], start + rows, unit, points)
+        own = near.index >= start
+        groups = self._found.near.add(near.keys, near.index, near.unit, own, lambda rows: self._entries(near, rows))
+        first = groups.order[groups.starts] - (len(near.keys) - len(rows))
         new = rows[first[first >= 0]]
-        self._found.sample.add(judged, new)
+        self._found.sample.append(check.take_some(judged, new))
         width = np.take(self._widths, points["wavepacket_index"][new])
         self._found.claimed += int(np.minimum(judged.n_samples[new] * width, points["wavepacket_size"][new]).sum())
         if len(rows):
             self._found.votes.add_points(take_whole_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
-            self._vote(groups, parts, own)
-        self._window.append(part)
+            self._vote(groups, near, own)
+        self._window = near
 
-    def _entries(self, parts: _Parts, rows: np.ndarray) -> np.ndarray:
+    def _entries(self, near: _Near, rows: np.ndarray) -> np.ndarray:
         entries = np.empty(len(rows), self._found.context.dtype)
-        entries["index"], entries["record"] = parts.index[rows], parts.take(rows)
+        entries["index"], entries["record"] = near.index[rows], near.take(rows)
         return entries
 
-    def _vote(self, groups: PacketGroups, parts: _Parts, own: np.ndarray) -> None:
+    def _vote(self, groups: PacketGroups, near: _Near, own: np.ndarray) -> None:
         follows = np.ones(len(groups.order), bool)
         follows[groups.starts] = False
         place = np.flatnonzero(follows)
         place = place[own[groups.order[place]]]
         place = place[:: max(1, len(place) // _PAIRS)]
-        first, second = parts.take(groups.order[place - 1]), parts.take(groups.order[place])
+        first, second = near.take(groups.order[place - 1]), near.take(groups.order[place])
         xyz = np.stack([locate(records, self._facts.header) for records in (first, second)])
         self._found.votes.add_pairs(xyz, first, second)
 
@@ -601,7 +577,7 @@ class _Scanner:
     def _suspect_keys(self, suspects: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for start, judged in self._judge_again():
             rows = np.flatnonzero(judged.usable)
-            rows = rows[self._found.near.is_suspect(judged.keys[rows], suspects)]
+            rows = rows[suspects[self._found.near.bin(judged.keys[rows])]]
             yield judged.keys[rows], start + rows
 
     def _vote_far(self) -> None:
@@ -614,8 +590,8 @@ class _Scanner:
             judged = self._judge.judge(points, self._form)
             rows = np.flatnonzero(judged.usable)
             rows = rows[np.argsort(index[rows], kind="stable")]
-            parts = _Parts([_Part(judged.keys[rows], np.arange(len(rows)), unit, take_whole_records(points, rows), 0)])
-            self._vote(group_keys(parts.keys), parts, np.ones(len(rows), bool))
+            near = _Near(judged.keys[rows], np.arange(len(rows)), rows, take_whole_records(points, rows), 0)
+            self._vote(group_keys(near.keys), near, np.ones(len(rows), bool))
 
     def _finish(self, packets: int, reach: int, overfull: np.ndarray, most: int) -> StripScan:
         """most: how many times packets may claim the bytes that are there."""
@@ -654,47 +630,33 @@ class _Scanner:
         )
 
 
-class _Part:
-    """Usable points of one unit that following units may share packets with."""
+@frozen(eq=False)
+class _Near:
+    """Usable points of a unit and of the window before it, in the order of the file."""
 
-    def __init__(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray, start: int) -> None:
-        self.keys, self.index, self.unit = keys, index, unit
-        self._points, self._start = points, start
+    keys: np.ndarray
+    index: np.ndarray
+    """In the file."""
+    unit: np.ndarray
+    points: np.ndarray
+    """All records from `start` on, usable or not."""
+    start: int
 
     def take(self, rows: np.ndarray) -> np.ndarray:
         """Returns the records of the usable points `rows`."""
-        return take_whole_records(self._points, self.index[rows] - self._start)
+        return take_whole_records(self.points, self.index[rows] - self.start)
 
-    def tail(self, least: int) -> _Part:
-        """The part from file index `least` on; a copy if that frees memory."""
-        at = int(np.searchsorted(self.index, least))
-        if not at:
-            return self
-        first = max(self._start, least)
-        points = self._points[first - self._start :].copy()
-        return _Part(self.keys[at:].copy(), self.index[at:].copy(), self.unit, points, first)
+    def tail(self, least: int) -> _Near:
+        """The part from file index `least` on; a copy, which frees memory."""
+        at, first = int(np.searchsorted(self.index, least)), max(self.start, least)
+        keys, index, unit = (part[at:].copy() for part in (self.keys, self.index, self.unit))
+        return _Near(keys, index, unit, self.points[first - self.start :].copy(), first)
 
-
-class _Parts:
-    """Several parts in one sequence."""
-
-    def __init__(self, parts: list[_Part]) -> None:
-        self.keys = np.concatenate([part.keys for part in parts])
-        self.index = np.concatenate([part.index for part in parts])
-        self.unit = np.concatenate([np.full(len(part.keys), part.unit) for part in parts])
-        self._starts = np.cumsum([0, *(len(part.keys) for part in parts)])
-        self._parts = parts
-
-    def take(self, rows: np.ndarray) -> np.ndarray:
-        """Returns the records at `rows` of the whole sequence."""
-        taken, places = [], []
-        for start, stop, part in zip(self._starts[:-1], self._starts[1:], self._parts, strict=True):
-            here = np.flatnonzero((rows >= start) & (rows < stop))
-            taken.append(part.take(rows[here] - start))
-            places.append(here)
-        back = np.empty(len(rows), np.int64)
-        back[np.concatenate(places)] = np.arange(len(rows))
-        return take_whole_records(np.concatenate(taken), back)
+    def join(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray) -> _Near:
+        """With the points that follow, all of one unit, of which those at `index` are usable."""
+        keys, index = np.concatenate([self.keys, keys]), np.concatenate([self.index, index])
+        units = np.append(self.unit, np.full(len(keys) - len(self.unit), unit))
+        return _Near(keys, index, units, join_records(self.points, points), self.start)
 
 
 def _find_cut(rest: np.ndarray, part: np.ndarray) -> int:

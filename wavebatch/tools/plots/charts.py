@@ -20,11 +20,10 @@ from wavebatch.files.las.crs import describe_crs
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
 from wavebatch.stages.chain import Chain
-from wavebatch.stages.decompose.models import rebuild_waveforms
-from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.systems.survey_result import full_width, sample_pulse
 from wavebatch.tools.cells import Raster, Tally, choose_grid, compute_cells, find_shown, robust_limits
+from wavebatch.tools.compare_chains import find_residual
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, draw_cells
 from wavebatch.tools.plots.draw_waveform import HEAD, LEGEND, draw_small_waveforms, sheet_size
 from wavebatch.tools.plots.waveform import WaveformView, build_views
@@ -301,19 +300,13 @@ def measure_view_residuals(block: WaveformBlock, chain: Chain, system: SystemPul
 
     Samples that are missing, or at the digitizer's limit, are left out.
     """
-    block, noise, system, echoes = chain.solve(block, system)
-    fit = rebuild_waveforms(block, system, chain.steps[2], echoes)
-    if fit is None:
+    solved = chain.solve(block, system)
+    found = find_residual(solved.block, solved.noise, solved.system, chain.steps[2], solved.echoes)
+    if found is None:
         return np.full(len(block), np.nan)
-    samples = block.samples.astype(np.float64)
-    used = samples < clip_level(block, system)
-    if block.missing is not None:
-        used &= ~block.missing
-    level = np.stack([np.broadcast_to(noise.level[row], samples.shape[1:]) for row in range(len(block))])
-    variance = noise.std[:, None].astype(np.float64) ** 2 + system.noise.gain * np.maximum(fit, 0)
-    square = np.where(used, (samples - level - fit) ** 2 / variance, 0.0)
-    number = used.sum(axis=1)
-    return np.sqrt(square.sum(axis=1) / np.maximum(number, 1))
+    fit, residual, used = found
+    variance = solved.noise.std[:, None].astype(np.float64) ** 2 + solved.system.noise.gain * np.maximum(fit, 0)
+    return np.sqrt((residual**2 / variance).sum(axis=1) / np.maximum(used.sum(axis=1), 1))
 
 
 def draw_waveforms(path: Path, chain: Chain, system: SystemPulse, name: str, **reading: Any) -> Iterator[Sheet]:

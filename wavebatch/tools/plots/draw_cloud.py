@@ -110,7 +110,7 @@ def count_values(
     clouds = Clouds(paths, (column,) if by is None else (column, by), chosen)
     if clouds.facts.is_flags:
         raise ConfigError(f"{paths[0]}: {clouds.facts.name} are bits: there is no histogram of their values")
-    if by is not None and clouds.other_facts[0].is_flags:
+    if by is not None and clouds.every[1].is_flags:
         raise ConfigError(f"{paths[0]}: {by} are bits and form no groups; --flags selects them")
     series: dict[_Key, _Series] = {}
     total = Tally()
@@ -196,7 +196,7 @@ def _name_series(key: _Key, clouds: Clouds, each: bool, by: str | None) -> str:
     cloud, group = key
     parts = [name_paths(clouds.paths)[cloud]] if each and len(clouds.paths) > 1 else []
     if by is not None:
-        column = clouds.other_facts[0].name
+        column = clouds.every[1].name
         meaning = CLASS_NAMES.get(int(group), "") if column.endswith("classification") and group >= 0 else ""
         known = f"{column} {group:g}" + (f" ({meaning})" if meaning else "")
         parts.append(f"no {column}" if group == _UNKNOWN else known)

@@ -359,33 +359,26 @@ def draw_small_waveforms(
         row, column = divmod(number, columns)
         left = (column * CELL[0] + 0.3) / size[0]
         bottom = (size[1] - head - (row + 1) * CELL[1] + 0.25) / size[1]
-        place = (left, bottom, (CELL[0] - 0.4) / size[0], (CELL[1] - 0.5) / size[1])
-        _draw_cell(figure, view, times, place, notes[number] if notes else "")
-
-
-def _draw_cell(
-    figure: Figure, view: WaveformView, times: tuple[float, float] | None, place: tuple[float, float, float, float],
-    note: str,
-) -> None:  # fmt: skip
-    left, bottom, width, height = place
-    upper = figure.add_axes((left, bottom + SHARE * height, width, (1 - SHARE) * height))
-    lower = figure.add_axes((left, bottom, width, (SHARE - 0.03) * height), sharex=upper)
-    times = times or view.span
-    draw_samples(upper, view, times, dot=1.2, thin=0.55)
-    upper.plot(view.echoes.time, find_echo_heights(view), "D", color=ECHO, markersize=3, markerfacecolor="none",
-               markeredgewidth=0.7)  # fmt: skip
-    fit_signal_panel(upper, view, times)
-    _draw_residual(lower, view, times, RESIDUAL)
-    upper.set_xlim(times)
-    for axes in (upper, lower):
-        axes.tick_params(labelsize=5.5, length=2, pad=1)
-        axes.grid(False)
-    upper.locator_params(nbins=4)
-    upper.tick_params(labelbottom=False)
-    lower.set_yticks([])
-    name = f"packet {view.packet}" if view.packet >= 0 else f"point {view.point}"
-    strongest = f"{view.echoes.amplitude.max():.0f} DN" if len(view.echoes) else "no echo"
-    flags = EchoFlag(int(np.bitwise_or.reduce(view.echoes.flags, initial=0))) & ~QUIET_FLAGS
-    names = ", ".join(flag.name for flag in flags)
-    title = "   ".join(filter(None, (name, strongest, note))) + (f"\n{names}" if names else "")
-    upper.set_title(fit_text(figure, title, CELL[0] - 0.45, size=6.5), fontsize=6.5, pad=2)
+        width, height = (CELL[0] - 0.4) / size[0], (CELL[1] - 0.5) / size[1]
+        upper = figure.add_axes((left, bottom + SHARE * height, width, (1 - SHARE) * height))
+        lower = figure.add_axes((left, bottom, width, (SHARE - 0.03) * height), sharex=upper)
+        shown = times or view.span
+        draw_samples(upper, view, shown, dot=1.2, thin=0.55)
+        upper.plot(view.echoes.time, find_echo_heights(view), "D", color=ECHO, markersize=3, markerfacecolor="none",
+                   markeredgewidth=0.7)  # fmt: skip
+        fit_signal_panel(upper, view, shown)
+        _draw_residual(lower, view, shown, RESIDUAL)
+        upper.set_xlim(shown)
+        for axes in (upper, lower):
+            axes.tick_params(labelsize=5.5, length=2, pad=1)
+            axes.grid(False)
+        upper.locator_params(nbins=4)
+        upper.tick_params(labelbottom=False)
+        lower.set_yticks([])
+        name = f"packet {view.packet}" if view.packet >= 0 else f"point {view.point}"
+        strongest = f"{view.echoes.amplitude.max():.0f} DN" if len(view.echoes) else "no echo"
+        flags = EchoFlag(int(np.bitwise_or.reduce(view.echoes.flags, initial=0))) & ~QUIET_FLAGS
+        names = ", ".join(flag.name for flag in flags)
+        title = "   ".join(filter(None, (name, strongest, *notes[number : number + 1])))
+        title = fit_text(figure, title + (f"\n{names}" if names else ""), CELL[0] - 0.45, size=6.5)
+        upper.set_title(title, fontsize=6.5, pad=2)

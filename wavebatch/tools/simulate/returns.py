@@ -6,7 +6,7 @@ much light each return of a cloud sends back, how wide its echo is, and which sh
 
 `synthesize_strip` makes a strip of a cloud of discrete returns, with modelled waveforms: a Gaussian per return, from
 range and intensity. The cloud is read once in pieces that cut no pulse, and once before to choose the gain where none
-is given. Heights, widths and shares of the beam are those of `return_light`.
+is given. Heights, widths and shares of the beam are those of `LightModel`.
 """
 
 from __future__ import annotations
@@ -153,16 +153,6 @@ class LightCounts:
     """Sum of all shares."""
 
 
-@frozen(eq=False)
-class ReturnLight:
-    """k returns of whole pulses."""
-
-    strength: np.ndarray
-    """Peak of each before the gain: intensity, or received power [W], f8 (k,)."""
-    sigma: np.ndarray
-    """Standard deviation of each echo [ns], f8 (k,)."""
-
-
 class LightModel:
     """The light of the returns of one cloud; counts what is assumed.
 
@@ -194,8 +184,10 @@ class LightModel:
             self.counts.assumed_unit |= option == "widths" and facts.unit == "-"
             return reader.find_value(column)
 
-    def measure(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> ReturnLight:
-        """The light of returns (k,), RETURN_DTYPE, with their raw records; starts: first return of each pulse.
+    def measure(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Peak of each return (k,) before the gain (intensity, or received power [W]) and deviation of its echo [ns].
+
+        rows: RETURN_DTYPE; records: the same as raw records; starts: first return of each pulse.
 
         Raises InputError for shares that are none, and for points above the sensor.
         """
@@ -208,7 +200,7 @@ class LightModel:
         sigma = np.where(known, limited, self.options.sigma)
         intensity = rows["intensity"].astype(np.float64)
         if self.options.radar is None:
-            return ReturnLight(intensity, sigma)
+            return intensity, sigma
         radar = self.options.radar
         distance = (radar.height - rows["xyz"][:, 2]) / np.cos(np.radians(np.clip(rows["scan_angle"], -80, 80)))
         if len(distance) and distance.min() <= 0:
@@ -228,7 +220,7 @@ class LightModel:
         power *= self.options.sigma / sigma
         if self.options.shares is not None:
             power *= self._measure_shares(rows, records, starts)
-        return ReturnLight(power, sigma)
+        return power, sigma
 
     def check_widths(self) -> None:
         """Raises ConfigError where most widths of the named column had to be limited: they are no widths in ns."""
@@ -604,7 +596,7 @@ def _choose_gain(reader: CloudReader, light: LightModel) -> float:
     """The gain that fills the digitizer; reads all points."""
     counts, options = np.zeros(len(_LEVELS) + 1, np.int64), light.options
     for rows, records in _read_pulses(reader):
-        strength = light.measure(rows, records, group_pulses(rows["gps_time"], rows["number"])).strength
+        strength = light.measure(rows, records, group_pulses(rows["gps_time"], rows["number"]))[0]
         counts += np.bincount(np.searchsorted(_LEVELS, strength[strength > 0]), minlength=len(counts))
     total = int(counts.sum())
     if reader.point_count and not total:
@@ -624,8 +616,7 @@ def _model_pulses(
     count = np.diff(np.append(starts, len(rows)))
     pulse = np.repeat(np.arange(len(starts)), count)
     ray = fit_rays(rows["xyz"], starts, rows["scan_angle"], rows["source"])
-    seen: ReturnLight = light.measure(rows, records, starts)
-    sigma = seen.sigma
+    strength, sigma = light.measure(rows, records, starts)
     delay = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], ray[pulse]) / HALF_C
     margin = MARGIN * np.maximum.reduceat(sigma, starts)
     phase = spacing * rng.random(len(starts))
@@ -634,7 +625,7 @@ def _model_pulses(
     return _Pulses(
         pulse=pulse,
         time=time,
-        amplitude=gain * seen.strength,
+        amplitude=gain * strength,
         sigma=sigma,
         ray=ray,
         kind=np.searchsorted(_LENGTHS, n_samples),

@@ -241,18 +241,6 @@ def _find_room(recording: Recording, margin: float) -> tuple[float, float]:
     return keep, recording.duration - keep
 
 
-def widen_on_slope(
-    sigma: np.ndarray, amplitude: np.ndarray, incidence: np.ndarray, beam_radius: np.ndarray | float
-) -> tuple[np.ndarray, np.ndarray]:
-    """sigma [ns] and amplitude of echoes of a tilted plane: s_alpha = w tan(alpha)/c (docs/algorithms.md 1.4).
-
-    incidence: angle between ray and normal [rad]; beam_radius: 1/e^2 radius of the footprint [m]. The energy falls
-    with cos(alpha) and is spread over the longer echo.
-    """
-    wide = np.hypot(sigma, beam_radius * np.tan(incidence) / C)
-    return wide, amplitude * np.cos(incidence) * sigma / wide
-
-
 Draw = Callable[[np.random.Generator, int, Recording], Drawn]
 
 
@@ -423,8 +411,11 @@ class Scene:
             energy = self.light * reflectance * transmit(rays.distance, AIR_ATTENUATION) / rays.distance**2
             amplitude = energy[waveform] / self.recording.pulse.sigma
         if self.divergence:
-            radius = (0.5e-3 * self.divergence * rays.distance)[waveform]
-            sigma, amplitude = widen_on_slope(sigma, amplitude, rays.incidence[waveform], radius)
+            # A tilted plane: s_alpha = w tan(alpha)/c, with w the 1/e^2 radius of the footprint (docs/algorithms.md
+            # 1.4). The energy falls with cos(alpha) and is spread over the longer echo.
+            radius, incidence = (0.5e-3 * self.divergence * rays.distance)[waveform], rays.incidence[waveform]
+            wide = np.hypot(sigma, radius * np.tan(incidence) / C)
+            sigma, amplitude = wide, amplitude * np.cos(incidence) * sigma / wide
         order = np.lexsort((time, waveform)) if len(self.counts) > 2 else slice(None)
         return Drawn(waveform, time[order], amplitude[order], sigma[order])
 

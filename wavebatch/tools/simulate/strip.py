@@ -241,14 +241,41 @@ def simulate_strip(
     """
     scene, options = find_scene(scene), options or StripOptions()
     parts = _simulate_parts(scene, pulses, seed, flight, progress)
-    summary = StripSummary()
+    summary, whole = StripSummary(), seed_block(scene)
     with (
         TruthWriter(truth, overwrite=overwrite) if truth else nullcontext() as truth_writer,
-        _open_writer(target, scene, options, overwrite) as writer,
-    ):
+        FullwaveWriter(
+            Path(target), version=options.las_version, point_format=options.point_format, internal=options.internal,
+            digitizers=[scene.recording.digitizer], scales=(options.scale,) * 3, offsets=(EAST, NORTH, 0.0),
+            wkt=WKT if options.las_version != "1.3" else None, toward=options.toward, overwrite=overwrite,
+        ) as writer,
+    ):  # fmt: skip
         for number, simulated in enumerate(parts):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, 1)))
-            _write_part(writer, truth_writer, simulated, scene, options, rng, summary)
+            block, n = simulated.block, len(simulated.block)
+            returns = list_returns(
+                simulated.truth, n, scene.recording, options.most_returns, keep_empty=options.keep_empty
+            )
+            # Always a whole block of random numbers: pulse k gets the same whatever the number of pulses.
+            jitter = rng.uniform(-0.5, 0.5, whole)[:n] * scene.recording.spacing
+            stored = rng.random(whole)[:n] >= options.without_waveform
+            stored &= np.bincount(returns.pulse, minlength=n) > 0
+            rows = np.flatnonzero(stored)
+            offset = np.zeros(n, np.uint64)
+            offset[rows] = writer.write_packets(block.samples[rows], 1)
+            points, pulse = _fill_points(writer.dtype, simulated, returns, options.scale), returns.pulse
+            size, time = block.samples.shape[1] * block.samples.itemsize, returns.time + jitter[pulse]
+            fill_packets(points, stored[pulse], offset[pulse], size, time, block.direction[pulse])
+            writer.write_points(points)
+            kept = simulated.truth.take(np.flatnonzero(stored[simulated.truth.waveform]))
+            if truth_writer:
+                packet = summary.packets + np.cumsum(stored) - 1
+                truth_writer.add({"packet_byte_offset": offset[rows], "packet_gps_time": block.gps_time[rows]})
+                truth_writer.add(_list_truth(Simulated(block, kept, simulated.rays), packet, offset))
+            summary.pulses += n
+            summary.packets += len(rows)
+            summary.points += len(points)
+            summary.echoes += len(kept)
         if truth_writer:
             writer.drafts.insert(0, truth_writer.complete(_describe(scene, seed, summary)))
         writer.commit()
@@ -308,57 +335,6 @@ def _simulate_parts(
         yield simulate_seed_block(scene, seed, first // block, flight).cut(0, n)
         if progress:
             progress(n)
-
-
-def _open_writer(target: Path, scene: Scene, options: StripOptions, overwrite: bool) -> FullwaveWriter:
-    return FullwaveWriter(
-        Path(target),
-        version=options.las_version,
-        point_format=options.point_format,
-        internal=options.internal,
-        digitizers=[scene.recording.digitizer],
-        scales=(options.scale,) * 3,
-        offsets=(EAST, NORTH, 0.0),
-        wkt=WKT if options.las_version != "1.3" else None,
-        toward=options.toward,
-        overwrite=overwrite,
-    )
-
-
-def _write_part(
-    writer: FullwaveWriter,
-    truth_writer: TruthWriter | None,
-    simulated: Simulated,
-    scene: Scene,
-    options: StripOptions,
-    rng: np.random.Generator,
-    summary: StripSummary,
-) -> None:
-    """Packets, points and truth of a seed block; adds to the summary."""
-    block, n = simulated.block, len(simulated.block)
-    returns = list_returns(simulated.truth, n, scene.recording, options.most_returns, keep_empty=options.keep_empty)
-    # Always a whole block of random numbers: pulse k gets the same whatever the number of pulses.
-    whole = seed_block(scene)
-    jitter = rng.uniform(-0.5, 0.5, whole)[:n] * scene.recording.spacing
-    stored = rng.random(whole)[:n] >= options.without_waveform
-    stored &= np.bincount(returns.pulse, minlength=n) > 0
-    rows = np.flatnonzero(stored)
-    offset = np.zeros(n, np.uint64)
-    offset[rows] = writer.write_packets(block.samples[rows], 1)
-    points = _fill_points(writer.dtype, simulated, returns, options.scale)
-    pulse = returns.pulse
-    size = block.samples.shape[1] * block.samples.itemsize
-    fill_packets(points, stored[pulse], offset[pulse], size, returns.time + jitter[pulse], block.direction[pulse])
-    writer.write_points(points)
-    kept = simulated.truth.take(np.flatnonzero(stored[simulated.truth.waveform]))
-    if truth_writer:
-        packet = summary.packets + np.cumsum(stored) - 1
-        truth_writer.add({"packet_byte_offset": offset[rows], "packet_gps_time": block.gps_time[rows]})
-        truth_writer.add(_list_truth(Simulated(block, kept, simulated.rays), packet, offset))
-    summary.pulses += n
-    summary.packets += len(rows)
-    summary.points += len(returns.pulse)
-    summary.echoes += len(kept)
 
 
 def _fill_points(dtype: np.dtype, simulated: Simulated, returns: Returns, scale: float) -> np.ndarray:

@@ -4,9 +4,9 @@
 that the result does not depend on block size or order.
 
 Voxels are written as a sparse .npz, or as a point cloud with a point at the centre of each: `strip.voxelize_strip`
-calls `check_voxel_target` before it reads the strip, and `write_voxels` at the end. `ProfileWriter` writes the
-deconvolved profiles of single pulses as an .npz: sigma(t) of every pulse, not only its sum in voxels. Only samples with
-signal are stored, so a file is about as large as the cloud of the strip. It must not depend on block size: nothing
+calls `check_voxel_target` before it reads the strip, and `write_npz` or `write_las` at the end. `ProfileWriter` writes
+the deconvolved profiles of single pulses as an .npz: sigma(t) of every pulse, not only its sum in voxels. Only samples
+with signal are stored, so a file is about as large as the cloud of the strip. It must not depend on block size: nothing
 there may mix pulses of a batch. `VoxelFile` reads voxels as points, for sections and height profiles.
 """
 
@@ -318,25 +318,15 @@ class VoxelSpace:
     """How the voxels were made."""
 
 
-def write_voxels(
-    target: Path, space: VoxelSpace, pieces: Iterable[Piece], *, others: Sequence[Draft] = (), overwrite: bool
-) -> int:
-    """Writes voxels in the format of the target's suffix; returns their number.
-
-    pieces: index i8 (m, 3) and columns of some voxels at a time. others: complete files that are published with this
-    one. After an error nothing remains.
-    Raises InputError where the target cannot be written.
-    """
-    write = _write_npz if target.suffix.lower() == ".npz" else _write_las
-    return write(target, space, pieces, others, overwrite)
-
-
-def _write_npz(
+def write_npz(
     target: Path, space: VoxelSpace, pieces: Iterable[Piece], others: Sequence[Draft], overwrite: bool
 ) -> int:
-    """An .npz of index i4 (n, 3), an array per column, origin f8 (3,) [m], size [m], crs (WKT or empty), meta (JSON).
+    """Writes an .npz and returns its number of voxels; after an error nothing remains.
 
+    It has index i4 (n, 3), an array per column, origin f8 (3,) [m], size [m], crs (WKT or empty), meta (JSON).
     Voxel i lies between origin + i size and origin + (i + 1) size. No-data is NaN.
+    pieces: some voxels at a time. others: complete files that are published with this one.
+    Raises InputError where the target cannot be written.
     """
     dtypes = {"index": np.dtype(("<i4", (3,)))}
     dtypes |= {column.name: np.dtype(f"<{column.dtype}") for column in space.columns}
@@ -351,10 +341,10 @@ def _write_npz(
     return number
 
 
-def _write_las(
+def write_las(
     target: Path, space: VoxelSpace, pieces: Iterable[Piece], others: Sequence[Draft], overwrite: bool
 ) -> int:
-    """A .las or .laz with a point at the centre of each voxel, the columns as extra bytes, and the CRS of the strip.
+    """As `write_npz`, a .las or .laz: a point at the centre of each voxel, columns as extra bytes, the strip's CRS.
 
     The centres are exact: coordinates count half voxels from the lower corner of the grid.
     """

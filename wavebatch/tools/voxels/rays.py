@@ -389,14 +389,8 @@ def read_batches(
     for number in range(reader.unit_count()) if numbers is None else numbers:
         near = [one for one in (number, number + 1) if one < reader.unit_count()]
         units = {one: units.get(one) or reader.read_unit(one, scan) for one in near}
-        lost = {one: lost.get(one, np.empty(0, LOST)) for one in (number - 1, *near)}
-        for one, unit in units.items():
-            if not len(lost[one]):  # the returns without a packet that can be read
-                points = unit.points[unit.packet_of_point < 0]
-                lost[one] = np.zeros(len(points), LOST)
-                lost[one]["time"], lost[one]["place"] = points["gps_time"], locate(points, reader.facts.header)
-                scanner = read_scanner(points)
-                lost[one]["scanner"] = 0 if scanner is None else scanner
+        lost = {one: found for one, found in lost.items() if one >= number - 1}
+        lost |= {one: _list_lost(unit, reader) for one, unit in units.items() if one not in lost}
         rows = [np.flatnonzero(unit.packets.owned) for unit in units.values()]
         rows[0] = rows[0][~np.isin(units[number].packets.owner[rows[0]], taken)]
         tables = list(zip(units.values(), rows, strict=True))
@@ -408,12 +402,10 @@ def read_batches(
         # Lost returns of equal time with packets, with their group.
         known = np.concatenate(list(lost.values()))
         values, first, count = np.unique(time, return_index=True, return_counts=True)
-        at = np.minimum(np.searchsorted(values, known["time"]), max(len(values) - 1, 0))
-        if len(values):
-            known["group"] = owner[first[at]]
-            known = known[(values[at] == known["time"]) & (known["time"] != 0) & (count[at] < LONGEST_PULSE)]
-        else:
-            known = known[:0]
+        known = known[np.isin(known["time"], values) & (known["time"] != 0)]
+        at = np.searchsorted(values, known["time"])
+        known["group"] = owner[first[at]]
+        known = known[count[at] < LONGEST_PULSE]
         kept = np.ones(len(owner), bool)
         if keep is not None:
             kept = np.concatenate([_choose_packets(unit, keep)[some] for unit, some in tables])
@@ -433,6 +425,15 @@ def read_batches(
                 parts.append((unit, mine[some[inside] - shift], groups[inside], kept[some[inside]]))
             if len(some):
                 yield Batch(parts, known[np.isin(known["group"], groups)])
+
+
+def _list_lost(unit: Unit, reader: StripReader) -> np.ndarray:
+    """The returns of a unit whose packet is missing or broken, LOST (k,)."""
+    points = unit.points[unit.packet_of_point < 0]
+    lost, scanner = np.zeros(len(points), LOST), read_scanner(points)
+    lost["time"], lost["place"] = points["gps_time"], locate(points, reader.facts.header)
+    lost["scanner"] = 0 if scanner is None else scanner
+    return lost
 
 
 def _choose_packets(unit: Unit, keep: PlannedFilter) -> np.ndarray:

@@ -257,8 +257,8 @@ def voxelize_strip(
             if writer is not None:
                 known = {name: value for name, value in meta.items() if name not in ("columns", "size_m", "headroom_m")}
                 others.append(writer.complete_profiles(known, space.facts.crs or ""))
-            summary.voxels = voxel_grid.write_voxels(target, space, grid.pieces(rule.log_error), others=others,
-                                          overwrite=overwrite)  # fmt: skip
+            write = voxel_grid.write_npz if target.suffix.lower() == ".npz" else voxel_grid.write_las
+            summary.voxels = write(target, space, grid.pieces(rule.log_error), others, overwrite)
             summary.profile_samples = 0 if writer is None else writer.samples
             summary.shape, summary.origin = tuple(grid.shape.tolist()), tuple((grid.low * grid.size).tolist())
             summary.outside, summary.energy, summary.unknown = grid.outside, grid.energy, grid.unknown
