@@ -259,28 +259,20 @@ def compute_cells(statistic: str, cell: np.ndarray, values: np.ndarray, number: 
             # Differences from the mean first: squares of large values would cancel.
             square = np.bincount(cell, (values - mean[cell]) ** 2, number)
             return np.where(count > 1, np.sqrt(square / (count - 1)), np.nan)
-    return _pick(cell, values, count, _PLACES[statistic])
+    ordered = values[np.lexsort((values, cell))]
+    place = np.flatnonzero(count)
+    first = (np.cumsum(count) - count)[place]
+    low, high = (ordered[first + rank] for rank in _RANKS[statistic](count[place]))
+    filled[place] = low + 0.5 * (high - low)
+    return filled
 
 
-_PLACES: dict[str, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
+_RANKS: dict[str, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
     "median": lambda count: ((count - 1) // 2, count // 2),
     "min": lambda count: (np.zeros_like(count), np.zeros_like(count)),
     "max": lambda count: (count - 1, count - 1),
 }
 """Ranks of the two values whose mean is the statistic, from the counts of cells."""
-
-
-def _pick(
-    cell: np.ndarray, values: np.ndarray, count: np.ndarray, places: Callable[[np.ndarray], tuple[np.ndarray, ...]]
-) -> np.ndarray:
-    """The values of these ranks in each cell."""
-    ordered = values[np.lexsort((values, cell))]
-    filled = np.flatnonzero(count)
-    first = (np.cumsum(count) - count)[filled]
-    low, high = (ordered[first + place] for place in places(count[filled]))
-    result = np.full(len(count), np.nan)
-    result[filled] = low + 0.5 * (high - low)
-    return result
 
 
 HELD = 2_000_000
