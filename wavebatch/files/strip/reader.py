@@ -215,7 +215,25 @@ class StripReader(Closing):
         sizes = np.concatenate([points["wavepacket_size"][own], entries["record"]["wavepacket_size"]])
         n_samples = np.concatenate([judged.n_samples[own], n_samples])
         packed = np.concatenate([judged.packed[own], packed])
-        packets, packet_of = _collect_packets(keys, index, sizes, n_samples, packed, (start, stop))
+        # Packets in the order of their owners: the first point with each.
+        by_index = np.argsort(index, kind="stable")
+        groups = scanner.group_keys(keys[by_index])
+        lead = by_index[groups.order[groups.starts]]
+        order = np.argsort(index[lead], kind="stable")
+        rank = np.empty(len(lead), np.int32)
+        rank[order] = np.arange(len(lead), dtype=np.int32)
+        packet_of = np.empty(len(keys), np.int32)
+        packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
+        lead = lead[order]
+        packets = PacketTable(
+            digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
+            offset=keys[lead] >> packet_check.INDEX_BITS,
+            size=sizes[lead],
+            n_samples=n_samples[lead],
+            owner=index[lead],
+            owned=(index[lead] >= start) & (index[lead] < stop),
+            packed=packed[lead],
+        )
         packet_of_point = np.full(len(points), -1, np.int32)
         packet_of_point[own] = packet_of[: len(own)]
         return Unit(
@@ -392,36 +410,6 @@ def read_scanner(records: np.ndarray) -> np.ndarray | None:
     if "classification_flags" not in field_names(records.dtype):
         return None
     return (records["classification_flags"] >> 4) & 3
-
-
-def _collect_packets(
-    keys: np.ndarray,
-    index: np.ndarray,
-    sizes: np.ndarray,
-    n_samples: np.ndarray,
-    packed: np.ndarray,
-    unit: tuple[int, int],
-) -> tuple[PacketTable, np.ndarray]:
-    """Packets of points (n,) in order of their owners, and the row of each point, i4 (n,)."""
-    by_index = np.argsort(index, kind="stable")
-    groups = scanner.group_keys(keys[by_index])
-    lead = by_index[groups.order[groups.starts]]
-    order = np.argsort(index[lead], kind="stable")
-    rank = np.empty(len(lead), np.int32)
-    rank[order] = np.arange(len(lead), dtype=np.int32)
-    packet_of = np.empty(len(keys), np.int32)
-    packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
-    lead = lead[order]
-    table = PacketTable(
-        digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
-        offset=keys[lead] >> packet_check.INDEX_BITS,
-        size=sizes[lead],
-        n_samples=n_samples[lead],
-        owner=index[lead],
-        owned=(index[lead] >= unit[0]) & (index[lead] < unit[1]),
-        packed=packed[lead],
-    )
-    return table, packet_of
 
 
 MOST_SLICES = 4096

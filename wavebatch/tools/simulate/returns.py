@@ -569,7 +569,15 @@ def synthesize_strip(
                 ray = pulses.ray[pulses.pulse] * HALF_C
                 fill_packets(points, index, offset[pulses.pulse], size, pulses.time, ray)
                 writer.write_points(points)
-                _count(summary, pulses, recordings[0])
+                too_long, modelled = pulses.kind == len(_LENGTHS), SQRT_2PI * pulses.amplitude * pulses.sigma
+                summary.energy += float(modelled.sum())
+                summary.energy_without_packet += float(modelled[too_long[pulses.pulse]].sum())
+                summary.points += len(points)
+                summary.packets += int(np.count_nonzero(~too_long))
+                summary.without_packet += int(np.count_nonzero(too_long[pulses.pulse]))
+                most = recordings[0].clip - recordings[0].baseline
+                summary.saturated += int(np.count_nonzero(pulses.amplitude > most))
+                summary.scattered += int(np.count_nonzero(pulses.is_scattered))
                 if progress:
                     progress(len(rows))
             light.check_widths()
@@ -654,15 +662,3 @@ def _write_packets(
             energy += recording.spacing * (float(counts.sum(dtype=np.float64)) - recording.baseline * counts.size)
             offset[chosen] = writer.write_packets(counts, number + 1)
     return offset, energy
-
-
-def _count(summary: SynthesisSummary, pulses: _Pulses, recording: Recording) -> None:
-    too_long = pulses.kind == len(_LENGTHS)
-    energy = SQRT_2PI * pulses.amplitude * pulses.sigma
-    summary.energy += float(energy.sum())
-    summary.energy_without_packet += float(energy[too_long[pulses.pulse]].sum())
-    summary.points += len(pulses.pulse)
-    summary.packets += int(np.count_nonzero(~too_long))
-    summary.without_packet += int(np.count_nonzero(too_long[pulses.pulse]))
-    summary.saturated += int(np.count_nonzero(pulses.amplitude > recording.clip - recording.baseline))
-    summary.scattered += int(np.count_nonzero(pulses.is_scattered))
