@@ -65,6 +65,17 @@ def name_paths(paths: Sequence[Path]) -> tuple[str, ...]:
     return tuple(str(path) if names.count(path.name) > 1 else path.name for path in paths)
 
 
+@frozen(eq=False)
+class CloudData:
+    """What a picture shows of a column of clouds: the base of histograms, maps, sections and profiles."""
+
+    facts: ColumnFacts
+    names: tuple[str, ...]
+    """Of the clouds, or of the series where there are several."""
+    total: Tally
+    """Counts of all points of the clouds."""
+
+
 class Clouds:
     """Several clouds that are read as one, as often as needed; only one is open at a time.
 
@@ -415,17 +426,13 @@ _SIDE = 128
 
 
 @frozen(eq=False)
-class Raster:
+class Raster(CloudData):
     """A map."""
 
-    names: tuple[str, ...]
-    """Of the clouds."""
-    facts: ColumnFacts
     statistic: str
     grid: Grid
     values: np.ndarray
     """f8 (rows, columns), the first row is the southernmost; NaN without a point."""
-    total: Tally
     outside: int
     """Points with a value outside the grid."""
     shown: tuple[float, float]
@@ -478,8 +485,8 @@ def grid_values(
         part[:] = tile[0, : part.shape[0], : part.shape[1]]
     values = values[::-1]  # the first row is the southernmost
     names = tuple(path.name for path in paths)
-    return Raster(names, clouds.facts, statistic, grid, values, total, total.values - placed.values[0],
-                  find_shown(values), crs)  # fmt: skip
+    outside = total.values - placed.values[0]
+    return Raster(clouds.facts, names, total, statistic, grid, values, outside, find_shown(values), crs)
 
 
 def find_shown(values: np.ndarray) -> tuple[float, float]:
