@@ -70,10 +70,10 @@ class Histogram(CloudData):
 
 @frozen(eq=False)
 class FlagCounts(CloudData):
-    """Points per flag."""
+    """Points per flag: the series are the flags."""
 
-    flags: tuple[str, ...]
-    """Names of the flags."""
+    clouds: tuple[str, ...]
+    """Names of the clouds."""
     counts: np.ndarray
     """Points with each flag, i8 (16,)."""
     clean: int
@@ -229,7 +229,7 @@ def count_points_by_flag(paths: Sequence[Path], column: str, chosen: PointFilter
     if not total.values:
         raise clouds.complain(total)
     names = tuple(path.name for path in paths)
-    return FlagCounts(clouds.facts, names, total, tuple(flag.name for flag in EchoFlag), counts, clean)
+    return FlagCounts(clouds.facts, tuple(flag.name for flag in EchoFlag), total, names, counts, clean)
 
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a8a8a")
@@ -355,9 +355,9 @@ def draw_flags(
     """Writes a picture of the points per flag; log: logarithmic axis of counts."""
     with open_picture(target, (8.0, 5.2), overwrite=overwrite) as figure:
         axes = figure.subplots()
-        flags, counts = ["no flag", *found.flags], np.array([found.clean, *found.counts.tolist()])
+        flags, counts = ["no flag", *found.names], np.array([found.clean, *found.counts.tolist()])
         place = np.arange(len(flags))
-        axes.barh(place, counts, color=["#8a8a8a", *[SERIES[0]] * len(found.flags)], height=0.7)
+        axes.barh(place, counts, color=["#8a8a8a", *[SERIES[0]] * len(found.names)], height=0.7)
         axes.set_yticks(place, flags)
         axes.invert_yaxis()
         axes.grid(axis="y", visible=False)
@@ -370,7 +370,7 @@ def draw_flags(
         axes.set_xlim(0, max(int(counts.max(initial=1)), 1) * (10.0 if log else 1.25))
         axes.xaxis.set_major_formatter(lambda value, _: _count_text(value))
         axes.set_xlabel("points [-]")
-        name = name_clouds(found.names)
+        name = name_clouds(found.clouds)
         title = f"{name}   {plain_text(found.facts.name, 40)}\n"
         title += f"{found.total.values:,} points; a point may have several flags"
         axes.set_title(fit_text(figure, title, 6.0, size=10.5))
