@@ -428,14 +428,13 @@ class Judge:
         reason, n_samples, keys, short, packed = judge_packets(fields, self._rules, geometry)
         if overfull is not None and len(overfull):
             place = np.minimum(np.searchsorted(overfull, keys), len(overfull) - 1)
-            reason[(overfull[place] == keys) & (reason == Reason.USABLE)] = Reason.OVERFULL
+            full = (overfull[place] == keys) & (reason == Reason.USABLE)
+            reason[full], n_samples[full], short[full] = Reason.OVERFULL, 0, False
         if self._rules.packs.any():
             rows = np.flatnonzero(self._rules.packs[fields["index"]] & (reason == Reason.USABLE))
             index, offset, size = (fields[name][rows] for name in ("index", "offset", "size"))
-            whole = self._decode(index, offset, size.astype(np.int64))
-            reason[rows[~whole]] = Reason.DAMAGED
-        bad = reason != Reason.USABLE
-        n_samples[bad], short[bad] = 0, False
+            broken = rows[~self._decode(index, offset, size.astype(np.int64))]
+            reason[broken], n_samples[broken], short[broken] = Reason.DAMAGED, 0, False
         return Judged(reason, n_samples, keys, short, packed)
 
     def _decode(self, index: np.ndarray, offset: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -604,8 +603,9 @@ class _Votes:
         self.up += int(np.count_nonzero((up >= LEAST_HEIGHT) & (up >= CLEAR * down)))
         self.down += int(np.count_nonzero((down >= LEAST_HEIGHT) & (down >= CLEAR * up)))
         self.number += values.size
-        self.squares += float(np.sum(values**2))
-        self.cubes += float(np.sum(values**3))
+        squares = values * values
+        self.squares += float(np.sum(squares))
+        self.cubes += float(np.sum(squares * values))  # a power of three takes as long as all the rest
 
     def join(self, other: _Votes) -> _Votes:
         """Return both together."""

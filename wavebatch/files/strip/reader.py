@@ -18,7 +18,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.order import distinct, even_places, quantile
+from wavebatch.core.order import distinct, even_places, find_order, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
@@ -194,8 +194,13 @@ class StripReader(Closing):
         """Return the number of units."""
         return -(-self.facts.header.point_count // self._unit_points)
 
-    def read_points(self, start: int, stop: int) -> np.ndarray:
-        """Return records [start, stop) of the file."""
+    def read_points(self, start: int, stop: int, scan: StripScan | None = None) -> np.ndarray:
+        """Return records [start, stop) of the file; those of one unit are not decoded again where scan keeps them."""
+        if scan is not None:
+            unit = int(np.searchsorted(scan.borders, start, "right")) - 1
+            kept = scan.decoded.read(unit)[start - scan.borders[unit] : stop - scan.borders[unit]]
+            if len(kept) == stop - start:
+                return kept
         return self._points.read(start, stop)
 
     def read_unit(self, number: int, scan: StripScan) -> Unit:
@@ -215,16 +220,7 @@ class StripReader(Closing):
         sizes = np.concatenate([points["wavepacket_size"][own], entries["record"]["wavepacket_size"]])
         n_samples = np.concatenate([judged.n_samples[own], n_samples])
         packed = np.concatenate([judged.packed[own], packed])
-        # Packets in the order of their owners: the first point with each.
-        by_index = np.argsort(index, kind="stable")
-        groups = scanner.group_keys(keys[by_index])
-        lead = by_index[groups.order[groups.starts]]
-        order = np.argsort(index[lead], kind="stable")
-        rank = np.empty(len(lead), np.int32)
-        rank[order] = np.arange(len(lead), dtype=np.int32)
-        packet_of = np.empty(len(keys), np.int32)
-        packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
-        lead = lead[order]
+        lead, packet_of = _group_packets(keys, index)
         packets = PacketTable(
             digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
             offset=keys[lead] >> packet_check.INDEX_BITS,
@@ -363,7 +359,8 @@ class _Geometry:
         packet_of = np.concatenate([unit.packet_of_point, unit.packet_of_context])
         index = np.concatenate([np.arange(unit.start, unit.start + len(unit.points)), unit.context_index])
         used = np.flatnonzero(packet_of >= 0)
-        self._entry = used[np.lexsort((index[used], packet_of[used]))]
+        order = find_order(packet_of[used], index[used])
+        self._entry = used if order is None else used[order]
         self._index = index[self._entry]
         self._counts = np.bincount(packet_of[used], minlength=len(unit.packets))
         self._starts = np.cumsum(self._counts) - self._counts
@@ -412,6 +409,23 @@ def read_scanner(records: np.ndarray) -> np.ndarray | None:
     return (records["classification_flags"] >> 4) & 3
 
 
+def _group_packets(keys: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the owners of the packets of points (n,), in their order, and the packet of each point, i4 (n,)."""
+    packet_of = np.empty(len(keys), np.int32)
+    if np.all(index[1:] > index[:-1]) and np.all(keys[1:] >= keys[:-1]):  # as most vendors write them
+        groups = scanner.group_keys(keys)
+        packet_of[:] = np.repeat(np.arange(len(groups.starts), dtype=np.int32), groups.counts)
+        return groups.starts, packet_of
+    by_index = np.argsort(index, kind="stable")
+    groups = scanner.group_keys(keys[by_index])
+    lead = by_index[groups.order[groups.starts]]
+    order = np.argsort(index[lead], kind="stable")
+    rank = np.empty(len(lead), np.int32)
+    rank[order] = np.arange(len(lead), dtype=np.int32)
+    packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
+    return lead[order], packet_of
+
+
 MOST_SLICES = 4096
 """Most places of a strip at which rays are read."""
 
@@ -445,6 +459,8 @@ class RaySample(NamedTuple):
     """Away from the sensor, any length, f8 (n, 3)."""
     weight: np.ndarray
     """Relative weight (inverse variance) of the direction, f8 (n,)."""
+    vector: np.ndarray = np.empty((0, 3))
+    """Of pairs: the packet's, away from the sensor, any length, f8 (n, 3); NaN where it is no direction."""
 
 
 def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySample]:
@@ -455,11 +471,13 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
     kept, pairs = [], []
 
     def take(start: int, stop: int) -> float:
-        points = reader.read_points(start, stop)
+        points = reader.read_points(start, stop, scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
-        pairs.append(_pair_returns(xyz, time))
+        away = _read_vectors(points, scan)
+        pairs.append(_pair_returns(xyz, time, away))
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
-        kept.append(_read_vectors(points[rows], xyz[rows], time[rows], scan))
+        rows = rows[np.isfinite(time[rows]) & np.isfinite(xyz[rows]).all(axis=1) & np.isfinite(away[rows, 0])]
+        kept.append(RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)), away[rows]))
         return float(time[0])
 
     units = _choose_units(scan)
@@ -485,7 +503,7 @@ def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
     ratios = [np.empty(0)]
     units = _choose_units(scan)
     for start, stop in units[:: max(1, -(-len(units) // SCALE_PLACES))]:
-        points = reader.read_points(start, min(start + SLICE_POINTS, stop))
+        points = reader.read_points(start, min(start + SLICE_POINTS, stop), scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
         with np.errstate(all="ignore"):
             vectors = packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
@@ -509,29 +527,28 @@ def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
     return [(int(borders[i]), int(borders[i + 1])) for i in chosen.tolist() if borders[i + 1] > borders[i]]
 
 
-def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> RaySample:
+def _read_vectors(points: np.ndarray, scan: StripScan) -> np.ndarray:
+    """Vectors away from the sensor, f8 (n, 3); NaN where they are no directions."""
     with np.errstate(all="ignore"):
         away = -packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
         ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
         good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
-    good &= np.isfinite(time) & np.isfinite(xyz).all(axis=1)
-    rows = np.flatnonzero(good)
-    return RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)))
+    return np.where(good[:, None], away, np.nan)
 
 
-def _pair_returns(xyz: np.ndarray, time: np.ndarray) -> RaySample:
+def _pair_returns(xyz: np.ndarray, time: np.ndarray, away: np.ndarray) -> RaySample:
     """Rays from neighbouring returns of one pulse; returns far apart get a large weight."""
     place = np.flatnonzero(time[1:] == time[:-1])
     apart = xyz[place + 1] - xyz[place]
     square = (apart * apart).sum(axis=1)
     far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
     middle = 0.5 * (xyz[place[far]] + xyz[place[far] + 1])
-    return RaySample(time[place[far]], middle, apart[far], square[far])
+    return RaySample(time[place[far]], middle, apart[far], square[far], away[place[far]])
 
 
 def _join(parts: list[RaySample]) -> RaySample:
     if not parts:
-        return RaySample(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+        return RaySample(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty((0, 3)))
     joined = [np.concatenate(values) for values in zip(*parts, strict=True)]
     order = np.argsort(joined[0], kind="stable")
     return RaySample(*(values[order] for values in joined))

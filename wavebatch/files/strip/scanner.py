@@ -417,7 +417,11 @@ class Scanner:
         self._facts, self._source, self._unit_points, self._sizes = facts, source, unit_points, sizes
         self._packets = packets
         self._judge = check.Judge(facts)
-        self._form = check.find_form(self._take_first())
+        most = min(_FIRST_POINTS, _FIRST_BYTES // facts.header.point_length, facts.header.point_count)
+        self._head = source.read(0, most)
+        """The first points, until they are scanned: those of a small strip take longer to decode than to scan."""
+        has_packet = (self._head["wavepacket_index"] > 0) & (self._head["wavepacket_size"] > 0)
+        self._form = check.find_form(self._head[has_packet])
         self._units = -(-facts.header.point_count // unit_points)
         self._found = ScanPart(facts, self._form, self._units, sizes)
         self._keeps = facts.header.compressed
@@ -427,12 +431,6 @@ class Scanner:
         """Number of the first unit that is scanned."""
         none = np.empty(0, np.int64)
         self._window = _Near(none.astype(np.uint64), none, none, np.empty(0, facts.dtype), 0)
-
-    def _take_first(self) -> np.ndarray:
-        """Those of the first points that have packets."""
-        most = min(_FIRST_POINTS, _FIRST_BYTES // self._facts.header.point_length)
-        points = self._source.read(0, min(self._facts.header.point_count, most))
-        return points[(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
 
     def scan_units(self, first: int, last: int) -> ScanPart:
         """Scan the units [first, last)."""
@@ -478,7 +476,7 @@ class Scanner:
         begin, end = first * step, min(last * step, count)
         rest = self._source.read(max(begin - self._sizes.window, 0), begin)
         for at in range(begin, end, step):
-            part = self._source.read(at, min(at + step, count))
+            part = self._read(at, min(at + step, count))
             cut = _find_cut(rest, part) if at else 0
             if at == begin:
                 # The window begins with the last points before the first unit.
@@ -496,6 +494,13 @@ class Scanner:
             cut = _find_cut(rest, after) if len(after) else 0
             yield borders[-1], join_records(rest, after[:cut]) if cut else rest
             borders.append(end + cut)
+
+    def _read(self, start: int, stop: int) -> np.ndarray:
+        """Points [start, stop); the first ones are there."""
+        here, self._head = self._head[start:stop], self._head if stop < len(self._head) else self._head[:0]
+        if not len(here):
+            return self._source.read(start, stop)
+        return here if len(here) == stop - start else np.concatenate([here, self._source.read(start + len(here), stop)])
 
     def _keep(self, unit: int, points: np.ndarray) -> None:
         """Keep the points of a compressed strip: to decode them again takes twenty times as long as to read them."""
