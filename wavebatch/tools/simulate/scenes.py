@@ -24,8 +24,17 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.kernels.physics.radiometry import transmit
-from wavebatch.tools.simulate import render
-from wavebatch.tools.simulate.render import AIR_SPEED, GROUND, FlightLine, PulseModel, Recording, SceneRays
+from wavebatch.tools.simulate.render import (
+    AIR_SPEED,
+    GROUND,
+    FlightLine,
+    PulseModel,
+    Recording,
+    SceneRays,
+    paint_echoes,
+    record_counts,
+    trace_rays,
+)
 
 MARGIN = 6.0
 """Distance that echoes keep from the ends of the window, in sigma of the pulse."""
@@ -602,10 +611,10 @@ def simulate_pulses(
 ) -> Simulated:
     """Block, truth and rays of pulses [first, first + n)."""
     recording = scene.recording
-    rays = render.trace_rays(flight or scene.flight or FlightLine(), scene.terrain, first + np.arange(n))
+    rays = trace_rays(flight or scene.flight or FlightLine(), scene.terrain, first + np.arange(n))
     drawn = scene.draw(rng, n, rays)
-    signal = render.paint_echoes(recording, n, drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
-    counts = render.record_counts(recording, signal, rng, drawn.constant)
+    signal = paint_echoes(recording, n, drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
+    counts = record_counts(recording, signal, rng, drawn.constant)
     real = slice(None) if drawn.ghost is None else ~drawn.ghost
     truth = EchoTable.build(drawn.waveform[real], drawn.time[real], drawn.amplitude[real], drawn.sigma[real])
     truth = flag_truth(truth, recording)
