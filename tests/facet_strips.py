@@ -59,7 +59,8 @@ class Sensor:
     energy_spread: float = 0.0
     """Relative standard deviation of the energy of shots."""
     store_energy: bool = False
-    """Write the energy of each shot as the extra byte `pulse_energy`."""
+    """Write the energy of each shot as an extra byte."""
+    energy_column: str = "pulse_energy"
     vendor: str = ""
     """Write reflectances of surfaces that face the sensor, with 5 % noise, as the extra byte Reflectance: dB, share or
     percent."""
@@ -141,7 +142,7 @@ def write_strip(
     sent = strength * energy[:, None]
     if light is not None:
         sent = sent * light(seconds)[:, None]
-    wave = _render(distance / C_AIR - first[:, None], sent, sensor)
+    wave = render(distance / C_AIR - first[:, None], sent, sensor)
     wave = wave if receive is None else receive(wave)
     clean = np.rint(20.0 + wave + sensor.noise * rng.standard_normal(wave.shape))
     samples = np.clip(clean, 0, (1 << sensor.bits) - 1).astype(np.uint16 if sensor.bits > 8 else np.uint8)
@@ -150,7 +151,7 @@ def write_strip(
     stored = Stored(origin, ray, first, hit, facing)
     if store is not None:
         store(stored)
-    _write(path, sensor, stored, seconds, channel, samples, energy)
+    write_pulses(path, sensor, stored, seconds, channel, samples, energy)
     return path
 
 
@@ -194,7 +195,7 @@ def _trace(origin: np.ndarray, ray: np.ndarray, facets: Sequence[Facet], sensor:
     return best, sensor.light * strength * air / best**2 / len(offsets)
 
 
-def _render(time: np.ndarray, strength: np.ndarray, sensor: Sensor) -> np.ndarray:
+def render(time: np.ndarray, strength: np.ndarray, sensor: Sensor) -> np.ndarray:
     grid = np.arange(sensor.n_samples) * sensor.spacing
     wave = np.zeros((len(time), len(grid)))
     for k in range(time.shape[1]):
@@ -204,14 +205,14 @@ def _render(time: np.ndarray, strength: np.ndarray, sensor: Sensor) -> np.ndarra
     return wave
 
 
-def _write(path, sensor, stored, seconds, channel, samples, energy) -> None:
+def write_pulses(path, sensor, stored, seconds, channel, samples, energy) -> None:
     origin, ray, first, hit, facing = (getattr(stored, one.name) for one in fields(stored))
     indices = [1] if sensor.scanners else list(sensor.gains)
     digitizers = [
         Digitizer(index, sensor.bits, sensor.n_samples, sensor.spacing, sensor.descriptor_gain) for index in indices
     ]
     kind = {"version": "1.4", "point_format": 9} if sensor.scanners else {"version": "1.3", "point_format": 4}
-    extra = [ExtraRecord.build("pulse_energy", "f4", "")] if sensor.store_energy else []
+    extra = [ExtraRecord.build(sensor.energy_column, "f4", "energy of the pulse")] if sensor.store_energy else []
     if sensor.vendor:
         extra.append(ExtraRecord.build("Reflectance", "i2", "dB", no_data=-32768, scale=0.01))
     with FullwaveWriter(
@@ -229,7 +230,7 @@ def _write(path, sensor, stored, seconds, channel, samples, energy) -> None:
             points["xyz"[axis] + "_t"] = -ray[:, axis] * C_AIR / 1000.0
         points["gps_time"] = sensor.time + seconds
         if sensor.store_energy:
-            points["pulse_energy"] = energy
+            points[sensor.energy_column] = energy
         if sensor.vendor:
             facing = facing * (1 + 0.05 * np.random.default_rng(9).standard_normal(len(facing)))
             value = {"dB": 10 * np.log10(facing), "share": facing, "percent": 100 * facing}[sensor.vendor]

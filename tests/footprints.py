@@ -10,15 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from facet_strips import _render
+from facet_strips import C_AIR, EAST, NORTH, START, Sensor, Stored, render, write_pulses
 
-from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.las.header import ExtraRecord
-from wavebatch.files.strip.packets import FullwaveWriter
-
-SPEED = 0.299792458 * 0.9997 / 2
-"""One-way metres per two-way ns, in air."""
-EAST, NORTH, START = 500_000.0, 5_400_000.0, 300_000_000.0
+__all__ = ["EAST", "NORTH", "Flight", "Plane", "Truth", "match", "roofs", "write_strip"]
 
 
 @dataclass(frozen=True)
@@ -113,13 +107,16 @@ def write_strip(path: Path, planes: Sequence[Plane], flight: Flight, pulses: int
     energy = 1 + flight.energy_spread * rng.standard_normal(pulses)
     strength = flight.light * share * reflect[plane] * facing * 10.0 ** (-2e-4 * flight.air * distance) / distance**2
     strength *= energy[:, None]
-    first = distance.min(axis=1) / SPEED - 12.0 - rng.uniform(0, 1, pulses)
-    wave = _render(distance / SPEED - first[:, None], strength, flight)
+    first = distance.min(axis=1) / C_AIR - 12.0 - rng.uniform(0, 1, pulses)
+    wave = render(distance / C_AIR - first[:, None], strength, flight)
     counts = np.rint(20.0 + wave + flight.noise * rng.standard_normal(wave.shape))
     counts = np.clip(counts, 0, (1 << flight.bits) - 1).astype(np.uint16 if flight.bits > 8 else np.uint8)
     hit = _trace(origin, ray[:, None], planes)[0][:, 0]
     noisy = hit + flight.point_error * rng.standard_normal(pulses)
-    _write(path, flight, origin, ray, seconds, counts, first, noisy, energy)
+    sensor = Sensor(bits=flight.bits, n_samples=flight.n_samples, spacing=flight.spacing, energy_column="shot_energy",
+                    store_energy=flight.store_energy)  # fmt: skip
+    stored = Stored(origin, ray, first, noisy, facing)
+    write_pulses(path, sensor, stored, seconds, np.ones(pulses, int), counts, 7.5 * energy)
     incidence = np.degrees(np.arccos(np.clip(middle_facing[:, 0], -1, 1)))
     pure = (plane == middle).all(axis=1)
     return Truth(START + seconds, hit, incidence, reflect[middle[:, 0]], middle[:, 0], pure, energy)
@@ -169,25 +166,3 @@ def _trace(origin: np.ndarray, unit: np.ndarray, planes: Sequence[Plane]) -> tup
         facing = np.where(hit, fall / np.sqrt(1 + sx * sx + sy * sy), facing)
     assert np.isfinite(best).all(), "every sub-ray must meet a plane"
     return best, facing, plane
-
-
-def _write(path, flight, origin, ray, seconds, counts, first, hit, energy) -> None:
-    digitizer = Digitizer(1, flight.bits, flight.n_samples, flight.spacing)
-    extra = [ExtraRecord.build("shot_energy", "f4", "energy of the pulse")] if flight.store_energy else []
-    with FullwaveWriter(
-        path, version="1.3", point_format=4, internal=True, digitizers=[digitizer], offsets=(EAST, NORTH, 0.0),
-        extra_bytes=extra, overwrite=True,
-    ) as writer:  # fmt: skip
-        offset = writer.write_packets(counts, 1)
-        points = np.zeros(len(counts), writer.dtype)
-        for axis, name in enumerate("XYZ"):
-            points[name] = np.rint((origin + hit[:, None] * ray)[:, axis] / 0.001)
-            points["xyz"[axis] + "_t"] = -ray[:, axis] * SPEED / 1000.0
-        points["gps_time"], points["bit_fields"] = START + seconds, 1 | (1 << 3)
-        points["wavepacket_index"], points["wavepacket_offset"] = 1, offset
-        points["wavepacket_size"] = counts.shape[1] * counts.itemsize
-        points["return_point_wave_location"] = (hit / SPEED - first) * 1000.0
-        if flight.store_energy:
-            points[writer.dtype.names[-1]] = energy * 7.5
-        writer.write_points(points)
-        writer.commit()

@@ -281,8 +281,3 @@ def fit_rays(xyz, starts, angle, source):
             ray = np.array([*(np.polyval(line, tangent[k]) for line in lines), -1.0])
         rays.append(ray / np.linalg.norm(ray))
     return rays
-
-
-def near_tiles(low, high, point, buffer):
-    """Numbers of the boxes that a point lies in after they grew by the buffer on all sides."""
-    return [i for i in range(len(low)) if all(low[i] - buffer <= point) and all(point < high[i] + buffer)]

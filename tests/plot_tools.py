@@ -1,7 +1,7 @@
 """What the tests of pictures share: simulated waveforms, chains and clouds of any columns."""
 
-import laspy
 import numpy as np
+from writer_tools import write_points
 
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
@@ -30,19 +30,11 @@ def make_chain(decomposer, **parameters):
 def write_cloud(path, *, seed=1, n=POINTS, point_format=6, **columns):
     """A cloud of n points over 40 m x 25 m with the given extra columns: (values, no-data, scale) each."""
     rng = np.random.default_rng(seed)
-    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format >= 6 else "1.2")
-    header.scales, header.offsets = (0.001,) * 3, (500_000.0, 5_400_000.0, 0.0)
-    for name, (stored, no_data, scale, description) in columns.items():
-        scaling = {} if scale is None else {"scales": np.array([scale]), "offsets": np.array([0.0])}
-        header.add_extra_dim(laspy.ExtraBytesParams(name, stored.dtype, description, no_data=no_data, **scaling))
-    las = laspy.LasData(header)
-    las.points = laspy.ScaleAwarePointRecord.zeros(n, header=header)
-    las.x, las.y, las.z = 500_000 + rng.uniform(0, 40, n), 5_400_000 + rng.uniform(0, 25, n), rng.normal(100, 5, n)
-    las.intensity = rng.integers(0, 3000, n)
-    las.return_number = rng.integers(1, 4, n)
+    xyz = np.stack([500_000 + rng.uniform(0, 40, n), 5_400_000 + rng.uniform(0, 25, n), rng.normal(100, 5, n)], axis=1)
+    fields = {"intensity": rng.integers(0, 3000, n), "return_number": rng.integers(1, 4, n)}
     if point_format >= 6:
-        las.scan_angle = rng.integers(-3000, 3000, n)
-    for name, (stored, *_) in columns.items():
-        las.points.array[name] = stored
-    las.write(path)
+        fields["scan_angle"] = rng.integers(-3000, 3000, n)
+    write_points(path, xyz, point_format=point_format, offsets=(500_000.0, 5_400_000.0, 0.0),
+                 extra=[(name, stored.dtype, *how) for name, (stored, *how) in columns.items()],
+                 raw=[(name, stored) for name, (stored, *_) in columns.items()], **fields)  # fmt: skip
     return path

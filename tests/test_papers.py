@@ -181,7 +181,6 @@ def test_figures_have_the_digits_that_they_deserve(load):
 
 
 def test_the_page_has_every_table_and_picture(load, tmp_path, monkeypatch):
-    pytest.importorskip("matplotlib")
     page = load("page")
     rows = [["figure", "1", "-", "2", "0..3", "ok"], ["b", "-", "-", "9", "1", "FAIL"]]
     tables = [{"title": "one <table>", "rows": rows}]
@@ -209,7 +208,6 @@ def test_the_page_has_every_table_and_picture(load, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_page_is_shown_by_a_browser_without_complaints(load, tmp_path, monkeypatch):
     """With real pictures of small strips: every one is loaded, as wide as the window or less, and nothing is wider."""
-    pytest.importorskip("matplotlib")
     if BROWSER is None:
         pytest.skip("no headless browser is installed")
     page = load("page")
@@ -265,7 +263,6 @@ def test_long_tables_are_folded_unless_a_figure_is_not_accepted(load):
     ["draw_cases", "draw_coefficients", "draw_fan", "draw_noise", "draw_old_records", "draw_peak", "draw_record"],
 )
 def test_figures_are_drawn(name, load, tmp_path):
-    pytest.importorskip("matplotlib")
     target = tmp_path / "p.png"
     assert load("page").draw_figure(name, tmp_path, 1, target) == ""
     assert target.read_bytes().startswith(b"\x89PNG") and target.stat().st_size > 20_000

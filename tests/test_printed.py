@@ -130,7 +130,6 @@ def make_inputs(line):
 @pytest.mark.skipif(os.name == "nt" or shutil.which("make") is None, reason="lines are for a POSIX shell with make")
 @pytest.mark.parametrize("page", SHOWN)
 def test_every_line_runs_on_an_empty_disk(page, disk):
-    pytest.importorskip("matplotlib")
     wrong = []
     for line in SHOWN[page]:
         if line in ELSEWHERE:

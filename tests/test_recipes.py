@@ -100,8 +100,6 @@ def test_recipe(folder, title):
     missing = sorted({name for name in _programs(text) if name not in PROGRAMS and shutil.which(name) is None})
     if missing:
         pytest.skip(f"not installed: {', '.join(missing)}")
-    if "wavebatch grid" in text:
-        pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     for name in ("clouds", *(path.name for path in folder.glob("*.tif"))):
         path = folder / name
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)

@@ -79,6 +79,33 @@ def write_source(
     return points
 
 
+def write_points(
+    path: Path, xyz, *, point_format=6, scale=0.001, offsets=(0, 0, 0), extra=(), vlrs=(), raw=(), **fields
+) -> laspy.LasData:
+    """A cloud as laspy writes it: points (n, 3), fields by their names.
+
+    extra: columns as (name, type, no-data, scale, description), of which the last ones may be missing.
+    raw: (name, counts as they are stored).
+    """
+    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.2")
+    header.scales, header.offsets = np.full(3, scale), np.array(offsets, float)
+    for one in extra:
+        name, kind, no_data, step, description = (*one, *(None, None, "")[len(one) - 2 :])
+        steps = {} if step is None else {"scales": np.array([step]), "offsets": np.array([0.0])}
+        none = None if no_data is None else np.atleast_1d(no_data)
+        header.add_extra_dim(laspy.ExtraBytesParams(name, kind, description, no_data=none, **steps))
+    header.vlrs.extend(vlrs)
+    cloud = laspy.LasData(header)
+    cloud.points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header)
+    cloud.x, cloud.y, cloud.z = np.transpose(xyz)
+    for name, values in fields.items():
+        cloud[name] = values
+    for name, values in raw:
+        cloud.points.array[name] = values
+    cloud.write(path)
+    return cloud
+
+
 def facts_of(path: Path) -> StripFacts:
     """What the reader finds about a strip."""
     with StripReader(path) as reader:

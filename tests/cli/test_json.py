@@ -124,8 +124,6 @@ def test_documents_of_commands(folder, riegl, tmp_path, monkeypatch, line):
              "ROOT": PAGE.parents[1], "SIM": folder / "sim.las", "CUBE": folder / "cube.npz",
              "VOXELS": folder / "voxels.npz", "TARGETS": "t.csv"}  # fmt: skip
     Path("t.csv").write_text("name,reflectance,x,y,radius\ngrey,0.3,548363.742,5389952.964,3\n")
-    if line.startswith("grid"):
-        pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     found = _print(*(names.get(word, word) for word in line.split()))
     for document in found if isinstance(found, list) else [found]:
         _hold(document, f"wavebatch.{CASES[line]}")

@@ -5,10 +5,9 @@ import time
 from wavebatch.core.process import Seconds
 
 
-def test_waiting_is_no_time_of_a_processor(monkeypatch):
-    processor, wall = iter([10.0, 10.5]), iter([100.0, 103.0])
-    monkeypatch.setattr(time, "process_time", lambda: next(processor))
-    monkeypatch.setattr(time, "perf_counter", lambda: next(wall))
+def test_waiting_is_no_time_of_a_processor():
     start = Seconds.now()
-    assert Seconds.now() - start == Seconds(0.5, 3.0)
+    time.sleep(0.1)
+    spent = Seconds.now() - start
+    assert 0 <= spent.processor < 0.1 <= spent.wall
     assert Seconds(0.5, 3.0) + Seconds(1.0, 1.0) == Seconds(1.5, 4.0)

@@ -160,7 +160,6 @@ def test_bytes_that_are_no_sbet(tmp_path):
 
 @pytest.mark.parametrize(("heading", "wander"), [(np.inf, np.inf), (1e308, -1e308), (np.nan, 0.0)])
 def test_a_damaged_record_of_an_sbet_is_left_out_without_a_warning(tmp_path, heading, wander):
-    pytest.importorskip("pyproj")
     path = write_sbet(tmp_path / "s.sbet")
     sound = read_trajectory(path, crs="EPSG:32633", lever_arm=(1.0, 0.0, 0.0))
     records = np.fromfile(path, SBET_RECORD)
@@ -171,7 +170,6 @@ def test_a_damaged_record_of_an_sbet_is_left_out_without_a_warning(tmp_path, hea
 
 
 def test_sbet_is_projected(tmp_path):
-    pytest.importorskip("pyproj")
     found = read_trajectory(write_sbet(tmp_path / "s.sbet"), crs="EPSG:32632")
     # UTM zone 32: 11 E, 48 N by Snyder's series.
     assert found.xyz[0] == pytest.approx([649_168.5, 5_318_366.0, 1500.0], abs=200.0)

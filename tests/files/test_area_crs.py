@@ -126,7 +126,6 @@ def test_small_coordinates_inside_of_a_strip_are_those_of_the_strip(strip, plain
         assert place_rings(file, [box], path, _local(path))[0].tolist() == box.tolist()
     alone = read_area_file("a.geojson", None, boxes[1:])  # can only be in degrees
     if has_crs:
-        pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
         assert np.abs(place_rings(alone, boxes[1:], path, _local(path))[0]).max() > 1e6
     else:
         with pytest.raises(InputError, match="is in degrees"):
@@ -134,7 +133,6 @@ def test_small_coordinates_inside_of_a_strip_are_those_of_the_strip(strip, plain
 
 
 def test_one_point_at_the_origin_does_not_make_degrees_coordinates_of_the_strip(strip):
-    pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
     header = read_header(strip)
     box = _project(_box(strip), "EPSG:32633", "EPSG:4326")
     file = read_area_file("a.geojson", None, [box])
@@ -201,7 +199,6 @@ def test_degrees_of_a_strip_in_degrees_stay(plain, tmp_path, monkeypatch):
 
 
 def test_an_unknown_crs_is_one_line(strip, tmp_path):
-    pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
     (polygon,) = load_polygons(_write(tmp_path / "a.geojson", _box(strip), "my grid"))
     with pytest.raises(InputError, match="a.geojson: cannot be projected into the CRS of .*utm.las") as caught:
         polygon.place(strip, read_header(strip))
@@ -245,7 +242,6 @@ def test_a_crs_counts_wherever_it_stands(tmp_path):
 
 
 def test_resume_sees_another_crs_of_the_same_corners(strip, tmp_path):
-    pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
     file, words = tmp_path / "a.geojson", ["run", strip, "-o", tmp_path / "o", "--polygon", tmp_path / "a.geojson"]
     said = []
     for crs in ("EPSG:32633", "urn:ogc:def:crs:EPSG::32633", "EPSG:23033", "EPSG:23033"):
@@ -310,7 +306,6 @@ POINTS = np.array([[500000.0, 5400000.0, 312.3456], [500010.0, 5400020.5, 301.0]
 
 
 def test_longitude_and_latitude():
-    pytest.importorskip("pyproj")
     for code, longitude in ((32632, 9.0), (25833, 15.0)):
         crs = plan_crs("a.las", build_utm(code), "wgs84")
         (x, y, z), (other, _, _) = crs.place(POINTS)
@@ -328,7 +323,6 @@ def test_riegls_metres_in_the_geographic_crs_are_degrees():
     text, _ = read_crs(path, header)
     found = read_crs_definition(path, header)
     assert text.count("Meter") == 2 and found.count("Meter") == 1 and found.count('UNIT["degree"') == 1
-    pytest.importorskip("pyproj")
     ((longitude, latitude, _),) = plan_crs(path, found, "wgs84").place(np.array([header.mins]))
     assert (longitude, latitude) == (pytest.approx(15.656, abs=0.01), pytest.approx(48.66, abs=0.01))
 

@@ -8,6 +8,7 @@ import laspy
 import numpy as np
 import pytest
 from strips import make_raw
+from writer_tools import write_points
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, RETURN_DTYPE, CloudReader, ColumnReader, read_cloud
@@ -17,19 +18,10 @@ from wavebatch.files.las.header import STANDARD_DTYPES
 def write_cloud(path, point_format, n=300, extra=()):
     """A cloud of random points; extra: names of f4 dimensions."""
     rng = np.random.default_rng(point_format)
-    header = laspy.LasHeader(version="1.4" if point_format > 5 else "1.2", point_format=point_format)
-    header.scales, header.offsets = [0.01] * 3, [5.0, 6.0, 7.0]
-    for name in extra:
-        header.add_extra_dim(laspy.ExtraBytesParams(name, "f4"))
-    cloud = laspy.LasData(header)
-    cloud.points = laspy.ScaleAwarePointRecord.zeros(n, header=header)
-    for name in ("X", "Y", "Z"):
-        cloud.points.array[name] = rng.integers(-1000, 1000, n)
-    cloud.points.array["intensity"] = rng.integers(0, 65535, n)
-    for name in extra:
-        cloud.points.array[name] = rng.random(n)
-    cloud.write(path)
-    return cloud
+    xyz = [5.0, 6.0, 7.0] + 0.01 * rng.integers(-1000, 1000, (n, 3))
+    return write_points(path, xyz, point_format=point_format, scale=0.01, offsets=(5, 6, 7),
+                        extra=[(name, "f4") for name in extra],
+                        intensity=rng.integers(0, 65535, n), **{name: rng.random(n) for name in extra})  # fmt: skip
 
 
 def read_all(path):
@@ -69,18 +61,9 @@ def test_the_piece_is_small_where_records_are_long(tmp_path):
 
 def test_extra_bytes_that_are_no_column_of_that_name_are_left_alone(tmp_path):
     """A vector called amplitude, flags that are numbers, a scale that is none: no data, no warning."""
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    scaled = {"scales": np.array([1e308]), "offsets": np.array([0.0])}
-    header.add_extra_dim(laspy.ExtraBytesParams("amplitude", "3f4"))
-    header.add_extra_dim(laspy.ExtraBytesParams("echo_flags", "f4"))
-    header.add_extra_dim(laspy.ExtraBytesParams("pulse width", "u2", **scaled))
-    header.add_extra_dim(laspy.ExtraBytesParams("range_err", "f8"))
-    cloud = laspy.LasData(header)
-    cloud.points = laspy.ScaleAwarePointRecord.zeros(3, header=header)
-    cloud.points.array["echo_flags"] = [np.nan, 1e30, -1]
-    cloud.points.array["pulse width"] = 5
-    cloud.points.array["range_err"] = [1e300, np.inf, 0.25]
-    cloud.write(tmp_path / "a.las")
+    extra = [("amplitude", "3f4"), ("echo_flags", "f4"), ("pulse width", "u2", None, 1e308), ("range_err", "f8")]
+    raw = [("echo_flags", [np.nan, 1e30, -1]), ("pulse width", 5), ("range_err", [1e300, np.inf, 0.25])]
+    write_points(tmp_path / "a.las", np.zeros((3, 3)), extra=extra, raw=raw)
     with CloudReader(tmp_path / "a.las") as reader:
         assert reader.columns == ("echo_width", "range_err")
         (rows,) = reader.read_pieces()
@@ -100,15 +83,8 @@ def test_packet_vectors_that_are_no_numbers_are_none(tmp_path, value):
 
 def write_renamed(path, types, columns):
     """A cloud with an account of the run that names `columns`, whose extra bytes are of `types`."""
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    for name, kind in types.items():
-        header.add_extra_dim(laspy.ExtraBytesParams(name, kind))
-    header.vlrs.append(laspy.VLR("wavebatch", 1, record_data=json.dumps({"columns": columns}).encode()))
-    cloud = laspy.LasData(header)
-    cloud.points = laspy.ScaleAwarePointRecord.zeros(4, header=header)
-    for name in types:
-        cloud.points.array[name] = 2
-    cloud.write(path)
+    account = laspy.VLR("wavebatch", 1, record_data=json.dumps({"columns": columns}).encode())
+    write_points(path, np.zeros((4, 3)), extra=types.items(), vlrs=[account], raw=[(name, 2) for name in types])
     return path
 
 

@@ -293,8 +293,6 @@ def test_tools_leave_gaps_out(whole, tmp_path):
 
 @pytest.mark.slow
 def test_a_strip_with_gaps_runs_and_pictures_show_them(whole, tmp_path):
-    pytest.importorskip("matplotlib")
-
     strip = cut(whole, tmp_path / "gaps.las", 0, 7)
     assert run_one(strip, tmp_path).status == "written"
     report = json.loads((tmp_path / "gaps.report.json").read_text("utf-8"))

@@ -179,9 +179,15 @@ def test_cut_laz_files(tmp_path, cut, point_format):
     refused(path, "LAZ chunks|waveform record at byte")
 
 
-def test_a_chunk_that_does_not_fit_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(read_points, "MAX_CHUNK_BYTES", 100)
-    refused(laz_of(tmp_path)[1], "chunks are too large|table of LAZ chunks")
+def test_a_chunk_that_does_not_fit_memory_is_refused(tmp_path):
+    """All points in one chunk of half a gigabyte, by the table."""
+    raw, path = laz_of(tmp_path, variable=True)
+    data, at = path.read_bytes(), payload_at(path)
+    begin = struct.unpack_from("<I", data, 96)[0]
+    with open(path, "r+b") as file:
+        file.seek(struct.unpack_from("<q", data, begin)[0])
+        lazrs.write_chunk_table(file, [(len(raw.points), 2**29)], lazrs.LazVlr(data[at:begin]))
+    refused(path, "chunks are too large|table of LAZ chunks")
 
 
 def test_other_vlrs_do_not_confuse(tmp_path):

@@ -16,14 +16,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.temp_store import (
-    Spool,
-    make_folder,
-    owning_scratch,
-    remove_orphans,
-    scratch_place,
-    use_scratch,
-)
+from wavebatch.files.disk import temp_store
 from wavebatch.tools.simulate import simulate_strip
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="file locks of POSIX systems")
@@ -70,10 +63,10 @@ def hold(tmp_path):
 
 
 def test_a_folder_is_there_while_it_is_needed(tmp_path):
-    with owning_scratch(tmp_path) as folder:
-        inner = make_folder()
+    with temp_store.owning_scratch(tmp_path) as folder:
+        inner = temp_store.make_folder()
         assert inner.parent == folder and folder.parent == tmp_path and folder.name.startswith(".wavebatch-")
-        assert remove_orphans(tmp_path) == []
+        assert temp_store.remove_orphans(tmp_path) == []
         (inner / "file").write_text("x")
     assert list(tmp_path.iterdir()) == []
 
@@ -84,9 +77,9 @@ def test_what_a_killed_process_left_goes_and_what_is_in_use_stays(tmp_path, hold
     killed.send_signal(signal.SIGKILL)
     killed.wait()
     assert orphan.exists() and used.exists()
-    assert remove_orphans(tmp_path) == [orphan]
+    assert temp_store.remove_orphans(tmp_path) == [orphan]
     assert (used / "data").read_bytes() == bytes(1000) and not orphan.exists()
-    assert remove_orphans(tmp_path) == []
+    assert temp_store.remove_orphans(tmp_path) == []
 
 
 def test_only_what_is_surely_an_orphan_is_removed(tmp_path):
@@ -99,7 +92,7 @@ def test_only_what_is_surely_an_orphan_is_removed(tmp_path):
     (tmp_path / f"{here}2-link").symlink_to(kept[2])
     (tmp_path / f"{here}3-file").write_text("x")
     (tmp_path / f"{here}4-mine").mkdir()
-    assert remove_orphans(tmp_path) == [tmp_path / f"{here}4-mine"]
+    assert temp_store.remove_orphans(tmp_path) == [tmp_path / f"{here}4-mine"]
     assert all((folder / "precious").exists() for folder in kept)
     assert (tmp_path / f"{here}3-file").exists() and (tmp_path / f"{here}2-link").is_symlink()
 
@@ -112,33 +105,33 @@ def test_processes_that_start_together_leave_each_other_alone(tmp_path):
 
 def test_a_place_given_by_another_process_is_this_thread_s_only(tmp_path):
     found = []
-    use_scratch(tmp_path)
+    temp_store.use_scratch(tmp_path)
     try:
-        thread = threading.Thread(target=lambda: found.append(scratch_place()))
+        thread = threading.Thread(target=lambda: found.append(temp_store.scratch_place()))
         thread.start()
         thread.join()
-        assert make_folder().parent == tmp_path and found != [tmp_path]
+        assert temp_store.make_folder().parent == tmp_path and found != [tmp_path]
     finally:
-        use_scratch(None)
+        temp_store.use_scratch(None)
 
 
 def test_without_a_place_the_spool_says_so(tmp_path, monkeypatch):
-    with owning_scratch(tmp_path / "missing") as folder:
+    with temp_store.owning_scratch(tmp_path / "missing") as folder:
         assert folder is None
 
     def refuse(*args, **options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(tempfile, "mkdtemp", refuse)
-    spool = Spool(2, np.dtype("<i8"), memory=1)
+    spool = temp_store.Spool(2, np.dtype("<i8"), memory=1)
     with pytest.raises(InputError, match="No space left.*set TMPDIR"):
         spool.append(np.array([0, 1]), np.array([5, 6]))
 
 
 def test_a_spool_that_travels_takes_a_file_or_its_entries_with_it(tmp_path, monkeypatch):
-    use_scratch(tmp_path)
+    temp_store.use_scratch(tmp_path)
     try:
-        with Spool(2, np.dtype("<i8"), kept=0) as spool:
+        with temp_store.Spool(2, np.dtype("<i8"), kept=0) as spool:
             spool.append(np.array([1, 0, 1]), np.array([5, 6, 7]))
             assert spool.read(1).tolist() == [5, 7] and spool.path is None
             with monkeypatch.context() as full:
@@ -150,7 +143,7 @@ def test_a_spool_that_travels_takes_a_file_or_its_entries_with_it(tmp_path, monk
                 assert [one.read(bucket).tolist() for bucket in (0, 1)] == [[6], [5, 7]]
         assert not spool.path.exists()
     finally:
-        use_scratch(None)
+        temp_store.use_scratch(None)
 
 
 EVERY_PROCESS = """

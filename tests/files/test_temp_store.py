@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.temp_store import (
-    MOST_BUCKETS,
-    KeyedSums,
-    Spool,
-    count_buckets,
-    spread_keys,
-    spread_times,
-    time_keys,
-)
+from wavebatch.files.disk import temp_store
 
 resource = pytest.importorskip("resource", reason="limits of POSIX systems")
 
@@ -28,9 +20,9 @@ def test_buckets_give_every_row_back_in_order_and_pulses_whole(rng, number):
     rows = np.zeros(1000, ROW)
     rows["gps_time"], rows["number"] = rng.integers(0, 200, 1000) * 0.25, np.arange(1000)
     seen = []
-    with Spool(number, ROW) as buckets:
+    with temp_store.Spool(number, ROW) as buckets:
         for part in np.array_split(rows, 9):
-            buckets.append(spread_times(part["gps_time"], number), part)
+            buckets.append(temp_store.spread_times(part["gps_time"], number), part)
         for bucket in range(number):
             got = buckets.read(bucket)
             assert (np.diff(got["number"]) > 0).all()
@@ -43,18 +35,20 @@ def test_buckets_give_every_row_back_in_order_and_pulses_whole(rng, number):
 
 
 def test_times_that_are_equal_have_equal_keys():
-    keys = time_keys(np.array([0.0, -0.0, 1.5, 1.5]))
+    keys = temp_store.time_keys(np.array([0.0, -0.0, 1.5, 1.5]))
     assert keys[0] == keys[1] and keys[2] == keys[3] and keys[0] != keys[2]
 
 
 def test_keys_spread_evenly_even_if_they_are_regular():
-    for keys in (np.arange(72_000), np.arange(72_000) << 12, time_keys(np.arange(72_000) * 1e-5).astype(np.int64)):
-        count = np.bincount(spread_keys(keys.astype(np.uint64), 72), minlength=72)
+    regular = temp_store.time_keys(np.arange(72_000) * 1e-5).astype(np.int64)
+    for keys in (np.arange(72_000), np.arange(72_000) << 12, regular):
+        count = np.bincount(temp_store.spread_keys(keys.astype(np.uint64), 72), minlength=72)
         assert count.min() > 700 and count.max() < 1300
 
 
 def test_number_of_buckets():
-    assert [count_buckets(rows, 100) for rows in (0, 1, 100, 101, 10**9)] == [1, 1, 1, 2, MOST_BUCKETS]
+    numbers = [temp_store.count_buckets(rows, 100) for rows in (0, 1, 100, 101, 10**9)]
+    assert numbers == [1, 1, 1, 2, temp_store.MOST_BUCKETS]
 
 
 def slow_sums(parts):
@@ -78,7 +72,7 @@ def draw_parts(seed, spread, number=40):
 @pytest.mark.parametrize(("seed", "stride"), [(1, 256), (2, 4), (3, 1)])
 def test_sums_are_those_of_a_dictionary(held, spread, seed, stride):
     parts = draw_parts(seed, spread, 40 if held > 3 else 6)
-    with KeyedSums(3, held=held, stride=stride) as sums:
+    with temp_store.KeyedSums(3, held=held, stride=stride) as sums:
         for key, value in parts:
             sums.add(key, value)
         pieces = list(sums.pieces())
@@ -91,7 +85,7 @@ def test_sums_are_those_of_a_dictionary(held, spread, seed, stride):
 
 
 def test_pieces_of_many_runs_are_small():
-    with KeyedSums(3, held=400, stride=8) as sums:
+    with temp_store.KeyedSums(3, held=400, stride=8) as sums:
         for key, value in draw_parts(5, 2**23, 400):
             sums.add(key, value)
         runs = len(sums._runs)
@@ -100,7 +94,7 @@ def test_pieces_of_many_runs_are_small():
 
 
 def test_pieces_can_be_read_twice_and_may_be_none():
-    with KeyedSums(2, held=1000) as sums:
+    with temp_store.KeyedSums(2, held=1000) as sums:
         assert list(sums.pieces()) == []
         for key, value in draw_parts(3, 100_000, 300):
             sums.add(key, value[:, :2])
@@ -110,14 +104,14 @@ def test_pieces_can_be_read_twice_and_may_be_none():
 
 def test_a_full_disk_is_one_line(monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
-    with KeyedSums(3, held=10) as sums, pytest.raises(InputError, match="TMPDIR"):
+    with temp_store.KeyedSums(3, held=10) as sums, pytest.raises(InputError, match="TMPDIR"):
         for key, value in draw_parts(4, 1000):
             sums.add(key, value)
 
 
 def test_a_disk_that_is_full_for_a_moment_doubles_nothing():
     """The first pickling finds no room for its entries; the second writes them once."""
-    spool = Spool(3, np.dtype("i8"))
+    spool = temp_store.Spool(3, np.dtype("i8"))
     numbers = np.arange(400_000)
     spool.append(numbers % 3, numbers)
     spool.seal()

@@ -17,20 +17,8 @@ from hypothesis import strategies as st
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.schema import Key, Range
+from wavebatch.files import toml_file
 from wavebatch.files.text_file import MOST_BYTES, read_text
-from wavebatch.files.toml_file import (
-    LARGEST_INTEGER,
-    TomlTable,
-    check_number,
-    check_type,
-    describe_record,
-    format_toml,
-    list_comments,
-    list_keys,
-    parse_toml,
-    read_record,
-    shorten,
-)
 
 PLAIN = (
     st.text()
@@ -47,25 +35,26 @@ VALUES = st.recursive(
 
 @given(st.dictionaries(st.text(), VALUES, max_size=6))
 def test_round_trip(document):
-    text = format_toml(document, heading="any\ntext", comments=dict.fromkeys(document, "any\nremark"))
+    text = toml_file.format_toml(document, heading="any\ntext", comments=dict.fromkeys(document, "any\nremark"))
     assert tomllib.loads(text) == document
-    assert format_toml(tomllib.loads(text)) == format_toml(document)
+    assert toml_file.format_toml(tomllib.loads(text)) == toml_file.format_toml(document)
 
 
 def test_astral_characters_are_not_escaped():
-    assert format_toml({"a": "\U0001d538"}) == 'a = "\U0001d538"\n'
+    assert toml_file.format_toml({"a": "\U0001d538"}) == 'a = "\U0001d538"\n'
 
 
 def test_bytes_that_are_no_text_become_question_marks():
-    assert tomllib.loads(format_toml({"strip": "a\udcff.las"}))["strip"] == "a?.las"
+    assert tomllib.loads(toml_file.format_toml({"strip": "a\udcff.las"}))["strip"] == "a?.las"
 
 
 def test_numbers():
-    text = format_toml({"a": math.inf, "b": -math.inf, "c": 1e-5, "d": 1e300, "e": -0.0, "f": np.float32(0.5)})
+    values = {"a": math.inf, "b": -math.inf, "c": 1e-5, "d": 1e300, "e": -0.0, "f": np.float32(0.5)}
+    text = toml_file.format_toml(values)
     assert text == "a = inf\nb = -inf\nc = 1e-05\nd = 1e+300\ne = -0.0\nf = 0.5\n"
-    assert math.isnan(tomllib.loads(format_toml({"a": math.nan}))["a"])
+    assert math.isnan(tomllib.loads(toml_file.format_toml({"a": math.nan}))["a"])
     scalars = {"a": np.float64(0.1), "b": np.int64(3), "c": np.bool_(True)}
-    assert tomllib.loads(format_toml(scalars)) == {"a": 0.1, "b": 3, "c": True}
+    assert tomllib.loads(toml_file.format_toml(scalars)) == {"a": 0.1, "b": 3, "c": True}
 
 
 def test_layout_with_comments():
@@ -76,7 +65,7 @@ def test_layout_with_comments():
         "many": [{"x": 1}, {"x": 2, "y": {"z": "s"}}],
     }
     comments = {"last": "a table", "last.x": "a value", "last.rows": "an array", "many": "each", "many.x": "of each"}
-    assert format_toml(document, heading="head", comments=comments) == (
+    assert toml_file.format_toml(document, heading="head", comments=comments) == (
         "# head\nfirst = true\n\n# a table\n[last]\nx = 1  # a value\n# an array\nrows = [[1.0, 2]]\n\n[last.deep]\n"
         '\n# each\n[[many]]\nx = 1  # of each\n\n# each\n[[many]]\nx = 2  # of each\n\n[many.y]\nz = "s"\n'
     )
@@ -85,18 +74,18 @@ def test_layout_with_comments():
 def test_empty_comments_write_no_line():
     document = {"x": 1, "rows": [1], "table": {"x": 2}, "many": [{"x": 3}]}
     comments = dict.fromkeys(["x", "rows", "table", "table.x", "many", "many.x"], " ")
-    assert format_toml(document, comments=comments) == format_toml(document)
+    assert toml_file.format_toml(document, comments=comments) == toml_file.format_toml(document)
 
 
 def test_dates_keep_their_offset():
     when = datetime.datetime(2020, 1, 2, 3, 4, 5, tzinfo=datetime.UTC)
-    assert tomllib.loads(format_toml({"a": when, "b": when.time()})) == {"a": when, "b": when.time()}
+    assert tomllib.loads(toml_file.format_toml({"a": when, "b": when.time()})) == {"a": when, "b": when.time()}
 
 
 @pytest.mark.parametrize("value", [object(), [None], b"bytes", {1, 2}, 1j])
 def test_other_types_are_refused(value):
     with pytest.raises(TypeError, match="TOML cannot hold"):
-        format_toml({"a": value})
+        toml_file.format_toml({"a": value})
 
 
 def test_reading_is_bounded(tmp_path):
@@ -126,17 +115,18 @@ def test_reading_is_bounded(tmp_path):
 )
 def test_depth_and_digits_are_bounded(text, why):
     with pytest.raises(ConfigError, match=f"x.toml: .*{why}"):
-        parse_toml(text, "x.toml")
-    assert parse_toml("a = " + "[" * 60 + "]" * 60 + f"\nb = {'9' * 900}\n" + ".".join("c" * 60) + " = 1", "x")
+        toml_file.parse_toml(text, "x.toml")
+    deep = "a = " + "[" * 60 + "]" * 60 + f"\nb = {'9' * 900}\n" + ".".join("c" * 60) + " = 1"
+    assert toml_file.parse_toml(deep, "x")
 
 
 @pytest.mark.parametrize("text", ["a", "a = 1\na = 2", 'a = "\\ud835"'])
 def test_text_that_is_not_toml(text):
     with pytest.raises(ConfigError, match="x.toml: not valid TOML: "):
-        parse_toml(text, "x.toml")
+        toml_file.parse_toml(text, "x.toml")
 
 
-TABLE = parse_toml(
+TABLE = toml_file.parse_toml(
     'text = "s"\nyes = true\nwhole = 3\nhalf = 0.5\nbad = nan\nhuge = 0x1'
     + "0" * 5000
     + "\n[t]\na = 1\n[[r]]\nb = 2\n",
@@ -150,8 +140,8 @@ def test_typed_keys():
     assert type(TABLE.number("whole")) is float
     assert (TABLE.get("none", str, ""), TABLE.number("none", 1, 2, default=None)) == ("", None)
     assert TABLE.integer("none", 1, 2, default=0) == 0
-    assert TABLE.table("t") == TomlTable({"a": 1}, "x.toml: [t]")
-    assert TABLE.tables("r") == [TomlTable({"b": 2}, "x.toml: [[r]] 1")] and TABLE.tables("none") == []
+    assert TABLE.table("t") == toml_file.TomlTable({"a": 1}, "x.toml: [t]")
+    assert TABLE.tables("r") == [toml_file.TomlTable({"b": 2}, "x.toml: [[r]] 1")] and TABLE.tables("none") == []
     TABLE.check_keys(TABLE.values, ["text"])
 
 
@@ -178,10 +168,10 @@ def test_typed_keys():
             lambda: TABLE.check_schema("s/1", "survey again"),
             "x.toml: schema is None, this version reads 's/1'; survey again",
         ),
-        (lambda: check_type("s", (int, type(None)), "here"), "here must be an integer, it is 's'"),
-        (lambda: check_type("s", (int, bool), "here"), "here must be an integer or true or false, it is 's'"),
+        (lambda: toml_file.check_type("s", (int, type(None)), "here"), "here must be an integer, it is 's'"),
+        (lambda: toml_file.check_type("s", (int, bool), "here"), "here must be an integer or true or false, it is 's'"),
         (
-            lambda: check_number(LARGEST_INTEGER + 1, 0, math.inf, "here"),
+            lambda: toml_file.check_number(toml_file.LARGEST_INTEGER + 1, 0, math.inf, "here"),
             "here must be a finite number, it is 9007199254740993",
         ),
     ],
@@ -193,11 +183,11 @@ def test_messages(check, message):
 
 
 def test_integers_stay_where_they_are_allowed():
-    assert type(check_type(3, (int, float), "")) is int
+    assert type(toml_file.check_type(3, (int, float), "")) is int
 
 
 def test_shorten():
-    assert shorten("a" * 100) == "'" + "a" * 56 + "..." and shorten({"a": "b"}) == "{'a': 'b'}"
+    assert toml_file.shorten("a" * 100) == "'" + "a" * 56 + "..." and toml_file.shorten({"a": "b"}) == "{'a': 'b'}"
 
 
 Share = Annotated[float, Range(0.0, 1.0)]
@@ -232,31 +222,31 @@ FULL = Whole(
     3, Part(1 / 3, "a", 2.0), 0.1 + 0.2, True, (0.1, 1 / 7), ((0.5, -1 / 3),), {80: 3, 9: 1}, {"quiet": 1e-17},
     {1: 0.5, 12: 1 / 9}, {2: Part(0.1, "b")}, (Part(1.0, "c"), Part(2.0)), Part(4.0),
 )  # fmt: skip
-TEXT = format_toml(describe_record(FULL), comments=list_comments(Whole, ""))
+TEXT = toml_file.format_toml(toml_file.describe_record(FULL), comments=toml_file.list_comments(Whole, ""))
 
 
 def test_an_object_comes_back_without_what_has_no_key():
-    found = read_record(Whole, parse_toml(TEXT, "x"), strict=False)
+    found = toml_file.read_record(Whole, toml_file.parse_toml(TEXT, "x"), strict=False)
     assert found == Whole(**{**FULL.__dict__, "part": Part(1 / 3, "a")})
     assert "secret" not in TEXT and "size_m = 3  # of a cell" in TEXT
 
 
 def test_values_come_before_tables_and_lists():
-    keys = list(describe_record(FULL))
+    keys = list(toml_file.describe_record(FULL))
     assert keys.index("other_width") < keys.index("by_kind") < keys.index("shares") < keys.index("row")
-    assert describe_record(FULL)["seams"] == [[9, 1], [80, 3]]
-    assert set(list_keys(Whole)) >= {"size_m", "part_width", "other_note", "row"}
+    assert toml_file.describe_record(FULL)["seams"] == [[9, 1], [80, 3]]
+    assert set(toml_file.list_keys(Whole)) >= {"size_m", "part_width", "other_note", "row"}
 
 
 def test_what_is_empty_or_infinite_is_left_out():
-    plain = describe_record(Whole(1, Part(float("inf"))))
+    plain = toml_file.describe_record(Whole(1, Part(float("inf"))))
     assert plain["part_width"] is None and plain["limit_dn"] is None and plain["shares"] == []
     assert not {"pairs", "seams", "row", "other_width"} & plain.keys()
 
 
 def test_parts_that_are_not_whole_are_left_out_where_they_may_be():
     text = TEXT.replace("other_width = 4.0", "").replace("form_2_width = 0.1", "")
-    found = read_record(Whole, parse_toml(text, "x"), strict=False)
+    found = toml_file.read_record(Whole, toml_file.parse_toml(text, "x"), strict=False)
     assert found.other is None and found.forms == {}
 
 
@@ -281,16 +271,17 @@ def test_parts_that_are_not_whole_are_left_out_where_they_may_be():
 )
 def test_what_is_wrong_is_named(old, new, words):
     assert old in TEXT
-    table = parse_toml(TEXT.replace(old, new, 1), "x")
+    table = toml_file.parse_toml(TEXT.replace(old, new, 1), "x")
     with pytest.raises(ConfigError, match=words):
-        read_record(Whole, table, also=[key for key in table.values if key.startswith(("misfit_", "form_"))])
+        toml_file.read_record(Whole, table, also=[key for key in table.values if key.startswith(("misfit_", "form_"))])
 
 
 def test_a_remedy_stands_for_the_meaning():
     with pytest.raises(ConfigError, match="x: key 'size_m' is missing; survey again"):
-        read_record(Whole, parse_toml(TEXT.replace("size_m = 3", ""), "x"), strict=False, remedy="survey again")
+        old = toml_file.parse_toml(TEXT.replace("size_m = 3", ""), "x")
+        toml_file.read_record(Whole, old, strict=False, remedy="survey again")
 
 
 def test_a_day_without_quotes_is_text():
-    found = read_record(Part, parse_toml("width = 1\nnote = 2026-05-31", "x"))
+    found = toml_file.read_record(Part, toml_file.parse_toml("width = 1\nnote = 2026-05-31", "x"))
     assert found.note == "2026-05-31"

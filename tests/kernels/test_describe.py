@@ -4,20 +4,11 @@ import naive_describe as naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.describe import (
-    SampleNoise,
-    Sums,
-    count_echoes,
-    describe_left,
-    describe_widths,
-    gather_pulse,
-    measure_changes,
-    render_pulses,
-)
+from wavebatch.kernels.fit import describe
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
 SHAPES = [PulseShape(), PulseShape(kappa=0.15), PulseShape(components=((0.2, 4.0, 5.0), (-0.05, 1.0, -0.8)))]
-NOISES = [SampleNoise(1.3), SampleNoise(0.9, 0.02, (0.7, 0.4, 0.1))]
+NOISES = [describe.SampleNoise(1.3), describe.SampleNoise(0.9, 0.02, (0.7, 0.4, 0.1))]
 
 
 def _problem(shape, rng, n=12, s=70):
@@ -25,11 +16,11 @@ def _problem(shape, rng, n=12, s=70):
     waveform = np.repeat(np.arange(n), rng.integers(0, 5, n))
     m = len(waveform)
     main = np.stack([rng.uniform(5, 90, m), rng.uniform(8, 55, m), rng.uniform(1.5, 3.0, m)], axis=1)
-    model = render_pulses(shape, n, s, waveform, main)
+    model = describe.render_pulses(shape, n, s, waveform, main)
     used = np.ones((n, s), bool)
     used[3, 35:52] = False
     left = np.where(used, rng.standard_normal((n, s)), 0).astype(np.float32)
-    return Sums(shape, count_echoes(waveform, n), main, left, model, used)
+    return describe.Sums(shape, describe.count_echoes(waveform, n), main, left, model, used)
 
 
 def _echoes(sums, i):
@@ -51,7 +42,7 @@ def test_the_sum_of_echoes_is_that_of_a_loop(shape, rng):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_descriptions_are_those_of_a_loop(shape, noise, rng):
     sums, changes = _problem(shape, rng), (0.0, 0.02, 0.0)
-    length, volume = describe_left(sums, noise, changes)
+    length, volume = describe.describe_left(sums, noise, changes)
     np.testing.assert_array_equal(length[0], length[2])
     for i in range(len(sums.left)):
         planes = (sums.left[i].astype(float), sums.model[i].astype(float), sums.used[i])
@@ -65,7 +56,7 @@ def test_descriptions_are_those_of_a_loop(shape, noise, rng):
 @pytest.mark.parametrize("noise", NOISES)
 def test_changes_are_those_of_a_loop(noise, rng):
     sums = _problem(SHAPES[2], rng)
-    change, precision = measure_changes(sums, noise)
+    change, precision = describe.measure_changes(sums, noise)
     for i in range(len(sums.left)):
         if not _echoes(sums, i):
             assert not precision[i].any()
@@ -78,8 +69,8 @@ def test_changes_are_those_of_a_loop(noise, rng):
 
 def test_normal_equations_are_those_of_a_loop(rng):
     sums = _problem(SHAPES[2], rng)
-    delay, sigma, noise = np.arange(-4.0, 9.0), np.full(13, 1.4), SampleNoise(1.1, 0.03)
-    matrix, right = gather_pulse(sums, noise, 0.01, delay, sigma, 2.0, 3)
+    delay, sigma, noise = np.arange(-4.0, 9.0), np.full(13, 1.4), describe.SampleNoise(1.1, 0.03)
+    matrix, right = describe.gather_pulse(sums, noise, 0.01, delay, sigma, 2.0, 3)
     expected = [
         naive.gather(sums.left[i].astype(float), sums.model[i].astype(float), sums.used[i], _echoes(sums, i), 1.1, 0.03,
                      0.01, delay, sigma, 2.0)
@@ -93,9 +84,9 @@ def test_many_echoes_of_a_long_waveform_take_time_in_proportion(rng):
     """Two thousand echoes in 65,535 samples: groups of echoes are taken together, each in its own stretch."""
     m = 2000
     main = np.stack([rng.uniform(5, 90, m), np.sort(rng.uniform(0, 65_535, m)), np.full(m, 2.0)], axis=1)
-    model = render_pulses(PulseShape(), 1, 65_535, np.zeros(m, int), main)
-    sums = Sums(PulseShape(), np.array([0, m]), main, np.zeros_like(model), model, np.ones(model.shape, bool))
-    length, volume = describe_left(sums, SampleNoise(1.0), [0.01])
+    model = describe.render_pulses(PulseShape(), 1, 65_535, np.zeros(m, int), main)
+    sums = describe.Sums(PulseShape(), np.array([0, m]), main, np.zeros_like(model), model, np.ones(model.shape, bool))
+    length, volume = describe.describe_left(sums, describe.SampleNoise(1.0), [0.01])
     assert np.isfinite(length).all() and np.isfinite(volume).all()
 
 
@@ -107,15 +98,15 @@ def test_widths_cost_what_the_loop_says(scatter, rng):
     ratio += rng.normal(0, np.hypot(error, scatter))
     known = error < 0.15
     widths = ratio, error, known, (0.01, 0.02, 0.04, 0.06), 1 + 0.02 * 2.0 ** np.arange(9), 0.01
-    np.testing.assert_allclose(describe_widths(*widths), naive.describe_widths(*widths), atol=1e-4)
+    np.testing.assert_allclose(describe.describe_widths(*widths), naive.describe_widths(*widths), atol=1e-4)
     for wrong in ({1: 0 * error}, {0: ratio * np.nan}, {2: known[1:]}, {3: ()}, {4: np.array([1.0])}):
         with pytest.raises(ValueError):
-            describe_widths(*(wrong.get(place, value) for place, value in enumerate(widths)))
+            describe.describe_widths(*(wrong.get(place, value) for place, value in enumerate(widths)))
 
 
 def test_echoes_that_are_not_sorted_are_refused():
     with pytest.raises(ValueError, match="not sorted"):
-        render_pulses(PulseShape(), 2, 9, np.array([1, 0]), np.array([[1.0, 4.0, 1.0], [2.0, 4.0, 1.0]]))
+        describe.render_pulses(PulseShape(), 2, 9, np.array([1, 0]), np.array([[1.0, 4.0, 1.0], [2.0, 4.0, 1.0]]))
 
 
 def test_arrays_that_the_library_would_read_beyond_are_refused(rng):
@@ -125,6 +116,6 @@ def test_arrays_that_the_library_would_read_beyond_are_refused(rng):
         {"main": sums.main * [1, 1, 0]}, {"main": sums.main * np.nan},
     ):  # fmt: skip
         with pytest.raises(ValueError):
-            describe_left(sums._replace(**wrong), NOISES[0], [0.0])
+            describe.describe_left(sums._replace(**wrong), NOISES[0], [0.0])
     with pytest.raises(ValueError):
-        describe_left(sums, SampleNoise(0.0), [0.0])
+        describe.describe_left(sums, describe.SampleNoise(0.0), [0.0])

@@ -9,19 +9,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from wavebatch.kernels.elementary import exp, log, log1p, solve
+from wavebatch.kernels.fit import pulse_shape
 from wavebatch.kernels.fit.closed_form import estimate_starts, fit_parabola, start_errors
 from wavebatch.kernels.fit.decompose import Solution, choose
 from wavebatch.kernels.fit.learn_pulse import Stack, fit_bounded, refine_gaussians, stack_pulse
-from wavebatch.kernels.fit.pulse_shape import (
-    TAIL_STEP,
-    PulseShape,
-    PulseTail,
-    fit_one_gaussian,
-    measure_pulse,
-    residual_moments,
-    tail_at,
-    tail_reach,
-)
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
 
@@ -86,7 +77,7 @@ def test_moments_of_residuals_are_those_of_the_twin(rng):
     def read(rows, at):
         return np.take_along_axis(residual[rows], at, axis=1)
 
-    h3, h4 = residual_moments(read, s, time, width, np.full(30, 2.0))
+    h3, h4 = pulse_shape.residual_moments(read, s, time, width, np.full(30, 2.0))
     x = np.arange(float(s))
     for row in range(30):
         expected = naive_fit.moments(np.array([[1.0], [time[row]], [width[row]]]), x, residual[row].astype(float), 2.0)
@@ -102,7 +93,7 @@ def test_rendered_waveforms_are_sums_of_pulses(rng, shape, s):
     m = 60
     waveform = np.sort(rng.integers(0, 7, m))
     time, amplitude, width = rng.uniform(-3, s + 3, m), rng.uniform(-5, 200, m), rng.uniform(0.8, 6, m)
-    found = render_echoes(PulseShape(**shape), 8, s, waveform, time, amplitude, width)
+    found = render_echoes(pulse_shape.PulseShape(**shape), 8, s, waveform, time, amplitude, width)
     x = np.arange(float(s))
     for row in range(8):
         own = waveform == row
@@ -179,19 +170,20 @@ def test_chosen_solutions_are_those_of_a_loop(rng):
 
 def test_tails_are_those_of_a_loop(rng):
     first, values = -3.0, rng.normal(0, 0.1, 60)
-    tail = PulseTail(first, values)
+    tail = pulse_shape.PulseTail(first, values)
     lag = rng.uniform(-6, 16, 200)
-    places = first + TAIL_STEP * np.arange(60)
+    places = first + pulse_shape.TAIL_STEP * np.arange(60)
     expected = [values[np.argmin(np.abs(places - at))] if -3.1 < at < 11.8 else 0.0 for at in lag]
     inside = (np.abs(lag + 3.125) > 0.03) & (np.abs(lag - 11.875) > 0.2)
-    assert tail_at(tail, lag)[inside] == pytest.approx(np.array(expected)[inside])
+    assert pulse_shape.tail_at(tail, lag)[inside] == pytest.approx(np.array(expected)[inside])
     ratio = np.r_[0.0, 1.0, 5.0, rng.uniform(1, 200, 30)]
-    assert tail_reach(tail, ratio).tolist() == [naive_fit.tail_reach(first, values, TAIL_STEP, one) for one in ratio]
+    expected = [naive_fit.tail_reach(first, values, pulse_shape.TAIL_STEP, one) for one in ratio]
+    assert pulse_shape.tail_reach(tail, ratio).tolist() == expected
 
 
 @pytest.mark.parametrize("shape", [{}, {"components": ((0.2, 2.5, 1.0),)}, {"kappa": -0.2}])
 def test_measures_of_pulses_are_those_of_roots(shape):
-    found = measure_pulse(PulseShape(**shape), 1.2, 4.0)
+    found = pulse_shape.measure_pulse(pulse_shape.PulseShape(**shape), 1.2, 4.0)
     for row in (0, 90, 199):
         expected = naive_fit.measure(shape, found.width[row])
         assert (found.peak[row], found.half_width[row]) == pytest.approx(expected, abs=0.015)
@@ -205,7 +197,7 @@ def test_the_one_gaussian_of_a_pulse_is_that_of_scipy():
         return p[0] * naive.pulse(x, p[1], p[2]) - value
 
     expected = least_squares(misfit, [1.0, 1.0, 1.5], xtol=1e-12, ftol=1e-12).x
-    assert fit_one_gaussian(x, value) == pytest.approx(expected[1:], abs=1e-4)
+    assert pulse_shape.fit_one_gaussian(x, value) == pytest.approx(expected[1:], abs=1e-4)
 
 
 @pytest.mark.parametrize("spread", [0.0, 3.0])

@@ -1,10 +1,9 @@
-"""Scan lines, lines in slices and tiles against slow twins, on random, noisy and degenerate inputs."""
+"""Lines in slices against slow twins, on random, noisy and degenerate inputs."""
 
 import naive_geometry
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry.normals import cut_tiles, is_inside, sort_into_tiles
 from wavebatch.kernels.geometry.slice_lines import find_lines
 
 
@@ -33,21 +32,3 @@ def test_lines_of_a_slice_are_those_of_loops(rng, kind):
         assert line.rows.tolist() == rows
         assert line.start == pytest.approx(start, abs=1e-6) and line.end == pytest.approx(end, abs=1e-6)
         assert line.weight == pytest.approx(total)
-
-
-@pytest.mark.parametrize("kind", ["random", "equal", "line"])
-def test_points_are_in_the_tiles_that_a_loop_finds(rng, kind):
-    xyz = rng.normal(0, 10, (300, 3)).round(1)
-    if kind != "random":
-        xyz[:, 1:] = 0.0
-        xyz[: 200 if kind == "equal" else 0] = 0.0
-    tiles = cut_tiles(xyz[::2], 12, 0.5)
-    for buffer in (0.0, 1.5):
-        rows, numbers = sort_into_tiles(tiles, xyz, buffer)
-        near = [(i, n) for i in range(300) for n in naive_geometry.near_tiles(tiles.low, tiles.high, xyz[i], buffer)]
-        found = list(zip(rows.tolist(), numbers.tolist(), strict=True))
-        assert set(near) <= set(found) if buffer else sorted(found) == near
-        assert len(set(found)) == len(found)
-    for number in range(len(tiles)):
-        expected = [number in naive_geometry.near_tiles(tiles.low, tiles.high, point, 0.0) for point in xyz]
-        assert is_inside(tiles, number, xyz).tolist() == expected

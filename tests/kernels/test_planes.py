@@ -6,17 +6,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from wavebatch.core.units import MAD_TO_STD
-from wavebatch.kernels.geometry.normals import (
-    MOST_PER_CELL,
-    Gap,
-    Surroundings,
-    cut_tiles,
-    find_edges,
-    is_inside,
-    measure_normals,
-    sort_into_tiles,
-    thin_out,
-)
+from wavebatch.kernels.geometry import normals
 from wavebatch.kernels.geometry.planes import (
     DOUBTFUL,
     LEAST_SPREAD,
@@ -145,7 +135,7 @@ def test_one_normal(rng):
 
 def test_neighbours_are_those_of_a_loop(rng):
     around, points = rng.uniform(0, 5, (400, 3)).round(1), rng.uniform(0, 5, (70, 3)).round(1)
-    point, offset = Surroundings(around).find(points, 1.0)
+    point, offset = normals.Surroundings(around).find(points, 1.0)
     expected = []
     for number, place in enumerate(points):
         expected += [(number, *step) for step in around - place if (step * step).sum() <= 1.0]
@@ -169,7 +159,7 @@ def gable(rng, degrees, noise, density, half=6.0, length=40.0):
 def test_at_a_ridge_the_error_grows_or_there_is_no_angle(degrees, noise, density):
     """One plane through both slopes is off by the slope: it was off by 3 to 8 errors."""
     xyz, ray, true = gable(np.random.default_rng(degrees), degrees, noise, density, length=80.0)
-    (angle, error), gap = measure_normals(xyz, ray, Surroundings(xyz), **SETTINGS)
+    (angle, error), gap = normals.measure_normals(xyz, ray, normals.Surroundings(xyz), **SETTINGS)
     near, known = np.abs(xyz[:, 0]) < 1.5, np.isfinite(angle)
     ratio = np.abs(angle - true) / error
     assert (ratio[near & known] > 3).mean() < 0.05
@@ -177,7 +167,7 @@ def test_at_a_ridge_the_error_grows_or_there_is_no_angle(degrees, noise, density
     at_ridge = np.abs(xyz[:, 0]) < 0.3
     assert (known & (ratio > 3))[at_ridge].mean() < 0.05
     if degrees > 5:
-        assert (gap[at_ridge] == Gap.NO_PLANE).mean() > 0.75
+        assert (gap[at_ridge] == normals.Gap.NO_PLANE).mean() > 0.75
     plain = (np.abs(xyz[:, 0]) > 1.6) & (np.abs(xyz[:, 0]) < 4.4)
     assert known[plain].mean() > 0.98
     assert 0.62 < (ratio[plain & known] <= 1).mean() < 0.78
@@ -188,7 +178,7 @@ def test_a_step_is_no_tilt(rng):
     xyz = np.column_stack([rng.uniform(-6, 6, (4000, 2)), 0.02 * rng.standard_normal(4000)])
     xyz[:, 2] += 0.15 * (xyz[:, 0] > 0)
     down = np.tile([0, 0, -1.0], (len(xyz), 1))
-    (angle, error), _ = measure_normals(xyz, down, Surroundings(xyz), **SETTINGS)
+    (angle, error), _ = normals.measure_normals(xyz, down, normals.Surroundings(xyz), **SETTINGS)
     near = np.isfinite(angle) & (np.abs(xyz[:, 0]) < 1.5) & (np.abs(xyz[:, 1]) < 4.4)
     assert np.sqrt(np.mean((angle[near] / error[near]) ** 2)) < 1.4
 
@@ -244,17 +234,17 @@ def test_reasons():
     points = np.concatenate(parts)
     ray = np.tile([0, 0.2, -1.0], (len(points), 1))
     ray[-2:] = [[0, 0, 0], [np.nan, 0, 1]]
-    around = Surroundings(points[np.isfinite(points).all(axis=1)])
-    (angle, error), gap = measure_normals(points, ray, around, **SETTINGS)
+    around = normals.Surroundings(points[np.isfinite(points).all(axis=1)])
+    (angle, error), gap = normals.measure_normals(points, ray, around, **SETTINGS)
     gaps = np.split(gap, np.cumsum([len(part) for part in parts])[:-1])
-    assert (gaps[0] == Gap.KNOWN).mean() > 0.95
-    assert (gaps[1] == Gap.NO_PLANE).mean() > 0.95
-    assert (gaps[2] == Gap.TOO_STEEP).mean() > 0.9
-    assert (gaps[3] == Gap.UNCERTAIN).mean() > 0.9
-    assert gaps[4] == Gap.NO_PLANE and gaps[5] == Gap.FEW_NEIGHBOURS and gaps[6] == Gap.NO_RAY
-    assert (gaps[7] == Gap.NO_RAY).all()
-    np.testing.assert_array_equal(np.isnan(angle), gap != Gap.KNOWN)
-    np.testing.assert_array_equal(np.isnan(error), gap != Gap.KNOWN)
+    assert (gaps[0] == normals.Gap.KNOWN).mean() > 0.95
+    assert (gaps[1] == normals.Gap.NO_PLANE).mean() > 0.95
+    assert (gaps[2] == normals.Gap.TOO_STEEP).mean() > 0.9
+    assert (gaps[3] == normals.Gap.UNCERTAIN).mean() > 0.9
+    assert gaps[4] == normals.Gap.NO_PLANE and gaps[5] == normals.Gap.FEW_NEIGHBOURS and gaps[6] == normals.Gap.NO_RAY
+    assert (gaps[7] == normals.Gap.NO_RAY).all()
+    np.testing.assert_array_equal(np.isnan(angle), gap != normals.Gap.KNOWN)
+    np.testing.assert_array_equal(np.isnan(error), gap != normals.Gap.KNOWN)
     assert angle.dtype == error.dtype == np.float32
     assert np.nanmedian(angle) == pytest.approx(np.degrees(np.arctan(0.2)), abs=0.1)
 
@@ -262,17 +252,17 @@ def test_reasons():
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_points_and_one(count):
     points = np.zeros((count, 3))
-    (angle, _), gap = measure_normals(points, np.ones((count, 3)), Surroundings(points), **SETTINGS)
-    assert len(angle) == count and (gap == Gap.FEW_NEIGHBOURS).all()
+    (angle, _), gap = normals.measure_normals(points, np.ones((count, 3)), normals.Surroundings(points), **SETTINGS)
+    assert len(angle) == count and (gap == normals.Gap.FEW_NEIGHBOURS).all()
 
 
 def test_a_point_does_not_depend_on_what_is_asked_with_it(rng):
     points = np.column_stack([rng.uniform(0, 30, (3000, 2)), rng.normal(0, 0.05, 3000)]).round(2)
     ray = rng.normal(0, 0.2, (3000, 3)) - [0, 0, 1]
-    around = Surroundings(points)
-    (angle, error), gap = measure_normals(points, ray, around, **SETTINGS)
+    around = normals.Surroundings(points)
+    (angle, error), gap = normals.measure_normals(points, ray, around, **SETTINGS)
     some = rng.permutation(3000)[:500]
-    (again, error_again), gap_again = measure_normals(points[some], ray[some], around, **SETTINGS, pairs=1000)
+    (again, error_again), gap_again = normals.measure_normals(points[some], ray[some], around, **SETTINGS, pairs=1000)
     np.testing.assert_array_equal(again, angle[some])
     np.testing.assert_array_equal(error_again, error[some])
     np.testing.assert_array_equal(gap_again, gap[some])
@@ -280,22 +270,22 @@ def test_a_point_does_not_depend_on_what_is_asked_with_it(rng):
 
 def test_dense_points_are_thinned_alike_whatever_else_is_there(rng):
     xyz, row = rng.uniform(0, 4, (20_000, 3)), np.arange(20_000)
-    kept = thin_out(xyz, row, 1.0)
+    kept = normals.thin_out(xyz, row, 1.0)
     cells, number = np.unique(np.floor(xyz[kept] / 0.25), axis=0, return_counts=True)
-    assert number.max() == MOST_PER_CELL and len(cells) == len(np.unique(np.floor(xyz / 0.25), axis=0))
+    assert number.max() == normals.MOST_PER_CELL and len(cells) == len(np.unique(np.floor(xyz / 0.25), axis=0))
     part = np.flatnonzero(xyz[:, 0] < 2.0)
-    np.testing.assert_array_equal(thin_out(xyz[part], row[part], 1.0), kept[part])
-    assert thin_out(xyz[:200], row[:200], 0.1).all()
+    np.testing.assert_array_equal(normals.thin_out(xyz[part], row[part], 1.0), kept[part])
+    assert normals.thin_out(xyz[:200], row[:200], 0.1).all()
 
 
 def test_every_point_lies_in_one_tile_and_its_neighbours_are_listed(rng):
     xyz = np.concatenate([rng.uniform(0, 100, (4000, 3)), rng.normal(50, 0.5, (2000, 3)), [[1e7, -1e7, 0]]])
     xyz[:500, 0] = 10.0
-    tiles = cut_tiles(xyz[::2], 60, 8.0)
-    inside = np.array([is_inside(tiles, number, xyz) for number in range(len(tiles))])
+    tiles = normals.cut_tiles(xyz[::2], 60, 8.0)
+    inside = np.array([normals.is_inside(tiles, number, xyz) for number in range(len(tiles))])
     assert len(tiles) > 20
     np.testing.assert_array_equal(inside.sum(axis=0), 1)
-    rows, numbers = sort_into_tiles(tiles, xyz, 1.0)
+    rows, numbers = normals.sort_into_tiles(tiles, xyz, 1.0)
     assert len(rows) < 8 * len(xyz)
     pairs = cKDTree(xyz).query_pairs(1.0, output_type="ndarray")
     listed = np.unique(numbers * len(xyz) + rows)
@@ -305,9 +295,9 @@ def test_every_point_lies_in_one_tile_and_its_neighbours_are_listed(rng):
 
 
 def test_points_that_cannot_be_cut_apart_are_one_tile():
-    assert len(cut_tiles(np.zeros((1000, 3)), 10, 0.0)) == 1
-    assert len(cut_tiles(np.empty((0, 3)), 10, 1.0)) == 1
-    assert len(cut_tiles(np.repeat([[0, 0, 0], [0, 0, 9.0]], [1000, 1], axis=0), 10, 0.0)) == 2
+    assert len(normals.cut_tiles(np.zeros((1000, 3)), 10, 0.0)) == 1
+    assert len(normals.cut_tiles(np.empty((0, 3)), 10, 1.0)) == 1
+    assert len(normals.cut_tiles(np.repeat([[0, 0, 0], [0, 0, 9.0]], [1000, 1], axis=0), 10, 0.0)) == 2
 
 
 def test_edges_are_found_by_the_pulses_around():
@@ -319,7 +309,7 @@ def test_edges_are_found_by_the_pulses_around():
     points = level + (level[:, 2:] - 20.0) / ray[2] * ray * [1, 1, 0]
     points[0] = [points[0, 0], points[0, 1], -60.0]
     before, after = np.full(900, 2.0), np.full(900, 5.0)
-    found = find_edges(points, np.tile(ray, (900, 1)), np.arange(900.0), before, after, 0.5)
+    found = normals.find_edges(points, np.tile(ray, (900, 1)), np.arange(900.0), before, after, 0.5)
     flat = points[:, :2] - (points[:, 2:] - np.median(points[:, 2])) * ray[:2] / ray[2]
     apart = np.linalg.norm(flat[:, None] - flat, axis=2)
     most = 1.0 + np.median(np.sort(apart, axis=1)[:, 4])
@@ -333,5 +323,5 @@ def test_echoes_of_one_pulse_in_two_packets_share_its_light():
     points = np.stack([x.ravel(), y.ravel(), np.zeros(100)], axis=1)
     points = np.concatenate([points, points[[44]] + [0, 0, 30]])
     time = np.append(np.arange(100.0), 44.0)
-    found = find_edges(points, np.tile([0.0, 0, -1], (101, 1)), time, np.full(101, 2.0), np.full(101, 5.0), 0.2)
+    found = normals.find_edges(points, np.tile([0.0, 0, -1], (101, 1)), time, np.full(101, 2.0), np.full(101, 5.0), 0.2)
     assert np.flatnonzero(found).tolist() == [44, 100]

@@ -3,20 +3,8 @@
 import numpy as np
 import pytest
 
+from wavebatch.kernels.physics import radiometry
 from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
-from wavebatch.kernels.physics.radiometry import (
-    attenuation_of_visibility,
-    backscatter,
-    backscatter_error,
-    compute_cross_section,
-    diffuse_reflectance,
-    energy_error,
-    mean_haze,
-    receive_power,
-    reflectance_error,
-    spread_cross_section,
-    transmit,
-)
 
 BETA = 0.5e-3
 
@@ -30,15 +18,15 @@ BETA = 0.5e-3
 )
 def test_the_numbers_of_the_specification(attenuation, expected):
     light = 500.0**2 * 60.0 * 2.0
-    constant = 4 * 0.2 * np.cos(np.radians(10)) * float(transmit(500.0, attenuation)) / light
-    gamma = float(backscatter(constant, 700.0, 45.0, 2.4, attenuation))
+    constant = 4 * 0.2 * np.cos(np.radians(10)) * float(radiometry.transmit(500.0, attenuation)) / light
+    gamma = float(radiometry.backscatter(constant, 700.0, 45.0, 2.4, attenuation))
     angle = np.radians(30)
     found = (
         constant,
         constant * np.pi * BETA**2 / 4,
         gamma,
-        float(diffuse_reflectance(gamma, angle)),
-        float(compute_cross_section(gamma, 700.0, BETA)),
+        float(radiometry.diffuse_reflectance(gamma, angle)),
+        float(radiometry.compute_cross_section(gamma, 700.0, BETA)),
         gamma * np.cos(angle),
     )
     assert [f"{value:.6e}" for value in found[:2]] == [f"{value:.6e}" for value in expected[:2]]
@@ -50,30 +38,30 @@ def test_the_numbers_of_the_specification(attenuation, expected):
     [(0.1, (0.977, 0.955, 0.871)), (0.22, (0.951, 0.904, 0.738)), (0.5, (0.891, 0.794, 0.501))],
 )
 def test_transmission(attenuation, shares):
-    assert transmit(np.array([500.0, 1000.0, 3000.0]), attenuation) == pytest.approx(shares, abs=6e-4)
+    assert radiometry.transmit(np.array([500.0, 1000.0, 3000.0]), attenuation) == pytest.approx(shares, abs=6e-4)
 
 
 def test_what_is_not_known_is_nan():
     distance = np.array([np.nan, 0.0, -5.0, np.inf, 700.0])
-    gamma = backscatter(2.6e-8, distance, np.full(5, 45.0), np.full(5, 2.4), 0.0)
+    gamma = radiometry.backscatter(2.6e-8, distance, np.full(5, 45.0), np.full(5, 2.4), 0.0)
     assert np.isfinite(gamma).tolist() == [False] * 4 + [True]
-    assert np.isnan(compute_cross_section(gamma, distance, BETA)[:4]).all()
-    assert np.isnan(diffuse_reflectance(1.0, np.radians([86.0, 90.0, 120.0]))).all()
-    assert np.isnan(energy_error(np.array([0.0, -3.0, 9.0]), np.array([2.0, 2.0, 0.0]), 0.1, 0.1)).all()
+    assert np.isnan(radiometry.compute_cross_section(gamma, distance, BETA)[:4]).all()
+    assert np.isnan(radiometry.diffuse_reflectance(1.0, np.radians([86.0, 90.0, 120.0]))).all()
+    assert np.isnan(radiometry.energy_error(np.array([0.0, -3.0, 9.0]), np.array([2.0, 2.0, 0.0]), 0.1, 0.1)).all()
 
 
 def test_float32_input_keeps_the_fourth_power():
-    wide = compute_cross_section(np.float32(1.0), np.float32(3000.0), BETA)
+    wide = radiometry.compute_cross_section(np.float32(1.0), np.float32(3000.0), BETA)
     assert wide.dtype == np.float64 and wide == pytest.approx(np.pi / 4 * 1.5**2, rel=1e-12)
 
 
 def test_a_wrong_range_counts_four_times():
     none = np.zeros(1)
-    section = backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.0, power=4)
-    gamma = backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.0)
+    section = radiometry.backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.0, power=4)
+    gamma = radiometry.backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.0)
     assert section[0] == pytest.approx(0.008) and gamma[0] == pytest.approx(0.004)
     per_db = 2e-4 * np.log(10)  # air that is thicker than thought, and light that a wrong range sends through it
-    in_air = backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.5, attenuation_err=0.01)
+    in_air = radiometry.backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.5, attenuation_err=0.01)
     assert in_air[0] == pytest.approx(np.hypot(0.004 + 0.5 * per_db, 0.01 * 500 * per_db))
 
 
@@ -84,14 +72,15 @@ def test_errors_are_those_of_repeated_measurements():
     draw = rng.multivariate_normal(np.zeros(2), [[1, -1 / np.sqrt(3)], [-1 / np.sqrt(3), 1]], n)
     a, s = amplitude + a_err * draw[:, 0], sigma + s_err * draw[:, 1]
     r = distance + r_err * rng.standard_normal(n)
-    gamma = backscatter(2.6e-8 * (1 + c_err * rng.standard_normal(n)), r, a, s, 0.5)
-    rho = diffuse_reflectance(gamma, angle + angle_err * rng.standard_normal(n))
-    energy = energy_error(amplitude, sigma, a_err, s_err)
-    relative = backscatter_error(energy, distance, r_err, c_err, 0.5)
+    gamma = radiometry.backscatter(2.6e-8 * (1 + c_err * rng.standard_normal(n)), r, a, s, 0.5)
+    rho = radiometry.diffuse_reflectance(gamma, angle + angle_err * rng.standard_normal(n))
+    energy = radiometry.energy_error(amplitude, sigma, a_err, s_err)
+    relative = radiometry.backscatter_error(energy, distance, r_err, c_err, 0.5)
     assert relative == pytest.approx(np.std(gamma) / np.mean(gamma), rel=0.02)
-    assert reflectance_error(relative, angle, angle_err) == pytest.approx(np.std(rho) / np.mean(rho), rel=0.02)
-    section = compute_cross_section(gamma, r, BETA)
-    assert backscatter_error(energy, distance, r_err, c_err, 0.5, power=4) == pytest.approx(
+    stated = radiometry.reflectance_error(relative, angle, angle_err)
+    assert stated == pytest.approx(np.std(rho) / np.mean(rho), rel=0.02)
+    section = radiometry.compute_cross_section(gamma, r, BETA)
+    assert radiometry.backscatter_error(energy, distance, r_err, c_err, 0.5, power=4) == pytest.approx(
         np.std(section) / np.mean(section), rel=0.02
     )
 
@@ -102,7 +91,7 @@ def test_errors_are_those_of_repeated_measurements():
     [(23.0, 550.0, 0.7387), (23.0, 1064.0, 0.3133), (100.0, 1064.0, 0.0591), (4.0, 1064.0, 2.3052)],
 )
 def test_attenuation_by_visibility(visibility, wavelength, expected):
-    assert attenuation_of_visibility(visibility, wavelength) == pytest.approx(expected, rel=2e-3)
+    assert radiometry.attenuation_of_visibility(visibility, wavelength) == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.quick_cases("any-0.3", "dense-1.0", "open-3.3")
@@ -137,10 +126,10 @@ def test_received_power_is_that_of_light_on_its_way():
     """Light on the footprint, scattered over the sphere, caught by the lens."""
     distance, reflectance, air = 900.0, 0.3, 0.4
     footprint = np.pi * (distance * BETA / 2) ** 2
-    section = spread_cross_section(reflectance, distance, BETA)
+    section = radiometry.spread_cross_section(reflectance, distance, BETA)
     assert section == pytest.approx(4 * reflectance * footprint)
     caught = 3.0 / footprint * section / (4 * np.pi * distance**2) * np.pi * (0.1 / 2) ** 2
-    found = receive_power(section, distance, transmitted=3.0, aperture=0.1, divergence=BETA, efficiency=0.7,
+    found = radiometry.receive_power(section, distance, transmitted=3.0, aperture=0.1, divergence=BETA, efficiency=0.7,
                           attenuation=air)  # fmt: skip
     assert found == pytest.approx(caught * 0.7 * 10 ** (-2 * distance / 1000 * air / 10))
 
@@ -148,5 +137,6 @@ def test_received_power_is_that_of_light_on_its_way():
 def test_haze_is_the_mean_of_its_layers():
     z = np.linspace(1200.0, 4400.0, 20_001)
     usual = np.exp(-np.linspace(0.0, 700.0, 20_001) / 2000.0).mean()
-    assert mean_haze(1200.0, 4400.0) == pytest.approx(np.exp(-z / 2000.0).mean() / usual, rel=1e-4)
-    assert mean_haze(0.0, 700.0) == pytest.approx(1.0) and mean_haze(-300.0, 0.0) == mean_haze(0.0, 0.0) > 1.0
+    assert radiometry.mean_haze(1200.0, 4400.0) == pytest.approx(np.exp(-z / 2000.0).mean() / usual, rel=1e-4)
+    assert radiometry.mean_haze(0.0, 700.0) == pytest.approx(1.0)
+    assert radiometry.mean_haze(-300.0, 0.0) == radiometry.mean_haze(0.0, 0.0) > 1.0

@@ -4,6 +4,7 @@ import naive
 import numpy as np
 import pytest
 
+from wavebatch.kernels.signal import signal as signals
 from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_energy,
@@ -12,15 +13,6 @@ from wavebatch.kernels.signal.filters import (
     refine_peaks,
 )
 from wavebatch.kernels.signal.runs import find_runs
-from wavebatch.kernels.signal.signal import (
-    SMOOTH_GAIN,
-    find_peaks,
-    find_quiet,
-    quiet_mean,
-    smooth_121,
-    transpose_samples,
-    widen,
-)
 
 
 @pytest.fixture
@@ -35,7 +27,7 @@ def integers(rng, s, n, top):
 
 def test_transposed_samples_are_contiguous_floats(rng):
     raw = rng.integers(0, 65536, (5, 9)).astype(np.uint16)
-    signal = transpose_samples(raw)
+    signal = signals.transpose_samples(raw)
     assert signal.dtype == np.float32
     assert signal.flags.c_contiguous
     np.testing.assert_array_equal(signal, raw.T)
@@ -45,12 +37,12 @@ def test_transposed_samples_are_contiguous_floats(rng):
 def test_smoothing_equals_the_plain_filter(rng, s):
     signal = integers(rng, s, 6, 200)
     expected = np.stack([naive.smooth_121(column) for column in signal.T], axis=1)
-    np.testing.assert_array_equal(smooth_121(signal), expected)
+    np.testing.assert_array_equal(signals.smooth_121(signal), expected)
 
 
 def test_smoothing_lets_the_stated_noise_through(rng):
     noise = rng.standard_normal((400, 500)).astype(np.float32)
-    assert smooth_121(noise)[1:-1].std() == pytest.approx(SMOOTH_GAIN, rel=0.01)
+    assert signals.smooth_121(noise)[1:-1].std() == pytest.approx(signals.SMOOTH_GAIN, rel=0.01)
 
 
 @pytest.mark.parametrize("s", [1, 2, 3, 25])
@@ -58,30 +50,30 @@ def test_smoothing_lets_the_stated_noise_through(rng):
 def test_peaks_equal_those_of_a_loop(rng, s, top):
     signal = integers(rng, s, 120, top)
     threshold = rng.uniform(-1, top - 1, 120).astype(np.float32)
-    waveform, sample = find_peaks(signal, threshold)
+    waveform, sample = signals.find_peaks(signal, threshold)
     assert list(zip(waveform.tolist(), sample.tolist(), strict=True)) == naive.find_peaks(signal, threshold)
 
 
 def test_peaks_of_nothing():
-    waveform, sample = find_peaks(np.zeros((8, 0), np.float32), 1.0)
+    waveform, sample = signals.find_peaks(np.zeros((8, 0), np.float32), 1.0)
     assert len(waveform) == len(sample) == 0
 
 
 def test_a_step_of_a_flank_is_no_peak():
     signal = np.array([[0, 1, 1, 2, 2, 3, 1, 2, 2, 0]], np.float32).T
-    assert find_peaks(signal, 0.0)[1].tolist() == [5, 7]
+    assert signals.find_peaks(signal, 0.0)[1].tolist() == [5, 7]
 
 
 def test_peaks_of_more_waveforms_than_sixteen_bits_count():
     signal = np.zeros((3, 70_000), np.float32)
     signal[1, [3, 65_540, 69_999]] = 5
-    assert find_peaks(signal, 1.0)[0].tolist() == [3, 65_540, 69_999]
+    assert signals.find_peaks(signal, 1.0)[0].tolist() == [3, 65_540, 69_999]
 
 
 @pytest.mark.parametrize("reach", [0, 1, 2, 3, 7, 12, 40])
 def test_widened_masks_equal_those_of_a_loop(rng, reach):
     mask = rng.random((30, 50)) < 0.04
-    np.testing.assert_array_equal(widen(mask, reach), naive.widen(mask, reach))
+    np.testing.assert_array_equal(signals.widen(mask, reach), naive.widen(mask, reach))
 
 
 @pytest.mark.parametrize("s", [1, 2, 17])
@@ -99,22 +91,22 @@ def test_quiet_samples_keep_away_from_signal(rng, reach):
     signal = rng.standard_normal((40, 30)).astype(np.float32)
     signal[20, ::2] += 40
     smoothed = np.stack([naive.smooth_121(column) for column in signal.T], axis=1)
-    quiet = find_quiet(signal, 2.5, reach)
+    quiet = signals.find_quiet(signal, 2.5, reach)
     np.testing.assert_array_equal(quiet, ~naive.widen(np.abs(smoothed) > 2.5, reach))
-    mean, number = quiet_mean(signal, quiet)
+    mean, number = signals.quiet_mean(signal, quiet)
     for w in range(30):
         assert number[w] == quiet[:, w].sum()
         assert mean[w] == pytest.approx(signal[quiet[:, w], w].mean(), abs=1e-5)
 
 
 def test_mean_without_quiet_samples_is_zero():
-    mean, number = quiet_mean(np.full((5, 2), 9.0, np.float32), np.zeros((5, 2), bool))
+    mean, number = signals.quiet_mean(np.full((5, 2), 9.0, np.float32), np.zeros((5, 2), bool))
     assert mean.tolist() == [0, 0]
     assert number.tolist() == [0, 0]
 
 
 def test_mean_of_a_single_quiet_sample_is_that_sample():
-    mean, number = quiet_mean(np.full((5, 1), 9.0, np.float32), np.arange(5)[:, None] == 3)
+    mean, number = signals.quiet_mean(np.full((5, 1), 9.0, np.float32), np.arange(5)[:, None] == 3)
     assert mean.tolist() == [9] and number.tolist() == [1]
 
 
@@ -150,7 +142,7 @@ def test_refined_peaks_of_gaussians_are_exact():
     time = np.array([10.0, 10.3, 9.6, 10.49])
     x = np.arange(21)[:, None]
     signal = (37.0 * np.exp(-0.5 * ((x - time) / 2.0) ** 2)).astype(np.float32)
-    waveform, sample = find_peaks(signal, 20.0)
+    waveform, sample = signals.find_peaks(signal, 20.0)
     refined, height = refine_peaks(signal, waveform, sample)
     np.testing.assert_allclose(refined, time, atol=2e-5)
     np.testing.assert_allclose(height, 37.0, rtol=1e-5)

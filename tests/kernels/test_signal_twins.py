@@ -11,20 +11,6 @@ from wavebatch.kernels.signal import noise as noise_kernels
 from wavebatch.kernels.signal.deconvolve import correlate_pulse, deconvolve_wiener, fit_height, wiener_taps
 from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
 from wavebatch.kernels.signal.filters import curvature_taps, filter_autocorrelation, gaussian_taps
-from wavebatch.kernels.signal.noise import (
-    PooledNoise,
-    colour_factors,
-    coloured_variance,
-    find_ends,
-    find_levels,
-    keep_longest,
-    measure_covariance,
-    measure_recovery,
-    predict_noise,
-    quiet_edges,
-    residual_noise,
-    whitening_filter,
-)
 from wavebatch.kernels.signal.runs import find_stretches, lobe_edges
 from wavebatch.kernels.signal.signal import NARROW, accumulate, sum_samples, widen_after
 
@@ -139,7 +125,7 @@ def test_slopes_are_found_within_their_errors(rng, recovery):
 def test_edges_give_level_and_noise_before_anything_is_known(rng):
     signal = record(rng, n=400, level=rng.uniform(10, 90, 400))
     signal[:12, ::5] += np.float32(40)  # begins within an echo
-    level, std = quiet_edges(signal)
+    level, std = noise_kernels.quiet_edges(signal)
     for w in range(400):
         first, last = signal[: noise_kernels.EDGE, w], signal[-noise_kernels.EDGE :, w]
         lower = last if last.mean() < first.mean() else first
@@ -151,7 +137,7 @@ def test_edges_give_level_and_noise_before_anything_is_known(rng):
 def test_ends_lie_before_the_first_and_after_the_last_signal(rng, recovery):
     above = record(rng, level=0.0) - np.float32(0.3)
     above[:, 3] = 0
-    found = find_ends(above, 3.1, 6, recovery)
+    found = noise_kernels.find_ends(above, 3.1, 6, recovery)
     for w in range(above.shape[1]):
         height = np.abs(naive.smooth_121(above[:, w]))
         busy, strong = np.flatnonzero(height > 3.1), np.flatnonzero(height > 9.3)
@@ -161,13 +147,13 @@ def test_ends_lie_before_the_first_and_after_the_last_signal(rng, recovery):
         if len(strong) and recovery:
             quiet[busy[0] : strong[-1] + recovery + 1] = False
         np.testing.assert_array_equal(found[:, w], quiet)
-    assert not find_ends(np.full((20, 2), np.nan, np.float32), 3.0, 6).any()
+    assert not noise_kernels.find_ends(np.full((20, 2), np.nan, np.float32), 3.0, 6).any()
 
 
 @pytest.mark.parametrize("recovery", [0, 30])
 def test_levels_are_those_of_single_waveforms(rng, recovery):
     signal = record(rng, level=rng.uniform(10, 90, 40))
-    levels, quiet, number = find_levels(signal, 1.25, 3, recovery=recovery)
+    levels, quiet, number = noise_kernels.find_levels(signal, 1.25, 3, recovery=recovery)
     for w in range(signal.shape[1]):
         level, used = naive_signal.find_level(signal[:, w].astype(float), 1.25, 3, recovery=recovery)
         assert levels[w] == pytest.approx(level, abs=1e-4)
@@ -181,31 +167,31 @@ def test_correlations_are_those_of_pairs(rng, monkeypatch):
     signal = (12 + white[3:] + 0.6 * white[2:-1] - 0.2 * white[:-3]).astype(np.float32)
     quiet = rng.random(signal.shape) < 0.8
     quiet[15:, :10] = False  # too few
-    found = measure_covariance(signal, quiet, lags=6)
+    found = noise_kernels.measure_covariance(signal, quiet, lags=6)
     assert found == pytest.approx(naive_signal.measure_covariance(signal, quiet, 6), rel=1e-4, abs=1e-4)
     beyond = signal > 13.5, signal < 11
     expected = naive_signal.measure_covariance(signal, quiet, 6, beyond)
-    assert measure_covariance(signal, quiet, 6, beyond) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+    assert noise_kernels.measure_covariance(signal, quiet, 6, beyond) == pytest.approx(expected, rel=1e-4, abs=1e-4)
     slow, twice = np.tile(np.cumsum(white[3:], axis=0), 2).astype(np.float32), np.tile(quiet, 2)
     for columns, most in ((50, 13), (100, 49)):
-        found = measure_covariance(slow[:, :columns], twice[:, :columns], lags=12)
+        found = noise_kernels.measure_covariance(slow[:, :columns], twice[:, :columns], lags=12)
         assert 13 <= len(found) <= most and (len(found) > 20) == (columns == 100)  # tails, in few waveforms
         expected = naive_signal.measure_covariance(slow[:, :columns], twice[:, :columns], 12)
         assert found == pytest.approx(expected, rel=1e-4, abs=1e-3)
-    assert measure_covariance(signal, quiet & False) is None
+    assert noise_kernels.measure_covariance(signal, quiet & False) is None
     residual, used = signal.T - 12, quiet.T
     residual = residual + 30 * (rng.random(residual.shape) < 0.01)  # echoes that nobody fitted
-    std, correlation = residual_noise(residual.astype(np.float32), used, np.array([0.1, 0.05]), lags=5)
+    std, correlation = noise_kernels.residual_noise(residual.astype(np.float32), used, np.array([0.1, 0.05]), lags=5)
     expected = naive_signal.residual_noise(residual.astype(np.float32), used, np.array([0.1, 0.05]), 5)
     assert std == pytest.approx(expected[0], rel=1e-5) and correlation == pytest.approx(expected[1], abs=1e-5)
-    assert residual_noise(residual.astype(np.float32), used & False, np.zeros(0)) is None
+    assert noise_kernels.residual_noise(residual.astype(np.float32), used & False, np.zeros(0)) is None
 
 
 def test_the_longest_recording_is_kept():
     """The first one of those that are as long; all of one, and nothing of none."""
     for given, kept in (("..x...x.", "xxx...xx"), ("x..x..x.", "x..xxxxx"), ("........", "........"), ("xxx", "xxx")):
         missing = np.array([[one == "x"] for one in given])
-        assert "".join("x" if lost else "." for lost in keep_longest(np.tile(missing, 3))[:, 1]) == kept
+        assert "".join("x" if lost else "." for lost in noise_kernels.keep_longest(np.tile(missing, 3))[:, 1]) == kept
 
 
 def record_tails(rng, tail, n=260, s=90):
@@ -219,11 +205,11 @@ def record_tails(rng, tail, n=260, s=90):
 @pytest.mark.parametrize("tail", [0.0, 0.04])
 def test_the_recovery_is_that_of_a_loop(rng, tail):
     signal = record_tails(rng, tail)
-    pooled = PooledNoise(12.0, 1.0, 1.0, 0.3, 0.7)
-    found = measure_recovery(signal, pooled, 4, 4.0)
+    pooled = noise_kernels.PooledNoise(12.0, 1.0, 1.0, 0.3, 0.7)
+    found = noise_kernels.measure_recovery(signal, pooled, 4, 4.0)
     assert found == naive_signal.measure_recovery(signal, pooled, 4, 4.0)
     assert (found > 0) == (tail > 0)
-    assert measure_recovery(signal[:, :90], pooled, 4, 4.0) == 0
+    assert noise_kernels.measure_recovery(signal[:, :90], pooled, 4, 4.0) == 0
 
 
 def test_coloured_noise_widens_errors_as_its_covariance_says():
@@ -231,25 +217,25 @@ def test_coloured_noise_widens_errors_as_its_covariance_says():
     pulse = np.exp(-0.5 * x * x)
     columns = (pulse, x * pulse, x * x * pulse)
     for correlation in ((0.5, 0.2, -0.05), (0.6,), (-0.3, 0.1)):
-        assert colour_factors(correlation, *columns) == pytest.approx(
+        assert noise_kernels.colour_factors(correlation, *columns) == pytest.approx(
             naive_signal.colour_factors(correlation, *columns)
         )
-    assert colour_factors((), *columns) == (1.0, 1.0, 1.0, 1.0)
+    assert noise_kernels.colour_factors((), *columns) == (1.0, 1.0, 1.0, 1.0)
 
 
 def test_sums_of_coloured_samples_vary_as_their_matrix_says(rng):
     for correlation, size in (((0.5, 0.2), 7), ((0.6, 0.0, 0.1, -0.1), 3), ((), 4), ((0.9,), 1)):
         rows = rng.standard_normal((3, size))
         matrix = toeplitz(np.r_[1.0, correlation, np.zeros(size)][:size])
-        assert coloured_variance(rows, correlation) == pytest.approx([row @ matrix @ row for row in rows])
+        assert noise_kernels.coloured_variance(rows, correlation) == pytest.approx([row @ matrix @ row for row in rows])
 
 
 @pytest.mark.parametrize("correlation", [(0.8, 0.64, 0.5), (0.5,), (0.86, 0.59, 0.25), (-0.3, -0.1)])
 def test_a_whitening_filter_is_the_inverse_cholesky_factor_of_its_noise(correlation):
-    near, far = predict_noise(correlation)
+    near, far = noise_kernels.predict_noise(correlation)
     assert near + far * correlation[0] == pytest.approx(correlation[0])
     assert near * correlation[0] + far == pytest.approx((*correlation, 0.0)[1])
-    rows, white = whitening_filter((near, far), 1.5), naive_fit.whiten(8, np.zeros(8, bool), near, far)
+    rows, white = noise_kernels.whitening_filter((near, far), 1.5), naive_fit.whiten(8, np.zeros(8, bool), near, far)
     for i in range(8):
         q = min(i, 2)
         assert white[i, i - q : i + 1][::-1] == pytest.approx(rows[q, : q + 1] / 1.5)
@@ -258,7 +244,7 @@ def test_a_whitening_filter_is_the_inverse_cholesky_factor_of_its_noise(correlat
 
 @pytest.mark.parametrize("correlation", [(1.0, 1.0), (0.8, 0.1), (0.5, 1.0), (-0.9, 0.5)])
 def test_what_no_noise_has_is_not_predicted(correlation):
-    assert predict_noise(correlation) is None
+    assert noise_kernels.predict_noise(correlation) is None
 
 
 @pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4)])

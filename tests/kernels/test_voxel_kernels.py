@@ -5,17 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from wavebatch.kernels.geometry.voxels import (
-    KEY_BITS,
-    VoxelSamples,
-    cross_voxels,
-    differences_along,
-    fits_keys,
-    pack_index,
-    split_rays,
-    sum_before,
-    unpack_index,
-)
+from wavebatch.kernels.geometry import voxels
 from wavebatch.kernels.signal.deconvolve import keep_signal, measure_offsets, window_signal
 
 
@@ -51,7 +41,7 @@ def draw_rays(rng, n):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_crossings_are_those_of_a_slow_walk(size, seed):
     rays = draw_rays(np.random.default_rng(seed), 40)
-    found = cross_voxels(*rays, size)
+    found = voxels.cross_voxels(*rays, size)
     for row in range(40):
         expected = [one for one in walk(*(values[row] for values in rays), size) if one[2] > 2e-6]
         mine = np.flatnonzero((found.ray == row) & (found.inside > 2e-6))
@@ -64,7 +54,7 @@ def test_rays_along_faces_and_through_edges_lie_in_one_voxel_at_a_time():
     start = np.array([[1.0, 0.5, 5.0], [0.0, 0.0, 0.0], [0.25, 0.25, 3.0], [2.5, 2.5, 2.5]])
     step = np.array([[0.0, 0.0, -1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     begin, end = np.array([0.0, 0.0, 0.0, 1.5]), np.array([3.0, 4.0, 2.0, 3.0])
-    found = cross_voxels(start, step, begin, end, 1.0)
+    found = voxels.cross_voxels(start, step, begin, end, 1.0)
     cells = [found.voxel[found.ray == row].tolist() for row in range(4)]
     assert cells[0] == [[1, 0, 4], [1, 0, 3], [1, 0, 2]]
     assert cells[1] == [[i, i, i] for i in range(4)]
@@ -74,8 +64,8 @@ def test_rays_along_faces_and_through_edges_lie_in_one_voxel_at_a_time():
 
 def test_rays_do_not_know_of_each_other():
     rays = draw_rays(np.random.default_rng(4), 500)
-    whole = cross_voxels(*rays, 0.3)
-    parts = [cross_voxels(*(values[row : row + 1] for values in rays), 0.3) for row in range(0, 500, 7)]
+    whole = voxels.cross_voxels(*rays, 0.3)
+    parts = [voxels.cross_voxels(*(values[row : row + 1] for values in rays), 0.3) for row in range(0, 500, 7)]
     for row, part in zip(range(0, 500, 7), parts, strict=True):
         mine = whole.ray == row
         for name in ("enter", "inside", "voxel"):
@@ -84,22 +74,22 @@ def test_rays_do_not_know_of_each_other():
 
 def test_slices_of_rays_cover_all_and_stay_small():
     rays = draw_rays(np.random.default_rng(5), 300)
-    slices = split_rays(*rays, 0.2, crossings=2000)
+    slices = voxels.split_rays(*rays, 0.2, crossings=2000)
     assert np.concatenate([np.arange(300)[part] for part in slices]).tolist() == list(range(300))
     for part in slices:
-        found = cross_voxels(*(values[part] for values in rays), 0.2)
+        found = voxels.cross_voxels(*(values[part] for values in rays), 0.2)
         widest = np.bincount(found.ray).max()
         assert widest * (part.stop - part.start) <= 2000 or part.stop - part.start == 1
-    assert split_rays(*(values[:0] for values in rays), 0.2) == []
-    assert len(cross_voxels(*(values[:0] for values in rays), 0.2).ray) == 0
+    assert voxels.split_rays(*(values[:0] for values in rays), 0.2) == []
+    assert len(voxels.cross_voxels(*(values[:0] for values in rays), 0.2).ray) == 0
 
 
 def test_keys_sort_as_indices_and_come_back(rng):
-    limits = [1 << (bits - 1) for bits in KEY_BITS]
+    limits = [1 << (bits - 1) for bits in voxels.KEY_BITS]
     index = np.stack([rng.integers(-limit, limit, 2000) for limit in limits], axis=1)
     index[0], index[1] = [-limit for limit in limits], [limit - 1 for limit in limits]
-    keys = pack_index(index)
-    assert np.array_equal(unpack_index(keys), index)
+    keys = voxels.pack_index(index)
+    assert np.array_equal(voxels.unpack_index(keys), index)
     assert np.array_equal(np.argsort(keys), np.lexsort(index.T[::-1]))
 
 
@@ -108,13 +98,13 @@ def test_keys_sort_as_indices_and_come_back(rng):
 def test_rays_that_keys_cannot_reach_are_refused(bad, what):
     rays = [values.copy() for values in draw_rays(np.random.default_rng(6), 5)]
     rays[what].reshape(5, -1)[2, -1] = bad
-    assert fits_keys(*rays, 0.5).tolist() == [True, True, False, True, True]
+    assert voxels.fits_keys(*rays, 0.5).tolist() == [True, True, False, True, True]
 
 
 def test_a_ray_of_too_many_voxels_does_not_fit():
     start, step = np.zeros((2, 3)), np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
     times = np.zeros(2), np.full(2, 1e4)
-    assert fits_keys(start, step, *times, 0.005).tolist() == [True, False]
+    assert voxels.fits_keys(start, step, *times, 0.005).tolist() == [True, False]
 
 
 def slow_sum(time, spacing, value, until):
@@ -132,28 +122,29 @@ def test_sums_over_time_spread_every_sample_over_its_step(rng):
     spacing = rng.choice([0.5, 1.0, 2.0], count.sum())
     time = np.concatenate([np.cumsum(2 + rng.uniform(0, 3, n)) for n in count])
     value = rng.integers(0, 1 << 40, (len(time), 2))
-    samples = VoxelSamples(time, spacing, value)
+    samples = voxels.VoxelSamples(time, spacing, value)
     ray = np.repeat(np.arange(5), 30)
     until = rng.uniform(-3, 90, 150)
     until[::7] = time[rng.integers(0, len(time), len(until[::7]))]
-    found = sum_before(samples, first, count, ray, until)
+    found = voxels.sum_before(samples, first, count, ray, until)
     for row in range(150):
         part = slice(first[ray[row]], first[ray[row]] + count[ray[row]])
         for column in (0, 1):
             expected = slow_sum(time[part], spacing[part], value[part, column], until[row])
             assert abs(found[row, column] - expected) <= 1
-    whole = sum_before(samples, first, count, np.arange(5), np.full(5, np.inf))
+    whole = voxels.sum_before(samples, first, count, np.arange(5), np.full(5, np.inf))
     assert np.array_equal(whole, [value[one : one + n].sum(axis=0) for one, n in zip(first, count, strict=True)])
-    none = sum_before(VoxelSamples(*(part[:0] for part in samples)), first[:1], count[1:2], ray[:2] * 0, until[:2])
+    nothing = voxels.VoxelSamples(*(part[:0] for part in samples))
+    none = voxels.sum_before(nothing, first[:1], count[1:2], ray[:2] * 0, until[:2])
     assert none.tolist() == [[0, 0], [0, 0]]
 
 
 def test_differences_add_up_to_the_whole():
     ray = np.array([0, 0, 0, 2, 2])
     values, last = np.array([[0], [3], [7], [0], [5]]), np.array([[10], [99], [6]])
-    assert differences_along(values, ray, last).ravel().tolist() == [3, 4, 3, 5, 1]
+    assert voxels.differences_along(values, ray, last).ravel().tolist() == [3, 4, 3, 5, 1]
     none = np.empty(0, np.int64)
-    assert len(differences_along(values[:0], none, last)) == 0
+    assert len(voxels.differences_along(values[:0], none, last)) == 0
 
 
 def test_runs_below_the_least_are_noise_and_the_sum_of_a_run_stays():

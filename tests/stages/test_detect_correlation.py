@@ -9,14 +9,7 @@ from published import WAGNER
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
-from wavebatch.kernels.signal.filters import (
-    find_minima,
-    keep_prominent,
-    pad_samples,
-    slide_energy,
-    slide_taps,
-    square_differences,
-)
+from wavebatch.kernels.signal import filters
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.detect.transformed import parabola_shift
 from wavebatch.stages.pulse_tables import reference_pulse
@@ -45,7 +38,7 @@ def detect(name, y, system=SYSTEM, **parameters):
 
 def test_square_differences_of_the_test_vector():
     signal = np.array([[0, 0, 0, 0, 1, 2, 1, 0, 0, 0, 0]], np.float32).T
-    difference, _ = square_differences(signal, np.array([0, 0.5, 1, 0.5, 0]), np.array([2], np.float32))
+    difference, _ = filters.square_differences(signal, np.array([0, 0.5, 1, 0.5, 0]), np.array([2], np.float32))
     assert difference[:, 0].tolist() == [6, 6, 6, 6, 7, 9, 4, 0, 4, 9, 7, 6, 6, 6, 6]
     assert np.argmin(difference) - 4 == 3
 
@@ -59,16 +52,16 @@ def test_minima_of_the_test_vector():
     """Two echoes, three side minima where the window's end crosses one; 0.3 of the range removes those."""
     signal = gauss(64, (80, 20.4, 2), (50, 40.25, 2))[:, None]
     taps = np.exp(-0.5 * (np.arange(-8, 9) / 2) ** 2)
-    difference, _ = square_differences(signal, taps, np.array([80.0]))
+    difference, _ = filters.square_differences(signal, taps, np.array([80.0]))
     values = np.ascontiguousarray(difference.T)
-    minima = find_minima(values)
+    minima = filters.find_minima(values)
     row = minima.row
     shift = parabola_shift(*(values[0, row + d] for d in (-1, 0, 1)))
     np.testing.assert_allclose(row - 8 + shift, [4.521, 20.395, 31.116, 40.244, 56.116], atol=6e-4)
     least = 0.3 * np.ptp(difference, axis=0)
     assert least[0] == pytest.approx(12005.1, abs=0.05)
     assert difference.max() == pytest.approx(40468.5, abs=0.05)
-    np.testing.assert_array_equal(row[keep_prominent(minima, least)] - 8, [20, 40])
+    np.testing.assert_array_equal(row[filters.keep_prominent(minima, least)] - 8, [20, 40])
 
 
 @pytest.mark.parametrize("s", [1, 3, 30])
@@ -78,16 +71,16 @@ def test_square_differences_equal_the_definition(s, taps):
     signal, height = rng.uniform(-1, 5, (s, 6)), rng.uniform(0, 5, 6)
     expected = np.stack([naive.square_differences(signal[:, w], height[w] * taps) for w in range(6)], axis=1)
     for kind, error in ((np.float64, 1e-11), (np.float32, 2e-3)):
-        found, correlation = square_differences(signal.astype(kind), taps, height.astype(kind))
+        found, correlation = filters.square_differences(signal.astype(kind), taps, height.astype(kind))
         np.testing.assert_allclose(found, expected, atol=error)
         plain = np.stack([np.correlate(column, taps, "full") for column in signal.T], axis=1)
         np.testing.assert_allclose(correlation, plain, atol=error)
 
 
 def test_sums_of_slid_windows():
-    padded = pad_samples(np.arange(12, dtype=np.float64).reshape(4, 3), 1)
-    assert slide_taps(padded, np.array([1.0, 10, 100]))[0].tolist() == [300, 410, 520]
-    assert slide_energy(padded, 3)[:, 0].tolist() == [9, 45, 126, 117]
+    padded = filters.pad_samples(np.arange(12, dtype=np.float64).reshape(4, 3), 1)
+    assert filters.slide_taps(padded, np.array([1.0, 10, 100]))[0].tolist() == [300, 410, 520]
+    assert filters.slide_energy(padded, 3)[:, 0].tolist() == [9, 45, 126, 117]
 
 
 @pytest.mark.parametrize("top", [3, 8, 1000])
@@ -96,8 +89,8 @@ def test_prominent_minima_equal_those_of_removal_one_by_one(top):
     values = rng.integers(0, top, (300, 60)).astype(np.float32)
     values[:5] = 1
     least = rng.uniform(0, top, 300).astype(np.float32)
-    minima = find_minima(values)
-    rows = keep_prominent(minima.take(np.arange(len(minima.row))), least)
+    minima = filters.find_minima(values)
+    rows = filters.keep_prominent(minima.take(np.arange(len(minima.row))), least)
     kept = list(zip(minima.waveform[rows].tolist(), minima.row[rows].tolist(), strict=True))
     expected = []
     for w in range(300):

@@ -83,25 +83,16 @@ def test_backscatter_and_range():
     assert np.median(done["cross_section"] / section) == pytest.approx(1.0, abs=0.003)
 
 
-def test_a_wrong_position_is_in_the_error():
-    block, echoes, _ = make(np.full(10, 20.0), snr=1e6)
-    system = SYSTEM.with_radiometry(sensor_error=6.4, attenuation=0.0)
-    done = run(block, echoes, system, "backscatter_coefficient", "cross_section").attributes
-    assert done["cross_section_err"] / done["cross_section"] == pytest.approx(0.04, rel=0.01)
-    assert done["backscatter_coefficient_err"] / done["backscatter_coefficient"] == pytest.approx(0.02, rel=0.02)
-    calibrated = SYSTEM.with_radiometry(attenuation=0.0, constant_error=0.03)
-    done = run(block, echoes, calibrated, "cross_section").attributes
-    assert done["cross_section_err"] / done["cross_section"] == pytest.approx(0.03, rel=0.01)
-
-
 @pytest.mark.parametrize(
     ("system", "gamma", "section"),
     [
+        (SYSTEM.with_radiometry(sensor_error=6.4, attenuation=0.0), 0.02, 0.04),
+        (SYSTEM.with_radiometry(constant_error=0.03, attenuation=0.0), 0.03, 0.03),
         (SYSTEM.with_radiometry(shot_error=0.05), 0.05, 0.05),
         (SYSTEM.with_radiometry(divergence_error=0.1), 0.0, 0.2),
         (SYSTEM.with_radiometry(attenuation_error=0.1), 2e-4 * 640 * 0.1 * np.log(10), 2e-4 * 640 * 0.1 * np.log(10)),
     ],
-    ids=["energy from shot to shot", "divergence", "air"],
+    ids=["position", "constant", "energy from shot to shot", "divergence", "air"],
 )
 def test_what_is_uncertain_for_all_echoes_is_in_the_error(system, gamma, section):
     block, echoes, _ = make(np.full(10, 20.0), snr=1e6)
@@ -191,16 +182,7 @@ def test_only_echoes_alone_have_a_reflectance_and_an_angle():
     ("system", "known"),
     [
         (SYSTEM.with_radiometry(constant=None), {"range", "incidence_angle", "incidence_angle_err"}),
-        (
-            SYSTEM.with_radiometry(divergence=None),
-            {
-                "range",
-                "backscatter_coefficient",
-                "backscatter_coefficient_err",
-                "level_reflectance",
-                "level_reflectance_err",
-            },
-        ),
+        (SYSTEM.with_radiometry(divergence=None), {name for name in KNOWN if not name.startswith(("cross", "incid"))}),
         (replace(SYSTEM, sigma_ref=0.64), KNOWN - {"incidence_angle", "incidence_angle_err"}),
         (SYSTEM, KNOWN),
         (SYSTEM.with_radiometry(sensor_error=0.1), set(COLUMNS)),
@@ -220,14 +202,6 @@ def test_without_a_sensor_nothing_is_known():
     for sensor in (None, np.full((50, 3), np.nan)):
         done = run(replace(block, sensor=sensor), echoes, SYSTEM, *NAMES).attributes
         assert all(np.isnan(done[name]).all() for name in COLUMNS)
-
-
-def test_amplitudes_that_are_guesses_say_nothing():
-    block, echoes, _ = make(np.full(3, 30.0))
-    echoes = echoes.with_flags(EchoFlag.AMPLITUDE_UNRELIABLE | EchoFlag.SATURATED, np.array([True, False, False]))
-    done = run(block, echoes, SYSTEM, "cross_section", "level_reflectance").attributes
-    missing = np.isnan(done["cross_section"]).tolist()
-    assert missing == np.isnan(done["level_reflectance"]).tolist() == [True, False, False]
 
 
 def test_light_of_fits_at_a_bound_is_an_estimate_for_sums_and_no_reflectance():
@@ -364,6 +338,7 @@ def test_reasons_of_single_echoes_and_that_they_add_up():
     done = run(block, echoes, SYSTEM, names[-1], *names[:-1], reflectance={"surface": "echo"})
     told = reasons(done)
     assert told["incidence_angle"] == {"KNOWN": 7, "OVERLAPPED": 1, "SATURATED": 1, "CUT": 1, "UNSETTLED": 2}
+    assert told["cross_section"] == {"KNOWN": 11, "SATURATED": 1}
     assert told["reflectance"] == {"KNOWN": 7, "SATURATED": 1, "UNSETTLED": 1, "NO_ANGLE": 3}
     assert set(told) == set(names)
     for name, counts in told.items():
@@ -477,19 +452,14 @@ def test_a_normalized_amplitude_is_that_at_the_reference_range(reference):
 
 
 def test_the_error_of_the_air_counts_over_the_way_to_the_reference():
+    """Air without an error is known to a half."""
     block, echoes, _ = make(np.zeros(4), snr=1e6)
-    for reference, way in ((640.0, 0.0), (1640.0, 1000.0)):
-        system = SYSTEM.with_radiometry(attenuation_error=0.1)
-        done = run(block, echoes, system, "amplitude_normalized", amplitude_normalized={"reference_range": reference})
-        relative = done.attributes["amplitude_normalized_err"] / done.attributes["amplitude_normalized"]
-        assert relative == pytest.approx(2e-4 * way * 0.1 * np.log(10), rel=0.01, abs=1e-4)
-
-
-def test_air_without_an_error_is_known_to_a_half_in_normalized_amplitudes():
-    block, echoes, _ = make(np.zeros(4), snr=1e6)
-    done = run(block, echoes, SYSTEM, "amplitude_normalized").attributes
-    expected = 2e-4 * np.abs(1000.0 - 640.0) * 0.11 * np.log(10)
-    assert done["amplitude_normalized_err"] / done["amplitude_normalized"] == pytest.approx(expected, rel=0.01)
+    unsure = SYSTEM.with_radiometry(attenuation_error=0.1)
+    for system, error, reference, way in ((unsure, 0.1, 640, 0), (unsure, 0.1, 1640, 1000), (SYSTEM, 0.11, 1000, 360)):
+        given = {"reference_range": float(reference)}
+        done = run(block, echoes, system, "amplitude_normalized", amplitude_normalized=given).attributes
+        relative = done["amplitude_normalized_err"] / done["amplitude_normalized"]
+        assert relative == pytest.approx(2e-4 * way * error * np.log(10), rel=0.01, abs=1e-4)
 
 
 def test_the_energy_of_each_pulse_is_divided_out():

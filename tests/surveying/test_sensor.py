@@ -163,23 +163,54 @@ def test_pairs_of_returns():
     assert 0.02 < found.error < 1.0
 
 
-@pytest.mark.parametrize("degrees", [0.0, 0.2, -0.1])
-def test_vectors_that_are_turned_against_pairs_of_returns_are_found(degrees):
+def about(axis, degrees):
+    """Matrix of a rotation about axis 0, 1 or 2."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.eye(3)
+    turn[np.ix_(*2 * [[(axis + 1) % 3, (axis + 2) % 3]])] = [[c, -s], [s, c]]
+    return turn
+
+
+def flight_of_turned_vectors(turn, view=30.0, pairs=400):
+    """A flight over hills of 20 m, 700 m high, in centimetres, and some pairs of returns."""
     rng = np.random.default_rng(9)
     time = START_TIME + np.sort(rng.uniform(0.0, 3.0, 8000))
-    rays = trace_rays(FlightLine(), "flat", (time - START_TIME) * 1e5)
-    unit = rays.direction / HALF_C
-    angle = np.radians(degrees)
-    about = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
-    path = estimate_path(RaySample(time, rays.ground, unit @ about.T, np.ones(8000)), "direction vectors")
-    some = rng.choice(8000, 400, replace=False)
-    some.sort()
-    apart = 9.0 * unit[some] + 0.01 * rng.standard_normal((400, 3))
-    middle = rays.ground[some] - 4.5 * unit[some]
-    found = find_turn(RaySample(time[some], middle, apart, (apart**2).sum(axis=1)), path.trajectory)
-    assert found is None if not degrees else found == pytest.approx(abs(degrees), abs=0.02)
-    few = RaySample(*(values[some[:15]] for values in (time, rays.ground, rays.direction, np.full(8000, 99.0))))
-    assert find_turn(few, path.trajectory) is None
+    seconds = time - START_TIME
+    across = np.tan(np.radians(view / 2)) * (1.0 - 2.0 * (50.0 * seconds % 1.0))
+    unit = np.stack([np.full(8000, 0.05), across, np.full(8000, -1.0)], axis=1)
+    unit /= np.linalg.norm(unit, axis=1)[:, None]
+    distance = (700.0 + 20.0 * np.sin(30.0 * across)) / -unit[:, 2]
+    ground = np.stack([60.0 * seconds, 0.0 * seconds, 700.0 + 0.0 * seconds], 1) + distance[:, None] * unit
+    vector = unit @ turn.T
+    some = np.sort(rng.choice(8000, pairs, replace=False))
+    apart = np.round(ground[some], 2) - np.round(ground[some] - 9.0 * unit[some], 2)
+    return (
+        RaySample(time, np.round(ground, 2), vector, np.ones(8000)),
+        RaySample(time[some], ground[some] - 4.5 * unit[some], apart, (apart**2).sum(axis=1), vector[some]),
+    )
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("degrees", [0.0, 0.05, -0.1, 0.3])
+def test_vectors_that_are_turned_against_their_points_are_found(axis, degrees):
+    """Nothing but pairs of returns was looked at, where vectors met, and no line named them."""
+    turn = about(axis, degrees)
+    for pairs in (400, 0):
+        vectors, two = flight_of_turned_vectors(turn, pairs=pairs)
+        true = np.degrees(np.sqrt(np.mean(((vectors.direction - vectors.direction @ turn) ** 2).sum(axis=1))))
+        found = estimate_path(vectors, "direction vectors", two)
+        facts = dict(found.facts)
+        assert abs(facts["turned_deg"] - true) < 2.0 * facts["turned_error_deg"] + 0.01 * true
+        assert bool(found.doubt()) == facts["is_turned"]
+        assert facts["is_turned"] == (true > 0.03) if pairs else not (facts["is_turned"] and true < 0.03)
+        assert facts["turned_error_deg"] < (0.002 if pairs else 0.1)
+
+
+def test_vectors_of_which_nothing_is_known_may_be_turned_as_far_as_a_mounting():
+    vectors, pairs = flight_of_turned_vectors(about(0, 0.5), pairs=15)
+    facts, off = find_turn(vectors, pairs, [])
+    assert off == facts["turned_deg"] == 0.0 and not facts["is_turned"]
+    assert facts["turned_error_deg"] == pytest.approx(np.degrees(0.0025), abs=0.01)
 
 
 def test_flights_with_a_break_have_no_positions_in_it():

@@ -60,8 +60,9 @@ def check(columns, name, true, rows, *, bias=0.02, known=0.95):
     off = value[there] - true[rows][there]
     scale = np.median(true[rows]) if "angle" not in name else max(0.02 * np.median(true[rows]), 0.3) / bias
     assert abs(np.median(off)) < bias * scale, name
-    # Planes of neighbouring points share their errors, so that a roof counts as few independent ones.
-    most = 0.82 if name == "incidence_angle_normals" else 0.77
+    # Planes of neighbouring points share their errors, so that a roof counts as few independent ones; and their errors
+    # hold that vectors may be turned against the points, which these are not.
+    most = 0.85 if name == "incidence_angle_normals" else 0.77
     assert 0.60 < np.mean(np.abs(off) <= error[there]) < most, name
 
 

@@ -60,7 +60,6 @@ def test_command_writes_and_draws(riegl, tmp_path):
     assert {row["divergence_mrad"] for row in rows} == {"0.5"} and 100 < float(rows[0]["distance_m"]) < 5000
     refused = run(riegl, "--divergence", 0.5, "--angles", target)
     assert refused.exit_code in (1, 2) and "--overwrite" in refused.stderr
-    pytest.importorskip("matplotlib")
     assert run(riegl, "--divergence", 0.5, "--angles", tmp_path / "a.svg").exit_code == 0
     text = (tmp_path / "a.svg").read_text("utf-8")
     assert "incidence angle [deg]" in text and riegl.name in text

@@ -11,6 +11,7 @@ import laspy
 import numpy as np
 import pytest
 from commands import run_command
+from writer_tools import write_points
 
 from wavebatch.cli.compare import HEAD, format_comparison
 from wavebatch.core.echoes import EchoFlag
@@ -20,20 +21,15 @@ from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.tools.pairing import SPEED, Differences, compare_clouds, compare_truth, measure_lag
 from wavebatch.tools.simulate import StripOptions, TruthReader, simulate_strip
 
+CORNER = np.array([500_000.0, 5_400_000.0, 0.0])
+
 
 def write_cloud(path, gps_time, xyz, *, scale=1e-4, point_format=6, names=None, **columns):
     """A plain cloud with float extra bytes, NaN for no data, and echo_flags where given."""
-    header = laspy.LasHeader(version="1.4", point_format=point_format)
-    header.scales, header.offsets = np.full(3, scale), np.array([500_000.0, 5_400_000.0, 0.0])
-    for name, values in columns.items():
-        header.add_extra_dim(laspy.ExtraBytesParams((names or {}).get(name, name), np.asarray(values).dtype))
-    cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = xyz.T
-    if gps_time is not None:
-        cloud.gps_time = gps_time
-    for name, values in columns.items():
-        cloud[(names or {}).get(name, name)] = values
-    cloud.write(path)
+    columns = {(names or {}).get(name, name): np.asarray(values) for name, values in columns.items()}
+    how = {"scale": scale, "offsets": CORNER, "point_format": point_format}
+    how["extra"] = [(name, values.dtype) for name, values in columns.items()]
+    write_points(path, xyz, **how, **({} if gps_time is None else {"gps_time": gps_time}), **columns)
 
 
 def make_pulses(n=300, seed=0):
@@ -142,8 +138,7 @@ def test_points_passed_through_are_no_echoes(tmp_path):
 def test_without_useful_times_nearest_neighbours_are_matched(tmp_path, times_are):
     _, times, xyz, ray = make_pulses(3000)
     given = {"missing": None, "zero": np.zeros(len(times)), "of another day": times + 86400}[times_are]
-    form = 0 if times_are == "missing" else 6
-    write_cloud(tmp_path / "a.las", given, xyz + 0.3 * SPEED * ray, point_format=form)
+    write_cloud(tmp_path / "a.las", given, xyz + 0.3 * SPEED * ray, point_format=0 if given is None else 6)
     write_cloud(tmp_path / "b.las", times[:-20], xyz[:-20])
     result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", held=1500)
     assert result.matched_by == "position"
@@ -291,16 +286,8 @@ def test_columns_of_other_styles_and_collisions_are_understood(tmp_path):
         with CloudReader(tmp_path / "a.las") as reader:
             assert reader.columns == ("echo_width",)
             assert next(reader.read_pieces())["echo_width"] == pytest.approx(values)
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    scale = {"scales": np.array([0.1]), "offsets": np.array([0.0])}
-    header.add_extra_dim(laspy.ExtraBytesParams("pulse width", "u2", no_data=np.array([0]), **scale))
-    header.add_extra_dim(
-        laspy.ExtraBytesParams("Amplitude", "u2", "dB", scales=np.array([0.01]), offsets=np.array([0.0]))
-    )
-    cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = xyz[:2].T - np.array([[500_000], [5_400_000], [0]])
-    cloud["pulse width"] = [4.2, 0.0]
-    cloud.write(tmp_path / "b.las")
+    extra = [("pulse width", "u2", 0, 0.1), ("Amplitude", "u2", None, 0.01, "dB")]
+    write_points(tmp_path / "b.las", xyz[:2] - CORNER, extra=extra, **{"pulse width": [4.2, 0.0]})
     with CloudReader(tmp_path / "b.las") as reader:
         assert reader.columns == ("echo_width",)
         rows = next(reader.read_pieces())
@@ -394,7 +381,7 @@ def test_differences_by_class_and_by_number_of_echoes(tmp_path, classified, poin
     shift = 0.1 * kinds + 0.01 * total
     place = xyz + (shift * SPEED)[:, None] * ray
     for name, where in (("a", place), ("b", xyz)):
-        write_cloud(tmp_path / f"{name}.las", times, where, point_format=6)
+        write_cloud(tmp_path / f"{name}.las", times, where)
         _set_fields(tmp_path / f"{name}.las", number_of_returns=total, return_number=np.ones(len(times), int))
         if point_format == 1:
             cloud = laspy.convert(laspy.read(tmp_path / f"{name}.las"), point_format_id=1, file_version="1.2")

@@ -109,7 +109,6 @@ def test_the_chains_own_detector_keeps_its_parameters():
 @pytest.mark.quick_cases("detector", "wavelet")
 @pytest.mark.parametrize("show", ["detector", *list_signals()])
 def test_pictures_have_the_signal_and_its_rule(tiny_strip, tmp_path, show):
-    pytest.importorskip("matplotlib")
     result = run(tiny_strip, "-o", tmp_path / "p.svg", "--packet", 3, "--show", show, "--profile", "fast")
     assert result.exit_code == 0, result.output
     text = (tmp_path / "p.svg").read_text("utf-8")

@@ -160,7 +160,6 @@ def forest_strip(tmp_path):
 @pytest.mark.slow
 def test_strips_of_a_forest_become_one_raster_with_two_commands(tmp_path):
     """Each strip sees half of the plot; voxels in a folder are clouds, which grid reads as one."""
-    pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     rng = np.random.default_rng(7)
     leaves = grow(rng, SIDE, crowns=None, density=0.3)
     strips = [fly(tmp_path / f"{name}.las", rng, leaves, SIDE, pulses=1.5) for name in "ab"]
@@ -180,7 +179,6 @@ def test_strips_of_a_forest_become_one_raster_with_two_commands(tmp_path):
 
 
 def test_the_command_says_what_it_wrote(even, tmp_path):
-    pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     arguments = ["grid", even[1], "--forest", "--size", 10, "--bbox", "0,0,20,20", "-o", tmp_path / "f.tif"]
     result = run_command(*arguments)
     assert result.exit_code == 0 and "2 x 2 cells of 10 m: 4 with metrics, 0 with fewer" in result.output
@@ -192,8 +190,6 @@ def test_the_command_says_what_it_wrote(even, tmp_path):
 ])  # fmt: skip
 def test_parts_of_the_voxels_and_degrees_are_refused(even, tmp_path, option, words):
     """Of voxels above 3 m all cells became no-data, of those below the ground cells had metrics; both in silence."""
-    pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
-    pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
     arguments = ["grid", str(even[1]), "--forest", "--size", "10", *option, "-o", str(tmp_path / "f.tif")]
     result = run_command(*arguments)
     assert result.exit_code == 2 and words in result.output and list(tmp_path.iterdir()) == []

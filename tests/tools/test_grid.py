@@ -6,6 +6,7 @@ import laspy
 import numpy as np
 import pytest
 from commands import run_command
+from writer_tools import write_points
 
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.las.header import read_header
@@ -23,22 +24,16 @@ UTM = (
 
 def _cloud(path, rng, n=4000, *, wkt=UTM, west=500_000.0, south=5_400_000.0, epsg=None):
     """A cloud over 700 m x 300 m; a tenth of the heights have no data."""
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales, header.offsets = (0.001,) * 3, (west, 5_400_000.0, 0.0)
-    header.add_extra_dim(laspy.ExtraBytesParams("height", "f4", "over ground [m]", no_data=np.array([-9999.0])))
-    if wkt:
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    vlrs = [laspy.vlrs.known.WktCoordinateSystemVlr(wkt)] if wkt else []
     if epsg:
         keys = np.array([1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, epsg], "<u2").tobytes()
-        header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", keys))
-    las = laspy.LasData(header)
-    las.points = laspy.ScaleAwarePointRecord.zeros(n, header=header)
-    las.x, las.y = west + rng.uniform(0, 700, n), south + rng.uniform(0, 300, n)
-    las.gps_time = 1e9 + np.arange(n) * 1e-5
+        vlrs.append(laspy.VLR("LASF_Projection", 34735, "", keys))
+    xyz = np.stack([west + rng.uniform(0, 700, n), south + rng.uniform(0, 300, n), np.zeros(n)], axis=1)
     values = rng.normal(10, 3, n).astype(np.float32)
     values[::10] = -9999
-    las["height"] = values
-    las.write(path)
+    extra = [("height", "f4", -9999.0, None, "over ground [m]")]
+    las = write_points(path, xyz, offsets=(west, 5_400_000.0, 0.0), extra=extra, vlrs=vlrs,
+                       gps_time=1e9 + np.arange(n) * 1e-5, height=values)  # fmt: skip
     return np.asarray(las.x), np.asarray(las.y), np.where(values == -9999, np.nan, values.astype(np.float64))
 
 

@@ -10,7 +10,6 @@ from commands import run_command
 from pulse_files import Pulse, PulseFile, Sampling, bell
 
 from wavebatch.core.errors import InputError
-from wavebatch.files import pulsewaves_file as pulse_reader
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.tools.import_file import ImportOptions, find_utm_zone, import_file, project_utm
@@ -81,11 +80,10 @@ def test_fields_positions_and_packets_come_through(tmp_path, rng, internal):
     assert np.allclose(away, [0, 0, -C], atol=1e-6)
 
 
-def test_bytes_do_not_depend_on_the_pieces(tmp_path, rng, monkeypatch):
+def test_bytes_do_not_depend_on_the_pieces(tmp_path, rng):
     path = _make(tmp_path, list(_flight(rng)))
     import_file(path, tmp_path / "o.las", ImportOptions())
-    monkeypatch.setattr(pulse_reader, "PULSES", 17)
-    import_file(path, tmp_path / "p.las", ImportOptions())
+    import_file(path, tmp_path / "p.las", ImportOptions(), pulses=17)
     assert (tmp_path / "o.las").read_bytes() == (tmp_path / "p.las").read_bytes()
     assert (tmp_path / "o.system.toml").read_bytes() == (tmp_path / "p.system.toml").read_bytes()
 

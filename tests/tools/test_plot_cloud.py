@@ -201,7 +201,6 @@ def test_points_without_data_in_the_column_of_groups_are_a_group(tmp_path):
 
 
 def test_groups_are_drawn(cloud, tmp_path):
-    pytest.importorskip("matplotlib")
     target = tmp_path / "two.svg"
     result = run("histogram", cloud, "-o", target, "--column", "z", "--by", "return_number")
     assert result.exit_code == 0, result.output
@@ -229,7 +228,6 @@ def test_rare_far_values_are_outside_and_counted(tmp_path):
 
 
 def test_maps_say_their_crs_and_refuse_two(tmp_path, riegl, cloud):
-    pytest.importorskip("matplotlib")
     found = grid_values([riegl], "z")
     assert "UTM" in found.crs.name and found.crs.unit == "m"
     assert run("map", riegl, "--column", "z", "-o", tmp_path / "r.svg").exit_code == 0
@@ -338,7 +336,6 @@ def test_the_size_that_is_proposed_does(cloud):
 
 
 def test_one_point_and_one_value_can_be_drawn(tmp_path):
-    pytest.importorskip("matplotlib")
     one = write_cloud(tmp_path / "one.las", n=1, amplitude=(np.array([7.0], "f4"), None, None, "peak [DN]"))
     for kind in ("histogram", "map"):
         assert run(kind, one, "--column", "amplitude", "-o", tmp_path / f"{kind}.png").exit_code == 0
@@ -366,7 +363,6 @@ QUICK = {("histogram", ".svg"), ("flags", ".pdf"), ("map", ".png")}
     ],
 )
 def test_pictures_have_the_same_bytes_each_time(tmp_path, cloud, name, suffix):
-    pytest.importorskip("matplotlib")
     target = tmp_path / f"a{suffix}"
     words = [*COMMANDS[name], cloud, "-o", target]
     result = run(*words)
@@ -380,7 +376,6 @@ def test_pictures_have_the_same_bytes_each_time(tmp_path, cloud, name, suffix):
 
 
 def test_pictures_say_what_they_show(tmp_path, cloud):
-    pytest.importorskip("matplotlib")
     expected = {
         "histogram": ["cloud.laz", "amplitude: peak of the echo above the baseline [DN]", "without data", "median"],
         "flags": ["cloud.laz", "SATURATED", "no flag", "5,000 points"],
@@ -395,7 +390,6 @@ def test_pictures_say_what_they_show(tmp_path, cloud):
 
 
 def test_names_from_files_are_text_and_no_formulas(tmp_path):
-    pytest.importorskip("matplotlib")
     path = write_cloud(
         tmp_path / "a$\\frac{b$\u4e2d.las", n=40, odd=(np.arange(40.0), None, None, "$\\x$ \x01<b> & \u4e2d")
     )
@@ -405,7 +399,6 @@ def test_names_from_files_are_text_and_no_formulas(tmp_path):
 
 
 def test_a_matplotlib_that_does_not_work_is_one_line(cloud, tmp_path, monkeypatch):
-    pytest.importorskip("matplotlib")
     monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
     result = run("histogram", cloud, "--column", "z", "-o", tmp_path / "p.png")
     assert result.exit_code == 2 and "matplotlib cannot be imported" in result.stderr
@@ -438,7 +431,6 @@ def test_unreadable_values_do_not_count(tmp_path):
 
 
 def test_real_clouds(riegl, leica, tmp_path):
-    pytest.importorskip("matplotlib")
     found = count_values([riegl], "Pulse width")
     assert found.total.values == 2535 and found.percentiles[0][1] == pytest.approx(4.4)
     assert cells.Clouds([riegl], ["amplitude"]).facts.unit == "dB"
@@ -448,7 +440,6 @@ def test_real_clouds(riegl, leica, tmp_path):
 
 def test_groups_of_few_values_are_points(tmp_path, monkeypatch):
     """A line of two values would be two needles of 50 %."""
-    pytest.importorskip("matplotlib")
     from matplotlib.axes import Axes
 
     from wavebatch.tools.plots import draw_cloud

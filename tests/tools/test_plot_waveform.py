@@ -24,18 +24,9 @@ from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.surveying import survey_block
 from wavebatch.tools.compare_chains import ChainRun, measure_fit
+from wavebatch.tools.plots import waveform
 from wavebatch.tools.plots.charts import measure_view_residuals
 from wavebatch.tools.plots.draw_waveform import _draw_panels, draw_waveform_panels, draw_waveform_sheet
-from wavebatch.tools.plots.waveform import (
-    MOST,
-    Place,
-    Wanted,
-    add_ranges,
-    build_views,
-    find_places,
-    list_echoes,
-    read_views,
-)
 
 KAPPA = 0.15
 
@@ -56,7 +47,7 @@ def test_residuals_are_those_of_the_cleaned_samples():
     system, chain = survey_block(block).system, load_profile("accurate")
     chain = replace(chain, steps=chain.steps[:3])
     assert system.defects.slope_spread > 0.05
-    views = build_views(block, chain, system, range(1000))
+    views = waveform.build_views(block, chain, system, range(1000))
     residual = np.array([np.sqrt(np.nanmean(view.residual**2)) for view in views])
     assert np.median(residual) == pytest.approx(1.0, abs=0.1)
     np.testing.assert_allclose(measure_view_residuals(block, chain, system), residual, rtol=1e-3)
@@ -83,7 +74,7 @@ def test_curves_are_the_fit_of_every_decomposer(name):
         system, parameters = replace(PULSE, components=((1.0, 0.0, 2.0), (0.03, 8.0, 2.0))), {"model": "stretched"}
         shape = PulseShape(components=((0.03, 8.0, 0.0),))
     block = simulate(shape, [(100.0, 30.3, 2.0)])
-    views = build_views(block, make_chain(name, **parameters), system, range(len(block)))
+    views = waveform.build_views(block, make_chain(name, **parameters), system, range(len(block)))
     assert len(views) == 20
     worst = {"decompose.asdf_only": 4.0, "decompose.asdf_mixed": 4.0}.get(name, 1.25)
     for view in views:
@@ -106,7 +97,7 @@ def test_view_against_a_plain_sum_of_gaussians():
     system = replace(PULSE, noise=replace(PULSE.noise, gain=0.05))
     chain = make_chain("decompose.gaussian")
     whole = chain.run(block, system)
-    for row, view in enumerate(build_views(block, chain, system, range(len(block)))):
+    for row, view in enumerate(waveform.build_views(block, chain, system, range(len(block)))):
         mine = whole.take(np.flatnonzero(whole.waveform == row))
         for name in ("time", "amplitude", "sigma", "flags", "time_err"):
             assert np.array_equal(getattr(view.echoes, name), getattr(mine, name))
@@ -122,7 +113,7 @@ def test_view_against_a_plain_sum_of_gaussians():
 
 def test_clipped_samples_count_only_where_the_fit_lies_below():
     block = simulate(PulseShape(), [(400.0, 30.3, 2.0)], n=1)
-    (view,) = build_views(block, make_chain("decompose.gaussian"), PULSE, [0])
+    (view,) = waveform.build_views(block, make_chain("decompose.gaussian"), PULSE, [0])
     assert view.clipped.sum() >= 3 and np.array_equal(view.clipped, block.samples[0] == 255)
     assert np.isnan(view.residual[view.clipped]).any()
     assert np.isfinite(view.residual[~view.clipped]).all()
@@ -131,12 +122,12 @@ def test_clipped_samples_count_only_where_the_fit_lies_below():
 
 def test_views_of_a_strip_are_what_a_run_gives(tiny_strip):
     chain = load_profile("balanced")
-    wanted = Wanted(packets=((5, 8), (300, 301), (6, 7)), points=(0, 400), times=())
+    wanted = waveform.Wanted(packets=((5, 8), (300, 301), (6, 7)), points=(0, 400), times=())
     found = {}
     for points in (50_000, 37):
         with StripReader(tiny_strip, unit_points=points) as reader, reader.scan() as scan:
-            places = find_places(reader, scan, wanted, None)
-            found[points] = read_views(reader, scan, places, chain, PULSE)
+            places = waveform.find_places(reader, scan, wanted, None)
+            found[points] = waveform.read_views(reader, scan, places, chain, PULSE)
             blocks = [
                 (block.rows(slice(row, row + 1)), int(block.point[row]))
                 for number in range(reader.unit_count())
@@ -165,11 +156,11 @@ def test_pulses_are_found_by_time_and_flag(tiny_strip):
             tables.append((block, chain.run(block, PULSE)))
         times = np.concatenate([block.gps_time for block, _ in tables])
         asked = float(times[17] + 0.3 * np.diff(np.sort(times)).min())
-        (place,) = find_places(reader, scan, Wanted(times=(asked,)), None)
-        (view,) = read_views(reader, scan, [place], chain, PULSE)
+        (place,) = waveform.find_places(reader, scan, waveform.Wanted(times=(asked,)), None)
+        (view,) = waveform.read_views(reader, scan, [place], chain, PULSE)
         assert view.gps_time == times[17]
         with pytest.raises(ConfigError, match="nearest is"):
-            find_places(reader, scan, Wanted(times=(5.0,)), None)
+            waveform.find_places(reader, scan, waveform.Wanted(times=(5.0,)), None)
         bits = np.bitwise_or.reduce(np.concatenate([table.flags for _, table in tables]))
         assert bits
         flagged = sorted(
@@ -177,21 +168,20 @@ def test_pulses_are_found_by_time_and_flag(tiny_strip):
             for block, table in tables
             for row in np.unique(table.waveform[(table.flags & bits) != 0])
         )
-        wanted = Wanted(chosen=PointFilter(flags=int(bits)), most=4)
-        places = find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE))
-        assert [view.point for view in read_views(reader, scan, places, chain, PULSE)] == flagged[:4]
+        wanted = waveform.Wanted(chosen=PointFilter(flags=int(bits)), most=4)
+        places = waveform.find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE))
+        assert [view.point for view in waveform.read_views(reader, scan, places, chain, PULSE)] == flagged[:4]
         with pytest.raises(InputError, match="no echo"):
-            find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE).take(np.empty(0, int)))
+            waveform.find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE).take(np.empty(0, int)))
 
 
 def test_without_a_wish_a_few_are_spread_over_the_strip(tiny_strip):
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
-        places = find_places(reader, scan, Wanted(most=5), None)
+        places = waveform.find_places(reader, scan, waveform.Wanted(most=5), None)
         assert [place.packet for place in places] == np.linspace(0, scan.packets - 1, 5).round().astype(int).tolist()
 
 
 def test_strips_without_waveforms(tmp_path, riegl, data):
-    pytest.importorskip("matplotlib")
     raw = make_raw(4)
     raw.points["wavepacket_index"] = 0
     nothing = raw.write(tmp_path / "nothing.las")
@@ -210,14 +200,12 @@ def test_strips_without_waveforms(tmp_path, riegl, data):
 @pytest.mark.quick_cases("1")
 @pytest.mark.parametrize("samples", [1, 2, 8])
 def test_short_waveforms_can_be_drawn(tmp_path, samples):
-    pytest.importorskip("matplotlib")
     strip = make_raw(5, n_samples=samples).write(tmp_path / "short.las")
     result = run(strip, "-o", tmp_path / "p.png", "--packet", 2, "--profile", "fast")
     assert result.exit_code == 0, result.output
 
 
 def test_pictures_say_what_they_show_with_the_same_bytes_each_time(tiny_strip, tmp_path):
-    pytest.importorskip("matplotlib")
     words = (tiny_strip, "-o", tmp_path / "p.svg", "--packet", 3, "--overwrite")
     assert run(*words).exit_code == 0
     first = (tmp_path / "p.svg").read_bytes()
@@ -233,7 +221,6 @@ def test_pictures_say_what_they_show_with_the_same_bytes_each_time(tiny_strip, t
     ("suffix", "start"), [(".png", b"\x89PNG"), pytest.param(".pdf", b"%PDF", marks=pytest.mark.slow)]
 )
 def test_several_waveforms_and_other_kinds_of_file(tiny_strip, tmp_path, suffix, start):
-    pytest.importorskip("matplotlib")
     target = tmp_path / f"p{suffix}"
     result = run(tiny_strip, "-o", target, "--packet", "0:2", "--point", 20, "--profile", "fast", "--times", "0:40")
     assert result.exit_code == 0 and "3 waveforms" in result.stderr, result.output
@@ -241,7 +228,6 @@ def test_several_waveforms_and_other_kinds_of_file(tiny_strip, tmp_path, suffix,
 
 
 def test_a_chain_that_fits_nothing_is_drawn_without_a_fit(tiny_strip, tmp_path):
-    pytest.importorskip("matplotlib")
     chain = tmp_path / "none.toml"
     stages = ("noise.pooled", "detect.maximum", "decompose.none", "attribute.amplitude", "attribute.position")
     chain.write_text("".join(f'[[chain]]\nstage = "{stage}"\n' for stage in stages))
@@ -253,7 +239,6 @@ def test_a_chain_that_fits_nothing_is_drawn_without_a_fit(tiny_strip, tmp_path):
 
 @pytest.mark.slow
 def test_no_display_and_no_home_are_needed(tiny_strip, tmp_path):
-    pytest.importorskip("matplotlib")
     environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "MPLCONFIGDIR")}
     environment |= {"HOME": str(tmp_path / "nowhere"), "MPLBACKEND": "TkAgg"}
     command = [sys.executable, "-m", "wavebatch", "plot", "waveform", str(tiny_strip), "-o", "p.png", "-q"]
@@ -265,22 +250,21 @@ def test_no_display_and_no_home_are_needed(tiny_strip, tmp_path):
 
 def test_the_signal_is_shown_and_the_whole_on_request(tiny_strip):
     block = simulate(PulseShape(), [(100.0, 30.3, 2.0), (50.0, 45.0, 2.0)], s=400)
-    for view in build_views(block, make_chain("decompose.gaussian"), PULSE, range(20)):
+    for view in waveform.build_views(block, make_chain("decompose.gaussian"), PULSE, range(20)):
         low, high = view.span
         assert 0 <= low < 25 and 50 < high < 100 and view.span_is_cut((low, high))
         seen = view.time[view.samples > view.level + 5 * view.std]
         assert low < seen.min() and seen.max() < high
         assert not view.span_is_cut((-0.5, 399.5))
     quiet = simulate(PulseShape(), [], s=100, n=1)
-    (view,) = build_views(quiet, make_chain("decompose.gaussian"), PULSE, [0])
+    (view,) = waveform.build_views(quiet, make_chain("decompose.gaussian"), PULSE, [0])
     assert len(view.echoes) or view.span == (-0.5, 99.5)
 
 
 @pytest.mark.parametrize("error", [20.0, 1e5, 1e30, np.inf, np.nan])
 def test_no_error_bar_presses_the_waveform_into_a_line(tmp_path, error):
-    pytest.importorskip("matplotlib")
     block = simulate(PulseShape(), [(100.0, 30.3, 2.0)], n=1)
-    (view,) = build_views(block, make_chain("decompose.gaussian"), PULSE, [0])
+    (view,) = waveform.build_views(block, make_chain("decompose.gaussian"), PULSE, [0])
     table = replace(view.echoes, amplitude_err=np.array([error], np.float32))
     with open_picture(tmp_path / "e.png", (6, 5), overwrite=True) as figure:
         panels = _draw_panels(figure, figure.add_gridspec(1, 1)[0], replace(view, echoes=table), view.span,
@@ -292,11 +276,11 @@ def test_no_error_bar_presses_the_waveform_into_a_line(tmp_path, error):
 def test_echoes_are_listed_and_written(tiny_strip, tmp_path):
     target = tmp_path / "e.csv"
     result = run(tiny_strip, "-o", target, "--packet", "0:30", "--profile", "balanced")
-    assert result.exit_code == 2 and f"{MOST} fit" in result.stderr
+    assert result.exit_code == 2 and f"{waveform.MOST} fit" in result.stderr
     assert run(tiny_strip, "-o", target, "--packet", "0:20", "--profile", "balanced").exit_code == 0
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
-        places = find_places(reader, scan, Wanted(packets=((0, 20),)), None)
-        views = read_views(reader, scan, places, load_profile("balanced"), PULSE)
+        places = waveform.find_places(reader, scan, waveform.Wanted(packets=((0, 20),)), None)
+        views = waveform.read_views(reader, scan, places, load_profile("balanced"), PULSE)
     rows = list(csv.DictReader(target.read_text().splitlines()))
     assert [int(row["packet"]) for row in rows if row["echo"] in ("", "1")] == list(range(20))
     found = [row for row in rows if row["echo"]]
@@ -311,22 +295,21 @@ def test_echoes_are_listed_and_written(tiny_strip, tmp_path):
         assert 100 < float(row["range [m]"]) < 10_000
     refused = run(tiny_strip, "-o", target, "--packet", 1)
     assert refused.exit_code == 1 and "--overwrite" in refused.stderr
-    text = list_echoes(views, most=3)
+    text = waveform.list_echoes(views, most=3)
     assert "more: -o FILE.csv" in text and "packet" in text.split("\n")[0]
     errors = [view.echoes.amplitude * 1e-6 for view in views]
     long = [replace(view, echoes=replace(view.echoes, amplitude_err=e)) for view, e in zip(views, errors, strict=True)]
-    lines = list_echoes([*long[:2], *views[2:]]).split("\n")
+    lines = waveform.list_echoes([*long[:2], *views[2:]]).split("\n")
     assert len({line.rindex("  ") for line in lines}) == 1, "flags start in one column"
 
 
 def test_real_waveforms(riegl, leica, tmp_path):
     chain = load_profile("accurate")
     with StripReader(riegl) as reader, reader.scan() as scan:
-        (place,) = find_places(reader, scan, Wanted(points=(514,)), None)
-        views, unit = read_views(reader, scan, [place], chain, PULSE), reader.read_unit(place.unit, scan)
+        (place,) = waveform.find_places(reader, scan, waveform.Wanted(points=(514,)), None)
+        views, unit = waveform.read_views(reader, scan, [place], chain, PULSE), reader.read_unit(place.unit, scan)
         assert views[0].packet == 475 and unit.packet_of_point[514 - unit.start] == place.row
         assert views[0].samples.max() == pytest.approx(183, abs=20)
-    pytest.importorskip("matplotlib")
     assert run(leica, "-o", tmp_path / "l.png", "--most", 1).exit_code == 0
 
 
@@ -338,18 +321,16 @@ def test_long_texts_lose_their_middle():
 @pytest.mark.slow
 def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, tmp_path):
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
-        drawn = [
-            [place.packet for place in find_places(reader, scan, Wanted(random=40, seed=seed, sheet=True), None)]
-            for seed in (1, 1, 2)
-        ]
+        random = [waveform.Wanted(random=40, seed=seed, sheet=True) for seed in (1, 1, 2)]
+        drawn = [[place.packet for place in waveform.find_places(reader, scan, one, None)] for one in random]
         assert drawn[0] == drawn[1] == sorted(set(drawn[0])) and len(drawn[0]) == 40 and drawn[0] != drawn[2]
-        assert len(find_places(reader, scan, Wanted(packets=((0, 60),), sheet=True), None)) == 60
-        with pytest.raises(ConfigError, match=f"{MOST} fit"):
-            find_places(reader, scan, Wanted(random=40), None)
-        assert len(find_places(reader, scan, Wanted(sheet=True), None)) == 100  # as many as a sheet holds
+        assert len(waveform.find_places(reader, scan, waveform.Wanted(packets=((0, 60),), sheet=True), None)) == 60
+        with pytest.raises(ConfigError, match=f"{waveform.MOST} fit"):
+            waveform.find_places(reader, scan, waveform.Wanted(random=40), None)
+        # As many as a sheet holds.
+        assert len(waveform.find_places(reader, scan, waveform.Wanted(sheet=True), None)) == 100
         with pytest.raises(ConfigError, match="100 with --sheet"):
-            find_places(reader, scan, Wanted(most=30), None)
-    pytest.importorskip("matplotlib")
+            waveform.find_places(reader, scan, waveform.Wanted(most=30), None)
     target = tmp_path / "sheet.svg"
     words = (tiny_strip, "-o", target, "--random", 9, "--seed", 1, "--sheet", "--profile", "fast", "--overwrite")
     result = run(*words)
@@ -360,9 +341,8 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
 
 
 def test_titles_name_every_flag_of_many_echoes(tmp_path):
-    pytest.importorskip("matplotlib")
     peaks = [(100.0, 20.3 + 8 * k, 2.0) for k in range(3)]
-    (view,) = build_views(simulate(PulseShape(), peaks, n=1), make_chain("decompose.gaussian"), PULSE, [0])
+    (view,) = waveform.build_views(simulate(PulseShape(), peaks, n=1), make_chain("decompose.gaussian"), PULSE, [0])
     view.echoes.flags[:] = int(EchoFlag.SATURATED | EchoFlag.OVERLAPPED | EchoFlag.AMPLITUDE_UNRELIABLE)
     draw_waveform_panels([view] * 3, tmp_path / "w.svg", strip="s", chain="c")
     text = (tmp_path / "w.svg").read_text("utf-8")
@@ -371,11 +351,11 @@ def test_titles_name_every_flag_of_many_echoes(tmp_path):
 
 
 def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):
-    pytest.importorskip("matplotlib")
-    views = build_views(
+    views = waveform.build_views(
         simulate(PulseShape(), [(400.0, 30.3, 2.0)], n=2), make_chain("decompose.gaussian"), PULSE, [0, 1]
     )
-    views += build_views(simulate(PulseShape(), [(0.1, 30.3, 2.0)], n=1), make_chain("decompose.none"), PULSE, [2])
+    quiet = simulate(PulseShape(), [(0.1, 30.3, 2.0)], n=1)
+    views += waveform.build_views(quiet, make_chain("decompose.none"), PULSE, [2])
     draw_waveform_sheet(views, tmp_path / "s.svg", strip="a.las", chain="test")
     text = (tmp_path / "s.svg").read_text("utf-8")
     assert "SATURATED" in text and "no echo" in text and "3 waveforms" in text
@@ -385,11 +365,12 @@ def test_waveforms_are_those_with_an_echo_that_meets_a_condition(tiny_strip):
     chain = load_profile("balanced")
     chosen = PointFilter.build(where="number_of_returns >= 2 and not echo_width > 5 and not flag(WEAK)")
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
-        places = find_places(reader, scan, Wanted(chosen=chosen, most=4), lambda block: chain.run(block, PULSE))
-        every = [Place(unit.number, row, -1) for unit in reader.read_units(scan)
+        wanted = waveform.Wanted(chosen=chosen, most=4)
+        places = waveform.find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE))
+        every = [waveform.Place(unit.number, row, -1) for unit in reader.read_units(scan)
                  for row in np.flatnonzero(unit.packets.owned)[:400].tolist()]  # fmt: skip
         meets = []
-        for place, view in zip(every, read_views(reader, scan, every, chain, PULSE), strict=True):
+        for place, view in zip(every, waveform.read_views(reader, scan, every, chain, PULSE), strict=True):
             good = (view.echoes.attributes["echo_width"] <= 5) & ((view.echoes.flags & EchoFlag.WEAK) == 0)
             if len(view.echoes) >= 2 and good.any():
                 meets.append((place.unit, place.row))
@@ -398,9 +379,9 @@ def test_waveforms_are_those_with_an_echo_that_meets_a_condition(tiny_strip):
 
 def test_a_listed_range_has_the_error_of_the_sensor_too(tiny_strip):
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
-        places = find_places(reader, scan, Wanted(packets=((0, 5),)), None)
-        chain, fill, error = add_ranges(load_profile("balanced"), reader, scan)
+        places = waveform.find_places(reader, scan, waveform.Wanted(packets=((0, 5),)), None)
+        chain, fill, error = waveform.add_ranges(load_profile("balanced"), reader, scan)
         assert 0.001 < error < 0.02
-        views = read_views(reader, scan, places, chain, PULSE.with_radiometry(sensor_error=0.3), None, fill)
-    places = [line.split("\N{PLUS-MINUS SIGN}")[-1].split()[0] for line in list_echoes(views).splitlines()[1:]]
+        views = waveform.read_views(reader, scan, places, chain, PULSE.with_radiometry(sensor_error=0.3), None, fill)
+    places = [line.split("\N{PLUS-MINUS SIGN}")[-1].split()[0] for line in waveform.list_echoes(views).splitlines()[1:]]
     assert places and all(float(place) == pytest.approx(0.3, rel=0.1) for place in places)

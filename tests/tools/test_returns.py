@@ -11,6 +11,7 @@ import laspy
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from writer_tools import write_points
 
 from wavebatch.cli.clouds import SHOWN, stats
 from wavebatch.core.echoes import EchoFlag
@@ -249,12 +250,8 @@ def make_cloud(path, n=800, seed=0, east=300_000.0):
     xyz = np.round(start[pulse] + number[:, None] * step[pulse] + [east, 0, 0], 3)
     order = rng.permutation(len(pulse))
     pulse, xyz, number, total = pulse[order], xyz[order], number[order], count[pulse[order]]
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, 0.001), np.array([east, 0, 0])
-    cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = xyz.T
-    cloud.gps_time, cloud.return_number, cloud.number_of_returns = 1e5 + pulse, number, total
-    cloud.write(path)
+    fields = {"gps_time": 1e5 + pulse, "return_number": number, "number_of_returns": total}
+    write_points(path, xyz, offsets=(east, 0, 0), **fields)
     return pulse, xyz, number
 
 

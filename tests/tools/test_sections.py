@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import run_command as run
 from plot_tools import write_cloud
+from writer_tools import write_points
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
@@ -55,7 +56,6 @@ def test_a_section_has_the_points_beside_its_line(cloud):
 
 
 def test_a_section_of_many_points_is_an_even_sample_that_says_so(cloud, tmp_path):
-    pytest.importorskip("matplotlib")
     found = cut_section([cloud], "z", line=LINE, width=10.0, most=300)
     assert len(found.value) <= 300 < found.inside
     sections.draw_section(found, tmp_path / "s.svg", aspect=2)
@@ -168,7 +168,6 @@ def test_slices_of_the_cube(tmp_path):
 
 
 def test_slice_writes_cube_and_overview_once(riegl, tmp_path):
-    pytest.importorskip("matplotlib")
     words = ("slice", riegl, "--lines", "0:5", "--shortest", 10, "--cube", tmp_path / "c.npz", "--overview")
     assert run(*words, tmp_path / "o.png").exit_code == 0
     first = (tmp_path / "c.npz").read_bytes()
@@ -217,7 +216,6 @@ def test_segments_count_at_their_heights(tmp_path, suffix):
 
 
 def test_profile_of_the_segments_of_a_strip(riegl, tmp_path):
-    pytest.importorskip("matplotlib")
     assert run("slice", riegl, "-o", tmp_path / "s.csv", "--lines", "0:20", "-q").exit_code == 0
     result = run("plot", "profile", tmp_path / "s.csv", "--column", "length", "-o", tmp_path / "p.svg")
     number = (tmp_path / "s.csv").read_text().count("\n") - 1
@@ -228,7 +226,6 @@ def test_profile_of_the_segments_of_a_strip(riegl, tmp_path):
 @pytest.mark.parametrize("given", ["s*.csv", "segs", "@list.txt", "segs/*.*", "segs/s.csv segs/../segs/t.csv"])
 def test_segments_are_found_as_clouds_are(tmp_path, monkeypatch, given):
     """By pattern, folder and list, each file once; a folder with clouds gives these."""
-    pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "segs").mkdir()
     for folder in (tmp_path, tmp_path / "segs"):
@@ -242,7 +239,6 @@ def test_segments_are_found_as_clouds_are(tmp_path, monkeypatch, given):
 
 
 def test_a_folder_with_clouds_and_tables_gives_the_clouds(cloud, tmp_path):
-    pytest.importorskip("matplotlib")
     _write_segments(tmp_path / "s.csv", [(1, 2), (3, 4)], [1, 2])
     result = run("plot", "profile", tmp_path, "-o", tmp_path / "p.png", "--json", "-q")
     assert json.loads(result.stdout)["clouds"] == [str(cloud)]
@@ -254,14 +250,10 @@ def test_a_folder_with_clouds_and_tables_gives_the_clouds(cloud, tmp_path):
 @pytest.mark.parametrize("many", [40, 3000])
 def test_far_points_leave_the_frame_of_a_section_and_are_counted(tmp_path, many):
     """One point 116 m below pressed the others into a line; what is near the others stays."""
-    pytest.importorskip("matplotlib")
     rng = np.random.default_rng(1)
-    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
-    las.header.scales = [0.001] * 3
     height = rng.normal(350.0, 0.3, many)
     height[0], height[1] = 353.0, 234.0
-    las.x, las.y, las.z = np.linspace(0.0, 80.0, many), rng.uniform(0, 1, many), height
-    las.write(tmp_path / "c.las")
+    write_points(tmp_path / "c.las", np.stack([np.linspace(0.0, 80.0, many), rng.uniform(0, 1, many), height], axis=1))
     for most in (200_000, many // 2 + 20):
         found = cut_section([tmp_path / "c.las"], "z", line=(0, 0.5, 80, 0.5), width=2.0, most=most)
         assert (found.inside, found.outside) == (many, 1) and len(found.value) <= most
@@ -281,7 +273,6 @@ def test_a_tower_and_a_few_points_stay_in_the_section():
 
 def test_logarithmic_profiles_have_plain_labels(cloud, tmp_path):
     """Math text is off, so that a $ in a name is a $: powers of ten would show as source text."""
-    pytest.importorskip("matplotlib")
     assert run("plot", "profile", cloud, "--log", "-o", tmp_path / "p.svg").exit_code == 0
     text = (tmp_path / "p.svg").read_text("utf-8")
     assert "mathdefault" not in text and ">100<" in text.replace("\n", "")

@@ -10,18 +10,15 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
 from wavebatch.kernels.physics.radiometry import backscatter
-from wavebatch.tools.simulate import SCENES, PulseModel, Recording, find_pulse, find_scene, shape_pulse, simulate_block
-from wavebatch.tools.simulate.render import (
-    AIR_SPEED,
-    GROUND,
-    PULSES,
-    TERRAINS,
-    FlightLine,
-    main_lobe,
-    paint_echoes,
-    record_counts,
-    spread_lobes,
-    trace_rays,
+from wavebatch.tools.simulate import (
+    SCENES,
+    PulseModel,
+    Recording,
+    find_pulse,
+    find_scene,
+    render,
+    shape_pulse,
+    simulate_block,
 )
 from wavebatch.tools.simulate.scenes import HAZARDS, SEED_BLOCK, flag_truth, simulate_blocks
 
@@ -32,9 +29,9 @@ def paint_naively(recording, n, waveform, time, amplitude, sigma):
     """Slow twin of paint_echoes for pulses without lobes: every sample of every echo, in double precision."""
     x = np.arange(recording.n_samples) * recording.spacing
     signal = np.zeros((n, recording.n_samples))
-    peak = spread_lobes(recording.pulse, time, amplitude, sigma)[0][0]
+    peak = render.spread_lobes(recording.pulse, time, amplitude, sigma)[0][0]
     for w, t, a, s in zip(waveform, peak, amplitude, sigma, strict=True):
-        signal[w] += a * main_lobe((x - t) / s, recording.pulse.kappa)
+        signal[w] += a * render.main_lobe((x - t) / s, recording.pulse.kappa)
     return signal
 
 
@@ -47,7 +44,7 @@ def test_painting_equals_the_naive_twin(kappa, spacing, seed=1):
     waveform = np.sort(rng.integers(0, n, m))
     time = rng.uniform(-30, recording.duration + 30, m)
     amplitude, sigma = rng.uniform(5, 5000, m), rng.uniform(0.8, 9.0, m)
-    fast = paint_echoes(recording, n, waveform, time, amplitude, sigma)
+    fast = render.paint_echoes(recording, n, waveform, time, amplitude, sigma)
     slow = paint_naively(recording, n, waveform, time, amplitude, sigma)
     assert np.abs(fast - slow).max() < 1e-5 * 5000
     assert slow.max() > 1000
@@ -56,19 +53,19 @@ def test_painting_equals_the_naive_twin(kappa, spacing, seed=1):
 def test_painting_nothing_and_far_outside():
     none = np.empty(0)
     recording = Recording()
-    assert not paint_echoes(recording, 3, none.astype(int), none, none, none).any()
-    far = paint_echoes(recording, 1, np.array([0, 0]), np.array([-500.0, 900.0]), np.full(2, 50.0), np.full(2, 2.0))
-    assert not far.any()
+    assert not render.paint_echoes(recording, 3, none.astype(int), none, none, none).any()
+    far = np.array([0, 0]), np.array([-500.0, 900.0]), np.full(2, 50.0), np.full(2, 2.0)
+    assert not render.paint_echoes(recording, 1, *far).any()
 
 
-@pytest.mark.parametrize("name", list(PULSES))
+@pytest.mark.parametrize("name", list(render.PULSES))
 @pytest.mark.parametrize("ringing", [0.0, 0.03])
 @pytest.mark.parametrize("sigma_factor", [1.0, 1.7])
 def test_every_pulse_peaks_at_the_amplitude(name, ringing, sigma_factor):
     pulse = find_pulse(name).with_ringing(ringing)
     recording = Recording(n_samples=4000, spacing=0.02, pulse=pulse)
     sigma = np.array([pulse.sigma * sigma_factor])
-    signal = paint_echoes(recording, 1, np.array([0]), np.array([30.0]), np.array([100.0]), sigma)[0]
+    signal = render.paint_echoes(recording, 1, np.array([0]), np.array([30.0]), np.array([100.0]), sigma)[0]
     assert signal.max() == pytest.approx(100, rel=1e-3)
     # The Gaussian that fits a flat target's pulse lies at its time; a target that widens it moves it a little.
     datum = fit_one_gaussian(np.arange(4000) * 0.02, signal)[0]
@@ -78,10 +75,11 @@ def test_every_pulse_peaks_at_the_amplitude(name, ringing, sigma_factor):
 def test_riegl_pulse_has_its_after_pulse_and_ringing_its_lobes():
     pulse = find_pulse("riegl")
     recording = Recording(n_samples=100, spacing=0.5, pulse=pulse)
-    signal = paint_echoes(recording, 1, np.array([0]), np.array([10.0]), np.array([100.0]), np.array([pulse.sigma]))[0]
+    one = np.array([0]), np.array([10.0]), np.array([100.0])
+    signal = render.paint_echoes(recording, 1, *one, np.array([pulse.sigma]))[0]
     assert 3.0 < signal[41] < 5.0
     ring = replace(recording, pulse=PulseModel(sigma=2.0).with_ringing(0.05))
-    signal = paint_echoes(ring, 1, np.array([0]), np.array([10.0]), np.array([100.0]), np.array([2.0]))[0]
+    signal = render.paint_echoes(ring, 1, *one, np.array([2.0]))[0]
     assert signal[36] == pytest.approx(-5.0, abs=0.1)
     assert signal[52] == pytest.approx(5.0, abs=0.1)
 
@@ -90,7 +88,7 @@ def test_counts_are_rounded_clipped_and_read_only():
     recording = Recording(noise_std=0.0, baseline_spread=0.0, baseline=12.0, saturation=200)
     signal = np.zeros((1, 80), np.float32)
     signal[0, :4] = [0.4, 0.6, 500.0, -50.0]
-    counts = record_counts(recording, signal, np.random.default_rng(0))
+    counts = render.record_counts(recording, signal, np.random.default_rng(0))
     assert counts[0, :5].tolist() == [12, 13, 200, 0, 12]
     block, _ = make_block("mixed", 10)
     assert not block.samples.flags.writeable
@@ -99,7 +97,7 @@ def test_counts_are_rounded_clipped_and_read_only():
 @pytest.mark.parametrize(("rho", "smoothed"), [(0.0, 1.0), (0.5, 1.29), (0.667, 1.39), (0.8, 1.48)])
 def test_noise_has_the_spread_and_the_colour_asked_for(rho, smoothed):
     recording = Recording(noise_std=8.0, rho=rho, baseline=100.0, baseline_spread=0.0)
-    counts = record_counts(recording, np.zeros((4000, 80), np.float32), np.random.default_rng(2)) - 100.0
+    counts = render.record_counts(recording, np.zeros((4000, 80), np.float32), np.random.default_rng(2)) - 100.0
     assert counts.std() == pytest.approx(recording.recorded_noise, rel=0.01)
     correlation = (counts[:, 1:] * counts[:, :-1]).mean() / counts.var()
     assert correlation == pytest.approx(rho, abs=0.01)
@@ -109,7 +107,7 @@ def test_noise_has_the_spread_and_the_colour_asked_for(rho, smoothed):
 
 def test_signal_adds_variance_when_asked():
     recording = Recording(bits=16, noise_std=2.0, noise_gain=0.5, baseline=100.0, baseline_spread=0.0)
-    counts = record_counts(recording, np.full((3000, 80), 400.0, np.float32), np.random.default_rng(3))
+    counts = render.record_counts(recording, np.full((3000, 80), 400.0, np.float32), np.random.default_rng(3))
     assert counts.std() == pytest.approx(np.sqrt(4 + 0.5 * 400), rel=0.02)
 
 
@@ -148,7 +146,7 @@ def test_scenes_have_their_shares_of_echoes(name):
 def test_slope_widens_and_weakens_echoes():
     scene = find_scene("slope")
     block, truth = make_block("slope", 30_000, seed=6)
-    rays = trace_rays(FlightLine(), scene.terrain, np.arange(30_000))
+    rays = render.trace_rays(render.FlightLine(), scene.terrain, np.arange(30_000))
     incidence = rays.incidence
     assert np.degrees(incidence).max() > 50
     expected = np.hypot(2.0, 0.5e-3 * scene.divergence * rays.distance * np.tan(incidence) / 0.299792458)
@@ -165,7 +163,7 @@ def test_samples_hold_the_truth(name):
     if name in ("stiff", "stiff.ringing", "stiff.constant"):
         return
     recording = scene.recording
-    signal = paint_echoes(
+    signal = render.paint_echoes(
         recording, len(block), truth.waveform, truth.time, truth.amplitude.astype(float), truth.sigma.astype(float)
     )
     clear = signal + recording.baseline + 6 < recording.clip
@@ -274,16 +272,16 @@ def test_tiny_windows_still_take_the_scene():
     assert truth.time.max() < 15
 
 
-@pytest.mark.parametrize("terrain", list(TERRAINS))
+@pytest.mark.parametrize("terrain", list(render.TERRAINS))
 def test_rays_and_slopes_fit_together(terrain):
-    rays = trace_rays(FlightLine(), terrain, np.arange(0, 50_000, 7))
-    assert np.allclose(np.linalg.norm(rays.direction, axis=1), AIR_SPEED)
+    rays = render.trace_rays(render.FlightLine(), terrain, np.arange(0, 50_000, 7))
+    assert np.allclose(np.linalg.norm(rays.direction, axis=1), render.AIR_SPEED)
     assert (rays.direction[:, 2] < 0).all()
     assert (np.diff(rays.gps_time) > 0).all()
     assert np.abs(rays.scan_angle).max() <= 30
-    height, slope_x, slope_y = TERRAINS[terrain](rays.ground[:, 0], rays.ground[:, 1])
-    ahead = TERRAINS[terrain](rays.ground[:, 0] + 1e-4, rays.ground[:, 1])[0]
-    aside = TERRAINS[terrain](rays.ground[:, 0], rays.ground[:, 1] + 1e-4)[0]
+    height, slope_x, slope_y = render.TERRAINS[terrain](rays.ground[:, 0], rays.ground[:, 1])
+    ahead = render.TERRAINS[terrain](rays.ground[:, 0] + 1e-4, rays.ground[:, 1])[0]
+    aside = render.TERRAINS[terrain](rays.ground[:, 0], rays.ground[:, 1] + 1e-4)[0]
     assert np.median(np.abs((ahead - height) / 1e-4 - slope_x)) < 1e-3
     assert np.median(np.abs((aside - height) / 1e-4 - slope_y)) < 1e-3
 
@@ -293,7 +291,7 @@ def test_origin_and_direction_lead_to_the_ground():
     last = np.flatnonzero(np.append(np.diff(truth.waveform) != 0, True))
     at = truth.waveform[last]
     ground = block.origin[at] + truth.time[last][:, None] * block.direction[at]
-    height = TERRAINS["hills"](ground[:, 0], ground[:, 1])[0]
+    height = render.TERRAINS["hills"](ground[:, 0], ground[:, 1])[0]
     assert np.allclose(ground[:, 2] - 120.0, height, atol=1e-6)
 
 
@@ -339,8 +337,8 @@ def test_every_scene_says_what_it_is():
 def test_a_village_has_roofs_of_all_angles_as_bright_as_they_reflect():
     scene = find_scene("village")
     block, truth = make_block(scene, 30_000, seed=7)
-    rays = trace_rays(scene.flight, scene.terrain, np.arange(30_000))
-    roof = rays.ground[:, 2] > GROUND + 1
+    rays = render.trace_rays(scene.flight, scene.terrain, np.arange(30_000))
+    roof = rays.ground[:, 2] > render.GROUND + 1
     assert 0.15 < roof.mean() < 0.4
     steep = np.degrees(rays.incidence[roof])
     assert all((np.abs(steep - angle) < 3).any() for angle in (10, 20, 30, 40, 50, 60))

@@ -173,7 +173,6 @@ def test_csv_and_geojson_hold_the_same_segments(strip, tmp_path):
 
 
 def test_picture_of_a_slice(strip, tmp_path):
-    pytest.importorskip("matplotlib")
     for geometry in ("plane", "time"):
         target = tmp_path / f"{geometry}.png"
         assert run(strip, "--png", target, "--lines", "2", "--geometry", geometry).exit_code == 0

@@ -86,7 +86,6 @@ def test_clouds_in_feet_are_compared_in_metres(clouds):
 
 
 def test_the_summary_of_a_map_names_the_unit(clouds, tmp_path):
-    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     result = _print("plot", "map", clouds["ft"], "--statistic", "count", "-o", tmp_path / "m.png", "--json")
     assert " us-ft\n" in result.stderr and json.loads(result.stdout)["unit"] == "us-ft"
 

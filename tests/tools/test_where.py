@@ -136,7 +136,6 @@ def test_grids_are_of_them(cloud, split, tmp_path):
     ("echo_wdth > 9", "character 1: "),
 ])  # fmt: skip
 def test_a_grid_of_no_point_says_why(cloud, tmp_path, where, words):
-    pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     target = tmp_path / "x.tif"
     result = run_command("grid", cloud, "--column", "z", "--where", where, "-o", target)
     assert result.exit_code in (1, 2) and words in result.stderr and not target.exists()

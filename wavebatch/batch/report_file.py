@@ -271,6 +271,10 @@ JETS = 5000.0
 MOST_ABOVE_ONE = 0.03
 """Share of the reflectances above 1 from which a warning is printed."""
 
+UNSEEN_TURN = 0.05
+"""Angle from which a remark says that vectors which are turned against the points would not show [deg]: the best planes
+through points are known to a tenth of a degree."""
+
 MOST_GAPS = 3
 """Most gaps of a trajectory that a remark lists."""
 
@@ -301,6 +305,12 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         seen = dict(sensor.facts).get("height_m")
         where = f": {seen:.0f} m above the points" if seen else ""
         lines.append(f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}")
+    unseen = 0.0 if sensor.kind == "trajectory" else dict(sensor.facts).get("turned_error_deg", 0.0)
+    if "incidence_angle_normals" in prepared.job.chain.makes and unseen > UNSEEN_TURN:
+        lines.append(
+            "incidence_angle_normals: packet vectors that are turned against the points would not show in this strip: "
+            f"the errors hold {unseen:.1g} degrees of it; --trajectory would show it"
+        )
     # The pulse that a residual loop takes from the survey where the chain names none.
     step = prepared.job.chain.steps[2]
     if step.effective().get("model") == "auto":

@@ -116,6 +116,8 @@ def prepare(
     source = UNKNOWN
     if positions is not Positions.IF_NEEDED or needs_sensor(choice.chain):
         source = _find_sensor(reader, scan, sensor or SensorRequest(), positions)
+    elif "incidence_angle_normals" in choice.chain.makes:  # only to see whether its vectors are turned
+        source = _find_sensor(reader, scan, SensorRequest(), Positions.IF_KNOWN)
     system, sent = choice.survey.system, StripEnergies(None)
     source = replace(source, returns=measure_returns(reader, scan, system))
     if calibration is not None or positions is not Positions.IF_NEEDED or needs_sensor(choice.chain):

@@ -6,6 +6,7 @@ Before you change it: positions must depend on the strip and the request alone, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,21 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import robust_std
 from wavebatch.core.trajectory import Trajectory, solve_offset
-from wavebatch.core.units import AIR_ATTENUATION, MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.units import AIR_ATTENUATION
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.reader import LEAST_PAIRS, RaySample, StripReader, StripScan, measure_scale, sample_rays
 from wavebatch.files.trajectory_file import read_trajectory
-from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, measure_extent, range_error, sensor_at
+from wavebatch.kernels.geometry.ray_convergence import (
+    CLIP,
+    SensorFit,
+    TurnSeen,
+    fit_best,
+    measure_extent,
+    measure_turn,
+    range_error,
+    sensor_at,
+)
 from wavebatch.kernels.physics.radiometry import mean_haze
 from wavebatch.surveying.measuring.return_scatter import ReturnScatter
 
@@ -59,17 +69,20 @@ parabola leaves of it: a root mean square of JERK half^3 times this."""
 LEAST_DOUBT = 2.0
 """Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
 
-MOST_LAG = 5e-3
-"""Least distance along the flight, as a share of the range, between a trajectory and the packet vectors for a remark: a
-mounting is known better than to 5 mrad."""
+MOUNTING = 5e-3
+"""Angle to which a mounting is known at least [rad]: the least between a trajectory and the packet vectors, along the
+flight, for a remark; and twice the error of vectors where nothing shows whether they are turned."""
 
-LEAST_PAIR, SURE_TURN = 5.0, 4.0
-"""Distance of returns of a pair [m] from which they show a direction to a tenth of a degree; and errors from which
-their median shows that packet vectors are turned."""
+SURE_TURN, LEAST_TURN = 5.0, 5e-4
+"""Errors from which packet vectors are said to be turned against their points, and least angle that counts [rad]: by
+it, an echo 20 m from its return is 1 cm off, as coordinates are rounded."""
 
 HEIGHT_ERROR = 0.05
 """Error of the range, relative, where only the height of the flight is known; and scatter of the points' heights, over
 it, from which one height for all is doubted."""
+
+TURNED = ("turned_deg", "turned_error_deg", "is_turned")
+"""Facts of a turn of the packet vectors."""
 
 LEAST_RAYS, LEAST_SPREAD = 100, np.radians(4.0)
 """So many packet vectors, which cover so wide an angle, meet in a path, or contradict their points."""
@@ -121,9 +134,11 @@ class SensorSource:
 
     @property
     def turned(self) -> float:
-        """Angle between packet vectors and rays from a trajectory, or pairs of returns, where these show it [deg]."""
+        """Error of the packet vectors against the points [deg]: what was measured, and what cannot be seen."""
         facts = dict(self.facts)
-        return facts.get("angle_to_packet_vectors_deg") or facts.get("angle_to_pairs_deg") or 0.0
+        if self.kind == "trajectory":
+            return facts.get("angle_to_packet_vectors_deg", 0.0)
+        return float(np.hypot(facts.get("turned_deg", 0.0), facts.get("turned_error_deg", 0.0)))
 
     def place(self, system: SystemPulse) -> SystemPulse:
         """Return the system with errors of sensor and returns, and with the usual air at the flight's heights."""
@@ -168,8 +183,15 @@ class SensorSource:
                 f"range: --flight-height is one number, but heights scatter by {facts['relief_m']:.0f} m: the "
                 f"error of the ranges, {self.error:.2g} m, holds it; give --trajectory"
             )
+        if facts.get("is_turned"):
+            off, error = facts["turned_deg"], facts["turned_error_deg"]
+            return (
+                f"angles: the packets' vectors are turned against the points by {off:.2g} degrees, known to "
+                f"{error:.1g}: echoes 10 m from a return are {1000 * np.radians(off):.1g} cm off, and the errors of "
+                "angles and ranges hold it; compute points and vectors with the same mounting"
+            )
         late, behind = (facts.get(name) or 0.0 for name in ("late_s", "behind_m"))
-        if abs(behind) > max(MOST_LAG * (self.distance or 0.0), 10.0 * (self.vectors_error or 0.0)):
+        if abs(behind) > max(MOUNTING * (self.distance or 0.0), 10.0 * (self.vectors_error or 0.0)):
             return (
                 f"range: the trajectory is {abs(behind):.1f} m {'behind' if late > 0 else 'ahead of'} the packets' "
                 f"vectors, as if its clock were off by {late:+.2f} s: check its clock and lever arm; the error of the "
@@ -223,15 +245,14 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     refuse_units(reader, scan)
     vectors, pairs = sample_rays(reader, scan)
     if request.trajectory is not None:
-        return _from_file(reader, vectors, request, scan.packets > 1)
-    for kind, rays in (("direction vectors", vectors), ("pairs of returns", pairs)):
-        found = estimate_path(rays, kind)
-        if found is not None:
-            turn = None
-            if rays is vectors and found.trajectory is not None:
-                turn = find_turn(pairs, found.trajectory)
-            return found if turn is None else replace(found, facts=(*found.facts, ("angle_to_pairs_deg", turn)))
-    facts: dict[str, float] = {}
+        return _from_file(reader, vectors, pairs, request, scan.packets > 1)
+    found = estimate_path(vectors, "direction vectors", pairs)
+    if found is not None:
+        return found
+    facts: dict[str, Any] = dict(find_turn(vectors, pairs, [])[0])
+    found = estimate_path(pairs, "pairs of returns")
+    if found is not None:
+        return replace(found, facts=(*found.facts, *facts.items()))
     if len(vectors.time) >= LEAST_RAYS and vectors.time[0] < vectors.time[-1]:
         with np.errstate(invalid="ignore", divide="ignore"):
             unit = vectors.direction / np.sqrt((vectors.direction**2).sum(axis=1))[:, None]
@@ -314,7 +335,9 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
     return ()
 
 
-def _from_file(reader: StripReader, rays: RaySample, request: SensorRequest, several: bool) -> SensorSource:
+def _from_file(
+    reader: StripReader, rays: RaySample, pairs: RaySample, request: SensorRequest, several: bool
+) -> SensorSource:
     path = Path(request.trajectory or "")
     crs = request.crs or read_crs_definition(reader.facts.path, reader.facts.header, heights=True)
     known = read_trajectory(path, crs=crs, lever_arm=request.lever_arm)
@@ -336,7 +359,8 @@ def _from_file(reader: StripReader, rays: RaySample, request: SensorRequest, sev
     except InputError as error:
         raise InputError(f"{request.trajectory}: {error}") from error
     share = known.share_known(start, stop)
-    seen = estimate_path(rays, "direction vectors")
+    seen = estimate_path(rays, "direction vectors", pairs)
+    shown = dict(seen.facts if seen else ())
     farther, range_error_m, vectors_error = _compare_ranges(distance, rays, seen)
     late, behind = (None, None) if seen is None or seen.trajectory is None else _find_lag(known, seen.trajectory)
     distance = distance[np.isfinite(distance)]
@@ -347,6 +371,7 @@ def _from_file(reader: StripReader, rays: RaySample, request: SensorRequest, sev
         "share_covered": round(share, 6),
         "gaps_s": [[round(a, 3), round(b, 3)] for a, b in known.gaps(start, stop)[:20]],
         "angle_to_packet_vectors_deg": round(float(np.degrees(angle)), 4),
+        **{name: shown[name] for name in TURNED if name in shown},
         "distance_m": None,
         "farther_than_by_vectors_m": farther,
         "by_vectors_error_m": vectors_error,
@@ -394,35 +419,90 @@ def _compare_ranges(
     return round(float(np.median(longer)), 3), error, round(path.error, 6)
 
 
-def find_turn(pairs: RaySample, path: Trajectory) -> float | None:
-    """Find the angle by which rays from a path are turned against pairs of returns.
+def find_turn(vectors: RaySample, pairs: RaySample, fits: Sequence[SensorFit]) -> tuple[dict[str, Any], float]:
+    """Find by how much packet vectors are turned against the points, alike in the whole strip.
 
     Parameters
     ----------
+    vectors : RaySample
     pairs : RaySample
-    path : Trajectory
-        By packet vectors: where these are turned, so are the rays from it.
+        Returns of one pulse lie on its ray, wherever its vector points.
+    fits : sequence of SensorFit
+        Of the vectors: rays that are turned do not meet.
 
     Returns
     -------
-    float or None
-        [deg]; None where too few pairs show it, or where chance explains it.
+    facts : dict
+        TURNED: angle between vectors and rays [deg]; its error, with what nothing shows; and whether
+        chance does not explain it.
+    off : float
+        By how much that makes ranges wrong, which count from where rays seem to meet, root mean square [m]; 0 for an
+        angle below LEAST_TURN.
+
+    Notes
+    -----
+    docs/algorithms.md 5.1.
     """
-    rows = np.flatnonzero(pairs.weight > LEAST_PAIR**2)
-    ahead = pairs.point[rows] - path.at(pairs.time[rows])
-    off = []
-    for vectors in (ahead, pairs.direction[rows]):
-        with np.errstate(invalid="ignore", divide="ignore"):
-            off.append(vectors / np.sqrt((vectors * vectors).sum(axis=1))[:, None])
-    turn = off[1] * np.sign(np.einsum("ni,ni->n", *off))[:, None] - off[0]
-    turn = turn[np.isfinite(turn).all(axis=1)]
-    if len(turn) < LEAST_PAIRS:
-        return None
-    middle = np.median(turn, axis=0)
-    errors = MEDIAN_ERROR * MAD_TO_STD * np.median(np.abs(turn - middle), axis=0) / len(turn) ** 0.5
-    if (np.abs(middle) < SURE_TURN * errors).all():
-        return None
-    return round(float(np.degrees(np.sqrt(middle @ middle))), 4)
+    known, right, shift = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
+    parts: list[TurnSeen] = []
+    end = -np.inf
+    for fit in fits:
+        if fit.centre - fit.half > end:  # windows that overlap have the same rays
+            rows = np.flatnonzero(np.abs(vectors.time - fit.centre) <= fit.half)
+            window = [values[rows[:: max(1, len(rows) // MOST_RAYS)]] for values in vectors[:4]]
+            parts.append(measure_turn(fit, *window))
+            end = fit.centre + fit.half
+    if parts:
+        each, sides, floors, shifts = (np.stack(values) for values in zip(*parts, strict=True))
+        total, floor, shift = each.sum(axis=0), floors.mean(axis=0), shifts.mean(axis=0)
+        seen = np.linalg.pinv(total, hermitian=True) @ sides.sum(axis=0)
+        off = sides - each @ seen
+        apart = np.einsum("wi,wij,wj->", off, np.linalg.pinv(each, hermitian=True), off)
+        total = total / max(1.0, apart / max(3 * len(parts) - 3, 1))
+        both = total @ np.linalg.pinv(total + floor, hermitian=True) @ floor
+        known, right = known + both, right + both @ seen
+    by_pairs, side = _turn_by_pairs(pairs)
+    known = known + by_pairs
+    # Within MOUNTING what is seen counts as it is. What is not seen is half of that, since a limit is two standard
+    # deviations, or all of it where vectors are turned.
+    error = np.linalg.inv(known + np.eye(3) / MOUNTING**2)
+    turn = error @ (right + side)
+    moved = float(turn @ known @ turn) > SURE_TURN**2
+    error = error if moved and turn @ turn > LEAST_TURN**2 else np.linalg.inv(known + np.eye(3) * (2.0 / MOUNTING) ** 2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = vectors.direction / np.sqrt((vectors.direction**2).sum(axis=1))[:, None]
+    unit = unit[np.isfinite(unit[:, 0])]
+    across = np.eye(3) - unit.T @ unit / max(len(unit), 1)
+    angle, doubt = float(np.sqrt(turn @ across @ turn)), float(np.sqrt(0.5 * np.sum(across * error)))
+    values = (round(float(np.degrees(angle)), 4), round(float(np.degrees(doubt)), 4), moved and angle > LEAST_TURN)
+    facts = dict(zip(TURNED, values, strict=True))
+    return facts, float(np.sqrt(np.mean((unit @ shift @ turn) ** 2))) if angle > LEAST_TURN else 0.0
+
+
+def _turn_by_pairs(pairs: RaySample) -> tuple[np.ndarray, np.ndarray]:
+    """Information of a turn and its right side, (3, 3) and (3,), by vectors across the ray between two returns."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        long = np.sqrt(pairs.weight)
+        ray = pairs.direction / long[:, None]
+        vector = pairs.vector / np.sqrt((pairs.vector**2).sum(axis=1))[:, None]
+        ray = ray * np.sign(np.einsum("ni,ni->n", vector, ray))[:, None]
+        off = (vector - ray) * long[:, None]
+    rows = np.isfinite(off).all(axis=1) & ((off * off).sum(axis=1) < (LARGEST_ANGLE * long) ** 2)
+    if rows.sum() < LEAST_PAIRS:
+        return np.zeros((3, 3)), np.zeros(3)
+    off = off[rows]
+    turns = np.cross(np.eye(3), ray[rows, None]).transpose(0, 2, 1) * long[rows, None, None]
+    left = off
+    for _ in range(3):
+        size = np.sqrt((left * left).sum(axis=1))
+        good = size <= CLIP * max(float(np.median(size)), 1e-12)
+        normal, right = (
+            np.einsum("nki,nkj->ij", turns[good], turns[good]),
+            np.einsum("nki,nk->i", turns[good], off[good]),
+        )
+        left = off - turns @ (np.linalg.pinv(normal, hermitian=True) @ right)
+    variance = max(float((left[good] ** 2).sum()) / max(2 * int(good.sum()) - 3, 1), 1e-12)
+    return normal / variance, right / variance
 
 
 def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> float:
@@ -443,7 +523,7 @@ def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: RaySample) -> f
     return angle
 
 
-def estimate_path(rays: RaySample, kind: str) -> SensorSource | None:
+def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) -> SensorSource | None:
     """Estimate the sensor's path from the points where its rays meet, in time windows along the flight.
 
     Parameters
@@ -452,6 +532,8 @@ def estimate_path(rays: RaySample, kind: str) -> SensorSource | None:
         A sample of the strip's rays, sorted by time.
     kind : str
         Of the rays; becomes the kind of the source.
+    pairs : RaySample, optional
+        Of rays by packet vectors: shows, as rays do that do not meet, whether the vectors are turned.
 
     Returns
     -------
@@ -480,6 +562,9 @@ def estimate_path(rays: RaySample, kind: str) -> SensorSource | None:
     path = Trajectory.build(time, xyz, velocity, gap=(max(WIDER) + 1) * NODE_SECONDS)
     distance = round(float(np.median([fit.distance for fit, _, _ in found])), 2)
     error, facts = _overall_error(found, rays), _describe(found, path, rays)
+    if pairs is not None:
+        shown, off = find_turn(rays, pairs, [fit for fit, _, _ in found])
+        error, facts = float(np.hypot(error, off)), (*facts, *shown.items())
     return SensorSource(kind, path, distance=distance, error=error, facts=facts)
 
 

@@ -91,7 +91,11 @@ class ImportSummary:
 
 
 def import_file(
-    path: Path, target: Path, options: ImportOptions, progress: Callable[[int], Any] = lambda pulses: None
+    path: Path,
+    target: Path,
+    options: ImportOptions,
+    progress: Callable[[int], Any] = lambda pulses: None,
+    pulses: int | None = None,
 ) -> ImportSummary:
     """Import a PulseWaves file.
 
@@ -104,6 +108,8 @@ def import_file(
     options : ImportOptions
     progress : callable
         Called with numbers of pulses that were written.
+    pulses : int, optional
+        Most pulses read at a time; the output does not depend on it.
 
     Returns
     -------
@@ -123,7 +129,7 @@ def import_file(
     # A killed import may have left the packets of a strip that never appeared.
     overwrite = options.overwrite or (options.resume and state != "other")
     refuse_existing(target, overwrite)
-    with PulseReader(header) as reader:
+    with PulseReader(header, pulses=pulses) as reader:
         plan, frame = make_plan(reader), find_frame(reader)
         by_index = {one.index: one for one in plan.digitizers.values()}
         counts = ImportSummary(str(path), str(target), header.count, descriptors=len(by_index))

@@ -478,6 +478,8 @@ class RaySample(NamedTuple):
     """Away from the sensor, any length, f8 (n, 3)."""
     weight: np.ndarray
     """Relative weight (inverse variance) of the direction, f8 (n,)."""
+    vector: np.ndarray = np.empty((0, 3))
+    """Of pairs: the packet's, away from the sensor, any length, f8 (n, 3); NaN where it is no direction."""
 
 
 def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySample]:
@@ -490,9 +492,11 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
     def take(start: int, stop: int) -> float:
         points = reader.read_points(start, stop, scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
-        pairs.append(_pair_returns(xyz, time))
+        away = _read_vectors(points, scan)
+        pairs.append(_pair_returns(xyz, time, away))
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
-        kept.append(_read_vectors(points[rows], xyz[rows], time[rows], scan))
+        rows = rows[np.isfinite(time[rows]) & np.isfinite(xyz[rows]).all(axis=1) & np.isfinite(away[rows, 0])]
+        kept.append(RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)), away[rows]))
         return float(time[0])
 
     units = _choose_units(scan)
@@ -542,29 +546,28 @@ def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
     return [(int(borders[i]), int(borders[i + 1])) for i in chosen.tolist() if borders[i + 1] > borders[i]]
 
 
-def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> RaySample:
+def _read_vectors(points: np.ndarray, scan: StripScan) -> np.ndarray:
+    """Vectors away from the sensor, f8 (n, 3); NaN where they are no directions."""
     with np.errstate(all="ignore"):
         away = -packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
         ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
         good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
-    good &= np.isfinite(time) & np.isfinite(xyz).all(axis=1)
-    rows = np.flatnonzero(good)
-    return RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)))
+    return np.where(good[:, None], away, np.nan)
 
 
-def _pair_returns(xyz: np.ndarray, time: np.ndarray) -> RaySample:
+def _pair_returns(xyz: np.ndarray, time: np.ndarray, away: np.ndarray) -> RaySample:
     """Rays from neighbouring returns of one pulse; returns far apart get a large weight."""
     place = np.flatnonzero(time[1:] == time[:-1])
     apart = xyz[place + 1] - xyz[place]
     square = (apart * apart).sum(axis=1)
     far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
     middle = 0.5 * (xyz[place[far]] + xyz[place[far] + 1])
-    return RaySample(time[place[far]], middle, apart[far], square[far])
+    return RaySample(time[place[far]], middle, apart[far], square[far], away[place[far]])
 
 
 def _join(parts: list[RaySample]) -> RaySample:
     if not parts:
-        return RaySample(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+        return RaySample(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty((0, 3)))
     joined = [np.concatenate(values) for values in zip(*parts, strict=True)]
     order = np.argsort(joined[0], kind="stable")
     return RaySample(*(values[order] for values in joined))

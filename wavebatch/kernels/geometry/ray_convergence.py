@@ -33,7 +33,11 @@ SYSTEMATIC = 2.0
 what a turned mounting does for a shift of the sensor (measured: 1.8 to 2.3).
 """
 
-_CLIP = 4.0 * MAD_TO_STD
+SCANNER = 0.01
+"""Rays of a scanner miss the point from which they leave by so much [m], beyond what a shift explains: what its mirrors
+do is no turn. RIEGL's rays of a polygon miss it by less than .1 mm, Leica's of a swinging mirror by 6 mm at most."""
+
+CLIP = 4.0 * MAD_TO_STD
 """Residuals above this many medians are outliers: four robust standard deviations."""
 _ROUNDS = 3
 """Rounds of the linear solution, each with new weights."""
@@ -68,6 +72,19 @@ class SensorFit(NamedTuple):
         """Whether the directions differ enough to meet in one place."""
         good = np.isfinite(self.coefficients).all() and np.isfinite(self.covariance).all()
         return bool(good and self.condition < LARGEST_CONDITION and self.spread > LEAST_SPREAD)
+
+
+class TurnSeen(NamedTuple):
+    """What a window shows of a turn of its directions about the three axes [rad]."""
+
+    information: np.ndarray
+    """Inverse of the covariance, float64 (3, 3)."""
+    right: np.ndarray
+    """Information times the turn, float64 (3,)."""
+    floor: np.ndarray
+    """Most information of rays that miss their point by SCANNER, however many they are, float64 (3, 3)."""
+    shift: np.ndarray
+    """By how much the sensor seems to be moved, per turn, float64 (3, 3) [m/rad]."""
 
 
 def sensor_at(fit: SensorFit, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -198,6 +215,48 @@ def fit_best(
     return best if best is not None and least < LARGEST_ERROR * best.distance else None
 
 
+def measure_turn(
+    fit: SensorFit, time: np.ndarray, point: np.ndarray, direction: np.ndarray, weight: np.ndarray
+) -> TurnSeen:
+    """Measure by how much the directions of a window are turned against its points.
+
+    Rays that are turned about a common axis meet no longer: a shift of the sensor explains most of it, but not what
+    grows with the square of the angle across the flight, or with the distance.
+
+    Parameters
+    ----------
+    fit : SensorFit
+        A sound fit of these rays.
+    time, point, direction, weight
+        As for `fit_sensor`.
+
+    Returns
+    -------
+    TurnSeen
+    """
+    order = len(fit.coefficients) - 1
+    powers = np.vander((time - fit.centre) / fit.half, order + 1, increasing=True)
+    ahead = point - powers @ fit.coefficients
+    distance = np.sqrt(np.einsum("ni,ni->n", ahead, ahead))
+    q, unit = ahead / distance[:, None], direction / np.sqrt(np.einsum("ni,ni->n", direction, direction))[:, None]
+    unit = np.where((np.einsum("ni,ni->n", unit, q) < 0)[:, None], -unit, unit)
+    r = unit - q
+    root = np.sqrt(_keep(np.sqrt(np.einsum("ni,ni->n", r, r) * weight), weight))[:, None]
+    across = (np.eye(3) - q[:, :, None] * q[:, None, :]) * (root / distance[:, None])[:, :, None]
+    moves = (across[:, :, None, :] * powers[:, None, :, None]).reshape(3 * len(q), -1)
+    turns = (np.cross(np.eye(3), q[:, None]).transpose(0, 2, 1) * root[:, :, None]).reshape(-1, 3)
+    off = np.column_stack([turns, ((r - q * np.einsum("ni,ni->n", q, r)[:, None]) * root).ravel()])
+    explained = np.linalg.lstsq(moves, off, rcond=None)[0]
+    off -= moves @ explained
+    normal, right = off[:, :3].T @ off[:, :3], off[:, :3].T @ off[:, 3]
+    left = (off[:, 3] - off[:, :3] @ (np.linalg.pinv(normal, hermitian=True) @ right)).reshape(-1, 3)
+    kept = int((root > 0).sum())
+    variance = float((left * left).sum()) / max(2 * kept - moves.shape[1] - 3, 1) * _redundancy(time, unit, left)
+    variance = max(variance, 1e-30)
+    floor = normal / kept * (fit.distance / SCANNER) ** 2
+    return TurnSeen(normal / variance, right / variance, floor, explained[:3, :3])
+
+
 def _nothing(order: int, pulses: int) -> SensorFit:
     """A fit that is not sound."""
     size = 3 * (order + 1)
@@ -234,7 +293,7 @@ def _solve(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 def _keep(error: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Weights, 0 for what lies beyond four robust standard deviations."""
-    limit = _CLIP * max(float(np.median(error)), 1e-12)
+    limit = CLIP * max(float(np.median(error)), 1e-12)
     return np.where(error <= limit, weight, 0.0)
 
 
