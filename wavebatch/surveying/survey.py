@@ -14,7 +14,7 @@ from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, Waveform
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
-from wavebatch.surveying.measuring.choose_pulse import choose_pulse, settle
+from wavebatch.surveying.measuring.choose_pulse import bear, choose_pulse, settle
 from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.learn_pulse import (
     find_clear,
@@ -272,7 +272,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             noise = measure_once_more(block, system)
             if narrower or noise.by_kind["quiet"]:
                 system = replace(system, noise=replace(noise, gain=first.noise.gain))
-        echoes = decompose_sample(part, system)
+        echoes = decompose_sample(part, bear(system, choice.best.change))
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)

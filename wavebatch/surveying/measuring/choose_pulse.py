@@ -64,10 +64,10 @@ once in three million times."""
 
 HINT, FEWER = 1.5, 0.95
 """Standard errors by which another pulse must describe shorter, in place of SURE, where it needs no more echoes than a
-learned pulse of several Gaussians (AS_FEW), at most this share of those of a learned Gaussian, or where that is known
-to miss the stacked echoes by more than the change from shot to shot; and beyond SURE, where it needs more echoes than
-any. Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes so many errors once in fifteen
-times."""
+learned pulse of several Gaussians (AS_FEW), or where that is known to miss the stacked echoes by more than the change
+from shot to shot. And standard errors less than SURE where it needs this share of the echoes of a learned Gaussian, or
+more where it needs so many more than any; in proportion between: at a step, halves of a strip fall on either side.
+Each echo is a claim too; one in twenty is what `run` calls a doubt. Chance makes 1.5 errors once in fifteen times."""
 
 LEAST_SAVED, LEAST_OF_KNOWN, OTHER_WIDTH = 0.25, 2.0, 0.1
 """Nats per echo that other pulses must save in place of a Gaussian, and learned ones in place of one from elsewhere:
@@ -219,13 +219,13 @@ def _learn_from_all(block: WaveformBlock, best: Candidate) -> Candidate:
         return replace(best, system=_find_gaussian(block, best.system, best.change))
     if best.name not in ROUNDS:
         return best
-    explained = explain(block, _bear(best.system, best.change), **ROUNDS[best.name])
+    explained = explain(block, bear(best.system, best.change), **ROUNDS[best.name])
     return replace(best, system=learn_jointly(block, best.system, explained, best.change, last=True))
 
 
 def _find_gaussian(block: WaveformBlock, system: SystemPulse, change: float) -> SystemPulse:
     """A Gaussian of the width that strong echoes of a block repeat, decomposed with another one."""
-    explained = explain(block, _bear(system, change), width_prior=0.0)
+    explained = explain(block, bear(system, change), width_prior=0.0)
     own = find_own_width(explained, shape_limits(system, block.spacing).ref)
     return replace(system, sigma_ref=system.sigma_ref * own)
 
@@ -242,21 +242,21 @@ def _learn(block: WaveformBlock, begin: Candidate) -> Iterator[tuple[str, System
     for name, options in ROUNDS.items():
         for last in (False, True):
             change = begin.change if last else max(begin.change, FIRST_CHANGE)
-            explained = explain(block, _bear(system, change), **options)
+            explained = explain(block, bear(system, change), **options)
             if count_telling(explained) < ENOUGH_TO_LEARN:
                 return
             system = learn_jointly(block, system, explained, begin.change, last=last)
         yield name, system
 
 
-def _bear(system: SystemPulse, change: float) -> SystemPulse:
-    """The system with the misfit that a change of the pulse from shot to shot asks for, or what its model misses."""
+def bear(system: SystemPulse, change: float) -> SystemPulse:
+    """Return the system with the misfit that a change of the pulse asks for, or what its model misses."""
     return replace(system, misfit=max(COVERED * change, system.misfit), tail_misfit=(), beside=(), hidden=())
 
 
 def _judge(block: WaveformBlock, name: str, system: SystemPulse, change: float, *, known: bool) -> Candidate:
     """A pulse judged on waveforms; echoes narrower than the pulse are forbidden: nothing reflects so."""
-    borne = _bear(system, change)
+    borne = bear(system, change)
     explained = explain(block, borne, least_width=STRICT, width_prior=0.0)
     gaussians = max(len(system.components), 1)
     used = max(int(np.count_nonzero(explained.sums.used)), 1)
@@ -359,11 +359,12 @@ def _beats(shorter: Candidate, longer: Candidate) -> bool:
 
 def _bound_errors(shorter: Candidate, longer: Candidate) -> float:
     """Standard errors by which a candidate must describe shorter to be taken in place of the other."""
+    fewer = float(np.clip((1 - shorter.echoes / max(longer.echoes, 1)) / (1 - FEWER), -1.0, 1.0))
+    if longer.known:
+        return SURE - HINT * min(fewer, 0.0)
     doubtful = AS_FEW * shorter.echoes <= longer.echoes and longer.gaussians > 1
-    doubtful |= longer.missed > max(COVERED * longer.change, shorter.missed) or shorter.echoes <= FEWER * longer.echoes
-    if doubtful and not longer.known:
-        return HINT
-    return SURE + HINT if longer.echoes <= FEWER * shorter.echoes else SURE
+    doubtful |= longer.missed > max(COVERED * longer.change, shorter.missed)
+    return HINT if doubtful else SURE - HINT * fewer
 
 
 def settle(

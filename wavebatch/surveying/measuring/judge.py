@@ -124,13 +124,8 @@ def measure_change(system: SystemPulse, explained: Explained) -> float:
     known = precision > 0
     if np.count_nonzero(known) < 2 * LEAST_KNOWN:
         return 0.0
-    square, noise = change[known] ** 2, 1 / precision[known]
-    low, high = 0.0, 1.0
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        more = np.median(square / (middle * middle + noise)) > SQUARED_NORMAL_MEDIAN
-        low, high = (middle, high) if more else (low, middle)
-    return low
+    square = change[known] ** 2 / SQUARED_NORMAL_MEDIAN - 1 / precision[known]
+    return float(np.sqrt(np.clip(np.median(square), 0.0, 1.0)))
 
 
 def describe_waveforms(

@@ -18,6 +18,7 @@ from wavebatch.stages.flags import find_unexplained
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
+from wavebatch.surveying.measuring.judge import SURE
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_strongest
 from wavebatch.surveying.measuring.residuals import decompose_sample, render_own, subtract_echoes
 
@@ -45,9 +46,10 @@ MEAN_OFF, MOST_OFF = 0.7979, 4.0
 """Mean size of a normal value, and most that one counts: an echo that is off by more is another one. A mean varies
 less from part to part than a quantile: most echoes are hardly off, some by much."""
 
-CONSTANT = 2.0
+CONSTANT, LOWEST_ERROR = 2.0, 2.8
 """What comes before or after a pulse belongs to it where its mean share is so many times its scatter: else it is
-neighbours, too weak to be found or taken for a part of the pulse."""
+neighbours, too weak to be found or taken for a part of the pulse. Unless even the lowest quantile of NORMAL_BELOW shows
+it: its error, over the noise of a value and the root of their number."""
 
 LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says; less where the strip's echoes are so high that twice the
@@ -221,14 +223,17 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     expected = system.noise.std / np.median(echoes.amplitude) / np.sqrt(energy)
     profile = []
     for place in range(-TAIL_BEFORE, TAIL_AFTER):
-        here = left[(lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)]
+        inside = (lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)
+        here = left[inside]
         if abs(place) < 3 or len(here) < ENOUGH_TO_LEARN:
             continue
         # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
         lowest, low = np.quantile(here, NORMAL_BELOW)
         spread = max(low - lowest, expected)
         common, scatter = abs(low + spread), 2 * np.sqrt(spread**2 - expected**2)
-        share = common + scatter
-        if share > min(LEAST_TAIL, 2 * expected) and common > CONSTANT * scatter:
+        share, number = common + scatter, np.count_nonzero(inside.any(axis=1))
+        # A tail that changes from shot to shot scatters too, but hardly any echo is without it, as without a neighbour.
+        all_have = NORMAL_BELOW[0] * number > 1 and lowest > SURE * LOWEST_ERROR * expected / np.sqrt(number)
+        if share > min(LEAST_TAIL, 2 * expected) and (common > CONSTANT * scatter or all_have):
             profile.append((float(place * system.sigma_ref), float(share)))
     return tuple(profile)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
 from wavebatch.surveying.measuring.judge import SURE, describe_waveforms, exceed, explain
@@ -59,7 +60,11 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
     strong = echoes.alone(len(block)) & (echoes.amplitude > STRONG * system.noise.std)
     lone = echoes.waveform[strong & ((echoes.flags & np.uint16(UNCLEAN)) == 0)]
     left = explain(block.rows(lone), whitened, max_echoes=1).echoes.residual.astype(np.float64) ** 2
-    if len(left) < FEW or np.median(left) > MOST_LEFT:
+    if len(left) < FEW:
+        return plain
+    typical = np.median(left)
+    error = MEDIAN_ERROR * MAD_TO_STD * np.median(np.abs(left - typical)) / np.sqrt(len(left))
+    if typical - error > MOST_LEFT:
         return plain
     # Whitened fits take small changes of the pulse for echoes: the description, which knows both, is then longer.
     length = describe_waveforms(block, whitened, explain(block, whitened), [change])[0]
