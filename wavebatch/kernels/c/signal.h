@@ -81,17 +81,25 @@ static int read_signal(const Block *b, int64_t waveform, float *signal) {
 
 /* Sum of the recorded samples from .. to - 1 of a waveform, in four parts; adds their number to `found`. */
 static double sum_recorded(const float *signal, const uint8_t *missing, int64_t from, int64_t to, int64_t *found) {
-    wide sum = {0};
+    double sum[LANES] = {0};
     int64_t i = from;
     for (; i + LANES <= to && !missing; i += LANES) {
-        lanes four;
-        memcpy(&four, signal + i, sizeof four);
-        sum += __builtin_convertvector(four, wide);
+        for (int64_t q = 0; q < LANES; q++) sum[q] += signal[i + q];
         *found += LANES;
     }
     for (; i < to; i++)
         if (!missing || !missing[i]) { sum[0] += signal[i]; ++*found; }
     return (sum[0] + sum[2]) + (sum[1] + sum[3]);
+}
+
+/* The next mark from sample i on, s without one; `marks` has eight zeros after the last. */
+INLINE int64_t next_mark(int64_t s, const uint8_t *marks, int64_t i) {
+    for (uint64_t eight; i < s; i++) {
+        memcpy(&eight, marks + i, sizeof eight);
+        if (!eight) i += 7;
+        else if (marks[i]) return i;
+    }
+    return s;
 }
 
 /* Samples that are far from any signal: neither within `reach` of a smoothed sample beyond +-limit, nor within `recovery`
@@ -108,9 +116,10 @@ EXPORT int64_t quiet_levels(const Block *b, int64_t n, double limit, int64_t rea
         read_counts(b, w * s, s, r.signal);
         take_level(b, w, w * s, s, r.signal);
         smooth_121(s, r.signal, r.smoothed);
-        for (int64_t i = 0; i < s; i++) {
+        for (int64_t i = 0; i < s; i++) r.marks[i] = fabsf(r.smoothed[i]) > busy;
+        memset(r.marks + s, 0, 8);
+        for (int64_t i = next_mark(s, r.marks, 0); i < s; i = next_mark(s, r.marks, i + 1)) {
             const float height = fabsf(r.smoothed[i]);
-            if (!(height > busy)) continue;
             if (i - reach > from) total += sum_recorded(r.signal, missing, from, i - reach, &found);
             const int64_t next = i + 1 + (height > strong ? after : reach);
             from = next > from ? next : from;
@@ -171,14 +180,10 @@ INLINE int is_peak(int64_t s, const float *y, int64_t i) {
     return y[i] > y[i - 1] && (ahead == s || y[ahead] < y[i]);
 }
 
-/* Next local maximum above `least` from sample i on, s without one; `marks` has where one may begin, and zeros after it. */
+/* Next local maximum from sample i on, s without one; `marks` has where one may begin. */
 INLINE int64_t next_peak(int64_t s, const float *y, const uint8_t *marks, int64_t i) {
-    for (uint64_t eight; i < s; i++) {
-        memcpy(&eight, marks + i, sizeof eight);
-        if (!eight) i += 7;
-        else if (marks[i] && is_peak(s, y, i)) return i;
-    }
-    return s;
+    for (i = next_mark(s, marks, i); i < s && !is_peak(s, y, i);) i = next_mark(s, marks, i + 1);
+    return i;
 }
 
 /* Marks samples above `least` at which a local maximum may begin, without branches. */
