@@ -156,16 +156,6 @@ def correlate_antisymmetric(waveform, taps):
     return whole[len(taps) - 1 :][: len(waveform)]
 
 
-def walk_down(waveform, sample, level, step):
-    """Where one waveform falls to the level from a peak; a rise or the end stops the walk."""
-    here = sample
-    while 0 <= here + step < len(waveform) and waveform[here + step] <= waveform[here]:
-        if waveform[here + step] <= level and waveform[here + step] < waveform[here]:
-            return here + step * (waveform[here] - level) / (waveform[here] - waveform[here + step])
-        here += step
-    return here
-
-
 def square_differences(waveform, reference):
     """ASDF of one waveform and one reference by its definition, for every lag at which they touch."""
     n, m = len(reference), len(waveform)

@@ -249,35 +249,3 @@ def number_returns(pulse, xyz, direction):
         place = {i: sum((xyz[i] - xyz[head]) * direction[head]) for i in same}
         found.append((1 + sorted(same, key=place.get).index(row), len(same), ray is not None))
     return found
-
-
-def fit_slopes(tangent, slopes):
-    """(constant, factor) of the slopes (m, 2) by the tangent, fitted three times without outliers."""
-    used = list(range(len(tangent)))
-    for _ in range(3):
-        lines = [np.polyfit(tangent[used], slopes[used, axis], 1) for axis in (0, 1)]
-        off = [np.hypot(*(slopes[i] - [np.polyval(line, tangent[i]) for line in lines])) for i in range(len(tangent))]
-        used = [i for i, one in enumerate(off) if one <= 4 * max(1.482602 * np.median(off), 1e-6)]
-    return lines
-
-
-def fit_rays(xyz, starts, angle, source):
-    """Unit vector of each pulse: from its first to its last return, by the scan angle, or straight down."""
-    ends = [*starts[1:], len(xyz)]
-    span = [xyz[b - 1] - xyz[a] for a, b in zip(starts, ends, strict=True)]
-    rays = []
-    for k, (start, own) in enumerate(zip(starts, span, strict=True)):
-        ray = np.array([0.0, 0.0, -1.0])
-        sure = [
-            j for j, other in enumerate(span)
-            if source[starts[j]] == source[start] and np.linalg.norm(other) >= 2
-            and -other[2] > 0.3 * np.linalg.norm(other)
-        ]  # fmt: skip
-        if np.linalg.norm(own) >= 0.5:
-            ray = own
-        elif len(sure) >= 20:
-            tangent = np.tan(np.radians(np.clip(angle[starts], -80, 80)))
-            lines = fit_slopes(tangent[sure], np.array([span[j][:2] / -span[j][2] for j in sure]))
-            ray = np.array([*(np.polyval(line, tangent[k]) for line in lines), -1.0])
-        rays.append(ray / np.linalg.norm(ray))
-    return rays

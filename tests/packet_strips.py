@@ -58,19 +58,20 @@ def write_recorded(path, counts, begin, xy, echoes, packets=None, *, time=None, 
                             digitizers=digitizers, wkt="" if scanner is not None else None)  # fmt: skip
     with writer:
         rows = []
-        for pulse, number in ((p, k) for p in range(n) for k in range(len(packets[p]))):
-            first, last = packets[pulse][number]
-            kind = int(np.searchsorted(LENGTHS, last - first + 1))
-            first = max(min(first, s - LENGTHS[kind]), 0)
-            stored = counts[pulse : pulse + 1, first : first + LENGTHS[kind]]
-            offset = writer.write_packets(stored, kind + 1)[0]
-            lost = (pulse, number) in wrong
-            mine = echoes[echoes[:, 0] == pulse]
-            at = (mine[:, 1] - begin[pulse]) / direction[pulse, 2]
-            inside = (at >= first) & (at < first + stored.shape[1]) & (at >= packets[pulse][number][0])
-            inside &= at <= packets[pulse][number][1]
-            for one in at[inside] if inside.any() else [first + stored.shape[1] / 2]:
-                rows.append((pulse, one, one - first, 0 if lost else kind + 1, offset, stored.size * 2))
+        of, number, low, high = np.array([(p, k, *one) for p in range(n) for k, one in enumerate(packets[p])]).T
+        kind = np.searchsorted(LENGTHS, high - low + 1)
+        start, offset = np.maximum(np.minimum(low, s - LENGTHS[kind]), 0), np.zeros(len(of), np.int64)
+        for k in np.unique(kind):
+            own = np.flatnonzero(kind == k)
+            place = start[own, None] + np.arange(min(LENGTHS[k], s))
+            offset[own] = writer.write_packets(counts[of[own, None], place], int(k) + 1)
+        ends = np.searchsorted(echoes[:, 0], np.arange(n + 1))
+        for i, (pulse, first, length) in enumerate(zip(of, start, np.minimum(LENGTHS[kind], s), strict=True)):
+            at = (echoes[ends[pulse] : ends[pulse + 1], 1] - begin[pulse]) / direction[pulse, 2]
+            inside = (at >= max(first, low[i])) & (at < first + length) & (at <= high[i])
+            known = 0 if (pulse, number[i]) in wrong else kind[i] + 1
+            for one in at[inside] if inside.any() else [first + length / 2]:
+                rows.append((pulse, one, one - first, known, offset[i], length * 2))
         points = np.zeros(len(rows), writer.dtype)
         pulse = np.array([row[0] for row in rows])
         at = np.array([row[1] for row in rows])

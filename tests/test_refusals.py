@@ -510,6 +510,7 @@ def test_python_is_refused_what_the_command_line_is(kind):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX systems")
+@pytest.mark.quick_cases("*chain fifo*", "*log-file*", "*trajectory*", "*zero*", "*lost*")  # the others wait 2 s each
 @pytest.mark.parametrize(
     ("command", "code", "words"),
     [

@@ -40,25 +40,14 @@ def test_samples_of_odd_bits_in_whole_bytes_are_read(tmp_path, declared, bits):
     assert {block.digitizer.bits for block in blocks} == {bits}
 
 
-@pytest.mark.parametrize("point_format", [4, 5, 9, 10])
+@pytest.mark.parametrize(("point_format", "minor"), [(4, 3), (4, 4), (5, 3), (5, 4), (9, 4), (9, 5), (10, 4)])
 @pytest.mark.parametrize("internal", [True, False])
 @pytest.mark.parametrize("bits", [8, 16, 32])
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_every_kind_of_strip_gives_the_samples_in_its_bytes(tmp_path, point_format, internal, bits, suffix):
-    raw = make_raw(point_format=point_format, internal=internal, bits=bits)
+def test_every_kind_of_strip_gives_the_samples_in_its_bytes(tmp_path, point_format, minor, internal, bits, suffix):
+    raw = make_raw(point_format=point_format, minor=minor, internal=internal, bits=bits)
     path = raw.write(tmp_path / f"a{suffix}")
     assert_same(read_all(path), read_plainly(raw.points, bytes(60) + raw.packets, {1: (bits, 32)}))
-
-
-@pytest.mark.parametrize("minor", [3, 4])
-def test_formats_4_and_5_are_read_in_1_3_and_1_4(tmp_path, minor):
-    raw = make_raw(point_format=5, minor=minor)
-    assert len(read_all(raw.write(tmp_path / "a.las"))) == 40
-
-
-def test_las_1_5_is_read(tmp_path):
-    raw = make_raw(point_format=9, minor=5)
-    assert len(read_all(raw.write(tmp_path / "a.las"))) == 40
 
 
 def test_geometry_is_that_of_the_simulated_pulses(tmp_path):

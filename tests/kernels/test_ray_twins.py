@@ -72,17 +72,24 @@ def test_numbers_along_rays_are_those_of_a_loop(rng):
         assert found == naive_geometry.number_returns(pulse, xyz, direction)
 
 
-@pytest.mark.parametrize("pulses", [15, 120])
-def test_rays_are_those_of_a_loop(rng, pulses):
-    """Two flight lines of one to three returns; some distances are short, some pulses go sideways or upwards."""
-    count = rng.integers(1, 4, pulses)
-    starts = np.concatenate([[0], np.cumsum(count)[:-1]])
-    angle = np.repeat(rng.uniform(-89, 89, pulses) * rng.choice([0.3, 1.0], pulses), count)
-    source = np.repeat(np.sort(rng.integers(0, 2, pulses)), count)
-    ahead = 0.1 + 0.01 * rng.standard_normal(len(angle))
-    way = np.stack([np.tan(np.radians(np.clip(angle, -80, 80))), ahead, -np.ones(len(angle))], axis=1)
-    depth = np.concatenate([np.arange(k) * rng.choice([0.1, 0.4, 1.5, 4.0]) for k in count])
-    xyz = np.array([4e5, 5e6, 300.0]) + way * depth[:, None]
-    xyz[::17] += rng.normal(0, 2.0, (len(xyz[::17]), 3))
-    expected = naive_geometry.fit_rays(xyz, starts, angle, source)
-    np.testing.assert_allclose(fit_rays(xyz, starts, angle, source), expected, atol=1e-6)
+@pytest.mark.parametrize("pulses", [10, 120])
+def test_rays_follow_their_pulse_or_the_scan_angles_of_their_line(rng, pulses):
+    """Two flight lines with pitches of their own; one pulse goes sideways, one upwards, and two are far off."""
+    count = np.tile([1, 2, 3, 2], pulses // 2)
+    starts, line = np.cumsum(count) - count, np.arange(len(count)) // pulses
+    angle, ahead = rng.uniform(-30, 30, len(count)), np.array([0.1, -0.2])[line]
+    angle[4] = 89.0  # counts as 80
+    way = np.stack([0.9 * np.tan(np.radians(angle.clip(-80, 80))), ahead, -np.ones(len(count))], axis=1)
+    unit = way / np.linalg.norm(way, axis=1)[:, None]
+    apart = np.where(np.arange(len(count)) % 3, 3.0, 0.2)  # between returns [m]; rays of their own from .5 m on
+    unit[1], unit[5] = [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
+    unit[7], unit[9] = [0.8, 0.0, -0.6], [0.0, 0.8, -0.6]
+    pulse = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(pulse)) - starts[pulse]
+    xyz = np.array([4e5, 5e6, 300.0]) + unit[pulse] * (apart[pulse] * number)[:, None]
+    found = fit_rays(xyz, starts, angle[pulse], line[pulse])
+    own = (count - 1) * apart >= 0.5
+    np.testing.assert_allclose(found[own], unit[own], atol=1e-6)
+    fitted = way / np.linalg.norm(way, axis=1)[:, None] if pulses > 20 else [[0.0, 0.0, -1.0]] * len(count)
+    np.testing.assert_allclose(found[~own], np.array(fitted)[~own], atol=1e-6)
+    assert 0.3 < own.mean() < 0.7

@@ -39,12 +39,13 @@ def test_nothing_has_no_runs():
     assert len(highest_samples(signal, none, none)) == 0
 
 
-@pytest.mark.parametrize("step", [-1, 1])
-def test_walks_equal_those_of_a_loop(signal, step):
-    sample, waveform = (field.ravel() for field in np.indices(signal.shape))
-    level = np.random.default_rng(3).uniform(-2, 5, len(sample))
-    below = level < signal[sample, waveform]
-    sample, waveform, level = sample[below], waveform[below], level[below]
-    place = walk_down(signal, waveform, sample, level, step)
-    expected = [naive.walk_down(signal[:, w], i, v, step) for w, i, v in zip(waveform, sample, level, strict=True)]
-    np.testing.assert_allclose(place, expected, atol=1e-6)
+@pytest.mark.parametrize(("text", "peak", "level", "ahead", "behind"), [
+    ("0 2 4 8 6 2 1", 3, 3.0, 4.75, 1.5), ("0 2 4 8 6 2 1", 3, 8.0, 3.0, 3.0), ("0 2 4 8 6 2 1", 3, 2.0, 5.0, 1.0),
+    ("0 2 4 8 6 2 1", 3, -1.0, 6.0, 0.0), ("5 3 8 5 6 0 0", 2, 4.0, 3.0, 1.2), ("8 8 8 4 4 4 0", 1, 4.0, 3.0, 0.0),
+    ("8 8 8 4 4 4 0", 1, 3.0, 5.25, 0.0), ("8 8 8 4 4 4 0", 1, 8.0, 2.0, 0.0), ("9", 0, 1.0, 0.0, 0.0),
+])  # fmt: skip
+def test_walks_end_at_the_level_a_rise_or_the_end(text, peak, level, ahead, behind):
+    signal = np.array(text.split(), np.float32)[:, None] * np.ones(3, np.float32)
+    for step, place in ((1, ahead), (-1, behind)):
+        found = walk_down(signal, np.array([2, 0]), np.full(2, peak), np.full(2, level), step)
+        assert found.tolist() == pytest.approx([place] * 2)

@@ -5,6 +5,7 @@ import struct
 import laspy
 import numpy as np
 import pytest
+import rasterio
 from commands import run_command
 from writer_tools import write_points
 
@@ -67,13 +68,8 @@ def test_the_epsg_code_of_geotiff_keys_and_wkt_is_found(rng, tmp_path):
         assert read_crs_definition(tmp_path / name, read_header(tmp_path / name)) == wanted
 
 
-@pytest.fixture
-def rasterio():
-    return pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
-
-
 @pytest.mark.parametrize("statistic", ["median", "mean", "max", "count"])
-def test_cells_are_those_of_a_plain_count(rasterio, rng, tmp_path, statistic):
+def test_cells_are_those_of_a_plain_count(rng, tmp_path, statistic):
     x, y, height = _cloud(tmp_path / "a.las", rng)
     result = _run(tmp_path / "a.las", "--column", "height", "--column", "gps_time", "--statistic", statistic,
                   "--size", 2, "-o", tmp_path / "x.tif")  # fmt: skip
@@ -105,7 +101,7 @@ def test_tiles_do_not_depend_on_the_points_in_memory(rng, tmp_path, held, size):
         np.testing.assert_array_equal(parts, whole)
 
 
-def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rasterio, rng, tmp_path):
+def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rng, tmp_path):
     x, _, _ = _cloud(tmp_path / "a.las", rng)
     _run(tmp_path / "a.las", "--statistic", "count", "--size", 7, "--bbox", "500100,5400100,500200.5,5400150", "-o",
          tmp_path / "x.tif")  # fmt: skip
@@ -122,7 +118,7 @@ def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rasterio, rng, tmp_p
         assert found.read(1, window=window, masked=True).sum() >= part > 0
 
 
-def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(rasterio, rng, tmp_path):
+def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(rng, tmp_path):
     _cloud(tmp_path / "a.las", rng, 500)
     _cloud(tmp_path / "b.las", rng, 500, west=600_000.0)
     result = _run(tmp_path / "*.las", "--statistic", "density", "-o", tmp_path / "x.tif")
@@ -137,7 +133,7 @@ def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(r
     assert "are too many (at most 1e+11)" in result.stderr and "points lie from 50000" in result.stderr
 
 
-def test_a_cloud_without_a_crs_beside_others_is_named(rasterio, rng, tmp_path):
+def test_a_cloud_without_a_crs_beside_others_is_named(rng, tmp_path):
     _cloud(tmp_path / "a.las", rng, 500)
     _cloud(tmp_path / "b.las", rng, 500, wkt=None)
     result = _run(tmp_path / "*.las", "--statistic", "count", "-o", tmp_path / "x.tif")
@@ -147,14 +143,14 @@ def test_a_cloud_without_a_crs_beside_others_is_named(rasterio, rng, tmp_path):
 
 
 @pytest.mark.parametrize("degree", ["1e308", "0"])
-def test_a_crs_that_gdal_reads_but_cannot_write_is_one_line(rasterio, rng, tmp_path, degree):
+def test_a_crs_that_gdal_reads_but_cannot_write_is_one_line(rng, tmp_path, degree):
     _cloud(tmp_path / "a.las", rng, 50, wkt=UTM.replace("0.0174532925199433", degree))
     result = _run(tmp_path / "a.las", "--statistic", "count", "-o", tmp_path / "x.tif", code=2)
     assert "the CRS cannot be" in result.stderr and result.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
 
 
-def test_a_crs_with_heights_is_written_without_them(rasterio, rng, tmp_path):
+def test_a_crs_with_heights_is_written_without_them(rng, tmp_path):
     """GDAL would put it into a file beside the raster: RIEGL strips have one."""
     axes = 'AXIS["Easting",EAST],AXIS["Northing",NORTH],AXIS["Height",UP]'
     _cloud(tmp_path / "a.las", rng, 50, wkt=UTM.replace('AUTHORITY["EPSG","32633"]', axes))
@@ -164,7 +160,7 @@ def test_a_crs_with_heights_is_written_without_them(rasterio, rng, tmp_path):
         assert found.crs.is_projected and "Transverse_Mercator" in found.crs.to_wkt() and found.descriptions[0]
 
 
-def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rasterio, rng, tmp_path):
+def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rng, tmp_path):
     _cloud(tmp_path / "a.las", rng, 50)
     _cloud(tmp_path / "b.las", rng, 50, wkt=None, epsg=25832)
     result = _run(tmp_path / "*.las", "--statistic", "count", "-o", tmp_path / "x.tif", code=2)
@@ -183,7 +179,7 @@ RIPROCESS = (
 """As RIEGL writes it: a projected CRS with three axes."""
 
 
-def test_a_crs_with_an_axis_of_height_is_in_the_file_itself(rasterio, rng, tmp_path):
+def test_a_crs_with_an_axis_of_height_is_in_the_file_itself(rng, tmp_path):
     # GDAL wrote it to an .aux.xml of the temporary file's name, so the raster had no CRS and the folder a stray file.
     _cloud(tmp_path / "a.las", rng, 100, wkt=RIPROCESS)
     _run(tmp_path / "a.las", "--column", "height", "-o", tmp_path / "x.tif")
@@ -192,7 +188,7 @@ def test_a_crs_with_an_axis_of_height_is_in_the_file_itself(rasterio, rng, tmp_p
         assert found.crs.to_epsg() == 32633
 
 
-def test_a_crs_that_no_geotiff_can_hold_is_refused(rasterio, rng, tmp_path, monkeypatch):
+def test_a_crs_that_no_geotiff_can_hold_is_refused(rng, tmp_path, monkeypatch):
     _cloud(tmp_path / "a.las", rng, 100, wkt=RIPROCESS)
     monkeypatch.setattr("wavebatch.files.geotiff_file._flatten", lambda crs: crs)
     result = _run(tmp_path / "a.las", "--column", "height", "-o", tmp_path / "x.tif", code=2)
@@ -200,14 +196,14 @@ def test_a_crs_that_no_geotiff_can_hold_is_refused(rasterio, rng, tmp_path, monk
     assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
 
 
-def test_the_raster_of_a_real_strip_has_its_crs(rasterio, riegl, tmp_path):
+def test_the_raster_of_a_real_strip_has_its_crs(riegl, tmp_path):
     assert run_command("run", riegl, "-o", tmp_path, "-q").exit_code == 0
     _run(tmp_path / f"{riegl.stem}.laz", "--column", "echo_width", "--size", 2, "-o", tmp_path / "x.tif")
     with rasterio.open(tmp_path / "x.tif") as found:
         assert found.crs.to_epsg() == 32633
 
 
-def test_cells_in_metres_are_refused_on_degrees(rasterio, rng, tmp_path):
+def test_cells_in_metres_are_refused_on_degrees(rng, tmp_path):
     degrees = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257]],UNIT["degree",0.0174532925]]'
     _cloud(tmp_path / "d.las", rng, wkt=degrees)
     content = bytearray((tmp_path / "d.las").read_bytes())

@@ -360,15 +360,14 @@ def test_light_goes_out_along_the_ray_and_empty_voxels_are_written_on_request(tm
 @pytest.mark.quick_cases("v.laz")
 @pytest.mark.parametrize("target", ["v.npz", "v.laz"])
 def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target):
+    """Of voxels and of profiles."""
     strip, _ = forest
-    folder = tmp_path / "whole"
-    folder.mkdir()
-    options = {"all_crossed": target == "v.npz"}
-    voxelize(strip, folder / target, 0.8, **options)
-    whole = (folder / target).read_bytes()
-    for block_size, held in ((97, 1 << 20), (600, 500), (1500, 3)):
-        voxelize(strip, tmp_path / target, 0.8, block_size=block_size, held=held, overwrite=True, **options)
-        assert (tmp_path / target).read_bytes() == whole
+    options = {"all_crossed": target == "v.npz", "overwrite": True, "profiles": tmp_path / "p.npz"}
+    made = set()
+    for block_size, held in ((None, 400_000), (97, 1 << 20), (600, 500), (1500, 3)):
+        voxelize(strip, tmp_path / target, 0.8, block_size=block_size, held=held, **options)
+        made.add((tmp_path / target).read_bytes() + (tmp_path / "p.npz").read_bytes())
+    assert len(made) == 1
 
 
 def test_two_halves_of_a_strip_add_up_to_the_whole(tmp_path):
@@ -439,21 +438,23 @@ def test_cross_sections_are_those_of_the_echoes(level, tmp_path):
     assert again.sensor is None and again.energy == summary.energy
 
 
-def test_what_is_not_known_is_no_data_never_zero(level, tmp_path):
-    path = tmp_path / "trajectory.txt"
+@pytest.fixture(scope="module")
+def half_known(level):
+    """The position of the sensor for half of the flight over `level`."""
+    path = level.with_name("trajectory.txt")
     with StripReader(level) as reader:
         block, _ = next(reader.read_blocks(reader.read_unit(0, reader.scan()), 5000, True))
-    middle = float(np.median(block.gps_time))
-    rows = []
-    for time in np.linspace(block.gps_time.min() - 0.01, middle, 30):
+    rows = ["time x y z"]
+    for time in np.linspace(block.gps_time.min() - 0.01, np.median(block.gps_time), 30):
         ray = np.argmin(np.abs(block.gps_time - time))
-        sensor = block.origin[ray] - block.direction[ray] * 5000.0
-        rows.append(f"{time:.7f} {sensor[0]:.3f} {sensor[1]:.3f} {sensor[2]:.3f}")
-    path.write_text("time x y z\n" + "\n".join(rows) + "\n")
+        rows.append(" ".join(map(repr, map(float, (time, *(block.origin[ray] - block.direction[ray] * 5000.0))))))
+    path.write_text("\n".join(rows) + "\n")
+    return {"calibration": CALIBRATION, "sensor": SensorRequest(trajectory=path)}
+
+
+def test_what_is_not_known_is_no_data_never_zero(level, half_known, tmp_path):
     for target in ("v.npz", "v.las"):
-        summary, found = voxelize(
-            level, tmp_path / target, 1.0, calibration=CALIBRATION, sensor=SensorRequest(trajectory=path)
-        )
+        summary, found = voxelize(level, tmp_path / target, 1.0, **half_known)
         assert 0 < summary.unknown < summary.with_signal
         section = np.asarray(found["cross_section"])
         none = np.isnan(section) if target == "v.npz" else section == -9999.0
@@ -655,22 +656,8 @@ def test_two_surfaces_are_two_parts_of_one_profile(tmp_path):
         assert np.array(energy) == pytest.approx(np.array([60, 90]) * 2.0 * SQRT_2PI, rel=0.1)
 
 
-def test_the_bytes_of_profiles_do_not_depend_on_blocks(forest, tmp_path):
-    for name, size in (("a", None), ("b", 137)):
-        profiles_of(forest[0], tmp_path, name, block_size=size)
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-
-
-def test_unknown_cross_sections_of_profiles_are_no_data(level, tmp_path):
-    """No position of the sensor for half of the flight: energy is known there, cross sections are not."""
-    path = tmp_path / "trajectory.txt"
-    with StripReader(level) as reader:
-        block, _ = next(reader.read_blocks(reader.read_unit(0, reader.scan()), 5000, True))
-    rows = ["time x y z"]
-    for time in np.linspace(block.gps_time.min() - 0.01, np.median(block.gps_time), 30):
-        ray = np.argmin(np.abs(block.gps_time - time))
-        rows.append(" ".join(map(repr, map(float, (time, *(block.origin[ray] - block.direction[ray] * 5000.0))))))
-    path.write_text("\n".join(rows) + "\n")
-    summary, _, made = profiles_of(level, tmp_path, calibration=CALIBRATION, sensor=SensorRequest(trajectory=path))
+def test_unknown_cross_sections_of_profiles_are_no_data(level, half_known, tmp_path):
+    """Energy is known there, cross sections are not."""
+    summary, _, made = profiles_of(level, tmp_path, **half_known)
     unknown = np.isnan(np.add.reduceat(made["cross_section"].astype(float), made["first"]))
     assert unknown.sum() == summary.unknown > 100 and np.isfinite(made["energy"]).all()
