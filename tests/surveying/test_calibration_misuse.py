@@ -242,7 +242,7 @@ def test_what_scenes_do_not_show_of_another_gain_or_energy_is_in_the_error():
     other = scene + 0.2 * np.where(np.arange(10) % 2, 1.0, -1.0)
     alike, unlike = compare_scenes(scene, scene + 0.02, 0.0), compare_scenes(scene, other, 0.0)
     assert alike.chance < 0.1 and alike.error < 0.02
-    assert unlike.chance < 0.25 and 0.08 < unlike.error < 0.13
+    assert unlike.chance < 0.25 and 0.1 < unlike.error < 0.15
     for factor in (0.7, 0.8, 1.25, 1.4):
         change = np.log(factor)
         assert compare_scenes(scene + change, scene, 0.0).chance > 0.8
@@ -541,7 +541,7 @@ def test_a_chance_of_zero_adds_nothing_for_what_scenes_do_not_show():
         known = Calibration(2e-8, 0.03, 0.22, channels=(row,), change_chance=chance)
         growth, lines, notes = compare_setting(known, found, SystemPulse(2.0))
         said.append((growth, len(lines), "by an assumed chance of 30% (change_chance)" in "".join(notes)))
-    assert 0.08 < said[0][0] < 0.15 and said[0][1:] == (0, True) and said[1] == (0.0, 0, False)
+    assert 0.15 < said[0][0] < 0.22 and said[0][1:] == (0, True) and said[1] == (0.0, 0, False)
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
 from wavebatch.files.cloud.writer import OutputLayout
+from wavebatch.files.disk.raw_bytes import naming, undoing
 from wavebatch.files.disk.temp_store import RowParcel
 from wavebatch.files.las.header import split_numbers
 from wavebatch.files.las.write_points import CHUNK_POINTS, Chunk, Statistics, compress_rows
@@ -176,7 +177,7 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
         facts = reader.facts
         plan_filter(job, plan_layout(job, facts))
         scan = reader.scan(force=job.request.force, parts=parts)
-        try:
+        with undoing(scan.close):
             scanned = Seconds.now()
             setup = prepare(reader, scan, job.chain, job.request, sensor=job.sensor, calibration=job.calibration,
                             air=job.attenuation and job.attenuation[0], energy=job.energy,
@@ -208,9 +209,6 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
             layout = plan_layout(job, facts)
             chosen = plan_filter(job, layout)
             units = reader.unit_count()
-        except BaseException:
-            scan.close()
-            raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": Seconds.now() - surveyed}
     report = RunReport(counts={"points_cut": scan.cut}, timing=timing)
     found = choice, layout, chosen, report, sensor, setup.stranger, setup.sent.energy, doubts, setup.forced
@@ -508,7 +506,5 @@ def pack_chunk(path: Path, parts: list[Part], point_format: int) -> tuple[Chunk,
 def pack_rows(path: Path, rows: np.ndarray, point_format: int) -> list[Chunk]:
     """Compress rows that begin where a chunk does; arguments and errors as for `pack_chunk`."""
     parts = (rows[first : first + CHUNK_POINTS] for first in range(0, len(rows), CHUNK_POINTS))
-    try:
+    with naming(path):
         return [compress_rows(part, point_format) for part in parts]
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error

@@ -23,9 +23,10 @@ from wavebatch.core.errors import WARNINGS, ConfigError, InputError, StripWarnin
 from wavebatch.core.process import importing
 from wavebatch.core.units import count
 from wavebatch.files.disk.publish import refuse_input
+from wavebatch.files.disk.raw_bytes import Closing
 
 
-class Progress:
+class Progress(Closing):
     """Shows the events of a batch.
 
     kind: `bar`, `json`, `none`, or `auto`: a bar if stderr is a terminal. level: -1 shows errors only, 0 also a line
@@ -49,10 +50,8 @@ class Progress:
             total = sum(self._sizes.values())
             self._bar = tqdm(total=total, unit="B", unit_scale=True, file=sys.stderr, dynamic_ncols=True)
 
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
+        """Ends the bar."""
         if self._bar is not None:
             self._bar.close()
 

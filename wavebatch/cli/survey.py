@@ -131,9 +131,8 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
             from wavebatch.tools.sheets.survey import write_angles
 
             distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
-            sizes = {"spacing": found.figures.spacing_ns, "amplitude": found.figures.amplitude_50}
-            write_angles(options["angles"], found.system, distance=distance, strip=opened.facts.path.name, **sizes,
-                         overwrite=options["overwrite"])  # fmt: skip
+            name, overwrite = opened.facts.path.name, options["overwrite"]
+            write_angles(options["angles"], found, distance, strip=name, overwrite=overwrite)
     return SavedSurvey(found, strip.name, take_fingerprint(strip, packet_file)), facts
 
 

@@ -155,3 +155,12 @@ def check_options(options: Any) -> None:
             raise ConfigError(f"{place} {value!r}: choose {', '.join(map(str, one.choices))}")
         if one.limits is not None and not one.limits.hold(value):
             raise ConfigError(f"{place} {value!s:.20}: must lie {one.limits}")
+
+
+class CheckedOptions:
+    """Base of frozen options that are checked when they are made."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        check_options(self)

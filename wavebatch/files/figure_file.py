@@ -80,7 +80,8 @@ def open_picture(
     Raises as `check_picture` does, and InputError if the file cannot be written.
     """
     check_picture(target, overwrite=overwrite)
-    with _style(str(target)), _new_figure(size, dpi) as figure:
+    with _style(str(target)):
+        figure = _new_figure(size, dpi)
         set_layout(figure, w_pad=0.1, h_pad=0.08)
         yield figure
         _save(figure, target, overwrite)
@@ -114,8 +115,8 @@ def open_svg(size: tuple[float, float]) -> Iterator[tuple[Figure, list[str]]]:
 
     For the many pictures inside of pages: no layout is computed, and places have a tenth of a point.
     """
-    with _style("the page", {"font.sans-serif": ["DejaVu Sans", "Verdana"]}), _new_figure(size, 72) as figure:
-        drawn: list[str] = []
+    with _style("the page", {"font.sans-serif": ["DejaVu Sans", "Verdana"]}):
+        figure, drawn = _new_figure(size, 72), list[str]()
         yield figure, drawn
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
@@ -160,14 +161,13 @@ def _read_style() -> Any:
     return matplotlib.RcParams({**kept, **_STYLE})
 
 
-@contextlib.contextmanager
-def _new_figure(size: tuple[float, float], dpi: float) -> Iterator[Figure]:
+def _new_figure(size: tuple[float, float], dpi: float) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, dpi=dpi)
     FigureCanvasAgg(figure)
-    yield figure
+    return figure
 
 
 _UNTOUCHED = ("backend", "backend_fallback", "interactive", "toolbar", "timezone", "webagg.port")

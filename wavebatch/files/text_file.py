@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import glob
-import io
 import os
 import stat
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO, cast
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import Draft, is_stream, open_stream, protect, real_name, reporting
@@ -40,8 +38,7 @@ def read_text(path: Path | str, what: str, most: int = MOST_BYTES) -> str:
     Raises ConfigError where the file cannot be read, is too large or is not UTF-8 text.
     """
     try:
-        with _open(path) as file:
-            data = file.read(most + 1)
+        data = _read(path, most + 1)
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         why = getattr(error, "strerror", None) or error
         raise ConfigError(f"{path}: {what} cannot be read: {why}") from error
@@ -53,50 +50,27 @@ def read_text(path: Path | str, what: str, most: int = MOST_BYTES) -> str:
         raise ConfigError(f"{path}: {what} is not UTF-8 text (byte {error.start})") from error
 
 
-def _open(path: Path | str) -> BinaryIO:
-    """Open a file or a pipe for reading; OSError for devices, which may never end, and pipes that nothing writes to."""
+def _read(path: Path | str, most: int) -> bytes:
+    """Read at most so many bytes of a file or a pipe.
+
+    Raises OSError for devices, which may never end, and pipes that nothing writes to.
+    """
     mode = os.stat(path).st_mode
     if stat.S_ISREG(mode) or stat.S_ISDIR(mode):
-        return open(path, "rb")
+        with open(path, "rb") as file:
+            return file.read(most)
     if not stat.S_ISFIFO(mode):
         raise OSError("it is a device; give a file")
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # else this would wait for a writer, for ever
-    file = os.fdopen(descriptor, "rb")
-    with undoing(file.close):
-        begin = _read_first(descriptor)
-    os.set_blocking(descriptor, True)
-    return cast(BinaryIO, _Pipe(file, begin))
-
-
-def _read_first(descriptor: int) -> bytes:
-    """The first bytes of a pipe, empty where its writer is there but slow; OSError where nothing comes."""
-    deadline = time.monotonic() + _PATIENCE
-    while True:
-        try:
-            begin = os.read(descriptor, 1 << 16)
-        except BlockingIOError:
-            return b""
-        if begin:
-            return begin
-        if time.monotonic() > deadline:
-            raise OSError("nothing writes into this pipe")
-        time.sleep(0.01)
-
-
-class _Pipe(io.RawIOBase):
-    """A pipe whose first bytes are read already."""
-
-    def __init__(self, file: BinaryIO, begin: bytes) -> None:
-        self._file, self._begin = file, begin
-
-    def read(self, size: int = -1, /) -> bytes:
-        """Return at most so many bytes."""
-        return self._begin + self._file.read(size - len(self._begin))
-
-    def close(self) -> None:
-        """Close the pipe."""
-        self._file.close()
-        super().close()
+    with os.fdopen(descriptor, "rb") as file:
+        begin, deadline = b"", time.monotonic() + _PATIENCE
+        with contextlib.suppress(BlockingIOError):  # its writer is there but slow
+            while not (begin := os.read(descriptor, 1 << 16)):
+                if time.monotonic() > deadline:
+                    raise OSError("nothing writes into this pipe")
+                time.sleep(0.01)
+        os.set_blocking(descriptor, True)
+        return begin + file.read(most - len(begin))
 
 
 def write_text(path: Path, text: str, *, overwrite: bool) -> None:

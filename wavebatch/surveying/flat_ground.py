@@ -15,11 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.frozen import frozen
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.order import even_places
@@ -34,7 +33,7 @@ from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_varia
 from wavebatch.stages.attribute.basic import added_variance
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, MIN_SNR
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, find_single
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey
@@ -194,14 +193,7 @@ def _share_in_two_lines(xyz: np.ndarray, tree: cKDTree, some: np.ndarray, radius
     return float(np.mean(in_two_lines(offset[:, 0], offset[:, 1], group, len(some))))
 
 
-class Fills(Protocol):
-    """A source of the sensor's positions."""
-
-    def fill(self, block: WaveformBlock) -> WaveformBlock:
-        """Return the block with them."""
-
-
-def sample_slopes(reader: StripReader, scan: StripScan, fill: Fills, n_waveforms: int) -> Iterator[Slopes]:
+def sample_slopes(reader: StripReader, scan: StripScan, fill: SensorSource, n_waveforms: int) -> Iterator[Slopes]:
     """Yield waveforms spread over a strip with the slopes of the surfaces that they hit.
 
     Parameters
@@ -312,8 +304,7 @@ def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:
     block = sample.block
     system = replace(system.of(block), widths=LevelWidths())
     echoes = decompose_sample(block, system)
-    clean = echoes.alone(len(block)) & (echoes.amplitude > MIN_SNR * system.noise.std)
-    echoes = echoes.take(np.flatnonzero(clean & ((echoes.flags & np.uint16(UNCLEAN)) == 0)))
+    echoes = echoes.take(np.flatnonzero(find_single(echoes, len(block), system)))
     variance, error = added_variance(block, system, echoes, "system", 0.0)
     row = echoes.waveform
     off = block.origin[row] + block.direction[row] * echoes.time[:, None] - np.asarray(block.sensor)[row]

@@ -19,6 +19,7 @@ from wavebatch.core.order import robust_std
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.units import AIR_ATTENUATION
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.disk.raw_bytes import naming
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.files.strip.reader import LEAST_PAIRS, RaySample, StripReader, StripScan, measure_scale, sample_rays
 from wavebatch.files.trajectory_file import read_trajectory
@@ -350,14 +351,12 @@ def _from_file(
     if not len(rays.time):
         return SensorSource("trajectory", known, facts=(("file", path.name),))
     start, stop = float(rays.time[0]), float(rays.time[-1])
-    try:
+    with naming(path):
         offset, clocks = solve_offset(known, start, stop)
         known = known.shifted(offset).between(start - MARGIN, stop + MARGIN)
         ahead = rays.point - known.at(rays.time)
         distance = np.sqrt((ahead * ahead).sum(axis=1))
         angle = _disagreement(ahead, distance, rays)
-    except InputError as error:
-        raise InputError(f"{request.trajectory}: {error}") from error
     share = known.share_known(start, stop)
     seen = estimate_path(rays, "direction vectors", pairs)
     shown = dict(seen.facts if seen else ())

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import Defects, LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.stages.clean import clean_block, find_seams, mark_seam, measure_defects
@@ -38,6 +38,7 @@ from wavebatch.surveying.measuring.noise_and_width import (
     MIN_SNR,
     RESIDUAL_LOOK,
     SMALL,
+    find_single,
     list_widths,
     measure_again,
     measure_begin,
@@ -308,9 +309,7 @@ def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
 
     From those narrower than the system pulse: slopes and plants only widen. 0 with too few of them.
     """
-    clear = echoes.alone(len(block)) & (echoes.amplitude > MIN_SNR * system.noise.std)
-    clear &= (echoes.flags & np.uint16(UNCLEAN)) == 0
-    below = clear & (echoes.sigma < system.sigma_ref)
+    below = find_single(echoes, len(block), system) & (echoes.sigma < system.sigma_ref)
     if np.count_nonzero(below) < ENOUGH_TO_LEARN:
         return 0.0
     lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)

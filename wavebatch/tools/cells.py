@@ -65,6 +65,17 @@ def name_paths(paths: Sequence[Path]) -> tuple[str, ...]:
     return tuple(str(path) if names.count(path.name) > 1 else path.name for path in paths)
 
 
+@frozen(eq=False)
+class CloudData:
+    """What a picture shows of a column of clouds: the base of histograms, maps, sections and profiles."""
+
+    facts: ColumnFacts
+    names: tuple[str, ...]
+    """Of the clouds, or of the series where there are several."""
+    total: Tally
+    """Counts of all points of the clouds."""
+
+
 class Clouds:
     """Several clouds that are read as one, as often as needed; only one is open at a time.
 
@@ -259,28 +270,20 @@ def compute_cells(statistic: str, cell: np.ndarray, values: np.ndarray, number: 
             # Differences from the mean first: squares of large values would cancel.
             square = np.bincount(cell, (values - mean[cell]) ** 2, number)
             return np.where(count > 1, np.sqrt(square / (count - 1)), np.nan)
-    return _pick(cell, values, count, _PLACES[statistic])
+    ordered = values[np.lexsort((values, cell))]
+    place = np.flatnonzero(count)
+    first = (np.cumsum(count) - count)[place]
+    low, high = (ordered[first + rank] for rank in _RANKS[statistic](count[place]))
+    filled[place] = low + 0.5 * (high - low)
+    return filled
 
 
-_PLACES: dict[str, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
+_RANKS: dict[str, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
     "median": lambda count: ((count - 1) // 2, count // 2),
     "min": lambda count: (np.zeros_like(count), np.zeros_like(count)),
     "max": lambda count: (count - 1, count - 1),
 }
 """Ranks of the two values whose mean is the statistic, from the counts of cells."""
-
-
-def _pick(
-    cell: np.ndarray, values: np.ndarray, count: np.ndarray, places: Callable[[np.ndarray], tuple[np.ndarray, ...]]
-) -> np.ndarray:
-    """The values of these ranks in each cell."""
-    ordered = values[np.lexsort((values, cell))]
-    filled = np.flatnonzero(count)
-    first = (np.cumsum(count) - count)[filled]
-    low, high = (ordered[first + place] for place in places(count[filled]))
-    result = np.full(len(count), np.nan)
-    result[filled] = low + 0.5 * (high - low)
-    return result
 
 
 HELD = 2_000_000
@@ -423,17 +426,13 @@ _SIDE = 128
 
 
 @frozen(eq=False)
-class Raster:
+class Raster(CloudData):
     """A map."""
 
-    names: tuple[str, ...]
-    """Of the clouds."""
-    facts: ColumnFacts
     statistic: str
     grid: Grid
     values: np.ndarray
     """f8 (rows, columns), the first row is the southernmost; NaN without a point."""
-    total: Tally
     outside: int
     """Points with a value outside the grid."""
     shown: tuple[float, float]
@@ -486,8 +485,8 @@ def grid_values(
         part[:] = tile[0, : part.shape[0], : part.shape[1]]
     values = values[::-1]  # the first row is the southernmost
     names = tuple(path.name for path in paths)
-    return Raster(names, clouds.facts, statistic, grid, values, total, total.values - placed.values[0],
-                  find_shown(values), crs)  # fmt: skip
+    outside = total.values - placed.values[0]
+    return Raster(clouds.facts, names, total, statistic, grid, values, outside, find_shown(values), crs)
 
 
 def find_shown(values: np.ndarray) -> tuple[float, float]:

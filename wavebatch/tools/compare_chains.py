@@ -205,8 +205,23 @@ def match_sides(
         blocks = reader.all_blocks(scan, block_size)
         if limit is not None:
             blocks = reader.sample_blocks(scan, limit, block_size, long_samples=limit * MAX_SAMPLES)
-        if clouds:
-            between = _match_cloud(blocks, Path(strip), a, b, runs, tolerance_ns)
+        if clouds:  # as two clouds
+            ((key, run),) = runs.items()
+            side = 1 if key == "a" else 0  # of the cloud
+            with (
+                CloudReader(Path((a, b)[side].name)) as cloud,
+                CloudReader(Path(strip)) as returns,
+                pairing.open_task(cloud, returns, tolerance_ns) as task,
+            ):
+                for rows in pairing.read_echoes(cloud):
+                    task.add(side, rows)
+                for block in blocks:
+                    found = run.find(block)
+                    run.add(block, found, np.zeros(len(block), bool))
+                    rows = found.rows(block)
+                    rows["gps_time"] = block.gps_time[found.echoes.waveform]
+                    task.add(1 - side, rows)
+                between = task.finish(a.name, b.name)
         else:
             between = match_chains(blocks, runs, (a.name, b.name if b else str(strip)), tolerance_ns)
     some = next(iter(runs.values())).vendor
@@ -231,33 +246,6 @@ def match_chains(
             sides = [one.rows_along(block) for one in found.values()]
         between.pair_by_time(*sides, _keys(block))
     return between.finish(*names, "waveform")
-
-
-def _match_cloud(
-    blocks: Iterator[WaveformBlock],
-    strip: Path,
-    a: Contender,
-    b: Contender,
-    runs: dict[str, ChainRun],
-    tolerance_ns: float,
-) -> pairing.Comparison:
-    """Compares a chain with a cloud, as two clouds."""
-    ((key, run),) = runs.items()
-    cloud_side = 1 if key == "a" else 0
-    with (
-        CloudReader(Path((a, b)[cloud_side].name)) as cloud,
-        CloudReader(strip) as returns,
-        pairing.open_task(cloud, returns, tolerance_ns) as task,
-    ):
-        for rows in pairing.read_echoes(cloud):
-            task.add(cloud_side, rows)
-        for block in blocks:
-            found = run.find(block)
-            run.add(block, found, np.zeros(len(block), bool))
-            rows = found.rows(block)
-            rows["gps_time"] = block.gps_time[found.echoes.waveform]
-            task.add(1 - cloud_side, rows)
-        return task.finish(a.name, b.name)
 
 
 class _Found(Solved):

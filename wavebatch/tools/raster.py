@@ -19,7 +19,7 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.schema import Above, Range, check_options, option
+from wavebatch.core.schema import Above, CheckedOptions, Range, check_options, option
 from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
@@ -53,7 +53,7 @@ KNOWN, FEW_RAYS, NO_GROUND = range(3)
 
 
 @frozen
-class ForestOptions:
+class ForestOptions(CheckedOptions):
     """How metrics are computed."""
 
     leaf_projection: Annotated[float, Range(0.1, 1.0)] = option(
@@ -63,9 +63,6 @@ class ForestOptions:
     layer: Annotated[float, Above(0.0, TALLEST)] = option(
         5.0, "Height of the layers that leaf area density is written for [m].", form="M"
     )
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class _Voxels(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.schema import Above, Range, check_options, option
+from wavebatch.core.schema import Above, CheckedOptions, Range, option
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -221,7 +221,7 @@ _GAP, _PULSES_PER_GAP = 10.0, 3.0
 
 
 @frozen
-class SliceOptions:
+class SliceOptions(CheckedOptions):
     """How slices are cut and searched."""
 
     geometry: Literal["plane", "time"] = option(
@@ -239,9 +239,6 @@ class SliceOptions:
     most: Annotated[int, Range(1, math.inf)] = option(20, "Most segments per slice.", form="N")
     floor: float = 0.0
     """Samples up to this far above their level are not searched [DN]: the noise of the strip."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 @frozen(eq=False)

@@ -21,7 +21,7 @@ import io
 import json
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,16 +42,16 @@ LAS_VERSIONS = ("1.4", "1.3", "keep")
 """Values of --las-version."""
 
 
-@frozen
+@frozen(eq=False)
 class Version:
     """What `choose_version` chose."""
 
     version: tuple[int, int]
     point_format: int
-    wkt: str | None = None
-    """WKT record to write in place of those of the strip."""
-    notes: tuple[str, ...] = ()
-    """Lines for the user."""
+    wkt: str | None
+    """WKT in place of that of the input: where this gives GeoTIFF keys only, or a WKT that GIS misunderstand."""
+    notes: tuple[str, ...]
+    """What the user should know about the format."""
 
 
 def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format: int | None, keep: bool) -> Version:
@@ -81,7 +81,7 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
             if target < 6:
                 note = f"written in point format {target} of LAS 1.4 in place of {modern}: {why}; "
                 note += f"--point-format {modern} tries"
-            return Version(max(header.version, (1, 4)), target, notes=(note, *notes))
+            return Version(max(header.version, (1, 4)), target, None, (note, *notes))
         return Version(max(header.version, (1, 4)), modern, wkt or repaired, notes)
     wkt = repaired
     if only_keys and target >= 6:
@@ -157,13 +157,11 @@ def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[Carried, ...]:
 
 
 @frozen(eq=False)
-class OutputLayout:
+class OutputLayout(Version):
     """Layout of the output points of one strip; picklable, so that workers can make rows with it."""
 
     source: CheckedHeader
     """Of the input; the output has its scales and offsets."""
-    version: tuple[int, int]
-    point_format: int
     dtype: np.dtype
     """One output record: the standard fields with laspy's names, then the extra dimensions."""
     carried: tuple[Carried, ...]
@@ -172,10 +170,6 @@ class OutputLayout:
     """Whether all rows keep the input's extra bytes (returns), or only matched rows (echoes)."""
     packets: PacketPlace | None
     """The packets of the input, if the output keeps them."""
-    wkt: str | None = None
-    """WKT in place of that of the input: where this gives GeoTIFF keys only, or a WKT that GIS misunderstand."""
-    notes: tuple[str, ...] = ()
-    """What the user should know about the format."""
 
     @property
     def copied(self) -> tuple[str, ...]:
@@ -355,16 +349,13 @@ def plan_output(
     if packets is not None and packets.packets.file is None:
         raise InputError(f"{path}: has no packets to keep; leave --keep-packets out")
     layout = OutputLayout(
+        **{one.name: getattr(chosen, one.name) for one in fields(chosen)},
         source=checked,
-        version=chosen.version,
-        point_format=chosen.point_format,
         dtype=dtype,
         carried=carried,
         written=tuple(written),
         whole=points == "returns",
         packets=None if packets is None else packets.packets,
-        wkt=chosen.wkt,
-        notes=chosen.notes,
     )
     if strict and layout.copied:
         raise InputError(
@@ -476,22 +467,18 @@ def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: li
         encoding &= ~las.WKT_BIT  # a reserved bit there
     elif not has_keys and (has_wkt or layout.point_format >= 6) or has_wkt and layout.point_format >= 6:
         encoding |= las.WKT_BIT
-    return las.LasHeader(
+    # `PointFile` sets what follows from the points: their number, length, bounds, times and compression.
+    return replace(
+        source,
         version=layout.version,
         point_format=layout.point_format,
-        point_length=layout.dtype.itemsize,
-        scales=source.scales,
-        offsets=source.offsets,
         vlrs=vlrs,
-        padding=source.padding,
-        user_bytes=source.user_bytes,
-        file_source_id=source.file_source_id,
         global_encoding=encoding,
-        project_id=source.project_id,
         system_identifier=b"MODIFICATION",
         generating_software=las.SOFTWARE,
-        creation=source.creation,
-        gps_offset=source.gps_offset,
+        waveform_start=0,
+        evlr_start=0,
+        evlr_count=0,
     )
 
 

@@ -30,7 +30,6 @@ from wavebatch.files.disk.raw_bytes import Closing, in_one_line, read_exactly, t
 
 _LOCK = "lock"
 _place: ContextVar[Path | None] = ContextVar("wavebatch_scratch", default=None)
-_own: list[_Owned] = []
 
 
 def make_folder() -> Path:
@@ -38,13 +37,15 @@ def make_folder() -> Path:
 
     Raises OSError if there is no room for it.
     """
-    place = _place.get()
-    if place is None:
-        if not _own:
-            _own.append(_Owned(Path(tempfile.gettempdir()), ""))
-            atexit.register(_own[0].close)
-        place = _own[0].folder
-    return Path(tempfile.mkdtemp(dir=place))
+    return Path(tempfile.mkdtemp(dir=_place.get() or _own_folder()))
+
+
+@functools.cache
+def _own_folder() -> Path:
+    """The folder of this process, made when it is first asked for."""
+    owned = _Owned(Path(tempfile.gettempdir()), "")
+    atexit.register(owned.close)
+    return owned.folder
 
 
 def scratch_place() -> Path:

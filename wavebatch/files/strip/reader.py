@@ -24,19 +24,9 @@ from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.raw_bytes import Closing, join_records, reading, take_whole_records, undoing, widen_integers
 from wavebatch.files.las.header import field_names, locate
 from wavebatch.files.las.read_points import open_points
-from wavebatch.files.strip import packet_check
+from wavebatch.files.strip import packet_check, scanner
 from wavebatch.files.strip.packets import PacketFile, StripFacts, block_rows, find_facts
-from wavebatch.files.strip.scanner import (
-    SCAN_SIZES,
-    Scanner,
-    ScanPart,
-    ScanSizes,
-    StripScan,
-    cut_scan,
-    expand,
-    group_keys,
-    unique_entries,
-)
+from wavebatch.files.strip.scanner import SCAN_SIZES, Scanner, ScanPart, ScanSizes, StripScan
 from wavebatch.kernels.signal.signal import find_fill, quiet_fill, recorded_lengths
 
 __all__ = ["UNIT_POINTS", "PacketTable", "StripFacts", "StripReader", "StripScan", "Unit"]
@@ -173,7 +163,7 @@ class StripReader(Closing):
 
     def cut_scan(self, parts: int) -> list[tuple[int, int]]:
         """Return at most so many runs of units that may be scanned one by one, by any processes."""
-        return cut_scan(self.unit_count(), self._unit_points, parts, self._sizes)
+        return scanner.cut_scan(self.unit_count(), self._unit_points, parts, self._sizes)
 
     def _find_stranger(self, scan: StripScan) -> str:
         """Why the packets of the .wdp are certainly those of another strip; empty where they may be its own."""
@@ -220,7 +210,7 @@ class StripReader(Closing):
         if not len(points):
             points = self._points.read(start, stop)
         judged = self._judge.judge(points, scan.vectors.form, scan.overfull)
-        entries = unique_entries(scan.context.read(number))
+        entries = scanner.unique_entries(scan.context.read(number))
         near = self._judge.judge(entries["record"], scan.vectors.form, scan.overfull)
         entries, keys, n_samples = entries[near.usable], near.keys[near.usable], near.n_samples[near.usable]
         packed = near.packed[near.usable]
@@ -230,7 +220,16 @@ class StripReader(Closing):
         sizes = np.concatenate([points["wavepacket_size"][own], entries["record"]["wavepacket_size"]])
         n_samples = np.concatenate([judged.n_samples[own], n_samples])
         packed = np.concatenate([judged.packed[own], packed])
-        packets, packet_of = _collect_packets(keys, index, sizes, n_samples, packed, (start, stop))
+        lead, packet_of = _group_packets(keys, index)
+        packets = PacketTable(
+            digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
+            offset=keys[lead] >> packet_check.INDEX_BITS,
+            size=sizes[lead],
+            n_samples=n_samples[lead],
+            owner=index[lead],
+            owned=(index[lead] >= start) & (index[lead] < stop),
+            packed=packed[lead],
+        )
         packet_of_point = np.full(len(points), -1, np.int32)
         packet_of_point[own] = packet_of[: len(own)]
         return Unit(
@@ -335,7 +334,7 @@ class StripReader(Closing):
         table = unit.packets
         kinds = (table.digitizer[rows].astype(np.int64) << 32) | (table.packed[rows].astype(np.int64) << 31)
         kinds |= table.n_samples[rows]
-        groups = group_keys(kinds)
+        groups = scanner.group_keys(kinds)
         for group in np.argsort(groups.order[groups.starts]).tolist():
             start = groups.starts[group]
             same = rows[groups.order[start : start + groups.counts[group]]]
@@ -371,7 +370,7 @@ class _Geometry:
     ) -> WaveformBlock:
         """Return the block of packets `rows`; the first return of each packet is its owner."""
         counts = self._counts[rows]
-        place = expand(self._starts[rows], counts)
+        place = scanner.expand(self._starts[rows], counts)
         records = self._take(self._entry[place])
         xyz = locate(records, self._facts.header)
         location = widen_integers(records["return_point_wave_location"])
@@ -410,39 +409,21 @@ def read_scanner(records: np.ndarray) -> np.ndarray | None:
     return (records["classification_flags"] >> 4) & 3
 
 
-def _collect_packets(
-    keys: np.ndarray,
-    index: np.ndarray,
-    sizes: np.ndarray,
-    n_samples: np.ndarray,
-    packed: np.ndarray,
-    unit: tuple[int, int],
-) -> tuple[PacketTable, np.ndarray]:
-    """Packets of points (n,) in order of their owners, and the row of each point, i4 (n,)."""
+def _group_packets(keys: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the owners of the packets of points (n,), in their order, and the packet of each point, i4 (n,)."""
     packet_of = np.empty(len(keys), np.int32)
     if np.all(index[1:] > index[:-1]) and np.all(keys[1:] >= keys[:-1]):  # as most vendors write them
-        groups = group_keys(keys)
-        lead = groups.starts
-        packet_of[:] = np.repeat(np.arange(len(lead), dtype=np.int32), groups.counts)
-    else:
-        by_index = np.argsort(index, kind="stable")
-        groups = group_keys(keys[by_index])
-        lead = by_index[groups.order[groups.starts]]
-        order = np.argsort(index[lead], kind="stable")
-        rank = np.empty(len(lead), np.int32)
-        rank[order] = np.arange(len(lead), dtype=np.int32)
-        packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
-        lead = lead[order]
-    table = PacketTable(
-        digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
-        offset=keys[lead] >> packet_check.INDEX_BITS,
-        size=sizes[lead],
-        n_samples=n_samples[lead],
-        owner=index[lead],
-        owned=(index[lead] >= unit[0]) & (index[lead] < unit[1]),
-        packed=packed[lead],
-    )
-    return table, packet_of
+        groups = scanner.group_keys(keys)
+        packet_of[:] = np.repeat(np.arange(len(groups.starts), dtype=np.int32), groups.counts)
+        return groups.starts, packet_of
+    by_index = np.argsort(index, kind="stable")
+    groups = scanner.group_keys(keys[by_index])
+    lead = by_index[groups.order[groups.starts]]
+    order = np.argsort(index[lead], kind="stable")
+    rank = np.empty(len(lead), np.int32)
+    rank[order] = np.arange(len(lead), dtype=np.int32)
+    packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
+    return lead[order], packet_of
 
 
 MOST_SLICES = 4096

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.errors import InputError
 from wavebatch.core.order import group_medians, robust_std
 from wavebatch.core.units import ASSUMED_DIVERGENCE, FWHM_PER_SIGMA, INSET, MAD_TO_STD, MEDIAN_ERROR
@@ -38,7 +37,7 @@ from wavebatch.surveying.calibrating.calibration_files import LEAST_REFLECTANCE,
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions, EchoSource
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
 from wavebatch.surveying.matching.setting import SCANNERS, keep_places, read_day, read_sensor_name
-from wavebatch.surveying.measuring.noise_and_width import MIN_SNR
+from wavebatch.surveying.measuring.noise_and_width import find_single
 from wavebatch.surveying.measuring.residuals import decompose_sample, subtract_echoes
 from wavebatch.surveying.sensor import SensorSource
 
@@ -99,8 +98,7 @@ def _describe(block: WaveformBlock, system: SystemPulse) -> Iterator[tuple[int, 
     """Channels, and of their lone echoes f8 (3, k): amplitude, share of the squared echo that is missing, and the light
     that goes with that."""
     echoes = decompose_sample(block, system)
-    clear = echoes.alone(len(block)) & ((echoes.flags & np.uint16(UNCLEAN)) == 0)
-    echoes = echoes.take(np.flatnonzero(clear & (echoes.amplitude > MIN_SNR * system.noise.std)))
+    echoes = echoes.take(np.flatnonzero(find_single(echoes, len(block), system)))
     if not len(echoes):
         return
     part = block.rows(echoes.waveform)

@@ -57,6 +57,11 @@ CHANGES = ((1.0, 0.0), (1.0, 1.0))
 """How another energy and another gain move light and noise; one is as likely as the other, and the chance of both is
 `Calibration.change_chance` before light and noise are seen."""
 
+LIKELY = 0.5
+"""Chance from which another gain or energy is named. From there on the error is that of a change; below, the square is
+less by the chance over this one: it would be too small by half for strips that have changed, if a chance of a quarter
+took three quarters of it."""
+
 ZONE_PARTS = 8
 """Parts of a strip whose bend is measured: their scatter tells ground from a wrong pulse zone."""
 
@@ -126,7 +131,7 @@ class Change(NamedTuple):
     chance: float
     """Of another gain or energy, from 0 to 1."""
     error: float
-    """Root mean square of the logarithm of that change, as far as the light shows it."""
+    """Root mean square of the logarithm of that change, as far as the light shows it, from LIKELY on; less below."""
     spread: float = np.inf
     """How much surfaces change the ratio (standard deviation)."""
 
@@ -200,7 +205,9 @@ def weigh_change(
         chances.append(prior * np.exp(-0.5 * seen @ inverse @ seen) * np.sqrt(np.linalg.det(inverse)))
         squares.append((light[0] @ inverse @ seen) ** 2 + light[0, 0] - light[0] @ inverse @ light[0])
     share = np.array(chances) / max(sum(chances), 1e-300)
-    return Change(shift, float(1.0 - share[0]), float(np.sqrt(share @ squares)), spread)
+    changed = float(1.0 - share[0])
+    share[1:] /= max(changed, LIKELY)
+    return Change(shift, changed, float(np.sqrt(share @ squares)), spread)
 
 
 def compare_scenes(

@@ -56,8 +56,8 @@ OTHER_RANGE, LIKE_RANGE = 1.5, 0.35
 LIKE_FEET = 0.35
 """Logarithm by which light may differ from what feet taken for metres make of it: other surfaces, and more air."""
 
-LIKELY, HIDDEN = 0.5, 0.05
-"""Chance from which another gain or energy is named; and error from which it is said that one would not show."""
+HIDDEN = 0.05
+"""Error from which it is said that another gain or energy would not show."""
 
 FROM_START = 2.0 / 3.0**0.5
 """Root mean square over a strip of light that changes evenly from its start, over the change from half to half."""
@@ -192,9 +192,9 @@ def compare_setting(
         chance = calibration.change_chance
         change = change or settings.compare_scenes(scene, row.scene, louder, chance=chance, usual=usual)
         # What common ground shows is in the error, whatever changed it.
-        more = math.expm1(max(change.error, abs(change.shift) * bool(ground or change.chance > LIKELY)))
+        more = math.expm1(max(change.error, abs(change.shift) * bool(ground or change.chance > settings.LIKELY)))
         growth, unseen = max(growth, more), 0.0
-        if change.chance <= LIKELY and more > HIDDEN:
+        if change.chance <= settings.LIKELY and more > HIDDEN:
             brighter = f"{100 * math.expm1(change.shift):+.0f} % brighter, which its scatter and moisture may do"
             known = f"ground in common {which} is {brighter}" if ground else f"surfaces {which} differ, none is common"
             notes.append(
@@ -202,7 +202,7 @@ def compare_setting(
                 f"{100 * more:.0f} % of error hold it, by an assumed chance of {chance:.0%} (change_chance); calibrate "
                 "a strip that overlaps this one"
             )
-        elif change.chance > LIKELY:
+        elif change.chance > settings.LIKELY:
             lines.append(
                 f"calibration: another gain or energy under the same header, or haze: all echoes {which} are brighter "
                 f"by a factor of {math.exp(change.shift):.2f}, "
@@ -239,7 +239,7 @@ def judge_fading(
     seen = max((ground[1] for ground in compared if ground and ground[1]), key=lambda one: one[1:3], default=fades)
     if seen.spread < fades.spread:
         fades, hidden = seen, "the scatter of the ground in common hides"
-    if fades.chance > LIKELY:
+    if fades.chance > settings.LIKELY:
         growth = math.expm1(FROM_START * abs(fades.shift))
         return growth, [
             f"calibration: the second half of the strip is {100 * math.expm1(fades.shift):+.0f} % brighter, though "

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.order import median
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, ReceiverNoise, SystemPulse, WaveformBlock
@@ -333,6 +333,12 @@ def _alone_share(amplitude: np.ndarray, second: np.ndarray, floor: float) -> flo
     alone = clear & (second < ALONE * amplitude)
     enough = max(LEAST_ALONE * clear.sum(), min(ENOUGH_ALONE, clear.sum()))
     return ALONE if alone.sum() >= enough else ALONE_BEFORE_RINGING
+
+
+def find_single(echoes: EchoTable, n: int, system: SystemPulse, above: float = MIN_SNR) -> np.ndarray:
+    """Return which echoes are clean, alone in their waveform, of n, and higher than `above` times the noise, bool."""
+    strong = echoes.amplitude > above * system.noise.std
+    return echoes.alone(n) & strong & ((echoes.flags & np.uint16(UNCLEAN)) == 0)
 
 
 def find_strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import predict_noise
 from wavebatch.surveying.measuring.judge import SURE, describe_waveforms, exceed, explain
-from wavebatch.surveying.measuring.noise_and_width import FEW, thin_samples
+from wavebatch.surveying.measuring.noise_and_width import FEW, find_single, thin_samples
 
 LEAST_NOISE = 0.5
 """Noise of a sample below which rounding makes what a filter of neighbours sees [count]."""
@@ -57,8 +56,7 @@ def choose_whitening(block: WaveformBlock, system: SystemPulse, change: float = 
     whitened = replace(system, noise=replace(system.noise, whitening=whitening))
     explained = explain(block, plain)
     echoes = explained.echoes
-    strong = echoes.alone(len(block)) & (echoes.amplitude > STRONG * system.noise.std)
-    lone = echoes.waveform[strong & ((echoes.flags & np.uint16(UNCLEAN)) == 0)]
+    lone = echoes.waveform[find_single(echoes, len(block), system, STRONG)]
     left = explain(block.rows(lone), whitened, max_echoes=1).echoes.residual.astype(np.float64) ** 2
     if len(left) < FEW:
         return plain

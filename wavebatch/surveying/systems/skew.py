@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.echoes import UNCLEAN, EchoTable
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.decompose import Candidates, Clusters, Settings, decompose_clusters
 from wavebatch.stages.detect.direct import samples_of
 from wavebatch.stages.noise import pooled
-from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_edge
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, find_edge, find_single
 
 MOST_FITTED = 400
 """Echoes whose skews are measured; more do not make the skew of the strip better known."""
@@ -59,8 +59,7 @@ def measure_skew(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     ----------
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 1.2.
     """
-    clear = echoes.alone(len(block)) & (echoes.amplitude > MIN_SNR * system.noise.std)
-    rows = np.flatnonzero(clear & ((echoes.flags & np.uint16(UNCLEAN)) == 0))
+    rows = np.flatnonzero(find_single(echoes, len(block), system))
     if len(rows) < ENOUGH_TO_LEARN:
         return system
     # Not every second or third: channels take turns.

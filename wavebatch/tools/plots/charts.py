@@ -278,7 +278,7 @@ def map_columns(path: Path, facts: Sequence[ColumnFacts], sample: EvenSample) ->
         found = compute_cells(statistic, cell, values[inside], size, grid.size**2 / sample.step)
         if np.isfinite(found).any():
             found = found.reshape(grid.rows, grid.columns)
-            maps.append(Raster((path.name,), one, statistic, grid, found, Tally(), 0, find_shown(found), crs))
+            maps.append(Raster(one, (path.name,), Tally(), statistic, grid, found, 0, find_shown(found), crs))
     return maps
 
 

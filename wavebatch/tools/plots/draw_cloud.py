@@ -18,11 +18,10 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import EvenSample
-from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.las.header import CLASS_NAMES
-from wavebatch.tools.cells import Clouds, Raster, Tally, name_paths, shown_limits
+from wavebatch.tools.cells import CloudData, Clouds, Raster, Tally, name_paths, shown_limits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,12 +46,9 @@ _LEAST_SPAN = 1e-300
 
 
 @frozen(eq=False)
-class Histogram:
-    """A histogram of one or several series."""
+class Histogram(CloudData):
+    """A histogram of one or several series, which are clouds and groups, as far as there are several."""
 
-    facts: ColumnFacts
-    names: tuple[str, ...]
-    """Names of the series: clouds and groups, as far as there are several."""
     clouds: tuple[str, ...]
     """Names of the clouds."""
     edges: np.ndarray
@@ -65,8 +61,6 @@ class Histogram:
     """Values above the last edge, i8 (series,)."""
     values: np.ndarray
     """Values of each series, inside and outside the edges, i8 (series,)."""
-    total: Tally
-    """Counts of all series."""
     percentiles: np.ndarray
     """PERCENTILES of each series (series, 3), of all values inside and outside the edges; NaN without values. For more
     than a million values, those of an even sample."""
@@ -75,19 +69,15 @@ class Histogram:
 
 
 @frozen(eq=False)
-class FlagCounts:
-    """Points per flag."""
+class FlagCounts(CloudData):
+    """Points per flag: the series are the flags."""
 
-    facts: ColumnFacts
     clouds: tuple[str, ...]
     """Names of the clouds."""
-    names: tuple[str, ...]
-    """Names of the flags."""
     counts: np.ndarray
     """Points with each flag, i8 (16,)."""
     clean: int
     """Points without any flag."""
-    total: Tally
 
 
 def count_values(
@@ -144,13 +134,13 @@ def count_values(
     return Histogram(
         clouds.facts,
         tuple(_name_series(key, clouds, each, by) for key in keys),
+        total,
         tuple(path.name for path in paths),
         edges,
         counts[:, 1:-1],
         below=counts[:, 0],
         above=counts[:, -1],
         values=np.array([series[key].values for key in keys]),
-        total=total,
         percentiles=np.stack([np.percentile(one, PERCENTILES) if len(one) else np.full(3, np.nan) for one in kept]),
         means=np.array([series[key].total / max(series[key].values, 1) for key in keys]),
     )
@@ -239,7 +229,7 @@ def count_points_by_flag(paths: Sequence[Path], column: str, chosen: PointFilter
     if not total.values:
         raise clouds.complain(total)
     names = tuple(path.name for path in paths)
-    return FlagCounts(clouds.facts, names, tuple(flag.name for flag in EchoFlag), counts, clean, total)
+    return FlagCounts(clouds.facts, tuple(flag.name for flag in EchoFlag), total, names, counts, clean)
 
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a8a8a")

@@ -16,7 +16,6 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.files.cloud.cloud_reader import ColumnFacts
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.figure_file import fit_text, open_picture, plain_text, set_head, set_layout, space_ticks
 from wavebatch.files.las.crs import CrsWords
@@ -55,11 +54,9 @@ def open_heights(
 
 
 @frozen(eq=False)
-class Section:
+class Section(cells.CloudData):
     """The points of a vertical section along a line."""
 
-    facts: ColumnFacts
-    names: tuple[str, ...]
     line: tuple[float, float, float, float]
     """x and y of both ends."""
     width: float
@@ -68,8 +65,6 @@ class Section:
     """Distance from the first end, f8 (n,)."""
     height: np.ndarray
     value: np.ndarray
-    total: cells.Tally
-    """Counts of all points of the clouds."""
     inside: int
     """Points with a value in the section; at most MOST_POINTS of them are here."""
     outside: int
@@ -136,8 +131,8 @@ def cut_section(
     far, height, value = places[near].T
     shown = tuple(np.percentile(value, (2, 98)).tolist())
     names = tuple(path.name for path in paths)
-    return Section(clouds.facts, names, tuple(map(float, line)), width, far, height, value, total, sample.seen,
-                   outside, shown, voxel, crs)  # fmt: skip
+    return Section(clouds.facts, names, total, tuple(map(float, line)), width, far, height, value, sample.seen, outside,
+                   shown, voxel, crs)  # fmt: skip
 
 
 def _find_crs(clouds: cells.Clouds | VoxelFile | SegmentFiles) -> CrsWords:
@@ -177,20 +172,17 @@ def _choose_line(clouds: cells.Clouds | VoxelFile) -> tuple[float, float, float,
 
 
 @frozen(eq=False)
-class Profile:
+class Profile(cells.CloudData):
     """Numbers or sums per height, for one series per cloud."""
 
-    facts: ColumnFacts
     statistic: str
     """`count`, `sum` or `mean`."""
-    names: tuple[str, ...]
     edges: np.ndarray
     """Heights, f8 (b + 1,)."""
     values: np.ndarray
     """f8 (series, b); NaN for a mean without a point."""
     outside: int
     """Points below or above the edges."""
-    total: cells.Tally
     unit: str
     """Of heights."""
     upright: str = "height"
@@ -262,7 +254,7 @@ def measure_profile(
     if isinstance(clouds, SegmentFiles):
         kind, unit, more = "files", UNIT, {"noun": "segments"}
     names = names if each or len(paths) == 1 else (f"{len(paths)} {kind}",)
-    return Profile(clouds.facts, statistic, names, edges, values, outside, total, unit, **more)
+    return Profile(clouds.facts, names, total, statistic, edges, values, outside, unit, **more)
 
 
 def share_heights(ends: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -377,28 +377,24 @@ def check_angles(target: Path, *, overwrite: bool) -> None:
 
 
 def write_angles(
-    target: Path,
-    system: SystemPulse,
-    *,
-    spacing: float,
-    distance: float | None,
-    amplitude: float,
-    strip: str = "",
-    overwrite: bool = False,
+    target: Path, survey: Survey, distance: float | None, *, strip: str = "", overwrite: bool = False
 ) -> None:
-    """Writes the table of a strip as .csv, or draws it; strip: its name, for the title.
+    """Writes the table of a strip as .csv, or draws it; distance: of the sensor [m]; strip: its name, for the title.
 
     Raises ConfigError where the beam is not known, InputError where the sensor's position is not known or no width of
     this system means an angle.
     """
+    system, figures = survey.system, survey.figures
     if not system.radiometry.divergence:
         raise ConfigError(f"--angles {target}: the beam is not known; give --divergence")
     if distance is None:
         raise InputError(f"--angles {target}: the distance of the sensor is not known, so no width means an angle")
     if math.isinf(system.widths.error or 0.0):
         raise InputError(f"--angles {target}: the strip does not show which width a surface has that faces the sensor")
-    beam = system.radiometry.divergence
-    tables = [tabulate_angles(system, spacing, distance, beam, part * amplitude) for part in DRAWN]
+    tables = [
+        tabulate_angles(system, figures.spacing_ns, distance, system.radiometry.divergence, part * figures.amplitude_50)
+        for part in DRAWN
+    ]
     if target.suffix.lower() == ".csv":
         write_text(target, format_angles(tables[0]), overwrite=overwrite)
     else:

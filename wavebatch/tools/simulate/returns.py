@@ -21,7 +21,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.schema import Above, Range, check_options, option
+from wavebatch.core.schema import Above, CheckedOptions, Range, check_options, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud.cloud_reader import RETURN_DTYPE, CloudReader, ColumnReader
@@ -47,7 +47,7 @@ _TOLERANCE = 1e-4
 
 
 @frozen
-class Radar:
+class Radar(CheckedOptions):
     """Parameters of the lidar equation besides range and reflectance, see kernels.physics.radiometry."""
 
     height: Annotated[float, Range(-1e6, 1e6)] = option(
@@ -68,9 +68,6 @@ class Radar:
     attenuation: Annotated[float, Range(0.0, 100.0)] = option(
         0.22, "Reflectance: attenuation of the air [dB/km].", form="DB_KM", unset="0.22"
     )
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 @frozen
@@ -305,7 +302,7 @@ class Returns:
 
 
 @frozen
-class DiscreteReceiver:
+class DiscreteReceiver(CheckedOptions):
     """A receiver that is blind for one dead zone after each return (docs/algorithms.md 1.5).
 
     A return fires at the first echo from which the amplitudes, summed over one dead zone, exceed the threshold.
@@ -320,9 +317,6 @@ class DiscreteReceiver:
     most: Annotated[int, Range(1, 15)] = option(
         4, "Discrete: most returns per pulse.", name="most-returns", unset="4"
     )
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def list_returns(self, truth: EchoTable, n: int) -> Returns:
         """The returns that the echoes of n pulses fire."""
@@ -569,7 +563,15 @@ def synthesize_strip(
                 ray = pulses.ray[pulses.pulse] * HALF_C
                 fill_packets(points, index, offset[pulses.pulse], size, pulses.time, ray)
                 writer.write_points(points)
-                _count(summary, pulses, recordings[0])
+                too_long, modelled = pulses.kind == len(_LENGTHS), SQRT_2PI * pulses.amplitude * pulses.sigma
+                summary.energy += float(modelled.sum())
+                summary.energy_without_packet += float(modelled[too_long[pulses.pulse]].sum())
+                summary.points += len(points)
+                summary.packets += int(np.count_nonzero(~too_long))
+                summary.without_packet += int(np.count_nonzero(too_long[pulses.pulse]))
+                most = recordings[0].clip - recordings[0].baseline
+                summary.saturated += int(np.count_nonzero(pulses.amplitude > most))
+                summary.scattered += int(np.count_nonzero(pulses.is_scattered))
                 if progress:
                     progress(len(rows))
             light.check_widths()
@@ -654,15 +656,3 @@ def _write_packets(
             energy += recording.spacing * (float(counts.sum(dtype=np.float64)) - recording.baseline * counts.size)
             offset[chosen] = writer.write_packets(counts, number + 1)
     return offset, energy
-
-
-def _count(summary: SynthesisSummary, pulses: _Pulses, recording: Recording) -> None:
-    too_long = pulses.kind == len(_LENGTHS)
-    energy = SQRT_2PI * pulses.amplitude * pulses.sigma
-    summary.energy += float(energy.sum())
-    summary.energy_without_packet += float(energy[too_long[pulses.pulse]].sum())
-    summary.points += len(pulses.pulse)
-    summary.packets += int(np.count_nonzero(~too_long))
-    summary.without_packet += int(np.count_nonzero(too_long[pulses.pulse]))
-    summary.saturated += int(np.count_nonzero(pulses.amplitude > recording.clip - recording.baseline))
-    summary.scattered += int(np.count_nonzero(pulses.is_scattered))

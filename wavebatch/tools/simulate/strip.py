@@ -24,7 +24,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
-from wavebatch.core.schema import Range, check_options, option
+from wavebatch.core.schema import CheckedOptions, Range, option
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.npz import NpzWriter, read_array_header, read_array_text, reading_npz
 from wavebatch.files.disk.publish import Draft
@@ -165,7 +165,7 @@ WKT = (
 
 
 @frozen
-class StripOptions:
+class StripOptions(CheckedOptions):
     """How a simulated strip is stored; its contents are those of the scene."""
 
     point_format: Literal[4, 5, 9, 10] = option(4, "LAS point format.")
@@ -183,9 +183,6 @@ class StripOptions:
     toward: bool = option(
         True, "Direction of the packet vectors: toward or away from the sensor.", opposite="away", unset="toward"
     )
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     @property
     def las_version(self) -> str:

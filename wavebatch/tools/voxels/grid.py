@@ -3,11 +3,11 @@
 `strip.voxelize_strip` adds the rays of every block, then writes `pieces`. Sums are integers, in the units below, so
 that the result does not depend on block size or order.
 
-Voxels are written as a sparse .npz, or as a point cloud with a point at the centre of each: `strip.voxelize_strip`
-calls `check_voxel_target` before it reads the strip, and `write_npz` or `write_las` at the end. `ProfileWriter` writes
-the deconvolved profiles of single pulses as an .npz: sigma(t) of every pulse, not only its sum in voxels. Only samples
-with signal are stored, so a file is about as large as the cloud of the strip. It must not depend on block size: nothing
-there may mix pulses of a batch. `VoxelFile` reads voxels as points, for sections and height profiles.
+Voxels are written as a sparse .npz, or as a point cloud with a point at the centre of each: `write_npz`, `write_las`.
+`ProfileWriter` writes the deconvolved profiles of single pulses as an .npz: sigma(t) of every pulse, not only its sum
+in voxels. Only samples with signal are stored, so a file is about as large as the cloud of the strip. It must not
+depend on block size: nothing there may mix pulses of a batch. `VoxelFile` reads voxels as points, for sections and
+height profiles.
 """
 
 from __future__ import annotations
@@ -293,14 +293,6 @@ SUFFIXES = (".npz", ".las", ".laz")
 
 Piece = tuple[np.ndarray, Mapping[str, np.ndarray]]
 """Index (m, 3) and columns of some voxels."""
-
-
-def check_voxel_target(target: Path, strip: Path) -> None:
-    """Raises ConfigError for an unknown suffix or where the output is the strip, InputError if it cannot be written."""
-    if target.suffix.lower() not in SUFFIXES:
-        raise ConfigError(f"{target}: voxels are written as {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    with protecting([strip]):
-        Draft(target, overwrite=True).discard()
 
 
 @frozen(eq=False)

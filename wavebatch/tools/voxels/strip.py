@@ -19,12 +19,12 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import even_places
-from wavebatch.core.schema import Above, Range, check_options, option
+from wavebatch.core.schema import Above, CheckedOptions, Range, option
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.point_filter import PointFilter
-from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.disk.publish import Draft, protecting, refuse_existing
 from wavebatch.files.disk.temp_store import HELD
 from wavebatch.files.las.header import locate
 from wavebatch.files.pulse_energy import PulseEnergy
@@ -56,7 +56,7 @@ _MOST_FITTING = 0.9
 
 
 @frozen
-class VoxelOptions:
+class VoxelOptions(CheckedOptions):
     """How a strip becomes voxels."""
 
     size: Annotated[float, Above(0.0, LARGEST)] = option(
@@ -80,9 +80,6 @@ class VoxelOptions:
     """Use only pulses of which a return is chosen, with all of their signal."""
     energy: str | None = None
     """Energy of each emitted pulse, by which the signal is divided; see `find_pulse_energy`."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 @dataclass(slots=True)
@@ -177,7 +174,11 @@ def voxelize_strip(
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
-    voxel_grid.check_voxel_target(target, strip)
+    *others, last = voxel_grid.SUFFIXES
+    if target.suffix.lower() not in (*others, last):
+        raise ConfigError(f"{target}: voxels are written as {', '.join(others)} or {last}")
+    with protecting([strip]):
+        Draft(target, overwrite=True).discard()  # before the work: whether it can be written
     keep = None  # the filter for the points of the strip, where it leaves any out
     if options.chosen:
         with CloudReader(strip) as cloud:
