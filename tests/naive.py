@@ -228,19 +228,6 @@ def power_pulse(x, t, s, power):
     return np.exp(-0.5 * np.abs((x - t) / s) ** power)
 
 
-def gauss_newton(y, x, start, iterations):
-    """Undamped Gauss-Newton of one waveform with derivatives by differences; parameters (3, k), NaN where lost."""
-    parameters = np.array(start, float)
-    shape = parameters.shape
-    for _ in range(iterations):
-        jacobian = differentiate(lambda flat: model(flat.reshape(shape), x), parameters)
-        step = np.linalg.lstsq(jacobian, y - model(parameters, x), rcond=None)[0]
-        parameters = parameters + step.reshape(parameters.shape)
-        if not np.isfinite(parameters).all() or (parameters[[0, 2]] <= 0).any():
-            return np.full_like(parameters, np.nan)
-    return parameters
-
-
 def compare_halves(xyz):
     """Smallest chance of two planes over six cuts of points around 0: (chance, gain in the sum of squares)."""
     centre = xyz.mean(axis=0)

@@ -46,10 +46,15 @@ MEAN_OFF, MOST_OFF = 0.7979, 4.0
 """Mean size of a normal value, and most that one counts: an echo that is off by more is another one. A mean varies
 less from part to part than a quantile: most echoes are hardly off, some by much."""
 
-CONSTANT, LOWEST_ERROR = 2.0, 2.8
+CONSTANT, COMMON_ERROR, LOWEST_ERROR = 2.0, 3.3, 2.8
 """What comes before or after a pulse belongs to it where its mean share is so many times its scatter: else it is
 neighbours, too weak to be found or taken for a part of the pulse. Unless even the lowest quantile of NORMAL_BELOW shows
-it: its error, over the noise of a value and the root of their number."""
+it. Errors of the mean, which both quantiles tell, and of the lowest one, over the scatter of values and the root of the
+number of echoes: what chance makes is no tail."""
+
+ENOUGH_FOR_TAIL = 8
+"""Strong echoes that show a tail beyond chance: where three in ten have a neighbour at some lag, all of so many do once
+in 15,000 lags."""
 
 LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says; less where the strip's echoes are so high that twice the
@@ -125,7 +130,7 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
 
 def measure_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
     """The system with what its pulse leaves before and after strong single echoes: `tail_misfit`, as shares of them."""
-    if len(strong) < FEW:
+    if len(strong) < ENOUGH_FOR_TAIL:
         return system
     rows = np.arange(len(strong), dtype=np.int32)
     part = block.rows(strong.waveform)
@@ -224,16 +229,19 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
     profile = []
     for place in range(-TAIL_BEFORE, TAIL_AFTER):
         inside = (lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)
-        here = left[inside]
-        if abs(place) < 3 or len(here) < ENOUGH_TO_LEARN:
+        here, number = left[inside], np.count_nonzero(inside.any(axis=1))
+        if abs(place) < 3 or number < ENOUGH_FOR_TAIL:
             continue
         # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
         lowest, low = np.quantile(here, NORMAL_BELOW)
         spread = max(low - lowest, expected)
         common, scatter = abs(low + spread), 2 * np.sqrt(spread**2 - expected**2)
-        share, number = common + scatter, np.count_nonzero(inside.any(axis=1))
+        share, chance = common + scatter, SURE / np.sqrt(number)
+        if number < FEW and np.median(here) > low + 2 * spread:
+            continue  # in a canopy all of so few may have a neighbour there, but most of them a higher one
+        is_part = common > max(CONSTANT * scatter, COMMON_ERROR * spread * chance)
         # A tail that changes from shot to shot scatters too, but hardly any echo is without it, as without a neighbour.
-        all_have = NORMAL_BELOW[0] * number > 1 and lowest > SURE * LOWEST_ERROR * expected / np.sqrt(number)
-        if share > min(LEAST_TAIL, 2 * expected) and (common > CONSTANT * scatter or all_have):
+        is_part |= NORMAL_BELOW[0] * number > 1 and lowest > LOWEST_ERROR * expected * chance
+        if is_part and share > min(LEAST_TAIL, 2 * expected):
             profile.append((float(place * system.sigma_ref), float(share)))
     return tuple(profile)
