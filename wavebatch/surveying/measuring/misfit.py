@@ -9,12 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.flags import find_unexplained
+from wavebatch.stages.decompose.solve import PROVEN
+from wavebatch.stages.flags import find_unexplained, list_neighbours
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
@@ -67,6 +68,11 @@ must be high beside the strip's strongest ones, which taught the pulse."""
 
 UNEXPLAINED = 0.05
 """Share of clear echoes that may miss their samples: neighbours too close to be found change the shape of some."""
+
+JUST, FAR, MOST_PROVEN = 1.05, (2.5, 4.0), 0.5
+"""How much more than PROVEN errors of its amplitude an echo may have that chi2 alone proves. Distances, in widths of
+the pulse, between which echoes are found nearly always. And close echoes that chi2 alone proves, over pairs so far
+apart, beyond which some are none: in simulated scenes .25 at most, with pulses whose shape changes 1 to 5."""
 
 LEAST_MISFIT, MOST_MISFIT, STEP_OF_MISFITS = 0.0005, 0.128, 2**0.5
 """Misfits of a pulse: half a noise at 1,000 noises up to an eighth of the pulse, beyond which it is no pulse of this
@@ -125,7 +131,37 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
         left = float(np.mean(find_unexplained(echoes, system, spacing)[clear] > 1))
         if left <= UNEXPLAINED or system.misfit >= MOST_MISFIT:
             return system.misfit, left
-        system = replace(system, misfit=max(STEP_OF_MISFITS * system.misfit, LEAST_MISFIT))
+        system = replace(system, misfit=raise_misfit(system.misfit))
+
+
+def raise_misfit(misfit: float) -> float:
+    """Return the next larger misfit."""
+    return max(STEP_OF_MISFITS * misfit, LEAST_MISFIT)
+
+
+def suspect_pairs(echoes: EchoTable, width: float) -> bool:
+    """Say whether more close echoes are proven by chi2 alone than targets of this strip can be.
+
+    Parameters
+    ----------
+    echoes : EchoTable
+        Of a sample.
+    width : float
+        Of the system pulse [ns].
+
+    Notes
+    -----
+    Two echoes nearer than a width are of two targets, or of one whose pulse has another shape: chi2 cannot tell. But
+    targets are no more often so near than FAR apart, where each of them is found.
+    """
+    doubtful = (echoes.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
+    doubtful &= echoes.amplitude < JUST * PROVEN * echoes.amplitude_err
+    proven, apart = 0, 0
+    for row, _, lag in list_neighbours(echoes):  # each pair from both sides
+        distance = np.abs(lag) / width
+        proven += int(np.count_nonzero(doubtful[row] & (distance < FAR[1] - FAR[0])))
+        apart += int(np.count_nonzero((distance >= FAR[0]) & (distance < FAR[1])))
+    return proven > MOST_PROVEN * apart / 2
 
 
 def measure_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
