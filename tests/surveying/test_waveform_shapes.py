@@ -463,3 +463,14 @@ def test_a_pulse_whose_shape_changes_is_one_echo(number, tmp_path):
     for one that is skewed and 3 % wider: they were 4 to 38 % of all echoes."""
     result = judge_strip(number, tmp_path)
     assert result["right"] and result["extra"] < 0.01 and result["missed"] < 0.02
+
+
+@pytest.mark.parametrize(("number", "gap", "ratio"), [(60, 1.4, 0.5), (150, 1.3, 0.8)])
+def test_close_pairs_of_one_distance_stay_two_where_the_pulse_does_not_change(number, gap, ratio):
+    """Kerbs, rows of crops: more than pairs further apart, and taken for a shape that changes."""
+    signal, rows, time, height = render(bell, 4, n=1500, s=64, amplitude=(50, 150))
+    at = (np.arange(64) - time[:number, None]) / 2.0
+    signal[:number] += ratio * height[:number, None] * bell(at - gap)
+    system, echoes = decompose(digitize(signal, 4, noise=1.0))
+    assert system.misfit < 0.005
+    assert (echoes.count(1500)[:number] == 2).mean() > 0.75 and (echoes.count(1500)[number:] == 1).mean() > 0.99

@@ -25,13 +25,11 @@ from wavebatch.surveying.measuring.learn_pulse import (
 from wavebatch.surveying.measuring.misfit import (
     LEAST_MISFIT,
     MOST_FAINT,
-    MOST_MISFIT,
     PEAK,
     cover_fits,
     limit_faint,
     measure_beside,
     measure_tail,
-    raise_misfit,
     suspect_pairs,
 )
 from wavebatch.surveying.measuring.noise_and_width import (
@@ -294,9 +292,9 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if misfit > system.misfit:
             system = replace(system, misfit=misfit)
             echoes = decompose_sample(part, system)
-        # Nor does either see a shape that changes where two echoes describe it as well.
-        while suspect_pairs(echoes, system.sigma_ref) and system.misfit < MOST_MISFIT:
-            system = replace(system, misfit=raise_misfit(system.misfit))
+        # Nor does either see a shape that changes, where two echoes describe it as well.
+        if choice.best.change and suspect_pairs(echoes, system.sigma_ref):
+            system = replace(system, misfit=bear(system, choice.best.change).misfit)
             echoes = decompose_sample(part, system)
         figures.width_in_doubt = choice.spread
         figures.echoes_in_doubt = max(choice.doubt, doubt, left, share_repeated(echoes, system.sigma_ref))

@@ -69,10 +69,10 @@ must be high beside the strip's strongest ones, which taught the pulse."""
 UNEXPLAINED = 0.05
 """Share of clear echoes that may miss their samples: neighbours too close to be found change the shape of some."""
 
-JUST, FAR, MOST_PROVEN = 1.05, (2.5, 4.0), 0.5
+JUST, APART, MOST_PROVEN = 1.05, (1.5, 4.0), 0.5
 """How much more than PROVEN errors of its amplitude an echo may have that chi2 alone proves. Distances, in widths of
-the pulse, between which echoes are found nearly always. And close echoes that chi2 alone proves, over pairs so far
-apart, beyond which some are none: in simulated scenes .25 at most, with pulses whose shape changes 1 to 5."""
+the pulse, between which most pairs are known as two. And nearer echoes that chi2 alone proves, over pairs so far apart,
+beyond which some are none: in simulated scenes .15 at most, with pulses whose shape changes .6 to 5."""
 
 LEAST_MISFIT, MOST_MISFIT, STEP_OF_MISFITS = 0.0005, 0.128, 2**0.5
 """Misfits of a pulse: half a noise at 1,000 noises up to an eighth of the pulse, beyond which it is no pulse of this
@@ -131,12 +131,7 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
         left = float(np.mean(find_unexplained(echoes, system, spacing)[clear] > 1))
         if left <= UNEXPLAINED or system.misfit >= MOST_MISFIT:
             return system.misfit, left
-        system = replace(system, misfit=raise_misfit(system.misfit))
-
-
-def raise_misfit(misfit: float) -> float:
-    """Return the next larger misfit."""
-    return max(STEP_OF_MISFITS * misfit, LEAST_MISFIT)
+        system = replace(system, misfit=max(STEP_OF_MISFITS * system.misfit, LEAST_MISFIT))
 
 
 def suspect_pairs(echoes: EchoTable, width: float) -> bool:
@@ -152,15 +147,15 @@ def suspect_pairs(echoes: EchoTable, width: float) -> bool:
     Notes
     -----
     Two echoes nearer than a width are of two targets, or of one whose pulse has another shape: chi2 cannot tell. But
-    targets are no more often so near than FAR apart, where each of them is found.
+    where targets are so near, others are a little further APART, where each of them is known.
     """
     doubtful = (echoes.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
     doubtful &= echoes.amplitude < JUST * PROVEN * echoes.amplitude_err
     proven, apart = 0, 0
     for row, _, lag in list_neighbours(echoes):  # each pair from both sides
         distance = np.abs(lag) / width
-        proven += int(np.count_nonzero(doubtful[row] & (distance < FAR[1] - FAR[0])))
-        apart += int(np.count_nonzero((distance >= FAR[0]) & (distance < FAR[1])))
+        proven += int(np.count_nonzero(doubtful[row] & (distance < APART[0])))
+        apart += int(np.count_nonzero((distance >= APART[0]) & (distance < APART[1])))
     return proven > MOST_PROVEN * apart / 2
 
 
