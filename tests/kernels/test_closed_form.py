@@ -44,10 +44,12 @@ def test_steps_lead_to_the_published_least_squares(steps, tolerance):
     assert echoes.sigma[0] == pytest.approx(1.802284, abs=tolerance)
 
 
-@pytest.mark.parametrize(("fraction", "low", "high"), [(0.1, 2, 7), (0.2, 2, 6), (0.5, 3, 6)])
-def test_only_samples_around_the_peak_that_are_high_enough_count(fraction, low, high):
+@pytest.mark.parametrize(
+    ("fraction", "third", "low", "high"), [(0.1, 20, 2, 7), (0.2, 20, 2, 6), (0.5, 20, 3, 6), (0.5, 30, 2, 6)]
+)
+def test_only_samples_around_the_peak_that_are_high_enough_count(fraction, third, low, high):
     """Not those behind a lower one, however high: a plain weighted parabola through the logarithms of the others."""
-    y = np.array([50.0, 3, 20, 45, 60, 40, 10, 2, 55])
+    y = np.array([50.0, 3, third, 45, 60, 40, 10, 2, 55])
     c2, c1, c0 = np.polyfit(np.arange(low - 4, high - 4), np.log(y[low:high]), 2, w=y[low:high])
     expected = np.exp(c0 - c1 * c1 / (4 * c2)), -c1 / (2 * c2), np.sqrt(-1 / (2 * c2))
     *found, holds = fit_closed_form(y[None], fraction)

@@ -287,6 +287,8 @@ def test_every_point_lies_in_one_tile_and_its_neighbours_are_listed(rng):
     np.testing.assert_array_equal(inside.sum(axis=0), 1)
     rows, numbers = normals.sort_into_tiles(tiles, xyz, 1.0)
     assert len(rows) < 8 * len(xyz)
+    whole = np.floor(xyz[:4000])  # many lie on the borders of their tiles
+    assert len(normals.sort_into_tiles(normals.cut_tiles(whole, 60, 0.0), whole, 0.0)[0]) == len(whole)
     pairs = cKDTree(xyz).query_pairs(1.0, output_type="ndarray")
     listed = np.unique(numbers * len(xyz) + rows)
     own = inside.argmax(axis=0)

@@ -483,9 +483,10 @@ def test_truth_is_described_as_the_painted_pulse_is(pulse):
 
 def test_a_hidden_echo_lies_within_six_widths_of_one_that_was_not_found():
     rows = [(0, 10.0, 1, 2.0), (0, 21.9, 1, 1.0), (0, 34.0, 1, 1.0), (0, 39.9, 1, 0.5), (1, 22.0, 1, 2.0)]
-    truth = table(*rows)
-    for lost, hidden in (((1,), {0}), ((0,), {1}), ((2,), {3}), ((3,), {2}), ((4,), set()), ((1, 2), {0, 3})):
-        matched = ~np.isin(np.arange(5), lost)
+    truth = table(*rows, (2, 10.0, 1, 0.5), (2, 16.0, 1, 0.5))  # beyond their own six widths, within the widest ones
+    cases = ((1,), {0}), ((0,), {1}), ((2,), {3}), ((3,), {2}), ((4,), set()), ((1, 2), {0, 3}), ((5,), set())
+    for lost, hidden in cases:
+        matched = ~np.isin(np.arange(len(truth)), lost)
         assert set(np.flatnonzero(accuracy.find_hidden(truth, matched)).tolist()) == hidden
     assert not accuracy.find_hidden(truth.take(np.zeros(0, int)), matched[:0]).any()
 

@@ -308,8 +308,8 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     unseen = 0.0 if sensor.kind == "trajectory" else dict(sensor.facts).get("turned_error_deg", 0.0)
     if "incidence_angle_normals" in prepared.job.chain.makes and unseen > UNSEEN_TURN:
         lines.append(
-            "incidence_angle_normals: packet vectors that are turned against the points would not show in this strip: "
-            f"the errors hold {unseen:.1g} degrees of it; --trajectory would show it"
+            "incidence_angle_normals: this strip does not show well whether its packet vectors are turned against the "
+            f"points: the errors hold {sensor.turned:.1g} degrees of it; --trajectory would show it"
         )
     # The pulse that a residual loop takes from the survey where the chain names none.
     step = prepared.job.chain.steps[2]

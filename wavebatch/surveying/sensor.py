@@ -186,10 +186,11 @@ class SensorSource:
             )
         if facts.get("is_turned"):
             off, error = facts["turned_deg"], facts["turned_error_deg"]
+            size = f"{off:.2g} degrees, known to {error:.1g}" if off > error else f"up to {off + error:.1g} degrees"
             return (
-                f"angles: the packets' vectors are turned against the points by {off:.2g} degrees, known to "
-                f"{error:.1g}: echoes 10 m from a return are {1000 * np.radians(off):.1g} cm off, and the errors of "
-                "angles and ranges hold it; compute points and vectors with the same mounting"
+                f"angles: the packets' vectors are turned against the points by {size}: echoes 10 m from a return are "
+                f"{1000 * np.radians(off):.1g} cm off, and the errors of angles and ranges hold "
+                "it; compute points and vectors with the same mounting"
             )
         late, behind = (facts.get(name) or 0.0 for name in ("late_s", "behind_m"))
         if abs(behind) > max(MOUNTING * (self.distance or 0.0), 10.0 * (self.vectors_error or 0.0)):
