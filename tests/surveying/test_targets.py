@@ -9,7 +9,6 @@ import pytest
 from commands import run_command as call
 
 from wavebatch.core.units import MAD_TO_STD
-from wavebatch.files.strip.packets import FullwaveWriter
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.planes import fit_planes
 from wavebatch.surveying.calibrating.calibration_files import (
@@ -148,18 +147,17 @@ def two_channels(tmp_path_factory, edit_points):
     folder = tmp_path_factory.mktemp("channels")
     path, copy = folder / "one.las", folder / "two.las"
     scene = find_scene("village")
-    open_writer = strip._open_writer
+    writer = strip.FullwaveWriter
 
-    def open_with_two(target, scene, options, overwrite):
-        both = [scene.recording.digitizer, replace(scene.recording.digitizer, index=2)]
-        return FullwaveWriter(target, version="1.3", point_format=4, internal=True, digitizers=both,
-                              scales=(0.001,) * 3, offsets=(EAST, NORTH, 0.0), overwrite=overwrite)  # fmt: skip
+    def open_with_two(*names, digitizers, **options):
+        return writer(*names, digitizers=[*digitizers, replace(digitizers[0], index=2)], **options)
 
-    strip._open_writer = open_with_two
+    strip.FullwaveWriter = open_with_two
     try:
-        strip.simulate_strip(scene, path, pulses=9000, seed=5)
+        kind = strip.StripOptions(version="1.3", point_format=4, internal=True)
+        strip.simulate_strip(scene, path, pulses=9000, seed=5, options=kind)
     finally:
-        strip._open_writer = open_writer
+        strip.FullwaveWriter = writer
     with StripReader(path) as reader:
         base = reader.facts.packets.base
     length = scene.recording.n_samples

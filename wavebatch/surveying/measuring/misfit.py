@@ -268,11 +268,11 @@ def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -
         spread = max(low - lowest, expected)
         common, scatter = abs(low + spread), 2 * np.sqrt(spread**2 - expected**2)
         share, chance = common + scatter, SURE / np.sqrt(number)
-        if number < FEW and np.median(here) > low + 2 * spread:
-            continue  # in a canopy all of so few may have a neighbour there, but most of them a higher one
-        is_part = common > max(CONSTANT * scatter, COMMON_ERROR * spread * chance)
+        higher = np.median(here) > low + 2 * spread  # in a canopy most echoes have a neighbour there, all of so few too
+        is_part = common > max(CONSTANT * scatter, COMMON_ERROR * spread * chance) and (number >= FEW or not higher)
         # A tail that changes from shot to shot scatters too, but hardly any echo is without it, as without a neighbour.
-        is_part |= NORMAL_BELOW[0] * number > 1 and lowest > LOWEST_ERROR * expected * chance
+        all_have = NORMAL_BELOW[0] * number > 1 and lowest > LOWEST_ERROR * expected * chance
+        is_part |= all_have and not higher
         if is_part and share > min(LEAST_TAIL, 2 * expected):
             profile.append((float(place * system.sigma_ref), float(share)))
     return tuple(profile)
