@@ -16,12 +16,7 @@ from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.look import compare_levels, describe_level, join_digitizers, pool_blocks, weigh
 from wavebatch.surveying.measuring.choose_pulse import bear, choose_pulse, settle
 from wavebatch.surveying.measuring.judge import SURE
-from wavebatch.surveying.measuring.learn_pulse import (
-    find_clear,
-    find_isolated,
-    find_strong,
-    learn_pulse,
-)
+from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, learn_pulse
 from wavebatch.surveying.measuring.misfit import (
     LEAST_MISFIT,
     MOST_FAINT,
@@ -278,7 +273,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         system = measure_residuals(part, system, echoes)
         if system.noise.gain > 0 and not first.noise.gain:
             return _survey(block, measure_again(block, first, system.noise.gain), learn=learn)
-        system = measure_tail(block, system, find_strong(clear))
+        system = measure_tail(block, system, clear)
         if not (system.components or system.kappa):
             system = replace(system, ringing=find_ringing(block, system, find_lone(block, system)))
         system = choose_whitening(part, system, choice.best.change)

@@ -88,14 +88,19 @@ def _reach(block: WaveformBlock, system: SystemPulse) -> tuple[float, float]:
     return BEFORE * half, AFTER * half
 
 
-def find_strong(echoes: EchoTable, least: int = FEW) -> EchoTable:
-    """The strongest fifth of the clear echoes that their target has not widened, `least` where there are so many."""
+def part_strong(echoes: EchoTable) -> tuple[EchoTable, EchoTable]:
+    """Part the clear echoes that no target has widened: the strongest fifth (FEW where there are so many), the others.
+
+    Fewer than FEW clear ones are all strong.
+    """
     if len(echoes) < FEW:
-        return echoes
-    narrow = echoes.sigma < WIDENED * find_edge(echoes.sigma)
-    share = max(1 - least / np.count_nonzero(narrow), 0.0)
-    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], min(share, 0.8))))
-    return echoes.take(strong[:: max(len(strong) // MOST_STRONG, 1)])
+        return echoes, echoes.take(np.empty(0, np.int64))
+    narrow = echoes.take(np.flatnonzero(echoes.sigma < WIDENED * find_edge(echoes.sigma)))
+    share = min(max(1 - FEW / len(narrow), 0.0), 0.8)
+    strong = narrow.amplitude >= np.quantile(narrow.amplitude, share)
+    parts = (narrow.take(np.flatnonzero(strong)), narrow.take(np.flatnonzero(~strong)))
+    first, second = (part.take(np.arange(0, len(part), max(len(part) // MOST_STRONG, 1))) for part in parts)
+    return first, second
 
 
 def find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:

@@ -6,6 +6,7 @@ Growth and detection ask more of an echo beside a strong one by these figures (d
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying.measuring.judge import SURE
+from wavebatch.surveying.measuring.learn_pulse import part_strong
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_strongest
 from wavebatch.surveying.measuring.residuals import decompose_sample, render_own, subtract_echoes
 
@@ -52,6 +54,10 @@ CONSTANT, COMMON_ERROR, LOWEST_ERROR = 2.0, 3.3, 2.8
 neighbours, too weak to be found or taken for a part of the pulse. Unless even the lowest quantile of NORMAL_BELOW shows
 it. Errors of the mean, which both quantiles tell, and of the lowest one, over the scatter of values and the root of the
 number of echoes: what chance makes is no tail."""
+
+LARGER = 1.5
+"""Standard errors by which neighbours are a larger share of weaker echoes: chance takes one lag of fifteen from a tail,
+whose others stay."""
 
 ENOUGH_FOR_TAIL = 8
 """Strong echoes that show a tail beyond chance: where three in ten have a neighbour at some lag, all of so many do once
@@ -159,16 +165,82 @@ def suspect_pairs(echoes: EchoTable, width: float) -> bool:
     return proven > MOST_PROVEN * apart / 2
 
 
-def measure_tail(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
+def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) -> SystemPulse:
     """The system with what its pulse leaves before and after strong single echoes: `tail_misfit`, as shares of them."""
+    strong, weaker = part_strong(clear)
     if len(strong) < ENOUGH_FOR_TAIL:
         return system
-    rows = np.arange(len(strong), dtype=np.int32)
-    part = block.rows(strong.waveform)
-    noise = pooled_noise(part, system)
-    fitted = adaptive(part, noise, system, replace(strong, waveform=rows), max_echoes=1, significance=0.0)
-    fitted = fitted.take(find_strongest(fitted, len(part))[0])
-    return replace(system, tail_misfit=_measure_tail(part, system, fitted))
+    left, others, profile = Left(block, system, strong), None, []
+    for place in range(-TAIL_BEFORE, TAIL_AFTER):
+        if abs(place) < 3 or (seen := left.look(place)).number < ENOUGH_FOR_TAIL:
+            continue
+        # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
+        scatter = 2 * np.sqrt(seen.spread**2 - left.noise**2)
+        share, chance = abs(seen.common) + scatter, SURE / np.sqrt(seen.number)
+        # In a canopy most echoes have a neighbour there, all of so few too.
+        higher = seen.median > seen.common + seen.spread
+        is_part = abs(seen.common) > max(CONSTANT * scatter, SURE * seen.error) and (seen.number >= FEW or not higher)
+        # A tail that changes from shot to shot scatters too, but hardly any echo is without it, as without a neighbour.
+        all_have = NORMAL_BELOW[0] * seen.number > 1 and seen.lowest > LOWEST_ERROR * left.noise * chance
+        is_part |= all_have and not higher
+        if not is_part or share <= min(LEAST_TAIL, 2 * left.noise):
+            continue
+        if higher and len(weaker) >= ENOUGH_FOR_TAIL:
+            # A tail is the same share of weaker echoes, neighbours are a larger one.
+            others = others or Left(block, system, weaker)
+            other = others.look(place)
+            more = np.sign(seen.common) * other.common - abs(seen.common)
+            if more > LARGER * np.hypot(seen.error, other.error):
+                continue
+        profile.append((float(place * system.sigma_ref), float(share)))
+    return replace(system, tail_misfit=tuple(profile))
+
+
+class Seen(NamedTuple):
+    """What echoes have in common at a lag, as shares of them."""
+
+    number: int
+    """Of the echoes whose waveforms reach there."""
+    lowest: float
+    common: float
+    """The mean of the lower half of them, as normal values have it."""
+    median: float
+    spread: float
+    """Standard deviation, that of noise at least."""
+
+    @property
+    def error(self) -> float:
+        """Standard error of what they have in common."""
+        return COMMON_ERROR * self.spread / np.sqrt(self.number)
+
+
+class Left:
+    """What a pulse leaves of single echoes, before and after them, as shares of their amplitudes."""
+
+    def __init__(self, block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> None:
+        part = block.rows(echoes.waveform)
+        echoes = replace(echoes, waveform=np.arange(len(echoes), dtype=np.int32))
+        fitted = adaptive(part, pooled_noise(part, system), system, echoes, max_echoes=1, significance=0.0)
+        fitted = fitted.take(find_strongest(fitted, len(part))[0])
+        ref = system.sigma_ref / part.spacing
+        taps = gaussian_taps(ref)
+        energy = filter_energy(taps)
+        residual = subtract_echoes(part, system, fitted)[fitted.waveform]
+        share = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
+        self.share = share / fitted.amplitude[:, None]
+        self.lag = (np.arange(residual.shape[1]) - (fitted.time / part.spacing)[:, None]) / ref
+        self.lag[~np.isfinite(residual)] = np.nan
+        self.noise = float(system.noise.std / np.median(fitted.amplitude) / np.sqrt(energy))
+
+    def look(self, place: int) -> Seen:
+        """What is left within half a width of the pulse of this lag [widths]."""
+        inside = (self.lag >= place - 0.5) & (self.lag < place + 0.5)
+        here, number = self.share[inside], int(np.count_nonzero(inside.any(axis=1)))
+        if not number:
+            return Seen(0, 0.0, 0.0, 0.0, self.noise)
+        lowest, low = np.quantile(here, NORMAL_BELOW)
+        spread = max(low - lowest, self.noise)
+        return Seen(number, lowest, low + spread, np.median(here), spread)
 
 
 def measure_beside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
@@ -245,34 +317,3 @@ def _add_beside(
     found, truth = found.take(pair.found), added.take(pair.truth)
     late, high = (found.time - truth.time) / found.time_err, (found.amplitude - truth.amplitude) / found.amplitude_err
     return np.tile(lag[rows][pair.truth], 2), np.concatenate([late, high])
-
-
-def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[tuple[float, float], ...]:
-    """(lag [ns], share) where strong echoes leave more than noise, in steps of the pulse's width."""
-    ref = system.sigma_ref / part.spacing
-    taps = gaussian_taps(ref)
-    energy = filter_energy(taps)
-    residual = subtract_echoes(part, system, echoes)[echoes.waveform]
-    left = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
-    left /= echoes.amplitude[:, None]
-    lag = (np.arange(residual.shape[1]) - (echoes.time / part.spacing)[:, None]) / ref
-    expected = system.noise.std / np.median(echoes.amplitude) / np.sqrt(energy)
-    profile = []
-    for place in range(-TAIL_BEFORE, TAIL_AFTER):
-        inside = (lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)
-        here, number = left[inside], np.count_nonzero(inside.any(axis=1))
-        if abs(place) < 3 or number < ENOUGH_FOR_TAIL:
-            continue
-        # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
-        lowest, low = np.quantile(here, NORMAL_BELOW)
-        spread = max(low - lowest, expected)
-        common, scatter = abs(low + spread), 2 * np.sqrt(spread**2 - expected**2)
-        share, chance = common + scatter, SURE / np.sqrt(number)
-        higher = np.median(here) > low + 2 * spread  # in a canopy most echoes have a neighbour there, all of so few too
-        is_part = common > max(CONSTANT * scatter, COMMON_ERROR * spread * chance) and (number >= FEW or not higher)
-        # A tail that changes from shot to shot scatters too, but hardly any echo is without it, as without a neighbour.
-        all_have = NORMAL_BELOW[0] * number > 1 and lowest > LOWEST_ERROR * expected * chance
-        is_part |= all_have and not higher
-        if is_part and share > min(LEAST_TAIL, 2 * expected):
-            profile.append((float(place * system.sigma_ref), float(share)))
-    return tuple(profile)
