@@ -401,12 +401,13 @@ def settle(
     misfit, doubt, explained = _choose_misfit(part, system, seen, change, missed)
     system = replace(system, misfit=misfit)
     harder = np.arange(SIGNIFICANCE + FINER, MOST_SIGNIFICANT + FINER, FINER)
-    tried = []
-    for significance, mirror in look_in_mirror(part, system, explained, [0.0, *map(float, harder)]):
-        tried.append((replace(system, significance=significance), mirror))
-        if mirror.quiet <= _bound(FALSE_QUIET, mirror.echoes):
-            break
-    return *max(tried, key=lambda one: one[1].worth), doubt
+    looks = look_in_mirror(part, system, explained, [0.0, *map(float, harder)])
+    best = last = next(looks)[1]
+    while last.quiet > _bound(FALSE_QUIET, last.echoes) and (look := next(looks, None)):
+        last = look[1]
+        if last.beats(best):
+            best, system = last, replace(system, significance=look[0])
+    return system, best, doubt
 
 
 def _choose_misfit(

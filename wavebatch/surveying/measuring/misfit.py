@@ -114,6 +114,7 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
     """Find the misfit, from the system's own on, that explains what the fits of clear echoes leave.
 
     The description of waveforms alone does not see it where false echoes describe what the pulse misses of strong ones.
+    By echoes alone in their waveform, where there are FEW: in a canopy neighbours too close to be found are left too.
 
     Parameters
     ----------
@@ -128,11 +129,13 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
     -------
     misfit : float
     left : float
-        Share of the clear echoes whose samples it does not explain; 0 with too few of them.
+        Share of these echoes whose samples it does not explain; 0 with too few of them.
     """
     clear = echoes.amplitude > MIN_SNR * system.noise.std
     if np.count_nonzero(clear) < FEW:
         return system.misfit, 0.0
+    alone = clear & echoes.alone(int(echoes.waveform.max()) + 1)
+    clear = alone if np.count_nonzero(alone) >= FEW else clear
     while True:
         left = float(np.mean(find_unexplained(echoes, system, spacing)[clear] > 1))
         if left <= UNEXPLAINED or system.misfit >= MOST_MISFIT:
@@ -177,22 +180,20 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
         # Other targets only add, and in a canopy most waveforms have some: what the lowest echoes show is the tail.
         scatter = 2 * np.sqrt(seen.spread**2 - left.noise**2)
         share, chance = abs(seen.common) + scatter, SURE / np.sqrt(seen.number)
-        # In a canopy most echoes have a neighbour there, all of so few too.
-        higher = seen.median > seen.common + seen.spread
-        is_part = abs(seen.common) > max(CONSTANT * scatter, SURE * seen.error) and (seen.number >= FEW or not higher)
-        # A tail that changes from shot to shot scatters too, but hardly any echo is without it, as without a neighbour.
-        all_have = NORMAL_BELOW[0] * seen.number > 1 and seen.lowest > LOWEST_ERROR * left.noise * chance
-        is_part |= all_have and not higher
-        if not is_part or share <= min(LEAST_TAIL, 2 * left.noise):
-            continue
-        if higher and len(weaker) >= ENOUGH_FOR_TAIL:
-            # A tail is the same share of weaker echoes, neighbours are a larger one.
+        is_part = abs(seen.common) > max(CONSTANT * scatter, SURE * seen.error)
+        if seen.median <= seen.common + seen.spread:
+            # A tail that changes from shot to shot scatters, but hardly any echo is without it, as without a neighbour.
+            all_have = NORMAL_BELOW[0] * seen.number > 1 and seen.lowest > LOWEST_ERROR * left.noise * chance
+            is_part |= all_have
+        elif is_part and (is_part := len(weaker) >= ENOUGH_FOR_TAIL):
+            # Most echoes have a neighbour there, perhaps all of them. A tail is the same share of weaker echoes, which
+            # must be there to show it; neighbours are a larger one.
             others = others or Left(block, system, weaker)
             other = others.look(place)
             more = np.sign(seen.common) * other.common - abs(seen.common)
-            if more > LARGER * np.hypot(seen.error, other.error):
-                continue
-        profile.append((float(place * system.sigma_ref), float(share)))
+            is_part = other.number >= ENOUGH_FOR_TAIL and more <= LARGER * np.hypot(seen.error, other.error)
+        if is_part and share > min(LEAST_TAIL, 2 * left.noise):
+            profile.append((float(place * system.sigma_ref), float(share)))
     return replace(system, tail_misfit=tuple(profile))
 
 
