@@ -35,7 +35,7 @@ FIRST_COMPONENTS = 3
 """Components of the first pulse, which only has to fit well enough to separate echoes."""
 
 MOST_STRONG = 800
-"""Strong echoes in which the misfit of the pulse is measured."""
+"""Strong echoes in which the misfit of the pulse is measured; a quarter as many weaker ones tell whether it is one."""
 
 REACHED = 0.3
 """Misfit of a pulse model, in noise at the strip's strongest amplitudes, that is too small to be seen."""
@@ -98,8 +98,8 @@ def part_strong(echoes: EchoTable) -> tuple[EchoTable, EchoTable]:
     narrow = echoes.take(np.flatnonzero(echoes.sigma < WIDENED * find_edge(echoes.sigma)))
     share = min(max(1 - FEW / len(narrow), 0.0), 0.8)
     strong = narrow.amplitude >= np.quantile(narrow.amplitude, share)
-    parts = (narrow.take(np.flatnonzero(strong)), narrow.take(np.flatnonzero(~strong)))
-    first, second = (part.take(np.arange(0, len(part), max(len(part) // MOST_STRONG, 1))) for part in parts)
+    parts = (np.flatnonzero(strong), MOST_STRONG), (np.flatnonzero(~strong), MOST_STRONG // 4)
+    first, second = (narrow.take(rows[:: max(len(rows) // most, 1)]) for rows, most in parts)
     return first, second
 
 

@@ -56,8 +56,8 @@ it. Errors of the mean, which both quantiles tell, and of the lowest one, over t
 number of echoes: what chance makes is no tail."""
 
 LARGER = 1.5
-"""Standard errors by which neighbours are a larger share of weaker echoes: chance takes one lag of fifteen from a tail,
-whose others stay."""
+"""Standard errors by which what most echoes have more of is a larger share of weaker ones: chance takes one lag of
+fifteen from a tail, whose others stay. Else SURE."""
 
 ENOUGH_FOR_TAIL = 8
 """Strong echoes that show a tail beyond chance: where three in ten have a neighbour at some lag, all of so many do once
@@ -181,17 +181,20 @@ def measure_tail(block: WaveformBlock, system: SystemPulse, clear: EchoTable) ->
         scatter = 2 * np.sqrt(seen.spread**2 - left.noise**2)
         share, chance = abs(seen.common) + scatter, SURE / np.sqrt(seen.number)
         is_part = abs(seen.common) > max(CONSTANT * scatter, SURE * seen.error)
-        if seen.median <= seen.common + seen.spread:
+        higher = seen.median > seen.common + seen.spread
+        if not higher:
             # A tail that changes from shot to shot scatters, but hardly any echo is without it, as without a neighbour.
             all_have = NORMAL_BELOW[0] * seen.number > 1 and seen.lowest > LOWEST_ERROR * left.noise * chance
             is_part |= all_have
-        elif is_part and (is_part := len(weaker) >= ENOUGH_FOR_TAIL):
-            # Most echoes have a neighbour there, perhaps all of them. A tail is the same share of weaker echoes, which
-            # must be there to show it; neighbours are a larger one.
+        if is_part and len(weaker) >= ENOUGH_FOR_TAIL:
+            # A tail is the same share of weaker echoes, neighbours are a larger one.
             others = others or Left(block, system, weaker)
             other = others.look(place)
             more = np.sign(seen.common) * other.common - abs(seen.common)
-            is_part = other.number >= ENOUGH_FOR_TAIL and more <= LARGER * np.hypot(seen.error, other.error)
+            is_part = more <= (LARGER if higher else SURE) * np.hypot(seen.error, other.error)
+            is_part &= other.number >= ENOUGH_FOR_TAIL or not higher
+        elif higher:  # most echoes have a neighbour there, perhaps all of them
+            is_part = False
         if is_part and share > min(LEAST_TAIL, 2 * left.noise):
             profile.append((float(place * system.sigma_ref), float(share)))
     return replace(system, tail_misfit=tuple(profile))
@@ -238,7 +241,7 @@ class Left:
         inside = (self.lag >= place - 0.5) & (self.lag < place + 0.5)
         here, number = self.share[inside], int(np.count_nonzero(inside.any(axis=1)))
         if not number:
-            return Seen(0, 0.0, 0.0, 0.0, self.noise)
+            return Seen(1, 0.0, 0.0, 0.0, np.inf)
         lowest, low = np.quantile(here, NORMAL_BELOW)
         spread = max(low - lowest, self.noise)
         return Seen(number, lowest, low + spread, np.median(here), spread)
