@@ -41,10 +41,10 @@ class Mirror:
     quiet: int
     """Unmatched ones further than ZONE from any echo."""
 
-    def beats(self, other: Mirror) -> bool:
-        """Whether of these echoes fewer are false than with another mirror, beyond those that are lost and chance."""
-        fewer = other.beside + other.quiet - self.beside - self.quiet
-        return fewer > 0 and (fewer - np.sqrt(fewer)) / WORTH > other.echoes - self.echoes
+    @property
+    def worth(self) -> float:
+        """Echoes that are found, less those that are false by the mirror."""
+        return self.echoes - (self.beside + self.quiet) / WORTH
 
 
 def look_in_mirror(

@@ -114,7 +114,8 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
     """Find the misfit, from the system's own on, that explains what the fits of clear echoes leave.
 
     The description of waveforms alone does not see it where false echoes describe what the pulse misses of strong ones.
-    By echoes alone in their waveform, where there are FEW: in a canopy neighbours too close to be found are left too.
+    Unless echoes alone in their waveform, where there are FEW, are explained: in a canopy neighbours too close to be
+    found are left too.
 
     Parameters
     ----------
@@ -129,13 +130,16 @@ def cover_fits(system: SystemPulse, echoes: EchoTable, spacing: float) -> tuple[
     -------
     misfit : float
     left : float
-        Share of these echoes whose samples it does not explain; 0 with too few of them.
+        Share of the clear echoes, or of those alone, whose samples it does not explain; 0 with too few of them.
     """
     clear = echoes.amplitude > MIN_SNR * system.noise.std
     if np.count_nonzero(clear) < FEW:
         return system.misfit, 0.0
     alone = clear & echoes.alone(int(echoes.waveform.max()) + 1)
-    clear = alone if np.count_nonzero(alone) >= FEW else clear
+    if np.count_nonzero(alone) >= FEW:
+        left = float(np.mean(find_unexplained(echoes, system, spacing)[alone] > 1))
+        if left <= UNEXPLAINED:
+            return system.misfit, left
     while True:
         left = float(np.mean(find_unexplained(echoes, system, spacing)[clear] > 1))
         if left <= UNEXPLAINED or system.misfit >= MOST_MISFIT:
