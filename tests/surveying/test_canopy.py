@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 from helpers_scenes import CANOPY_NOISE, CANOPY_SIGMA, grow_canopy
+from strangers import judge_strip
 
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import choose_chain
+from wavebatch.surveying.measuring.learn_pulse import find_clear
+from wavebatch.surveying.measuring.misfit import measure_tail
 from wavebatch.surveying.systems.known_systems import compare_pulses
 
 
@@ -74,3 +77,28 @@ def test_neighbours_are_no_tail_of_the_pulse(seed, density):
 def test_a_tail_stays_in_the_pulse_of_a_canopy():
     system = survey_block(grow_canopy(1, n=4000, tail=0.06)).system
     assert len(system.components) > 1
+
+
+@pytest.mark.parametrize("is_tail", [True, False])
+def test_a_layer_below_every_echo_is_no_tail(is_tail):
+    """Each echo has a part 5 widths later: of a twentieth of it, or as high as leaves are, whatever they lie below."""
+    rng = np.random.default_rng(5)
+    n, width, x = 1500, 2.0, np.arange(80.0)
+    height, time = np.exp(rng.uniform(np.log(60), np.log(200), n)), rng.uniform(24, 44, n)
+    part = 0.05 * height if is_tail else np.exp(rng.uniform(np.log(4), np.log(12), n))
+    signal = sum(
+        one[:, None] * np.exp(-0.5 * ((x - at[:, None]) / width) ** 2)
+        for one, at in ((height, time), (part, time + width * rng.uniform(4.8, 5.2, n)))
+    )
+    block = WaveformBlock.from_samples(np.rint(12 + signal + rng.standard_normal((n, 80))).astype(np.uint8))
+    system = SystemPulse(sigma_ref=width, noise=ReceiverNoise(baseline=12.0, std=1.0))
+    tail = measure_tail(block, system, find_clear(block, system)).tail_misfit
+    assert dict(tail).get(5 * width, 0.0) == (pytest.approx(0.05, rel=0.1) if is_tail else 0.0)
+
+
+@pytest.mark.quick_cases("1398")
+@pytest.mark.parametrize("number", [1398, 1836])
+def test_neighbours_raise_neither_misfit_nor_significance(number, tmp_path):
+    """Those too close to be found, and those in the mirror: 6 and 4 % of the clear echoes were lost."""
+    result = judge_strip(number, tmp_path)
+    assert result["right"] and result["missed"] < 0.03
