@@ -170,9 +170,7 @@ LEAST_SHARED = 0.05
 """Share of the pulses that two clouds of one strip have in common at least; else echoes are matched by position."""
 
 
-def open_task(
-    first: CloudReader, second: CloudReader, tolerance_ns: float, held: int = BUCKET_ROWS
-) -> CloudTask:
+def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float, held: int = BUCKET_ROWS) -> CloudTask:
     """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
     by_time = pulses_told_apart(first) and pulses_told_apart(second) and _share_times(first, second)
     for reader in (first, second):

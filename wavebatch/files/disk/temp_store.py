@@ -141,9 +141,7 @@ class Spool(Closing):
     bytes of entries that travel themselves to other processes; more of them read a file.
     """
 
-    def __init__(
-        self, buckets: int, dtype: np.dtype, *, memory: int = SPOOL_MEMORY, kept: int = SPOOL_KEPT
-    ) -> None:
+    def __init__(self, buckets: int, dtype: np.dtype, *, memory: int = SPOOL_MEMORY, kept: int = SPOOL_KEPT) -> None:
         self.buckets, self._most, self._kept = buckets, memory, kept
         self.dtype = np.dtype(dtype)
         self.path: Path | None = None

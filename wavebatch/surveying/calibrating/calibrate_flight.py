@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -185,10 +184,6 @@ class _TieArea:
         return inside & (hash_squares(xyz) < self._share)
 
 
-def _lies_on(target: Target, xyz: np.ndarray) -> np.ndarray:
-    return target.contains(xyz[:, 0], xyz[:, 1])
-
-
 def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> tuple[list[np.ndarray], np.ndarray]:
     """Echoes on each target (ECHO), and those for ties (TIE, with channels as sources)."""
     if source.column is not None:
@@ -199,7 +194,7 @@ def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> t
         corners = np.concatenate([target.corners for target in targets])
         low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
         near = lambda xyz: ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)  # noqa: E731
-        inside = [partial(_lies_on, target) for target in targets]
+        inside = [target.contains for target in targets]
     on_targets: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in inside]
     parts = [np.empty(0, TIE)]
 
@@ -255,9 +250,7 @@ class Trend(NamedTuple):
     """Root mean square of what it changes against the places of the targets, relative."""
 
 
-def fit_swath(
-    ties: Ties, anchors: Anchors, seen: np.ndarray
-) -> tuple[Adjustment, tuple[float, ...], float | None]:
+def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustment, tuple[float, ...], float | None]:
     """Adjust the constants with a term over the scan angle.
 
     Parameters

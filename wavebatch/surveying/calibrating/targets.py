@@ -235,7 +235,7 @@ def measure_target(
             "give its incidence [deg] in the target file, or a target that several scan lines cross"
         )
         return replace(blank, refused=reason), *nothing
-    depth = target.depth(rows["xyz"][:, 0], rows["xyz"][:, 1])
+    depth = target.depth(rows["xyz"])
     radius = 0.5e-3 * (divergence or ASSUMED_DIVERGENCE) * float(np.median(rows["distance"]))
     inset = INSET * radius / max(float(np.cos(np.median(angle))), 0.1)
     used = facet.kept & (depth >= inset)

@@ -106,9 +106,7 @@ LEAST_IN_ORDER = 0.8
 SCANNERS = 4
 """Scanner channels of LAS points (0 to 3). A channel number here is SCANNERS x digitizer + scanner channel."""
 
-OTHER_PULSE = (
-    "echoes were taken for those of another pulse; resolve the pulse zones again with the sensor's software"
-)
+OTHER_PULSE = "echoes were taken for those of another pulse; resolve the pulse zones again with the sensor's software"
 
 _CHANNEL_SAMPLE = 4096
 """Waveforms that show which scanner channels a strip has."""
