@@ -85,7 +85,7 @@ def compare(a: Path, b: Path | None, strip: Path | None, output: Path | None, **
     result = _match(a, b, strip, options) if strip else _compare(a, b, options)
     between = result.between if strip else result
     if output is not None:
-        write_text(output, format_comparison(result.to_json()), overwrite=options["overwrite"])
+        write_text(output, format_csv(HEAD, list_rows(result.to_json())), overwrite=options["overwrite"])
     chains = _list_match(result) if strip else ()
     parts = [*_list_parts(between), *chains]
     answer(result.to_json(), Sheet("compare", parts), "chains" if strip else "")
@@ -252,15 +252,8 @@ _TABLES = {"missed_by": ("missed", "B"), "extra_by": ("extra", "A")}
 Row = tuple[str, str, str, str, str, Any]
 
 
-def format_comparison(document: Mapping[str, Any]) -> str:
-    """The figures of a comparison, as its JSON document has them; empty cells are no data.
-
-    document: of `Comparison.to_json`, or of `Matchup.to_json`.
-    """
-    return format_csv(HEAD, _list_rows(document))
-
-
-def _list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+def list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+    """The figures of a comparison; document: of `Comparison.to_json`, or of `Matchup.to_json`."""
     for name, value in document.items():
         if name in _TABLES:
             # Echoes without a partner by return number, amplitude, flags and company.
@@ -276,11 +269,11 @@ def _list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
             for kind, groups in value.items():
                 yield from _list_nested(f"differences by {kind}", groups)
         elif name == "between":
-            yield from _list_rows(value)
+            yield from list_rows(value)
         elif name == "vendor":
             for side, one in value.items():
                 # Each side is compared with the vendor's returns: the tables are those of a comparison again.
-                for table, part, *rest in _list_rows(one):
+                for table, part, *rest in list_rows(one):
                     yield f"{table}, {side.upper()} and the vendor's returns", {"B": "vendor"}.get(part, part), *rest
         elif isinstance(value, Mapping):
             yield from _list_nested(name, value)

@@ -23,7 +23,7 @@ from wavebatch.core.order import even_places
 from wavebatch.core.waveforms import angle_across, angle_to_vertical, swath_columns
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.crs import describe_crs
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.las.header import read_header
 from wavebatch.surveying.calibrating.adjust_flight import (
     TIE,
     VIEW,
@@ -105,13 +105,6 @@ class Source(NamedTuple):
         """Of the strip, and of the channel where the strip has several."""
         of = f" digitizer {self.row.digitizer} scanner channel {self.row.scanner}"
         return self.strip.path.name + (of if len(self.strip.channels) > 1 else "")
-
-
-def find_box(path: Path) -> _Box:
-    """Lower and upper corner of a strip in x and y by its header."""
-    with StripReader(path) as reader:
-        header = reader.facts.header
-        return np.array(header.mins[:2]), np.array(header.maxs[:2])
 
 
 def read_strip(
@@ -410,7 +403,7 @@ def calibrate_flight(
     options = options or CalibrationOptions()
     check_attenuation(options.air)
     _refuse_zones(paths)
-    boxes = [find_box(path) for path in paths]
+    boxes = [(np.array(one.mins[:2]), np.array(one.maxs[:2])) for one in map(read_header, paths)]
     strips: list[FlightStrip] = []
     for i, path in enumerate(paths):
         # All energies count relative to those of the first strip: the mean of each would hide what lasers lose.
