@@ -29,9 +29,10 @@ from bench_tools import time_here
 from commands import run_command
 
 import wavebatch
+from wavebatch.batch.workers.futures import WorkerDied
 from wavebatch.cli.options import parse_length
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.errors import ConfigError, InputError, StageError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.chain import STAGES
@@ -298,19 +299,21 @@ def test_worker_answers_raises_and_dies():
     with command.Worker() as worker:
         assert worker.call(os.getenv, "OPENBLAS_NUM_THREADS") == "1"
         assert worker.call(os.getpid) != os.getpid()
-        with pytest.raises(StageError, match="FileNotFoundError"):
+        with pytest.raises(FileNotFoundError):
             worker.call(os.stat, "/no/such/file")
         memory = worker.call(command.peak_memory)
         assert memory is None or 5e6 < memory < 1e9
-    with command.Worker() as worker, pytest.raises(command.BenchWorkerDied):
-        worker.call(os._exit, 3)
+    with command.Worker() as worker:
+        for _ in range(2):  # a dead process takes no further call
+            with pytest.raises(WorkerDied):
+                worker.call(os._exit, 3)
 
 
 def test_closing_a_worker_ends_a_call_that_hangs():
     with ThreadPoolExecutor(1) as caller, command.Worker() as worker:
         worker.call(os.getpid)
         call = caller.submit(worker.call, time.sleep, 600)
-    assert isinstance(call.exception(), command.BenchWorkerDied)
+    assert isinstance(call.exception(), WorkerDied)
 
 
 FAKE = """
@@ -329,7 +332,7 @@ def GaussianDecomposition(y, thres):
 @pytest.mark.slow
 def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     (tmp_path / "gdecomp.py").write_text(FAKE)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
     scene = replace(find_scene("flat"), recording=Recording(bits=16))
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()

@@ -7,8 +7,8 @@ fast. A scene may be shaped like a strip: it draws whole waveforms of a sample o
 chain that a survey of a group chooses.
 
 `time_chains` measures run time and memory: kernels alone and from file to file, each chain in a process with one
-thread. The chains take turns, so that other load of the machine slows all of them alike. The process of a Worker is a
-plain one, not of multiprocessing, which would import the caller's main module into it.
+thread. The chains take turns, so that other load of the machine slows all of them alike. The process of a Worker is
+one of those of `wavebatch run`.
 
 The sheet, bench.json, bench.txt, a page and plots of error against run time show the document. A column of a table
 names a figure of the rows.
@@ -16,13 +16,10 @@ names a figure of the rows.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import os
 import pickle
 import re
-import subprocess
 import sys
 import tempfile
 import time
@@ -31,6 +28,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -40,10 +38,12 @@ from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.unit import BLOCK_SAMPLES
+from wavebatch.batch.workers.futures import PATIENCE, WorkerDied, end_future, wait_uninterrupted
+from wavebatch.batch.workers.spawned import Call, PipedProcess, start_early, take_early
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.errors import ConfigError, InputError, StageError, advise_install
+from wavebatch.core.errors import ConfigError, InputError, advise_install
 from wavebatch.core.frozen import frozen
-from wavebatch.core.process import CHILD, Seconds
+from wavebatch.core.process import Seconds
 from wavebatch.core.schema import Range, option
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -455,65 +455,32 @@ def peak_memory() -> int | None:
     return most if sys.platform == "darwin" else most * 1024
 
 
-_START = "from wavebatch.tools.bench.command import serve; serve()"
-
-
-class BenchWorkerDied(Exception):
-    """The process ended before it answered."""
-
-
 class Worker(Closing):
-    """Runs functions in another Python process, one after another; a context manager."""
+    """Runs functions in a process of their own, one after another; a context manager."""
 
     def __init__(self) -> None:
-        path = [str(Path(__file__).resolve().parents[3]), *filter(None, [os.environ.get("PYTHONPATH")]), *sys.path]
-        environment = {**os.environ, **CHILD, "PYTHONPATH": os.pathsep.join(path)}
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
-        )
+        self._calls: SimpleQueue[Call | None] = SimpleQueue()
+        start_early(1)
+        self._process = PipedProcess(take_early(), self._calls, None)
 
     def call(self, function: Callable, *arguments: Any) -> Any:
-        """`function(*arguments)` computed in the process; the function must be importable by name.
+        """`function(*arguments)` computed in the process; both must be picklable.
 
         Raises WorkerDied, or whatever the function raised. A caller that cannot wait uses a thread: `close` ends it.
         """
-        try:
-            pickle.dump((function, arguments), self._process.stdin, pickle.HIGHEST_PROTOCOL)
-            self._process.stdin.flush()
-            kind, value = pickle.load(self._process.stdout)
-        except (EOFError, OSError, ValueError, pickle.UnpicklingError):
-            raise BenchWorkerDied("the measuring process ended") from None
-        if kind == "raised":
-            raise value
-        return value
+        call = Call(pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL))
+        self._calls.put(call)
+        while not wait_uninterrupted([call.future], PATIENCE):
+            self._process.look()
+            if not self._process.serves:  # it died before it took the call
+                end_future(call.future, error=WorkerDied())
+        return call.future.result()
 
     def close(self) -> None:
         """Kills the process."""
-        self._process.kill()
-        self._process.wait()
-        with contextlib.suppress(OSError):  # what a call had not sent yet
-            self._process.stdin.close()
-        self._process.stdout.close()
-
-
-def serve() -> None:
-    """Answers calls on stdin until stdin ends; other output to stdout is sent to stderr."""
-    from wavebatch.core.process import keep_freed_memory
-
-    keep_freed_memory()
-    replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-    while True:
-        try:
-            function, arguments = pickle.load(sys.stdin.buffer)
-        except EOFError:
-            return
-        try:
-            answer = ("value", function(*arguments))
-        except Exception as error:
-            answer = ("raised", StageError(f"{type(error).__name__}: {error}"))
-        pickle.dump(answer, replies, pickle.HIGHEST_PROTOCOL)
-        replies.flush()
+        self._process.process.kill()
+        self._calls.put(None)
+        self._process.process.join()
 
 
 # The document as a sheet
