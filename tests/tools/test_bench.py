@@ -38,6 +38,7 @@ from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
 from wavebatch.tools.bench import accuracy, command
+from wavebatch.tools.sheets.sheet import list_lines
 from wavebatch.tools.simulate import (
     PULSES,
     PulseModel,
@@ -102,7 +103,7 @@ def test_document_has_a_row_per_chain_and_peer(timed_document):
 
 def test_document_is_plain_json_and_its_tables_show_all(document):
     assert json.loads(json.dumps(document, allow_nan=False)) == document
-    text = command.format_document(document)
+    text = "\n".join(list_lines(command.bench_sheet(document)))
     for row in document["scenes"][0]["rows"]:
         assert f"\n  {row['name']}" in text
     assert "cheapest chain with an error of 50 cm" in text
@@ -113,7 +114,8 @@ def test_document_is_plain_json_and_its_tables_show_all(document):
 def test_stiff_cases_count_failures_by_kind(document):
     cases = measure_cases(SMALL, list_cases(["H10"]), lambda text: None, waveforms=40)
     text = format_release({**document, "stability": cases})
-    assert text.startswith(command.format_document(document)) and "isolated, time error / bound" in text
+    shown = "\n".join(list_lines(command.bench_sheet(document)))
+    assert text.startswith(shown) and "isolated, time error / bound" in text
     assert "constant 0, 12 or 255" in text
     assert {row["case"] for row in cases} == {"constant 0, 12 or 255", "noise only"}
     assert any(row["is_auto"] for row in cases)

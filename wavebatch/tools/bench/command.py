@@ -11,7 +11,7 @@ thread. The chains take turns, so that other load of the machine slows all of th
 plain one, not of multiprocessing, which would import the caller's main module into it.
 
 The sheet, bench.json, bench.txt, a page and plots of error against run time show the document. A column of a table
-names a figure of the rows. `align` makes tables of the examples and of tests/bench.
+names a figure of the rows.
 """
 
 from __future__ import annotations
@@ -59,11 +59,10 @@ from wavebatch.stages.score import QUANTITIES
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import SAMPLE, choose_chain
 from wavebatch.surveying.look import pool_blocks
-from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools.api import AUTO
 from wavebatch.tools.bench import accuracy
 from wavebatch.tools.bench.accuracy import find_front
-from wavebatch.tools.sheets.sheet import Cell, Later, Note, Part, Picture, Sheet, Table, list_lines
+from wavebatch.tools.sheets.sheet import Cell, Later, Note, Part, Picture, Sheet, Table
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene, simulate_blocks, simulate_strip
 from wavebatch.tools.simulate.scenes import Drawn
 
@@ -132,7 +131,7 @@ def _measure_scene(
 ) -> dict[str, Any]:  # fmt: skip
     seed = accuracy.derive_seed(options.seed, place)
     groups = accuracy.make_groups(scene, options.waveforms, seed, progress)
-    chosen = [choose_chains(chains, group.survey) for group in groups]
+    chosen = [{**chains, AUTO: choose_chain(group.survey)} for group in groups]
     twin = find_twin(chosen)
     measured = {name: chain for name, chain in chosen[0].items() if name != AUTO or twin is None}
     tallies = {name: accuracy.AccuracyTally() for name in measured}
@@ -212,20 +211,13 @@ def load_chains(files: Sequence[Path]) -> dict[str, Chain]:
     return chains
 
 
-def choose_chains(chains: Mapping[str, Chain], survey: Survey) -> dict[str, Chain]:
-    """The given chains, and as `auto` the one that the survey chooses."""
-    return {**chains, AUTO: choose_chain(survey)}
-
-
 def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
     """The chain that equals `auto` on every strip, so that `auto` need not be measured; None if there is none.
 
     chosen: the chains of each strip.
     """
-    for name in chosen[0]:
-        if name != AUTO and all(AUTO in c and effective(c[name]) == effective(c[AUTO]) for c in chosen):
-            return name
-    return None
+    same = (name for name in chosen[0] if all(effective(each[name]) == effective(each[AUTO]) for each in chosen))
+    return next((name for name in same if name != AUTO), None)
 
 
 def list_methods() -> dict[str, Chain]:
@@ -564,11 +556,6 @@ def bench_sheet(document: Mapping[str, Any]) -> Sheet:
     return Sheet("bench", [Note(words), *scenes])
 
 
-def format_document(document: Mapping[str, Any]) -> str:
-    """The text of a benchmark."""
-    return "\n".join(list_lines(bench_sheet(document)))
-
-
 def _scene_sheet(section: Mapping[str, Any], tolerance_cm: float | None) -> Sheet:
     rows, survey = section["rows"], section["survey"]
     found = (
@@ -632,13 +619,6 @@ def figure_text(row: Mapping[str, Any], column: ReportColumn) -> str:
     return text if figure["error"] is None else f"{text} +-{figure['error'] * factor:.{decimals}f}"
 
 
-def align(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of cells as columns: the first aligned to the left, the others to the right."""
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    form = "  ".join(["{:<%d}", *["{:>%d}"] * (len(widths) - 1)]) % tuple(widths)
-    return [form.format(*line).rstrip() for line in lines]
-
-
 # Files and pictures
 
 NO_PLOT = f"no plot without matplotlib: {advise_install('matplotlib')}"
@@ -649,7 +629,7 @@ PANELS = (
 
 
 def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[str]:
-    """Writes bench.json, bench.txt and a PNG per scene, replacing old ones; returns messages for the user.
+    """Writes bench.json, bench.txt with the text, and a PNG per scene, replacing old ones; returns messages.
 
     Without matplotlib there are no plots, and a message says how to get them. Raises InputError where it cannot write.
     """
