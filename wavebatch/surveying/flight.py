@@ -29,15 +29,10 @@ from wavebatch.surveying.measuring.noise_and_width import FIRST_WIDTH
 from wavebatch.surveying.survey import survey_blocks
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.figures import Kind, Look
+from wavebatch.surveying.systems.saved_check import HELD
 
 LEAST_SHARE = 64
 """Waveforms that each strip gives to the survey, however many strips there are."""
-
-HELD = 512
-"""Waveforms of a strip from which it is decided whether it belongs to a flight, where the survey has not compared its
-echoes. Their width scatters by 0.6 %, far less than NARROWER and WIDER, and each 100 take 2 ms per strip; a saved
-survey is compared with one strip by twice as many.
-"""
 
 CANDIDATES = 32
 """Strips that are tried as the one that most others agree with."""
