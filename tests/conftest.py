@@ -3,7 +3,7 @@
 import fnmatch
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import kept_surveys
@@ -13,6 +13,7 @@ from bench_tools import time_here
 from child_signals import give_children_default_signals
 from hypothesis import HealthCheck, settings
 
+from wavebatch.files.disk.temp_store import use_scratch
 from wavebatch.tools.simulate import simulate_strip
 
 give_children_default_signals()
@@ -118,6 +119,14 @@ def edit_points() -> Callable[[Path, Path, Callable[[np.ndarray], np.ndarray]], 
         return target
 
     return edit
+
+
+@pytest.fixture
+def no_place(tmp_path) -> Iterator[Path]:
+    """Temporary files can nowhere be made: the folder for them is not there."""
+    use_scratch(tmp_path / "missing")
+    yield tmp_path / "missing"
+    use_scratch(None)
 
 
 @pytest.fixture

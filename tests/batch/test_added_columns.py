@@ -63,7 +63,8 @@ def test_a_flight_height_is_used_named_or_refused(tiny_strip, tmp_path):
     (line,) = [line for line in outcome.report.remarks if "--flight-height" in line]
     assert line.startswith("--flight-height 800 m is not used: positions are from the strip's direction vectors: ")
     assert not [line for line in seen.remarks if "--flight-height" in line]
-    error = run(8000.0, "far").error
-    assert "--flight-height 8000 m contradicts the strip: by its direction vectors" in str(error)
+    for height in (80, 8000):
+        error = run(height, "far").error
+        assert f"--flight-height {height} m contradicts the strip: by its direction vectors" in str(error)
     with pytest.raises(wb.ConfigError, match="--trajectory and --flight-height exclude each other"):
         wb.run(tiny_strip, tmp_path / "both", columns="+range", trajectory=tiny_strip, flight_height=800.0)

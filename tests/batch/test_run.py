@@ -9,7 +9,6 @@ import pytest
 from batch_tools import make_job, read_cloud, run_one
 from writer_tools import read_provenance
 
-from wavebatch import __version__
 from wavebatch.batch.job import choose_columns
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import LEAST_MEMORY, plan_memory, plan_strip, run_batch
@@ -146,8 +145,8 @@ def test_an_orphaned_report_is_refused_too(tiny_strip, tmp_path):
     assert run_one(tiny_strip, tmp_path, batch={"resume": True}).status == "written"
 
 
-@pytest.mark.parametrize("change", ["input", "chain", "options", "cloud", "report", "no report", "version"])
-def test_resume_does_again_what_is_not_the_same(tiny_strip, tmp_path, monkeypatch, change):
+@pytest.mark.parametrize("change", ["input", "chain", "options", "cloud", "no report"])
+def test_resume_does_again_what_is_not_the_same(tiny_strip, tmp_path, change):
     strip = tmp_path / "in" / "tiny.las"
     strip.parent.mkdir()
     shutil.copyfile(tiny_strip, strip)
@@ -164,12 +163,8 @@ def test_resume_does_again_what_is_not_the_same(tiny_strip, tmp_path, monkeypatc
         options["columns"] = "+echo_time"
     elif change == "cloud":
         cloud.write_bytes(cloud.read_bytes()[:-1])
-    elif change == "report":
-        counts.write_text("{}")
-    elif change == "no report":
-        counts.unlink()
     else:
-        counts.write_text(counts.read_text().replace(f'"version": "{__version__}"', '"version": "9.9"'))
+        counts.unlink()
     assert run_one(strip, folder, batch={"resume": True}, **options).status == "written"
     assert run_one(strip, folder, batch={"resume": True}, **options).status == "skipped"
     assert _files(folder) == ["tiny.laz", "tiny.report.json"]

@@ -87,6 +87,7 @@ class Ranked:
 def test_objects_are_sorted_by_their_values():
     ranked = [Ranked(2), Ranked(1, second="b"), Ranked(1, second="a")]
     assert sorted(ranked) == ranked[::-1] and max(ranked) is ranked[0]
+    assert ranked[1] <= Ranked(1, second="b") <= ranked[0] >= Ranked(2) > ranked[1]
     with pytest.raises(TypeError, match="takes first, each once"):
         Ranked(1, "a")
     with pytest.raises(TypeError):
@@ -148,16 +149,6 @@ def test_other_classes_may_be_made_of_it():
         @frozen
         class Hidden:
             x: int = field(default=0, init=False)
-
-
-def test_values_have_an_order_where_it_is_asked_for():
-    @frozen(order=True)
-    class Size:
-        x: int
-
-    assert Size(1) < Size(2) and Size(2) > Size(1) and Size(1) <= Size(1) and Size(2) >= Size(2)
-    with pytest.raises(TypeError):
-        assert Size(1) < 2
 
 
 @changeable

@@ -1,9 +1,7 @@
 """Units, packets, blocks: what StripReader gives against a plain reading of the same bytes."""
 
-import errno
 import os
 import pickle
-import tempfile
 
 import numpy as np
 import pytest
@@ -330,15 +328,11 @@ def test_facts_scans_and_units_travel_between_processes(tmp_path):
 
 
 @pytest.mark.parametrize("case", ["kept", "beyond the limit", "no room"])
-def test_compressed_points_are_decoded_once(tmp_path, monkeypatch, case):
+def test_compressed_points_are_decoded_once(tmp_path, request, case):
     """But those beyond a limit, and where there is no room for a temporary file."""
-
-    def refuse(*args, **options):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     sizes = ScanSizes(spooled=1, kept_bytes=150 * 57 if case == "beyond the limit" else 1 << 20)
     if case == "no room":
-        monkeypatch.setattr(tempfile, "mkdtemp", refuse)
+        request.getfixturevalue("no_place")
     raw = make_raw(200, most_returns=1)
     plain, path = raw.write(tmp_path / "a.las"), raw.write(tmp_path / "b.laz")
     readers = StripReader(plain, unit_points=64), StripReader(path, unit_points=64, sizes=sizes)

@@ -1,7 +1,6 @@
 """Sums by key: the same whatever was spilled, and in bounded memory."""
 
 import pickle
-import tempfile
 from contextlib import closing
 
 import numpy as np
@@ -22,7 +21,7 @@ def test_buckets_give_every_row_back_in_order_and_pulses_whole(rng, number):
     seen = []
     with temp_store.Spool(number, ROW) as buckets:
         for part in np.array_split(rows, 9):
-            buckets.append(temp_store.spread_times(part["gps_time"], number), part)
+            buckets.append(temp_store.spread_keys(temp_store.time_keys(part["gps_time"]), number), part)
         for bucket in range(number):
             got = buckets.read(bucket)
             assert (np.diff(got["number"]) > 0).all()
@@ -102,8 +101,7 @@ def test_pieces_can_be_read_twice_and_may_be_none():
     assert first == second and len(first) > 1
 
 
-def test_a_full_disk_is_one_line(monkeypatch, tmp_path):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+def test_without_a_place_sums_say_so(no_place):
     with temp_store.KeyedSums(3, held=10) as sums, pytest.raises(InputError, match="TMPDIR"):
         for key, value in draw_parts(4, 1000):
             sums.add(key, value)

@@ -159,12 +159,6 @@ def test_permuted_waveforms_give_permuted_echoes(scene, profile):
     assert_same(back.take(np.argsort(back.waveform, kind="stable")), whole)
 
 
-def test_the_same_waveforms_twice_give_the_same_bits(scene):
-    block, system = scene
-    for profile in PROFILES:
-        assert_same(load_profile(profile).run(block, system), load_profile(profile).run(block, system))
-
-
 @pytest.mark.parametrize("name", STAGES)
 def test_every_stage_says_what_comes_out(name):
     stage = STAGES[name]
