@@ -488,7 +488,8 @@ def find_turn(
     across = np.eye(3) - unit.T @ unit / max(len(unit), 1)
     angle, doubt = float(np.sqrt(turn @ across @ turn)), float(np.sqrt(0.5 * np.sum(across * error)))
     moved = bool(moved and angle > LEAST_TURN)
-    facts = dict(zip(TURNED, (round(float(np.degrees(angle)), 4), round(float(np.degrees(doubt)), 4), moved), strict=True))
+    values = (round(float(np.degrees(angle)), 4), round(float(np.degrees(doubt)), 4), moved)
+    facts = dict(zip(TURNED, values, strict=True))
     left = error if moved else np.outer(turn, turn) * (angle > LEAST_TURN)
     off = float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", unit @ shift, left, unit @ shift))))
     return facts, turn * moved, off
