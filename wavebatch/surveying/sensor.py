@@ -578,15 +578,14 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     path = Trajectory.build(time, xyz, velocity, gap=(max(WIDER) + 1) * NODE_SECONDS)
     distance = round(float(np.median([fit.distance for fit, _, _ in found])), 2)
     error, facts = _overall_error(found, rays), _describe(found, path, rays)
-    if pairs is not None:
-        shown, turn, off = find_turn(rays, pairs, [fit for fit, _, _ in found])
-        back = np.cross(rays.direction, turn)
-        straight = rays._replace(direction=rays.direction + back + 0.5 * np.cross(back, turn))
-        right = estimate_path(straight, kind) if turn.any() else None
-        if right is not None:
-            path, distance, error, facts = right.trajectory, right.distance, right.error, right.facts
-        error, facts = float(np.hypot(error, off)), (*facts, *shown.items())
-    return SensorSource(kind, path, distance=distance, error=error, facts=facts)
+    source = SensorSource(kind, path, distance=distance, error=error, facts=facts)
+    if pairs is None:
+        return source
+    shown, turn, off = find_turn(rays, pairs, [fit for fit, _, _ in found])
+    back = np.cross(rays.direction, turn)
+    straight = rays._replace(direction=rays.direction + back + 0.5 * np.cross(back, turn))
+    source = (estimate_path(straight, kind) if turn.any() else None) or source
+    return replace(source, error=float(np.hypot(source.error, off)), facts=(*source.facts, *shown.items()))
 
 
 def _fit_window(rays: RaySample, cells: np.ndarray, node: float) -> tuple[SensorFit | None, float, float]:

@@ -260,7 +260,8 @@ def measure_turn(
     bends = np.vander(angle / max(float(np.abs(angle).max()), 1e-9), BENDS, increasing=True)[:, 1:]
     mirror = ((across @ axes)[:, :, None, :] * bends[:, None, :, None]).reshape(3 * len(q), -1)
     parts = [_see_turn(off, some, root, (time, unit), fit.distance) for some in (moves, np.hstack([moves, mirror]))]
-    return TurnSeen(*map(np.stack, zip(*parts, strict=True)), explained[:3, :3])
+    information, right, floor = (np.stack(values) for values in zip(*parts, strict=True))
+    return TurnSeen(information, right, floor, explained[:3, :3])
 
 
 def _see_turn(
