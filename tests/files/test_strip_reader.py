@@ -11,6 +11,7 @@ from writer_tools import data_file, read_raw
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import protecting, refuse_input
+from wavebatch.files.strip.packet_check import Reason
 from wavebatch.files.strip.reader import LONG_SAMPLES, StripReader
 from wavebatch.files.strip.scanner import ScanSizes
 
@@ -262,6 +263,7 @@ def test_too_many_points_on_one_packet_are_broken_wherever_they_are(tmp_path):
     for sizes in (ScanSizes(), ScanSizes(window=64)):
         with StripReader(tmp_path / "a.las", unit_points=64, sizes=sizes) as reader, reader.scan() as scan:
             assert (scan.broken, scan.without_waveform, scan.with_waveform, scan.packets) == (39, 1, 960, 960)
+            assert scan.reasons == {Reason.OVERFULL: (39, 0)}
             flags = np.concatenate([reader.read_unit(n, scan).point_flags for n in range(reader.unit_count())])
             assert np.flatnonzero(flags).tolist() == bad.tolist()
             assert reader.read_unit(3, scan).context.size == 0
