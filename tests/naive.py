@@ -199,27 +199,30 @@ def pulse_matrix(s, taps):
     return scipy.linalg.convolution_matrix(taps, s)[len(taps) // 2 :][:s]
 
 
-def richardson_lucy(waveform, taps, background, iterations):
-    """Plain Richardson-Lucy of one waveform with matrices."""
+def richardson_lucy(waveform, taps, background, iterations, accelerate=True):
+    """Richardson-Lucy of one waveform with matrices; accelerated as by Biggs and Andrews."""
     pulse = pulse_matrix(len(waveform), taps)
     weight = pulse.sum(axis=0)
     data = np.maximum(waveform + background, 0)
-    estimate = np.full(len(waveform), data.mean()) / weight
-    for _ in range(iterations):
-        estimate = estimate * (pulse.T @ (data / (pulse @ estimate + background))) / weight
+    previous = estimate = np.full(len(waveform), data.mean()) / weight
+    before = change = np.zeros(len(waveform))
+    for number in range(iterations):
+        start = estimate
+        if accelerate and number > 1:
+            share = np.clip((change @ before) / (before @ before or 1.0), 0, 1)
+            start = np.maximum(estimate + share * (estimate - previous), 0)
+        previous, estimate = estimate, start * (pulse.T @ (data / (pulse @ start + background))) / weight
+        before, change = change, estimate - start
     return estimate
 
 
-def gold(waveform, taps, iterations, rounds, boost):
+def gold(waveform, taps, iterations):
     """Gold's deconvolution of one waveform with matrices."""
     pulse = pulse_matrix(len(waveform), taps)
     data = np.maximum(waveform, 0)
     estimate = data
-    for number in range(rounds):
-        if number:
-            estimate = estimate.max() * (estimate / estimate.max()) ** boost
-        for _ in range(iterations):
-            estimate = estimate * (pulse.T @ data) / (pulse.T @ pulse @ estimate)
+    for _ in range(iterations):
+        estimate = estimate * (pulse.T @ data) / (pulse.T @ pulse @ estimate)
     return estimate
 
 

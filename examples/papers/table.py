@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from wavebatch.tools.bench.command import align
-
 HEADS = ["figure", "paper", "spec", "ours", "accepted", ""]
 
 
@@ -75,7 +73,14 @@ class Table:
         self.add(name, ours, max(low, 0.0), min(high, whole), **known)
 
     def __str__(self) -> str:
-        return "\n".join(align([[self.title, *HEADS[1:]], *self.rows]))
+        return "\n".join(_align([[self.title, *HEADS[1:]], *self.rows]))
+
+
+def _align(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of cells as columns: the first aligned to the left, the others to the right."""
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    form = "  ".join(["{:<%d}", *["{:>%d}"] * (len(widths) - 1)]) % tuple(widths)
+    return [form.format(*line).rstrip() for line in lines]
 
 
 def scatter(number: int, full: int) -> float:

@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.batch.workers.futures import WorkerDied
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.detect.direct import maximum
 from wavebatch.stages.noise import pooled
 from wavebatch.tools.bench.accuracy import AccuracyTally, Group
-from wavebatch.tools.bench.command import BenchWorkerDied, Laps, Worker, make_row
+from wavebatch.tools.bench.command import Laps, Worker, make_row
 from wavebatch.tools.simulate import Scene
 
 PEER_GROUPS = 6
@@ -169,7 +170,7 @@ def _drive_gdecomp(signal: Path, results: Path, n: int, height: float, patience:
             try:
                 _wait(call, results, place, patience)
                 break
-            except BenchWorkerDied:
+            except WorkerDied:
                 pass
         done = np.load(results, mmap_mode="r")[place:, 0]
         place += int(np.argmax(np.isnan(done))) + 1 if np.isnan(done).any() else n
@@ -187,7 +188,7 @@ def _wait(call: Future, results: Path, place: int, patience: float) -> None:
         except TimeoutError:
             now = int(np.isfinite(np.load(results, mmap_mode="r")[place:, 0]).sum())
             if now == before:
-                raise BenchWorkerDied("no progress") from None
+                raise WorkerDied("no progress") from None
             before = now
 
 

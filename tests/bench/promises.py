@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from itertools import chain
 from typing import Any
 
-from wavebatch.tools.bench.command import align
+from bench.stability_tables import align
 
 Row = Mapping[str, Any]
 

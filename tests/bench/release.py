@@ -18,16 +18,18 @@ from bench.stability import FAILURES, measure_stability
 from bench.stability_tables import format_stability
 from bench.system import measure_system
 
+from wavebatch.surveying.choose_chain import choose_chain
+from wavebatch.tools.api import AUTO
 from wavebatch.tools.bench.command import (
     BenchOptions,
     BenchProgress,
-    choose_chains,
-    format_document,
+    bench_sheet,
     list_methods,
     load_chains,
     run_bench,
     write_outputs,
 )
+from wavebatch.tools.sheets.sheet import list_lines
 
 SCENES = ("mixed", "open", "forest", "empty")
 
@@ -55,7 +57,7 @@ def measure_cases(
     methods = list_methods() if options.all_methods else {}
     measured = load_chains(options.chains) | methods
     return measure_stability(
-        lambda survey: choose_chains(measured, survey),
+        lambda survey: {**measured, AUTO: choose_chain(survey)},
         waveforms,
         min(STABILITY_SURVEY, options.waveforms),
         options.seed,
@@ -67,7 +69,8 @@ def measure_cases(
 
 def format_release(document: dict[str, Any]) -> str:
     """All tables."""
-    tables = [format_document(document), format_stability(document["stability"]), format_promises(document["promises"])]
+    tables = ["\n".join(list_lines(bench_sheet(document)))]
+    tables += [format_stability(document["stability"]), format_promises(document["promises"])]
     return "\n\n".join(tables)
 
 

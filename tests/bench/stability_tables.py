@@ -6,7 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from wavebatch.stages.score import QUANTITIES
-from wavebatch.tools.bench.command import align, figure_text
+from wavebatch.tools.bench.command import figure_text
+
+
+def align(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of cells as columns: the first aligned to the left, the others to the right."""
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    form = "  ".join(["{:<%d}", *["{:>%d}"] * (len(widths) - 1)]) % tuple(widths)
+    return [form.format(*line).rstrip() for line in lines]
 
 
 def format_stability(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -57,11 +57,10 @@ def time_start(repeats: int = 5) -> dict[str, Any]:
 def time_jobs(chain: Chain, strip: Path, folder: Path, jobs: Sequence[int], repeats: int) -> dict[str, dict[str, Any]]:
     """Seconds from file to file, without scan and survey, by number of jobs; the numbers take turns."""
     seconds: dict[int, list[float]] = {number: [] for number in jobs}
-    with Worker() as worker:
-        for _ in range(repeats):
-            for number in jobs:
-                run = worker.call(run_file, chain, strip, folder, number)
-                seconds[number].append(run.seconds - run.survey_seconds)
+    for _ in range(repeats):
+        for number in jobs:  # here: a worker process starts no others
+            run = run_file(chain, strip, folder, number)
+            seconds[number].append(run.seconds - run.survey_seconds)
     return {str(number): median_range(values) for number, values in seconds.items()}
 
 

@@ -21,7 +21,7 @@ def test_buckets_give_every_row_back_in_order_and_pulses_whole(rng, number):
     seen = []
     with temp_store.Spool(number, ROW) as buckets:
         for part in np.array_split(rows, 9):
-            buckets.append(temp_store.spread_times(part["gps_time"], number), part)
+            buckets.append(temp_store.spread_keys(temp_store.time_keys(part["gps_time"]), number), part)
         for bucket in range(number):
             got = buckets.read(bucket)
             assert (np.diff(got["number"]) > 0).all()

@@ -1,6 +1,7 @@
 """One survey of all strips of a flight: the same for any order, and strips of other sensors are found."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 from helpers_scenes import make_scene
@@ -11,7 +12,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.flight import hold_strip, read_samples, survey_flight
 from wavebatch.surveying.look import read_flight, surveys_agree
-from wavebatch.surveying.system_file import format_survey, parse_survey
+from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
 from wavebatch.tools.simulate import PulseModel, find_pulse, simulate_strip
 
 PULSE = find_pulse("riegl")
@@ -73,17 +74,35 @@ def test_the_order_of_the_strips_does_not_matter(strips, flight):
 )
 def test_a_strip_of_another_sensor_does_not_belong_to_them(strips, flight, name, words):
     """Held against the flight as it is kept in a file, as a strip that comes later is; the pulse is named first."""
-    kept = parse_survey(format_survey(flight.saved), "x").survey
+    kept = parse_survey(format_survey(flight.saved), "x")
     with StripReader(strips[name]) as reader, reader.scan() as scan:
         assert words in hold_strip(reader, scan, kept)
 
 
 @pytest.mark.parametrize("name", [*FLIGHT, "calm"])
 def test_a_later_strip_of_the_sensor_belongs_to_them(strips, flight, name):
-    kept = parse_survey(format_survey(flight.saved), "x").survey
-    assert read_flight(kept) == read_flight(flight.saved.survey)
+    kept = replace(parse_survey(format_survey(flight.saved), "x"), fingerprint={})
+    assert read_flight(kept.survey) == read_flight(flight.saved.survey)
     with StripReader(strips[name]) as reader, reader.scan() as scan:
         assert hold_strip(reader, scan, kept) == ""
+
+
+def test_only_strips_whose_echoes_were_compared_are_not_compared_again(strips, flight):
+    """Else a strip of too few echoes would keep a pulse that it was never compared with."""
+    kept = parse_survey(format_survey(flight.saved), "x")
+    surveyed = kept.fingerprint["strips"]
+    assert len(surveyed) == 3 and all(strip["compared"] for strip in surveyed)
+    wider = replace(kept.survey.figures, look=replace(kept.survey.figures.look, width=9.0))
+    wrong = replace(kept, survey=replace(kept.survey, figures=wider))
+    with StripReader(strips["flat"]) as reader, reader.scan() as scan:
+        assert hold_strip(reader, scan, wrong) == ""
+        for others in ({}, {"strips": "none"}, {"strips": [{**strip, "compared": False} for strip in surveyed]}):
+            assert "those of the flight 9.00 ns" in hold_strip(reader, scan, replace(wrong, fingerprint=others))
+
+
+def test_a_share_with_too_few_echoes_is_no_comparison(strips):
+    few = survey_flight(read_samples([strips[name] for name in FLIGHT], waveforms=30))
+    assert few.misfits == [] and not any(strip["compared"] for strip in few.saved.fingerprint["strips"])
 
 
 @pytest.mark.slow
@@ -108,7 +127,7 @@ def test_a_survey_of_one_strip_is_none_of_a_flight(strips):
     with StripReader(strips["flat"]) as reader, reader.scan() as scan:
         survey = survey_blocks(reader.sample_blocks(scan, 300))
         with pytest.raises(ConfigError, match="holds no survey of a flight"):
-            hold_strip(reader, scan, survey)
+            hold_strip(reader, scan, SavedSurvey(survey))
 
 
 @pytest.mark.slow

@@ -27,10 +27,10 @@ pytestmark = pytest.mark.kept_surveys
 
 def test_what_lies_in_a_polygon():
     corners = np.array([[0, 0], [10, 0], [10, 10], [5, 3], [0, 10.0]])
-    x, y = np.array([1.0, 9, 5, 5, -1, 5]), np.array([1.0, 8, 1, 8, 5, 20])
-    assert Target("w", 0.2, corners).contains(x, y).tolist() == [True, True, True, False, False, False]
+    xyz = np.array([[1.0, 9, 5, 5, -1, 5], [1.0, 8, 1, 8, 5, 20], [0.0] * 6]).T
+    assert Target("w", 0.2, corners).contains(xyz).tolist() == [True, True, True, False, False, False]
     many = np.random.default_rng(1).uniform(-2, 12, (2, 100_000))
-    assert Target("w", 0.2, corners).contains(*many).mean() * 14**2 == pytest.approx(65.0, rel=0.02)
+    assert Target("w", 0.2, corners).contains(many.T).mean() * 14**2 == pytest.approx(65.0, rel=0.02)
 
 
 def test_long_packets_of_the_digitizer_have_its_constant(riegl, tmp_path):
@@ -53,14 +53,14 @@ def test_circles_and_polygons_of_csv_and_geojson(tmp_path):
     path.write_text("name,reflectance,x,y,radius,incidence\ngrey,0.25,100,200,5,\nwhite,0.8,300,400,2,12.5\n")
     grey, white = load_targets(path)
     assert (grey.name, grey.reflectance, grey.incidence, white.incidence) == ("grey", 0.25, None, 12.5)
-    assert grey.contains(np.array([104.9, 105.1]), np.array([200.0, 200.0])).tolist() == [True, False]
+    assert grey.contains(np.array([[104.9, 200.0], [105.1, 200.0]])).tolist() == [True, False]
     path.write_text("reflectance,vertices\n0.5,0 0 10 0 10 10\n")
     assert load_targets(path)[0].corners.shape == (3, 2)
     ring = [[0, 0], [10, 0], [10, 10], [0, 0]]
     feature = {"type": "Feature", "properties": {"reflectance": 0.4, "name": "a"},
                "geometry": {"type": "Polygon", "coordinates": [ring]}}  # fmt: skip
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
-    assert load_targets(path)[0].contains(np.array([8.0, 2.0]), np.array([2.0, 8.0])).tolist() == [True, False]
+    assert load_targets(path)[0].contains(np.array([[8.0, 2.0], [2.0, 8.0]])).tolist() == [True, False]
 
 
 def test_normals_are_not_bent_by_outliers():

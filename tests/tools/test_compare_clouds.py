@@ -13,12 +13,14 @@ import pytest
 from commands import run_command
 from writer_tools import write_points
 
-from wavebatch.cli.compare import HEAD, format_comparison
+from wavebatch.cli.compare import HEAD, list_rows
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
+from wavebatch.core.units import AIR_SPEED
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.kernels.fit.closed_form import crlb
-from wavebatch.tools.pairing import SPEED, Differences, compare_clouds, compare_truth, measure_lag
+from wavebatch.tools.pairing import Differences, compare_clouds, compare_truth, measure_lag
+from wavebatch.tools.sheets.sheet import format_csv
 from wavebatch.tools.simulate import StripOptions, TruthReader, simulate_strip
 
 CORNER = np.array([500_000.0, 5_400_000.0, 0.0])
@@ -93,7 +95,7 @@ def test_shifts_along_the_ray_are_measured_with_their_sign(tmp_path):
     _, times, xyz, ray = make_pulses()
     rng = np.random.default_rng(2)
     lag = 0.25 + 0.05 * rng.standard_normal(len(times))
-    moved = xyz + (lag * SPEED)[:, None] * ray
+    moved = xyz + (lag * AIR_SPEED)[:, None] * ray
     width = np.full(len(times), 4.0, "f4")
     write_cloud(tmp_path / "a.las", times, moved, echo_width=width + np.float32(0.5))
     write_cloud(tmp_path / "b.las", times, xyz, echo_width=width)
@@ -111,7 +113,7 @@ def test_shifts_along_the_ray_are_measured_with_their_sign(tmp_path):
 def test_missed_extra_and_far_echoes_are_counted(tmp_path):
     _, times, xyz, ray = make_pulses()
     far = xyz.copy()
-    far[:40] += 1.2 * SPEED * ray[:40]
+    far[:40] += 1.2 * AIR_SPEED * ray[:40]
     write_cloud(tmp_path / "a.las", times[:-30], far[:-30])
     write_cloud(tmp_path / "b.las", times, xyz)
     result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
@@ -138,7 +140,7 @@ def test_points_passed_through_are_no_echoes(tmp_path):
 def test_without_useful_times_nearest_neighbours_are_matched(tmp_path, times_are):
     _, times, xyz, ray = make_pulses(3000)
     given = {"missing": None, "zero": np.zeros(len(times)), "of another day": times + 86400}[times_are]
-    write_cloud(tmp_path / "a.las", given, xyz + 0.3 * SPEED * ray, point_format=0 if given is None else 6)
+    write_cloud(tmp_path / "a.las", given, xyz + 0.3 * AIR_SPEED * ray, point_format=0 if given is None else 6)
     write_cloud(tmp_path / "b.las", times[:-20], xyz[:-20])
     result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", held=1500)
     assert result.matched_by == "position"
@@ -153,7 +155,7 @@ def test_without_useful_times_nearest_neighbours_are_matched(tmp_path, times_are
 def test_times_that_formats_round_differently_match_by_position(tmp_path):
     _, times, xyz, ray = make_pulses(3000)
     rounded = np.where(np.arange(len(times)) < 5, times, times + 0.25e-6)
-    write_cloud(tmp_path / "a.las", rounded, xyz + 0.3 * SPEED * ray)
+    write_cloud(tmp_path / "a.las", rounded, xyz + 0.3 * AIR_SPEED * ray)
     write_cloud(tmp_path / "b.las", times, xyz)
     result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
     assert result.matched_by == "position" and result.matched > len(times) - 10
@@ -170,7 +172,7 @@ def test_buckets_do_not_change_the_result(tmp_path, by):
     keep = rng.random(len(times)) < 0.9
     times = times if by == "time" else np.zeros(len(times))
     jitter = 0.4 * rng.standard_normal(len(times))
-    write_cloud(tmp_path / "a.las", times, xyz + (jitter * SPEED)[:, None] * ray)
+    write_cloud(tmp_path / "a.las", times, xyz + (jitter * AIR_SPEED)[:, None] * ray)
     write_cloud(tmp_path / "b.las", times[keep], xyz[keep])
     whole = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
     parts = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", held=700)
@@ -195,7 +197,7 @@ def strip(tmp_path_factory):
     bounds = crlb(truth["amplitude"], sigma, noise, 1.0)
     error = [bound * rng.standard_normal(len(sigma)) for bound in bounds]
     xyz = np.stack([truth[k] for k in "xyz"], axis=1)
-    xyz[:, 2] -= error[0] * SPEED
+    xyz[:, 2] -= error[0] * AIR_SPEED
     write_cloud(
         folder / "a.las",
         truth["gps_time"],
@@ -205,7 +207,7 @@ def strip(tmp_path_factory):
         echo_width=(2.3548 * (sigma + error[2])).astype("f4"),
         amplitude_err=bounds[1].astype("f4"),
         echo_width_err=(2.3548 * bounds[2]).astype("f4"),
-        range_err=(SPEED * bounds[0]).astype("f4"),
+        range_err=(AIR_SPEED * bounds[0]).astype("f4"),
     )
     return folder, truth
 
@@ -272,9 +274,9 @@ def test_many_pairs_are_thinned_evenly():
         whole.add(a, b)
     spread = whole.spreads()["time"]
     assert spread.number == 20_000
-    assert spread.rms == pytest.approx(np.sqrt((heights**2).mean()) / SPEED)
-    assert spread.median == pytest.approx(0, abs=0.15 / SPEED)
-    assert spread.nmad == pytest.approx(1 / SPEED, rel=0.12)
+    assert spread.rms == pytest.approx(np.sqrt((heights**2).mean()) / AIR_SPEED)
+    assert spread.median == pytest.approx(0, abs=0.15 / AIR_SPEED)
+    assert spread.nmad == pytest.approx(1 / AIR_SPEED, rel=0.12)
     assert "amplitude" not in whole.spreads()
 
 
@@ -317,7 +319,7 @@ def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatc
     keep = rng.random(len(times)) < 0.8
     moved = xyz.copy()
     far = rng.random(len(times)) < 0.05
-    moved[far] += 1.5 * SPEED * ray[far]
+    moved[far] += 1.5 * AIR_SPEED * ray[far]
     flags = np.where(far, EchoFlag.WEAK | EchoFlag.OVERLAPPED, np.where(rng.random(len(times)) < 0.3, 32, 0))
     amplitude = np.exp(rng.uniform(-1, 6, len(times))).astype("f4")
     amplitude[:9] = np.nan
@@ -379,7 +381,7 @@ def test_differences_by_class_and_by_number_of_echoes(tmp_path, classified, poin
     kinds = np.random.default_rng(4).choice([1, 2, 6], len(times))
     total = np.bincount(pulse)[pulse]
     shift = 0.1 * kinds + 0.01 * total
-    place = xyz + (shift * SPEED)[:, None] * ray
+    place = xyz + (shift * AIR_SPEED)[:, None] * ray
     for name, where in (("a", place), ("b", xyz)):
         write_cloud(tmp_path / f"{name}.las", times, where)
         _set_fields(tmp_path / f"{name}.las", number_of_returns=total, return_number=np.ones(len(times), int))
@@ -460,5 +462,6 @@ def test_rows_are_the_figures_of_the_document(tmp_path, tiny_strip):
 
 
 def test_no_data_is_an_empty_cell():
-    text = format_comparison({"gain": float("nan"), "errors": {"all": {"time": {"bias": None, "number": 3}}}})
+    document = {"gain": float("nan"), "errors": {"all": {"time": {"bias": None, "number": 3}}}}
+    text = format_csv(HEAD, list_rows(document))
     assert text.splitlines()[1:] == ["all,,,,gain,", "errors,,all,time,bias,", "errors,,all,time,number,3"]

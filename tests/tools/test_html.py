@@ -22,7 +22,7 @@ from wavebatch.tools.plots.charts import chart, draw_histogram, draw_values, mer
 from wavebatch.tools.sheets import page
 from wavebatch.tools.sheets.run import FIGURES, count_tables, find_outliers
 from wavebatch.tools.sheets.sheet import Code, Table
-from wavebatch.tools.sheets.survey import write_calibrate_page
+from wavebatch.tools.sheets.survey import calibration_page
 
 
 def _run(*arguments, code=0):
@@ -110,7 +110,7 @@ def test_the_page_of_a_calibration(tmp_path):
     found = Calibration(2e-9, 0.05, strip="s.las", date="2026-01-02", targets=targets, strips=strips,
                         notes=("constants differ",))  # fmt: skip
     pairs = (PairOverlap("0.las", "1.las", 40, 1.1, 1.01, 0.02, 0.003, 0.01),)
-    write_calibrate_page(tmp_path / "c.html", FlightCalibration(found, pairs))
+    page.write_page(tmp_path / "c.html", "calibrate", calibration_page(FlightCalibration(found, pairs)))
     shown = Page(tmp_path / "c.html").check()
     assert "0.las / 1.las" in shown.text and shown.row("roof <i>")[2] == "50" and shown.row("lake")[-1] == "too few"
     assert "constants differ" in shown.text and shown.row("day of the flight")[1] == "not in the strip"

@@ -15,6 +15,7 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_scenes
 from wavebatch.cli.messages import answer, talk
 from wavebatch.tools.bench import command
+from wavebatch.tools.sheets.sheet import list_lines
 
 
 @click.command()
@@ -31,9 +32,7 @@ from wavebatch.tools.bench import command
                       required=False, folder=True)
 @shared.html_option
 @shared.common_options("json")
-def bench(
-    files: tuple[Path, ...], output: Path | None, tolerance: float | None, html_file: Path | None, **options: Any
-) -> None:
+def bench(files: tuple[Path, ...], output: Path | None, **options: Any) -> None:
     """Measure error and run time of all shipped chains and of CHAIN files (.toml).
 
     Waveforms with known echoes are simulated like those of STRIP: its noise, baselines, pulse and echoes come from a
@@ -48,6 +47,7 @@ def bench(
       # the cheapest chain with 2 cm of range error
       wavebatch bench --scene open --tolerance 0.02m
     """
+    tolerance, html_file = options["tolerance"], options["html_file"]
     shared.check_html(html_file)
     strips = [path for path in files if path.suffix.lower() != ".toml"]
     silent = options["quiet"] or not sys.stderr.isatty()
@@ -64,12 +64,7 @@ def bench(
     )
     document = command.run_bench(settings, say)
     sheet = command.bench_sheet(document)
-    for line in command.write_outputs(document, command.format_document(document), output) if output else []:
+    for line in command.write_outputs(document, "\n".join(list_lines(sheet)), output) if output else []:
         talk(line)
-    if html_file is not None:
-        from wavebatch.tools.sheets.page import write_page
-
-        names = ", ".join(section["scene"] for section in document["scenes"])
-        write_page(html_file, f"wavebatch bench: {names}", sheet.parts)
-        talk(f"{html_file}: written")
+    shared.write_html(html_file, ", ".join(section["scene"] for section in document["scenes"]), sheet.parts)
     answer(document, sheet)

@@ -44,14 +44,7 @@ if TYPE_CHECKING:
 @shared.declared("direction")
 @shared.html_option
 @shared.common_options("overwrite", "json")
-def calibrate(
-    strips: tuple[Path, ...],
-    targets: Path | None,
-    output: Path,
-    html_file: Path | None,
-    overwrite: bool,
-    **options: Any,
-) -> None:
+def calibrate(strips: tuple[Path, ...], targets: Path | None, output: Path, **options: Any) -> None:
     """Find the calibration constants of STRIPs over targets of known reflectance, for `wavebatch run --calibration`.
 
     STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line. Each channel
@@ -77,16 +70,17 @@ def calibrate(
     from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
     from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_targets
     from wavebatch.tools.api import find_request, read_sensor
-    from wavebatch.tools.sheets.survey import calibration_sheet, write_calibrate_page
+    from wavebatch.tools.sheets.survey import calibration_page, calibration_sheet
 
     if (targets is None) == (options["column"] is None):
         raise click.UsageError("give --targets FILE, or --from-column NAME, and not both")
     paths = shared.find_inputs(strips, recursive=options["recursive"])
+    html_file, report, overwrite = options["html_file"], options["report"], options["overwrite"]
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
-        for target in filter(None, (output, options["report"], html_file)):
+        for target in filter(None, (output, report, html_file)):
             refuse_input(target)
     shared.check_toml(output)
-    for target in filter(None, (output, options["report"])):
+    for target in filter(None, (output, report)):
         refuse_existing(target, overwrite)
     shared.check_html(html_file)
     asked = shared.from_options(RunOptions, options)
@@ -95,16 +89,15 @@ def calibrate(
     flight = calibrate_flight(paths, load_targets(targets) if targets else [], how)
     found = flight.calibration
     write_text(output, format_calibration(found), overwrite=overwrite)
-    if options["report"] is not None:
-        write_text(options["report"], format_json(_list_report(flight)) + "\n", overwrite=overwrite)
-    if html_file is not None:
-        write_calibrate_page(html_file, flight)
+    if report is not None:
+        write_text(report, format_json(_list_report(flight)) + "\n", overwrite=overwrite)
     answer(_list_report(flight))
     for note in found.notes:
         talk(f"warning: {note}")
     for line in list_lines(calibration_sheet(flight)):
         tell(line)
     tell(f"{output}: written")
+    shared.write_html(html_file, found.strip or "strips", calibration_page(flight))
 
 
 def _list_report(flight: FlightCalibration) -> dict[str, Any]:

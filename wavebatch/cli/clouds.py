@@ -19,7 +19,6 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_columns
 from wavebatch.cli.messages import answer, talk, tell
 from wavebatch.cli.plot import choose_points, find_clouds
-from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import HALF_C, count
 from wavebatch.files.cloud.point_filter import PointFilter
@@ -51,10 +50,7 @@ _COUNTED = ("by_number", "by_count")
 @shared.where_option("Count only points")
 @shared.output_option("Write a table with one row per cloud and area.", "FILE.csv", required=False)
 @shared.common_options("overwrite", "json")
-def stats(
-    clouds: tuple[Path, ...], size: float | None, polygon: Path | None, output: Path | None, overwrite: bool,
-    as_json: bool, quiet: bool, debug: bool, recursive: bool, where: Condition | None,
-) -> None:
+def stats(clouds: tuple[Path, ...], output: Path | None, **options: Any) -> None:
     """Count how many returns the pulses of CLOUDs have, how far apart they are, and which flags they have.
 
     CLOUD is a LAS or LAZ file with points in any order, a glob, a folder, or @list.txt with one of these per line. A
@@ -67,24 +63,25 @@ def stats(
       # return numbers, separations and flags of clouds
       wavebatch stats clouds/*.laz
     """  # fmt: skip
-    files = shared.find_inputs(clouds, recursive=recursive)
+    files, size, polygon = find_clouds(clouds, options), options["size"], options["polygon"]
     if output is not None:
-        check_target(output, overwrite=overwrite)
+        check_target(output, overwrite=options["overwrite"])
     divisions = [] if size is None else [returns.AreaGrid(size)]
     divisions += [] if polygon is None else [returns.PolygonSet(load_polygons(polygon))]
     failed: list[InputError] = []
 
     def skip(error: InputError) -> None:
-        if debug:
+        if options["debug"]:
             raise error
         failed.append(error)
         talk(f"error: {error}")
 
-    each, total = returns.count_returns(files, skip, divisions=divisions, chosen=PointFilter(where=where))
+    chosen = PointFilter(where=options["where"])
+    each, total = returns.count_returns(files, skip, divisions=divisions, chosen=chosen)
     if output is not None and failed:
         talk(f"error: {output}: not written, because {count(len(failed), 'cloud')} of {len(files)} cannot be read")
     elif output is not None:
-        write_text(output, _format_table(each, total), overwrite=overwrite)
+        write_text(output, _format_table(each, total), overwrite=options["overwrite"])
     shown = [*each, total] if len(files) > 1 else each
     document = {"files": [_plain(one) for one in each], "total": _plain(total)}
     sheets = [_sheet(one) for one in shown]

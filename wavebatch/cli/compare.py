@@ -17,7 +17,7 @@ import click
 
 from wavebatch import __version__
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import answer, talk, tell
+from wavebatch.cli.messages import answer, talk
 from wavebatch.core.units import count
 from wavebatch.files.cloud.point_filter import PointFilter
 from wavebatch.files.disk.publish import check_target
@@ -59,16 +59,7 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 @shared.html_option
 @shared.output_option("Write all figures as a table, one per row.", "FILE.csv", required=False)
 @shared.common_options("overwrite", "json", failure=2)
-def compare(
-    a: Path,
-    b: Path | None,
-    strip: Path | None,
-    truth: Path | None,
-    html_file: Path | None,
-    output: Path | None,
-    overwrite: bool,
-    **options: Any,
-) -> None:
+def compare(a: Path, b: Path | None, strip: Path | None, output: Path | None, **options: Any) -> None:
     """Compare the echoes of cloud A with those of B: another cloud, or the strip with the vendor's returns.
 
     Two echoes of a pulse are the same if their times differ by at most --within. Points that were passed through
@@ -88,13 +79,13 @@ def compare(
       # with the truth; exit code 1 below 95 %
       wavebatch compare clouds/strip.laz --truth truth.npz --min-completeness 0.95
     """  # fmt: skip
-    shared.check_html(html_file)
+    shared.check_html(options["html_file"])
     if output is not None:
-        check_target(output, overwrite=overwrite)
-    result = _match(a, b, strip, options) if strip else _compare(a, b, truth, options)
+        check_target(output, overwrite=options["overwrite"])
+    result = _match(a, b, strip, options) if strip else _compare(a, b, options)
     between = result.between if strip else result
     if output is not None:
-        write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
+        write_text(output, format_csv(HEAD, list_rows(result.to_json())), overwrite=options["overwrite"])
     chains = _list_match(result) if strip else ()
     parts = [*_list_parts(between), *chains]
     answer(result.to_json(), Sheet("compare", parts), "chains" if strip else "")
@@ -106,20 +97,17 @@ def compare(
             "Positions of two formats may differ: try a larger --within"
         )
     broken = _check_thresholds(between, options)
-    if html_file is not None:
-        from wavebatch.tools.sheets.page import write_page
-
-        names = " with ".join(Path(side).name for side in (between.a, between.b) if side)
-        warnings = [Note(words, "warning") for words in broken]
-        write_page(html_file, f"wavebatch compare: {names}", [*warnings, *parts, Fact("wavebatch", __version__)])
-        tell(f"{html_file}: written")
+    names = " with ".join(Path(side).name for side in (between.a, between.b) if side)
+    warnings = (Note(words, "warning") for words in broken)
+    shared.write_html(options["html_file"], names, [*warnings, *parts, Fact("wavebatch", __version__)])
     for line in broken:
         talk(line)
     if broken:
         sys.exit(EXIT_VIOLATED)
 
 
-def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
+def _compare(a: Path, b: Path | None, options: dict) -> Comparison:
+    truth = options["truth"]
     if (b is None) == (truth is None):
         raise click.UsageError("give either B or --truth FILE.npz")
     from wavebatch.tools.compare_chains import find_contender
@@ -264,15 +252,8 @@ _TABLES = {"missed_by": ("missed", "B"), "extra_by": ("extra", "A")}
 Row = tuple[str, str, str, str, str, Any]
 
 
-def format_comparison(document: Mapping[str, Any]) -> str:
-    """The figures of a comparison, as its JSON document has them; empty cells are no data.
-
-    document: of `Comparison.to_json`, or of `Matchup.to_json`.
-    """
-    return format_csv(HEAD, _list_rows(document))
-
-
-def _list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+def list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+    """The figures of a comparison; document: of `Comparison.to_json`, or of `Matchup.to_json`."""
     for name, value in document.items():
         if name in _TABLES:
             # Echoes without a partner by return number, amplitude, flags and company.
@@ -288,11 +269,11 @@ def _list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
             for kind, groups in value.items():
                 yield from _list_nested(f"differences by {kind}", groups)
         elif name == "between":
-            yield from _list_rows(value)
+            yield from list_rows(value)
         elif name == "vendor":
             for side, one in value.items():
                 # Each side is compared with the vendor's returns: the tables are those of a comparison again.
-                for table, part, *rest in _list_rows(one):
+                for table, part, *rest in list_rows(one):
                     yield f"{table}, {side.upper()} and the vendor's returns", {"B": "vendor"}.get(part, part), *rest
         elif isinstance(value, Mapping):
             yield from _list_nested(name, value)

@@ -60,15 +60,7 @@ _SURVEYED = 2000
 @shared.options_of(SliceOptions, "most")
 @shared.declared("direction")
 @shared.common_options("overwrite", "json")
-def slice_(
-    strips: tuple[str, ...],
-    output: Path | None,
-    lines: tuple[int, int | None],
-    png: Path | None,
-    overview: Path | None,
-    cube: Path | None,
-    **options: Any,
-) -> None:
+def slice_(strips: tuple[str, ...], output: Path | None, **options: Any) -> None:
     """Find the straight surface lines in the scan lines of each STRIP.
 
     STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line.
@@ -93,20 +85,19 @@ def slice_(
       # straight surface lines in the scan lines
       wavebatch slice strip.las -o lines.csv
     """  # fmt: skip
-    extras = [path for path in (png, overview, cube) if path is not None]
+    extras = options["extras"] = [path for path in map(options.get, ("png", "overview", "cube")) if path is not None]
     if output is None and not extras:
         raise click.UsageError("give -o for the segments, --png or --overview for a picture, or --cube")
     if options["geojson_crs"] == "keep" and (output is None or output.suffix.lower() != ".geojson"):
         raise click.UsageError("--geojson-crs keep is of no use without -o FILE.geojson: other files keep the CRS")
     for target in extras:
         refuse_existing(target, options["overwrite"])
-    for picture in filter(None, (png, overview)):
+    for picture in filter(None, (options["png"], options["overview"])):
         check_picture(picture, overwrite=options["overwrite"])
     paths = shared.find_inputs(strips, recursive=options["recursive"])
     if extras and len(paths) > 1:
         raise ConfigError(f"{extras[0]}: one file for {len(paths)} strips; make them one by one")
     targets = {} if output is None else shared.name_outputs(paths, output, SEGMENT_SUFFIXES, ".csv")
-    options |= {"lines": lines, "png": png, "overview": overview, "cube": cube, "extras": extras}
     shared.finish_each(paths, lambda strip: _slice(strip, targets.get(strip), options), options)
 
 

@@ -16,7 +16,6 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.command import complete_files, complete_stages
 from wavebatch.cli.messages import answer, print_sheet, print_text, printable, talk
-from wavebatch.cli.options import common_options
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.units import count
 from wavebatch.tools.file_facts import describe_file
@@ -42,9 +41,7 @@ EXIT_PROBLEMS, EXIT_UNREADABLE = 1, 1
 @click.option("-v", "--verbose", is_flag=True,
               help="Also survey the strip: its pulse, and the known sensor that it looks like.")
 @shared.common_options("json")
-def info(
-    strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool, quiet: bool, debug: bool, **reading: Any
-) -> None:
+def info(strips: tuple[str, ...], direction: str, headerless: bool, **options: Any) -> None:
     """Show header, points, wave packets, descriptors and sample values of strips, and how clouds were made.
 
     STRIP is a LAS or LAZ file of any version, with or without waveforms, a glob, a folder, or @list.txt with one of
@@ -57,13 +54,13 @@ def info(
       # points, packets, descriptors and samples
       wavebatch info strip.las
     """
-    paths, lost = shared.find_inputs(strips, recursive=recursive), 0
+    paths, lost = shared.find_inputs(strips, recursive=options["recursive"]), 0
 
     def show(path: Path) -> dict[str, Any]:
-        facts = describe_file(path, **reading)
-        if verbose and facts.get("packets", {}).get("count") and not facts["problems"]:
-            facts["pulse"] = _describe_pulse(path, **reading)
-        if not as_json:
+        facts = describe_file(path, direction=direction, headerless=headerless)
+        if options["verbose"] and facts.get("packets", {}).get("count") and not facts["problems"]:
+            facts["pulse"] = _describe_pulse(path, direction, headerless)
+        if not options["as_json"]:
             sheet = _sheet(facts)
             print_sheet(sheet if path == paths[0] else Sheet("info", [sheet]))  # an empty line between two
         if facts["problems"] and not facts.get("points_with_waveform"):  # points are shown, packets cannot be
@@ -72,7 +69,7 @@ def info(
             talk(f"error: {path}: {facts['problems'][0]}")
         return facts
 
-    results, failed = shared.for_each(paths, show, debug=debug)
+    results, failed = shared.for_each(paths, show, debug=options["debug"])
     answer(results[0] if len(paths) == 1 else results)
     sys.exit(EXIT_UNREADABLE if failed or lost else 0)
 
@@ -102,10 +99,7 @@ def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, A
 @shared.strip_options
 @click.option("--strict", is_flag=True, help="Count notes as problems.")
 @shared.common_options("json")
-def check(
-    files: tuple[Path, ...], direction: str, headerless: bool, strict: bool, as_json: bool, quiet: bool,
-    debug: bool, recursive: bool,
-) -> None:
+def check(files: tuple[Path, ...], direction: str, headerless: bool, **options: Any) -> None:
     """Check strips and chain files (.toml); print one line per problem, with its place and what to do.
 
     STRIP is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. Notes are oddities that
@@ -120,11 +114,11 @@ def check(
     from wavebatch.surveying.inspect_strip import check_file  # imports all stages
 
     clean, results = True, []
-    for path in shared.find_inputs(files, recursive=recursive):
+    for path in shared.find_inputs(files, recursive=options["recursive"]):
         found = check_file(path, direction=direction, headerless=headerless)
-        clean &= found.is_clean and not (strict and found.notes)
+        clean &= found.is_clean and not (options["strict"] and found.notes)
         results.append(found.to_json())
-        if as_json:
+        if options["as_json"]:
             continue
         for line in found.problems:
             print_text(printable(f"{found.file}: {line}"))
@@ -235,7 +229,7 @@ def _list_rest(facts: dict[str, Any]) -> Iterator[Part]:
 
 @click.command()
 @click.argument("name", required=False, shell_complete=complete_stages)
-@common_options("json")
+@shared.common_options("json")
 def stages(name: str | None, **options: Any) -> None:
     """List the algorithms that a chain can use, those of one kind, or explain the one called NAME.
 

@@ -27,6 +27,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.schema import Above, Declared, declared_options, typed
 from wavebatch.files.disk.publish import protecting, refuse_input
 from wavebatch.files.text_file import find_files
+from wavebatch.tools.sheets.sheet import Part
 
 _Options = TypeVar("_Options")
 
@@ -238,6 +239,15 @@ def check_html(target: Path | None, *, will_exist: bool = False) -> None:
         from wavebatch.tools.sheets.page import check_page
 
         check_page(target)
+
+
+def write_html(target: Path | None, of: str, parts: Iterable[Part]) -> None:
+    """Write the page of --html and say so; does nothing without it. of: what its title names beside the command."""
+    if target is not None:
+        from wavebatch.tools.sheets.page import write_page
+
+        write_page(target, f"wavebatch {click.get_current_context().info_name}: {of}", parts)
+        tell(f"{target}: written")
 
 
 def find_inputs(arguments: Iterable[Path | str], **how: Any) -> list[Path]:

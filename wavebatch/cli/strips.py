@@ -123,9 +123,7 @@ def export(strips: tuple[str, ...], output: Path, recursive: bool, **options: An
     def work(path: Path) -> ExportSummary:
         with counting("waveforms", options["quiet"]) as bar:
             names = ("direction", "headerless", "overwrite")
-            summary = export_strip(
-                path, targets[path], progress=bar.update, **{name: options[name] for name in names}
-            )
+            summary = export_strip(path, targets[path], progress=bar.update, **{name: options[name] for name in names})
         numbers = f"{count(summary.points, 'point')} and {count(summary.waveforms, 'waveform')}"
         tell(f"{summary.output}: {numbers}")
         for line in summary.repaired:

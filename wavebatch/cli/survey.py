@@ -43,14 +43,7 @@ EXIT_PROBLEMS = 1
 @shared.html_option
 @shared.strip_options
 @shared.common_options("overwrite", "json")
-def survey(
-    strips: tuple[str, ...],
-    output: Path | None,
-    chain_file: Path | None,
-    angles: Path | None,
-    html_file: Path | None,
-    **options: Any,
-) -> None:
+def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None, **options: Any) -> None:
     """Measure noise, pulse and scene of strips, and choose the chain that they need.
 
     STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line. Several strips
@@ -71,9 +64,9 @@ def survey(
     """  # fmt: skip
     from wavebatch.surveying.choose_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
-    from wavebatch.tools.sheets.survey import check_angles, list_doubts, survey_sheet, write_survey_page
+    from wavebatch.tools.sheets.survey import check_angles, list_doubts, survey_page, survey_sheet
 
-    overwrite = options["overwrite"]
+    angles, html_file, overwrite = options["angles"], options["html_file"], options["overwrite"]
     paths = shared.find_inputs(strips, recursive=options["recursive"])
     for target in (output, chain_file):
         shared.check_toml(target)
@@ -85,7 +78,6 @@ def survey(
             words = "is for one strip, because widths depend on the distance of the ground"
             raise ConfigError(f"--angles {angles}: {words}")
         check_angles(angles, overwrite=overwrite)
-    options["angles"] = angles
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
     if output is not None:
         write_text(output, format_survey(saved), overwrite=overwrite)
@@ -94,14 +86,13 @@ def survey(
     document = _document(saved, facts)
     sheet = survey_sheet(saved.survey, document)
     answer(document, Sheet("survey", [*sheet.parts, *list_doubts(document)]))
-    if html_file is not None:
-        reading = {name: options[name] for name in ("direction", "headerless")}
-        failed = {*facts.get("failed", ()), *facts.get("misfits", ())}
-        used = [path for path in paths if str(path) not in failed]
-        write_survey_page(html_file, saved.survey, document, used, **reading)
-    for target in (output, chain_file, angles, html_file):
-        if target is not None:
-            tell(f"{target}: written")
+    for target in filter(None, (output, chain_file, angles)):
+        tell(f"{target}: written")
+    reading = {name: options[name] for name in ("direction", "headerless")}
+    failed = {*facts.get("failed", ()), *facts.get("misfits", ())}
+    used = [path for path in paths if str(path) not in failed]
+    of = used[0].name if len(used) == 1 else f"{len(used)} strips"
+    shared.write_html(html_file, of, survey_page(saved.survey, document, used, **reading))
     if facts.get("misfits") or facts.get("failed"):
         sys.exit(EXIT_PROBLEMS)
 

@@ -12,12 +12,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
-
-WEEK = 604_800.0
-"""Length of a GPS week [s]."""
-
-ADJUSTED = 1e9
-"""Adjusted standard GPS time is standard GPS time minus this [s] (LAS 1.4, global encoding bit 0)."""
+from wavebatch.core.units import ADJUSTED, WEEK
 
 LONGEST_GAP = 1.0
 """Gaps between two positions up to this are always bridged [s]."""

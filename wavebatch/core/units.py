@@ -1,6 +1,7 @@
 """Physical and statistical constants that several rooms use, none to be tuned, and numbers with errors as text."""
 
 import math
+from datetime import datetime, timedelta
 
 C = 0.299792458
 """Speed of light in vacuum [m/ns]."""
@@ -18,6 +19,13 @@ SQRT_PI = math.sqrt(math.pi)
 """Integral of a Gaussian squared, in amplitude squared times sigma."""
 SQRT_2PI = math.sqrt(2.0 * math.pi)
 """Integral of a Gaussian, in amplitude times sigma."""
+
+AIR_SPEED = 0.9997 * HALF_C
+"""One-way metres per two-way ns in air, whose refractive index is 1.0003, as vendors store it."""
+
+WEEK, ADJUSTED = 604_800.0, 1e9
+"""Length of a GPS week, and what adjusted standard GPS time lacks of seconds since 1980 [s] (LAS 1.4, global encoding
+bit 0)."""
 
 QUANTISATION_STD = 1.0 / math.sqrt(12.0)
 """Standard deviation of rounding to whole counts (0.2887): no noise estimate may be lower."""
@@ -51,6 +59,11 @@ _MOST_DECIMALS = 6
 
 MAD_TO_STD = 1.4826
 """Median absolute deviation of a normal distribution times this is its standard deviation."""
+
+
+def date_gps(time: float) -> datetime:
+    """Return the date of an adjusted standard GPS time [s], without leap seconds."""
+    return datetime(1980, 1, 6) + timedelta(seconds=time + ADJUSTED)
 
 
 def format_measure(value: float, error: float, sign: str = "+-") -> str:

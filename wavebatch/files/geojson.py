@@ -95,9 +95,7 @@ def read_crs_name(path: Path | str, member: Any) -> str | None:
     return ":".join(part.upper() for part in found.groups() if part) if found else name
 
 
-def place_rings(
-    file: AreaFile | None, rings: Sequence[np.ndarray], strip: Path, header: LasHeader
-) -> list[np.ndarray]:
+def place_rings(file: AreaFile | None, rings: Sequence[np.ndarray], strip: Path, header: LasHeader) -> list[np.ndarray]:
     """Return the rings in the coordinates of a strip.
 
     Rings are projected where the file names another CRS than that of the strip, or where its corners can only be

@@ -257,9 +257,7 @@ class Calibration:
 
     def widened(self, growth: float) -> Calibration:
         """Return the calibration with a further relative error of all its constants."""
-        channels = tuple(
-            replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in self.channels
-        )
+        channels = tuple(replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in self.channels)
         strips = tuple(replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in self.strips)
         whole = math.hypot(self.relative_error, growth)
         return replace(self, relative_error=whole, channels=channels, strips=strips)

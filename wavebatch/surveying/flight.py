@@ -29,15 +29,10 @@ from wavebatch.surveying.measuring.noise_and_width import FIRST_WIDTH
 from wavebatch.surveying.survey import survey_blocks
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.figures import Kind, Look
-from wavebatch.surveying.systems.survey_result import Survey
+from wavebatch.surveying.systems.saved_check import HELD
 
 LEAST_SHARE = 64
 """Waveforms that each strip gives to the survey, however many strips there are."""
-
-HELD = 512
-"""Waveforms of a strip from which it is decided whether it belongs to a flight. Their width scatters by 0.6 %, far less
-than NARROWER and WIDER, and each 100 take 2 ms per strip; a saved survey is compared with one strip by twice as many.
-"""
 
 CANDIDATES = 32
 """Strips that are tried as the one that most others agree with."""
@@ -207,20 +202,28 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
         group = fitting
     used = {index: kind for index, kind in kinds.items() if any(block.digitizer.index == index for block in blocks)}
     figures = replace(survey.figures, look=whole, kinds=used, flight_strips=float(len(group)))
-    identity = {"strips": [dict(sample.fingerprint) for sample in group]}
+    compared = {strip.path for strip in held if strip.fits and strip.look is not None and strip.look.width}
+    identity = {"strips": [_identify(sample.fingerprint, sample.path in compared) for sample in group]}
     name = group[0].path.name if len(samples) == 1 else f"{len(group)} strips"
     return Flight(SavedSurvey(replace(survey, figures=figures), name, identity), tuple(held))
 
 
-def hold_strip(reader: StripReader, scan: StripScan, flight: Survey) -> str:
+def _identify(fingerprint: Mapping[str, Any], compared: bool) -> dict[str, Any]:
+    """A strip of a flight by its content; compared: it had enough echoes, whose width and shape are the flight's."""
+    return {**fingerprint, "compared": compared}
+
+
+def hold_strip(reader: StripReader, scan: StripScan, flight: SavedSurvey) -> str:
     """Return why a strip does not belong to a surveyed flight; empty where it does, or where it has no waveforms.
+
+    A strip whose echoes were compared when the flight was surveyed is not read again: each run decides as the first.
 
     Parameters
     ----------
     reader : StripReader
     scan : StripScan
-    flight : Survey
-        Of a file that `survey_flight` made.
+    flight : SavedSurvey
+        That `survey_flight` made.
 
     Returns
     -------
@@ -231,10 +234,14 @@ def hold_strip(reader: StripReader, scan: StripScan, flight: Survey) -> str:
     ConfigError
         If the survey is not that of a flight.
     """
-    whole, kinds = read_flight(flight)
+    whole, kinds = read_flight(flight.survey)
+    fingerprint = take_fingerprint(reader.facts.path, reader.facts.packets.file)
+    surveyed = flight.fingerprint.get("strips")
+    if isinstance(surveyed, list) and _identify(fingerprint, compared=True) in surveyed:
+        return ""
     number = min(HELD, sample_size(reader, scan))
-    sample = StripSample(reader.facts.path, {}, tuple(reader.sample_blocks(scan, number)))
-    return _hold((sample, None), flight.system, whole, kinds).reason if sample.blocks else ""
+    sample = StripSample(reader.facts.path, fingerprint, tuple(reader.sample_blocks(scan, number)))
+    return _hold((sample, None), flight.survey.system, whole, kinds).reason if sample.blocks else ""
 
 
 def _hold(

@@ -136,7 +136,7 @@ def _hold(reader: StripReader, scan: StripScan, request: Request) -> tuple[str, 
     if request.flight:
         from wavebatch.surveying.flight import hold_strip  # and with it the survey
 
-        return hold_strip(reader, scan, request.system.survey), ""
+        return hold_strip(reader, scan, request.system), ""
     return "", check_saved(reader, scan, request.system.survey, force=request.force)
 
 

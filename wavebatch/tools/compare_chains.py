@@ -16,6 +16,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import EvenSample
+from wavebatch.core.units import AIR_SPEED
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.packets import MAX_SAMPLES
@@ -273,7 +274,7 @@ class _Found(Solved):
         """
         rows = self.rows(block)
         rows["ray"] = rows["xyz"] = 0.0
-        rows["xyz"][:, 2] = -pairing.SPEED * self.echoes.time
+        rows["xyz"][:, 2] = -AIR_SPEED * self.echoes.time
         rows["echo_time"] = np.nan  # the distances are these times: they would be compared twice
         return rows
 

@@ -181,9 +181,7 @@ def _list_digitizers(reader: StripReader, scan: StripScan) -> dict[tuple[int, in
     return {name: replace(found[name], n_samples=reader.facts.digitizers[name[0]].n_samples) for name in names}
 
 
-def _build_points(
-    unit: Unit, dtype: np.dtype, index: np.ndarray, offset: np.ndarray, size: np.ndarray
-) -> np.ndarray:
+def _build_points(unit: Unit, dtype: np.dtype, index: np.ndarray, offset: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Points of a unit with the places of their new packets; those without a usable packet get none."""
     points = np.ascontiguousarray(unit.points).view(dtype).copy()
     has = np.flatnonzero(unit.packet_of_point >= 0)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.core.no_data import without_nan
+from wavebatch.core.units import ADJUSTED, WEEK, date_gps
 from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.las import header as las
@@ -25,12 +25,6 @@ from wavebatch.files.las.read_points import CheckedHeader, read_checked_header
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.inspect_strip import describe_samples
 
-_GPS_EPOCH = datetime(1980, 1, 6)
-_ADJUSTED = 1e9
-"""Seconds that adjusted standard GPS time leaves out."""
-_WEEK = 604_800.0
-_STANDARD_TIME = 0b1
-"""Bit of the global encoding: times are adjusted standard GPS time, not seconds of the week."""
 _MOST_SOURCES = 20
 
 
@@ -219,12 +213,11 @@ def _describe_time(header: las.LasHeader, found: tuple[float, float] | None) -> 
     """First and last GPS time, its kind, and the dates; None for a point format without times."""
     if found is None:
         return None
-    standard = bool(header.global_encoding & _STANDARD_TIME)
+    standard = bool(header.global_encoding & las.STANDARD_TIME)
     kind = "adjusted standard" if standard else "seconds of the week"
-    if not standard and found[1] > _WEEK:
+    if not standard and found[1] > WEEK:
         kind = "unknown (the header says seconds of the week, but they are too large)"
     times = {"least": found[0], "largest": found[1], "kind": kind}
-    if standard and -_ADJUSTED < found[0] <= found[1] < 4 * _ADJUSTED:
-        dates = [_GPS_EPOCH + timedelta(seconds=value + _ADJUSTED) for value in found]
-        times["dates_gps"] = [date.isoformat(sep=" ", timespec="seconds") for date in dates]
+    if standard and -ADJUSTED < found[0] <= found[1] < 4 * ADJUSTED:
+        times["dates_gps"] = [date_gps(time).isoformat(sep=" ", timespec="seconds") for time in found]
     return times

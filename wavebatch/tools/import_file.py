@@ -26,7 +26,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import option
-from wavebatch.core.units import MAD_TO_STD, PS_PER_NS, QUANTISATION_STD
+from wavebatch.core.units import ADJUSTED, MAD_TO_STD, PS_PER_NS, QUANTISATION_STD, WEEK
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files import pulsewaves_file
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
@@ -227,10 +227,6 @@ MOST_DESCRIPTORS = 250
 """Wave packet descriptors that a strip gets: LAS has 255. With more lengths, lengths are rounded up."""
 SAMPLED = 2 * STACKED
 """Pulses of the sample, about."""
-STANDARD_TIME = 1e9
-"""What GPS times in LAS lack: they are seconds since 1980 less this."""
-SECONDS_OF_WEEK = 604_800 * 2
-"""Largest time that can be one of a GPS week; flights over its end count on."""
 ONE_TIME = 64
 """Pulses of one time from which that is no time."""
 
@@ -321,10 +317,10 @@ def make_plan(reader: PulseReader) -> Plan:
     ratios, unknown = ({}, others) if ratio is None or ratio <= 1 else ({others[0]: ratio}, ())
     noise = max(float(np.median(np.concatenate(steps))) * MAD_TO_STD / np.sqrt(2), QUANTISATION_STD)
     latest = max(abs(time * header.time_scale + header.time_offset) for time in (first, last))
-    week = latest <= SECONDS_OF_WEEK
+    week = latest <= 2 * WEEK  # flights over the end of a week count on
     return Plan(
         primary, overlap.top, ratios, unknown, noise, _list_digitizers(codes, ratios), _learn_outgoing(outgoing),
-        header.count >= ONE_TIME and first == last, week, header.time_offset - (0.0 if week else STANDARD_TIME),
+        header.count >= ONE_TIME and first == last, week, header.time_offset - (0.0 if week else ADJUSTED),
         intensity == 0,
     )  # fmt: skip
 
@@ -713,7 +709,8 @@ def find_frame(reader: PulseReader) -> Frame:
     first = next(iter(reader.pieces())).anchor[:1] if header.count else np.zeros((1, 3))
     zero = _ZONES.get(keys.code or 4326)
     if keys.kind == "geographic" and zero is not None:
-        zone, south = find_utm_zone(float(first[0, 0])), bool(first[0, 1] < 0) and zero == 32600
+        # Longitudes from -180 to 360.
+        zone, south = int((first[0, 0] + 180) // 6) % 60 + 1, bool(first[0, 1] < 0) and zero == 32600
         code = zero + zone + (100 if south else 0)
         note = f"coordinates are degrees; they are projected to UTM zone {zone}{'S' if south else 'N'} (EPSG:{code})"
         frame = Frame(zone, south, (SCALE,) * 3, (0.0,) * 3, build_utm(code), (), (note,))
@@ -736,11 +733,6 @@ def find_frame(reader: PulseReader) -> Frame:
 _AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257222101
 """GRS80 [m]; WGS 84 differs by 0.1 mm."""
 _SCALE, _EASTING, _NORTHING = 0.9996, 500_000.0, 10_000_000.0
-
-
-def find_utm_zone(longitude: float) -> int:
-    """Return the UTM zone, 1 to 60, of a longitude in degrees (-180 to 360)."""
-    return int((longitude + 180) // 6) % 60 + 1
 
 
 def project_utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, *, south: bool) -> tuple[np.ndarray, ...]:

@@ -21,11 +21,11 @@ from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.order import EvenSample
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
+from wavebatch.core.units import AIR_SPEED, FWHM_PER_SIGMA, MAD_TO_STD
 from wavebatch.files.cloud.cloud_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.cloud.point_filter import EVERY, PointFilter
 from wavebatch.files.disk.raw_bytes import Closing
-from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, spread_times
+from wavebatch.files.disk.temp_store import BUCKET_ROWS, Spool, count_buckets, spread_keys, time_keys
 from wavebatch.files.las.header import CLASS_NAMES
 from wavebatch.kernels.fit.closed_form import crlb
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
@@ -170,9 +170,7 @@ LEAST_SHARED = 0.05
 """Share of the pulses that two clouds of one strip have in common at least; else echoes are matched by position."""
 
 
-def open_task(
-    first: CloudReader, second: CloudReader, tolerance_ns: float, held: int = BUCKET_ROWS
-) -> CloudTask:
+def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float, held: int = BUCKET_ROWS) -> CloudTask:
     """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
     by_time = pulses_told_apart(first) and pulses_told_apart(second) and _share_times(first, second)
     for reader in (first, second):
@@ -223,7 +221,7 @@ class CloudTask(Closing):
     def add(self, side: int, rows: np.ndarray) -> None:
         """Adds rows of a (side 0), of b (1) or of the truth's packets (2)."""
         if self.by_time:
-            self.buckets[side].append(spread_times(rows["gps_time"], self.number), rows)
+            self.buckets[side].append(spread_keys(time_keys(rows["gps_time"]), self.number), rows)
         else:
             # Each point goes to its slab, and to the neighbouring slabs that it is close to.
             low = np.searchsorted(self.borders, rows["xyz"][:, 0] - 2 * self.pairing.tolerance)
@@ -261,7 +259,7 @@ class Pairing:
     """
 
     def __init__(self, tolerance_ns: float, meta: dict | None = None, limit: int | None = None) -> None:
-        self.tolerance, self.tolerance_ns = tolerance_ns * SPEED, tolerance_ns
+        self.tolerance, self.tolerance_ns = tolerance_ns * AIR_SPEED, tolerance_ns
         self.meta = meta
         self.pulses = self.exact = self.matched = 0
         self.echoes = [0, 0]
@@ -412,8 +410,6 @@ def _list_crowded(
 
 # Differences of pairs
 
-SPEED = 0.9997 * HALF_C
-"""Metres along the ray per ns; the factor is the refractive index of air, n = 1.0003."""
 _BOTH = ("echo_time", "amplitude", "echo_width")
 """Columns that are compared if both sides have them."""
 GROUPS = {"class": "classification", "echoes": "total"}
@@ -444,7 +440,7 @@ class Differences:
     def add(self, a: np.ndarray, b: np.ndarray) -> None:
         """Adds pairs: a[i] with b[i]."""
         part = {name: a[name].astype(np.float64) - b[name] for name in _BOTH}
-        part["time"] = measure_lag(a, b) / SPEED
+        part["time"] = measure_lag(a, b) / AIR_SPEED
         for name, values in part.items():
             good = values[~np.isnan(values)]
             self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
@@ -499,8 +495,8 @@ class Differences:
         reported = {name: data[name].astype(np.float64) for name in ("range_err", "amplitude_err", "echo_width_err")}
         bounds = crlb(amplitude, sigma, meta["noise_std"], meta["spacing"])
         columns = {
-            "time": (data["time"], bounds[0], reported["range_err"] / SPEED),
-            "echo_time": (data["echo_time"], bounds[0], reported["range_err"] / SPEED),
+            "time": (data["time"], bounds[0], reported["range_err"] / AIR_SPEED),
+            "echo_time": (data["echo_time"], bounds[0], reported["range_err"] / AIR_SPEED),
             "amplitude": (data["amplitude"], bounds[1], reported["amplitude_err"]),
             "sigma": (data["echo_width"] / FWHM_PER_SIGMA, bounds[2], reported["echo_width_err"] / FWHM_PER_SIGMA),
         }

@@ -322,9 +322,7 @@ class GridOptions:
         1.0, "Side of a cell, in the unit of the coordinates. Borders are multiples of it, so that neighbouring "
         "rasters fit together.", form="M",
     )  # fmt: skip
-    crs: str | None = option(
-        None, "CRS of the clouds, e.g. EPSG:32632.", form="CRS", unset="that of their headers"
-    )
+    crs: str | None = option(None, "CRS of the clouds, e.g. EPSG:32632.", form="CRS", unset="that of their headers")
     no_data: float = option(-9999.0, "Value of cells without data; nan is possible.", form="VALUE")
     forest: ForestOptions | None = None
     """Metrics of voxels, in place of columns and a statistic."""

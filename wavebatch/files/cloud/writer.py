@@ -517,9 +517,7 @@ def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], numb
     if len(payload) > MOST_PAYLOAD:
         payload = _encode_json(_shorten(json.loads(payload)))
     if len(payload) > MOST_PAYLOAD:
-        raise ConfigError(
-            f"{path}: the provenance takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}"
-        )
+        raise ConfigError(f"{path}: the provenance takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}")
     return las.Vlr(USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
 
 

@@ -2,7 +2,7 @@
 
 The strip scan, the second pass, the voxel grid and all that compares clouds use it. Folders are removed when their
 process ends, or by the next run if it was killed: a folder is in use as long as it is locked. `Spool` sorts entries
-into numbered buckets (`count_buckets`, `spread_times`), `RowParcel` takes rows from one process to another past the one
+into numbered buckets (`count_buckets`, `spread_keys`), `RowParcel` takes rows from one process to another past the one
 that writes the cloud, `RowStore` keeps the rows of a cloud for the second pass, `KeyedSums` sums integers by key. All
 points of a pulse must come into the same bucket: sort by keys that are equal for equal GPS times.
 """
@@ -141,9 +141,7 @@ class Spool(Closing):
     bytes of entries that travel themselves to other processes; more of them read a file.
     """
 
-    def __init__(
-        self, buckets: int, dtype: np.dtype, *, memory: int = SPOOL_MEMORY, kept: int = SPOOL_KEPT
-    ) -> None:
+    def __init__(self, buckets: int, dtype: np.dtype, *, memory: int = SPOOL_MEMORY, kept: int = SPOOL_KEPT) -> None:
         self.buckets, self._most, self._kept = buckets, memory, kept
         self.dtype = np.dtype(dtype)
         self.path: Path | None = None
@@ -479,11 +477,6 @@ _MIX = np.uint64(0x9E3779B97F4A7C15)
 def count_buckets(rows: int, held: int = BUCKET_ROWS) -> int:
     """Return how many buckets of at most `held` rows are needed, at most MOST_BUCKETS."""
     return min(-(-max(rows, 1) // held), MOST_BUCKETS)
-
-
-def spread_times(gps_time: np.ndarray, number: int) -> np.ndarray:
-    """Return the bucket i8 (n,) of GPS times f8 (n,) [s]: a pulse in one bucket, pulses spread evenly."""
-    return spread_keys(time_keys(gps_time), number)
 
 
 def time_keys(gps_time: np.ndarray) -> np.ndarray:

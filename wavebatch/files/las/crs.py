@@ -384,9 +384,7 @@ def repair_evlr(path: Path, evlr: las.Evlr) -> bytes | None:
     """
     if not las.is_projection(evlr) or evlr.record_id != las.WKT_ID or evlr.length > LONGEST_WKT:
         return None
-    with open(path, "rb") as file:
-        file.seek(evlr.start + las.EVLR_HEADER_SIZE)
-        text = _repair_payload(file.read(evlr.length))
+    text = _repair_payload(las.read_evlr(path, evlr))
     return None if text is None else las.build_wkt(text).payload
 
 
@@ -529,9 +527,7 @@ def _read_records(path: Path, header: las.LasHeader) -> dict[int, bytes]:
     for evlr in evlrs:
         new = las.is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in found
         if new and evlr.length <= LONGEST_WKT:
-            with open(path, "rb") as file:
-                file.seek(evlr.start + las.EVLR_HEADER_SIZE)
-                found[evlr.record_id] = file.read(evlr.length)
+            found[evlr.record_id] = las.read_evlr(path, evlr)
     return found
 
 

@@ -335,6 +335,13 @@ def find_evlrs(path: Path, header: LasHeader, most: int = MAX_EVLRS) -> tuple[li
     return found, header.evlr_count - len(found)
 
 
+def read_evlr(path: Path, evlr: Evlr) -> bytes:
+    """Return the payload of an extended record."""
+    with open(path, "rb") as file:
+        file.seek(evlr.start + EVLR_HEADER_SIZE)
+        return file.read(evlr.length)
+
+
 def decode_text(data: bytes) -> str:
     """Return a text field up to its first NUL; bytes that are not ASCII show as Latin-1."""
     return data.split(b"\0")[0].decode("latin-1")

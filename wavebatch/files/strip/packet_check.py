@@ -685,9 +685,7 @@ def _find_orders(
     return found
 
 
-def _decide_direction(
-    digitizers: Mapping[int, Digitizer], votes: Mapping[int, _Votes], index: int
-) -> tuple[bool, str]:
+def _decide_direction(digitizers: Mapping[int, Digitizer], votes: Mapping[int, _Votes], index: int) -> tuple[bool, str]:
     """Whether the signal of a descriptor goes down, and why; where its waveforms do not show it, all that have its
     sign of the gain do."""
     negative = digitizers[index].gain < 0

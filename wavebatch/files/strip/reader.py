@@ -137,9 +137,7 @@ class StripReader(Closing):
         self._points.close()
         self._packets.close()
 
-    def scan(
-        self, *, tolerant: bool = False, force: bool = False, parts: Sequence[ScanPart] = ()
-    ) -> StripScan:
+    def scan(self, *, tolerant: bool = False, force: bool = False, parts: Sequence[ScanPart] = ()) -> StripScan:
         """Return the result of one pass over the point records; samples of some packets are read.
 
         tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse

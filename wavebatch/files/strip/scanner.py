@@ -346,7 +346,8 @@ def cut_scan(units: int, unit_points: int, parts: int, sizes: ScanSizes = SCAN_S
     """Cut a strip into at most so many runs of units [first, last) that `scan_units` may take one by one."""
     most = units // sizes.part_units if unit_points >= sizes.window + LONGEST_RUN else 1
     parts = max(1, min(parts, most))
-    return list(itertools.pairwise(units * part // parts for part in range(parts + 1)))
+    # The first runs are the longer ones: the others also decode what lies before them.
+    return list(itertools.pairwise(-(-units * part // parts) for part in range(parts + 1)))
 
 
 @changeable

@@ -99,9 +99,11 @@ def deconvolve_wiener(signal: np.ndarray, taps: np.ndarray, noise_to_signal: flo
 
 
 def deconvolve_richardson_lucy(
-    signal: np.ndarray, taps: np.ndarray, background: np.ndarray, iterations: int, *, accelerate: bool = True
+    signal: np.ndarray, taps: np.ndarray, background: np.ndarray, iterations: int
 ) -> np.ndarray:
     """Signal deconvolved by expectation maximisation for Poisson counts; never negative.
+
+    Each step is extrapolated from the two before it, which is worth about five times the iterations.
 
     Parameters
     ----------
@@ -113,8 +115,6 @@ def deconvolve_richardson_lucy(
         Added to signal and model, so that noise about 0 is not taken for signal; positive.
     iterations : int
         Number of steps.
-    accelerate : bool
-        Extrapolate each step from the two before it; worth about five times the iterations.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def deconvolve_richardson_lucy(
     before = change = np.zeros_like(estimate)
     for iteration in range(iterations):
         start = estimate
-        if accelerate and iteration > 1:
+        if iteration > 1:
             start = np.maximum(estimate + _share(change, before) * (estimate - previous), 0)
         model = convolve_pulse(start, taps)
         model += background
@@ -138,8 +138,7 @@ def deconvolve_richardson_lucy(
         ratio = correlate_pulse(np.divide(data, model, out=model), taps)
         ratio *= weight
         previous, estimate = estimate, start * ratio
-        if accelerate:
-            before, change = change, estimate - start
+        before, change = change, estimate - start
     return estimate
 
 
@@ -149,9 +148,7 @@ def _share(change: np.ndarray, before: np.ndarray) -> np.ndarray:
     return np.clip(along / np.where(length > 0, length, 1), 0, 1)
 
 
-def deconvolve_gold(
-    signal: np.ndarray, taps: np.ndarray, iterations: int, *, rounds: int = 1, boost: float = 1.0
-) -> np.ndarray:
+def deconvolve_gold(signal: np.ndarray, taps: np.ndarray, iterations: int) -> np.ndarray:
     """Signal deconvolved by Gold's ratios; never negative. Negative samples count as 0.
 
     Parameters
@@ -161,11 +158,7 @@ def deconvolve_gold(
     taps : float (k,)
         Pulse.
     iterations : int
-        Number of steps of a round.
-    rounds : int
-        Number of rounds.
-    boost : float
-        Power to which the result is raised between rounds.
+        Number of steps.
 
     Returns
     -------
@@ -174,13 +167,9 @@ def deconvolve_gold(
     data = np.maximum(signal, 0)
     target = np.maximum(correlate_pulse(data, taps), 0)
     estimate = data.copy()
-    for number in range(rounds):
-        if number:
-            top = np.maximum(estimate.max(axis=0), FLOOR)
-            estimate = top * (estimate / top) ** signal.dtype.type(boost)
-        for _ in range(iterations):
-            model = correlate_pulse(convolve_pulse(estimate, taps), taps)
-            estimate = np.divide(estimate * target, model, out=np.zeros_like(model), where=model > 0)
+    for _ in range(iterations):
+        model = correlate_pulse(convolve_pulse(estimate, taps), taps)
+        estimate = np.divide(estimate * target, model, out=np.zeros_like(model), where=model > 0)
     return estimate
 
 

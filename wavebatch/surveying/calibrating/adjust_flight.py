@@ -96,9 +96,7 @@ def hash_squares(xyz: np.ndarray) -> np.ndarray:
     return (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53
 
 
-def measure_ties(
-    rows: np.ndarray, size: float, slope: float | None = None, rights: np.ndarray | None = None
-) -> Ties:
+def measure_ties(rows: np.ndarray, size: float, slope: float | None = None, rights: np.ndarray | None = None) -> Ties:
     """Measure what each source saw in each flat cell.
 
     Parameters

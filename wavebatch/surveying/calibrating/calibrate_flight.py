@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ from wavebatch.core.order import even_places
 from wavebatch.core.waveforms import angle_across, angle_to_vertical, swath_columns
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.crs import describe_crs
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.las.header import read_header
 from wavebatch.surveying.calibrating.adjust_flight import (
     TIE,
     VIEW,
@@ -108,13 +107,6 @@ class Source(NamedTuple):
         return self.strip.path.name + (of if len(self.strip.channels) > 1 else "")
 
 
-def find_box(path: Path) -> _Box:
-    """Lower and upper corner of a strip in x and y by its header."""
-    with StripReader(path) as reader:
-        header = reader.facts.header
-        return np.array(header.mins[:2]), np.array(header.maxs[:2])
-
-
 def read_strip(
     path: Path,
     number: int,
@@ -185,10 +177,6 @@ class _TieArea:
         return inside & (hash_squares(xyz) < self._share)
 
 
-def _lies_on(target: Target, xyz: np.ndarray) -> np.ndarray:
-    return target.contains(xyz[:, 0], xyz[:, 1])
-
-
 def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> tuple[list[np.ndarray], np.ndarray]:
     """Echoes on each target (ECHO), and those for ties (TIE, with channels as sources)."""
     if source.column is not None:
@@ -199,7 +187,7 @@ def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> t
         corners = np.concatenate([target.corners for target in targets])
         low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
         near = lambda xyz: ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)  # noqa: E731
-        inside = [partial(_lies_on, target) for target in targets]
+        inside = [target.contains for target in targets]
     on_targets: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in inside]
     parts = [np.empty(0, TIE)]
 
@@ -255,9 +243,7 @@ class Trend(NamedTuple):
     """Root mean square of what it changes against the places of the targets, relative."""
 
 
-def fit_swath(
-    ties: Ties, anchors: Anchors, seen: np.ndarray
-) -> tuple[Adjustment, tuple[float, ...], float | None]:
+def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustment, tuple[float, ...], float | None]:
     """Adjust the constants with a term over the scan angle.
 
     Parameters
@@ -417,7 +403,7 @@ def calibrate_flight(
     options = options or CalibrationOptions()
     check_attenuation(options.air)
     _refuse_zones(paths)
-    boxes = [find_box(path) for path in paths]
+    boxes = [(np.array(one.mins[:2]), np.array(one.maxs[:2])) for one in map(read_header, paths)]
     strips: list[FlightStrip] = []
     for i, path in enumerate(paths):
         # All energies count relative to those of the first strip: the mean of each would hide what lasers lose.

@@ -170,12 +170,13 @@ class Target:
         (corners,) = place_rings(self.file, [self.corners], strip, header)
         return replace(self, corners=corners, file=None)
 
-    def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return whether points at x, y, f8 (n,) [m], lie inside, bool (n,)."""
-        return find_inside([self.corners], x, y)
+    def contains(self, xyz: np.ndarray) -> np.ndarray:
+        """Return whether positions f8 (n, 3) [m] lie inside, bool (n,)."""
+        return find_inside([self.corners], xyz[:, 0], xyz[:, 1])
 
-    def depth(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the distance of points at x, y to the outline, f8 (n,) [m]; it does not say on which side."""
+    def depth(self, xyz: np.ndarray) -> np.ndarray:
+        """Return the distance of positions f8 (n, 3) to the outline, f8 (n,) [m]; it does not say on which side."""
+        x, y = xyz[:, 0], xyz[:, 1]
         best = np.full(len(x), np.inf)
         for (x0, y0), (x1, y1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
             dx, dy = x1 - x0, y1 - y0

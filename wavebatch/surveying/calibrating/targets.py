@@ -235,7 +235,7 @@ def measure_target(
             "give its incidence [deg] in the target file, or a target that several scan lines cross"
         )
         return replace(blank, refused=reason), *nothing
-    depth = target.depth(rows["xyz"][:, 0], rows["xyz"][:, 1])
+    depth = target.depth(rows["xyz"])
     radius = 0.5e-3 * (divergence or ASSUMED_DIVERGENCE) * float(np.median(rows["distance"]))
     inset = INSET * radius / max(float(np.cos(np.median(angle))), 0.1)
     used = facet.kept & (depth >= inset)
@@ -248,7 +248,8 @@ def measure_target(
         return replace(blank, refused=reason, inset_m=round(inset, 3)), *nothing
     bright = target.reflectance * (1.0 + target.hot_spot)
     constant = 4.0 * bright * np.cos(angle[used]) / rows["light"][used]
-    relative = _by_channel(constant, rows["channel"][used])
+    _, channel = np.unique(rows["channel"][used], return_inverse=True)
+    relative = constant / group_medians(constant, channel)[0][channel]
     (edge, edge_err), (strange, strange_err) = _compare_edge(relative, depth[used]), _share_strange(relative)
     result = replace(
         summarise(blank, constant),
@@ -340,12 +341,6 @@ def summarise(blank: TargetResult, constant: np.ndarray) -> TargetResult:
     """Return the result with number, median and relative robust spread of constants (n,), n > 0."""
     middle = float(np.median(constant))
     return replace(blank, echoes=len(constant), constant=middle, spread=robust_std(constant) / middle)
-
-
-def _by_channel(constant: np.ndarray, channel: np.ndarray) -> np.ndarray:
-    """Constants over the median of their channel."""
-    _, group = np.unique(channel, return_inverse=True)
-    return constant / group_medians(constant, group)[0][group]
 
 
 def _share_strange(constant: np.ndarray) -> tuple[float, float]:

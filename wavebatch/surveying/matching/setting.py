@@ -7,14 +7,13 @@ makes another sensor of it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.order import even_places, robust_std
-from wavebatch.core.units import HALF_C, MEDIAN_ERROR
+from wavebatch.core.units import ADJUSTED, HALF_C, MEDIAN_ERROR, WEEK, date_gps
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.header import decode_text
@@ -106,17 +105,10 @@ LEAST_IN_ORDER = 0.8
 SCANNERS = 4
 """Scanner channels of LAS points (0 to 3). A channel number here is SCANNERS x digitizer + scanner channel."""
 
-OTHER_PULSE = (
-    "echoes were taken for those of another pulse; resolve the pulse zones again with the sensor's software"
-)
+OTHER_PULSE = "echoes were taken for those of another pulse; resolve the pulse zones again with the sensor's software"
 
 _CHANNEL_SAMPLE = 4096
 """Waveforms that show which scanner channels a strip has."""
-
-_GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-_ADJUSTED = 1e9
-"""Seconds that LAS takes off standard GPS time."""
-_WEEK = 604_800.0
 
 
 _Channel = tuple[int, int]
@@ -283,7 +275,7 @@ def measure_setting(
         block = sensor.fill(block)
         if block.sensor is None:
             continue
-        above = _take_off_level(block)
+        above = take_off_level(block)
         time = block.spacing * np.nanargmax(above, axis=1)
         away = block.origin + block.direction * time[:, None] - block.sensor
         distance = np.sqrt((away * away).sum(axis=1))
@@ -437,13 +429,9 @@ def weigh_alike(rest: np.ndarray) -> float:
     return FEW_PARTS * (1.0 + 2.0 * float(alike[1 : int(np.argmax(alike <= 0.0))].sum()))
 
 
-def sum_light(block: WaveformBlock) -> np.ndarray:
-    """Sum of the samples of each waveform above its median, f4 (n,) [DN]: the light of whole pulses, not fitted."""
-    return np.nansum(_take_off_level(block), axis=1)
-
-
-def _take_off_level(block: WaveformBlock) -> np.ndarray:
-    """Samples f4 (n, s) over the median of their waveform; NaN where they are missing."""
+def take_off_level(block: WaveformBlock) -> np.ndarray:
+    """Return samples f4 (n, s) over the median of their waveform, whose sum is the light of a pulse without any fit;
+    NaN where they are missing."""
     samples = block.samples.astype(np.float32)
     if block.missing is not None:
         samples[block.missing] = np.nan
@@ -468,10 +456,8 @@ def read_day(reader: StripReader) -> str:
     header = reader.facts.header
     if not header.point_count or not header.global_encoding & 1:
         return ""
-    second = float(reader.read_points(0, 1)["gps_time"][0]) + _ADJUSTED
-    if not _WEEK < second < 4e9:
-        return ""
-    return (_GPS_EPOCH + timedelta(seconds=second)).date().isoformat()
+    time = float(reader.read_points(0, 1)["gps_time"][0])
+    return date_gps(time).date().isoformat() if WEEK < time + ADJUSTED < 4e9 else ""
 
 
 def read_sensor_name(facts: StripFacts) -> str:

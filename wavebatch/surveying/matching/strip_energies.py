@@ -19,7 +19,7 @@ from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.matching.setting import SCANNERS, sum_light, weigh_alike
+from wavebatch.surveying.matching.setting import SCANNERS, take_off_level, weigh_alike
 
 OTHER_UNIT = 3.0
 """Ratio of mean energies from which a log is in another unit: lasers lose a half of their energy at most."""
@@ -187,7 +187,7 @@ def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy
         sent = np.ones(len(block)) if given is None else given
         channel = np.full(len(block), SCANNERS * block.digitizer.index)
         channel += 0 if block.scanner is None else block.scanner
-        parts.append(np.stack([block.gps_time, sum_light(block), sent, channel]))
+        parts.append(np.stack([block.gps_time, np.nansum(take_off_level(block), axis=1), sent, channel]))
     joined = np.concatenate(parts, axis=1)
     return joined[:, np.argsort(joined[0], kind="stable")]
 

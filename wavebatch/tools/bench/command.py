@@ -7,22 +7,19 @@ fast. A scene may be shaped like a strip: it draws whole waveforms of a sample o
 chain that a survey of a group chooses.
 
 `time_chains` measures run time and memory: kernels alone and from file to file, each chain in a process with one
-thread. The chains take turns, so that other load of the machine slows all of them alike. The process of a Worker is a
-plain one, not of multiprocessing, which would import the caller's main module into it.
+thread. The chains take turns, so that other load of the machine slows all of them alike. The process of a Worker is
+one of those of `wavebatch run`.
 
 The sheet, bench.json, bench.txt, a page and plots of error against run time show the document. A column of a table
-names a figure of the rows. `align` makes tables of the examples and of tests/bench.
+names a figure of the rows.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import os
 import pickle
 import re
-import subprocess
 import sys
 import tempfile
 import time
@@ -31,6 +28,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -40,10 +38,12 @@ from wavebatch.batch.job import StripJob, choose_columns
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.unit import BLOCK_SAMPLES
+from wavebatch.batch.workers.futures import PATIENCE, WorkerDied, end_future, wait_uninterrupted
+from wavebatch.batch.workers.spawned import Call, PipedProcess, start_early, take_early
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.errors import ConfigError, InputError, StageError, advise_install
+from wavebatch.core.errors import ConfigError, InputError, advise_install
 from wavebatch.core.frozen import frozen
-from wavebatch.core.process import CHILD, Seconds
+from wavebatch.core.process import Seconds
 from wavebatch.core.schema import Range, option
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -59,11 +59,10 @@ from wavebatch.stages.score import QUANTITIES
 from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.choose_chain import SAMPLE, choose_chain
 from wavebatch.surveying.look import pool_blocks
-from wavebatch.surveying.systems.survey_result import Survey
 from wavebatch.tools.api import AUTO
 from wavebatch.tools.bench import accuracy
 from wavebatch.tools.bench.accuracy import find_front
-from wavebatch.tools.sheets.sheet import Cell, Later, Note, Part, Picture, Sheet, Table, list_lines
+from wavebatch.tools.sheets.sheet import Cell, Later, Note, Part, Picture, Sheet, Table
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene, simulate_blocks, simulate_strip
 from wavebatch.tools.simulate.scenes import Drawn
 
@@ -132,7 +131,7 @@ def _measure_scene(
 ) -> dict[str, Any]:  # fmt: skip
     seed = accuracy.derive_seed(options.seed, place)
     groups = accuracy.make_groups(scene, options.waveforms, seed, progress)
-    chosen = [choose_chains(chains, group.survey) for group in groups]
+    chosen = [{**chains, AUTO: choose_chain(group.survey)} for group in groups]
     twin = find_twin(chosen)
     measured = {name: chain for name, chain in chosen[0].items() if name != AUTO or twin is None}
     tallies = {name: accuracy.AccuracyTally() for name in measured}
@@ -212,20 +211,13 @@ def load_chains(files: Sequence[Path]) -> dict[str, Chain]:
     return chains
 
 
-def choose_chains(chains: Mapping[str, Chain], survey: Survey) -> dict[str, Chain]:
-    """The given chains, and as `auto` the one that the survey chooses."""
-    return {**chains, AUTO: choose_chain(survey)}
-
-
 def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
     """The chain that equals `auto` on every strip, so that `auto` need not be measured; None if there is none.
 
     chosen: the chains of each strip.
     """
-    for name in chosen[0]:
-        if name != AUTO and all(AUTO in c and effective(c[name]) == effective(c[AUTO]) for c in chosen):
-            return name
-    return None
+    same = (name for name in chosen[0] if all(effective(each[name]) == effective(each[AUTO]) for each in chosen))
+    return next((name for name in same if name != AUTO), None)
 
 
 def list_methods() -> dict[str, Chain]:
@@ -463,65 +455,32 @@ def peak_memory() -> int | None:
     return most if sys.platform == "darwin" else most * 1024
 
 
-_START = "from wavebatch.tools.bench.command import serve; serve()"
-
-
-class BenchWorkerDied(Exception):
-    """The process ended before it answered."""
-
-
 class Worker(Closing):
-    """Runs functions in another Python process, one after another; a context manager."""
+    """Runs functions in a process of their own, one after another; a context manager."""
 
     def __init__(self) -> None:
-        path = [str(Path(__file__).resolve().parents[3]), *filter(None, [os.environ.get("PYTHONPATH")]), *sys.path]
-        environment = {**os.environ, **CHILD, "PYTHONPATH": os.pathsep.join(path)}
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
-        )
+        self._calls: SimpleQueue[Call | None] = SimpleQueue()
+        start_early(1)
+        self._process = PipedProcess(take_early(), self._calls, None)
 
     def call(self, function: Callable, *arguments: Any) -> Any:
-        """`function(*arguments)` computed in the process; the function must be importable by name.
+        """`function(*arguments)` computed in the process; both must be picklable.
 
         Raises WorkerDied, or whatever the function raised. A caller that cannot wait uses a thread: `close` ends it.
         """
-        try:
-            pickle.dump((function, arguments), self._process.stdin, pickle.HIGHEST_PROTOCOL)
-            self._process.stdin.flush()
-            kind, value = pickle.load(self._process.stdout)
-        except (EOFError, OSError, ValueError, pickle.UnpicklingError):
-            raise BenchWorkerDied("the measuring process ended") from None
-        if kind == "raised":
-            raise value
-        return value
+        call = Call(pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL))
+        self._calls.put(call)
+        while not wait_uninterrupted([call.future], PATIENCE):
+            self._process.look()
+            if not self._process.serves:  # it died before it took the call
+                end_future(call.future, error=WorkerDied())
+        return call.future.result()
 
     def close(self) -> None:
         """Kills the process."""
-        self._process.kill()
-        self._process.wait()
-        with contextlib.suppress(OSError):  # what a call had not sent yet
-            self._process.stdin.close()
-        self._process.stdout.close()
-
-
-def serve() -> None:
-    """Answers calls on stdin until stdin ends; other output to stdout is sent to stderr."""
-    from wavebatch.core.process import keep_freed_memory
-
-    keep_freed_memory()
-    replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-    while True:
-        try:
-            function, arguments = pickle.load(sys.stdin.buffer)
-        except EOFError:
-            return
-        try:
-            answer = ("value", function(*arguments))
-        except Exception as error:
-            answer = ("raised", StageError(f"{type(error).__name__}: {error}"))
-        pickle.dump(answer, replies, pickle.HIGHEST_PROTOCOL)
-        replies.flush()
+        self._process.process.kill()
+        self._calls.put(None)
+        self._process.process.join()
 
 
 # The document as a sheet
@@ -562,11 +521,6 @@ def bench_sheet(document: Mapping[str, Any]) -> Sheet:
     )
     scenes = (_scene_sheet(one, document.get("tolerance_cm")) for one in document["scenes"])
     return Sheet("bench", [Note(words), *scenes])
-
-
-def format_document(document: Mapping[str, Any]) -> str:
-    """The text of a benchmark."""
-    return "\n".join(list_lines(bench_sheet(document)))
 
 
 def _scene_sheet(section: Mapping[str, Any], tolerance_cm: float | None) -> Sheet:
@@ -632,13 +586,6 @@ def figure_text(row: Mapping[str, Any], column: ReportColumn) -> str:
     return text if figure["error"] is None else f"{text} +-{figure['error'] * factor:.{decimals}f}"
 
 
-def align(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of cells as columns: the first aligned to the left, the others to the right."""
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    form = "  ".join(["{:<%d}", *["{:>%d}"] * (len(widths) - 1)]) % tuple(widths)
-    return [form.format(*line).rstrip() for line in lines]
-
-
 # Files and pictures
 
 NO_PLOT = f"no plot without matplotlib: {advise_install('matplotlib')}"
@@ -649,7 +596,7 @@ PANELS = (
 
 
 def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[str]:
-    """Writes bench.json, bench.txt and a PNG per scene, replacing old ones; returns messages for the user.
+    """Writes bench.json, bench.txt with the text, and a PNG per scene, replacing old ones; returns messages.
 
     Without matplotlib there are no plots, and a message says how to get them. Raises InputError where it cannot write.
     """

@@ -349,9 +349,7 @@ def _value_text(value: float, edges: np.ndarray) -> str:
     return f"{value:.{max(digits, 0)}f}"
 
 
-def draw_flags(
-    found: FlagCounts, target: Path, *, log: bool = False, overwrite: bool = False
-) -> None:
+def draw_flags(found: FlagCounts, target: Path, *, log: bool = False, overwrite: bool = False) -> None:
     """Writes a picture of the points per flag; log: logarithmic axis of counts."""
     with open_picture(target, (8.0, 5.2), overwrite=overwrite) as figure:
         axes = figure.subplots()

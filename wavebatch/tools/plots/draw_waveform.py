@@ -168,9 +168,7 @@ def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, 
     fit_signal_panel(axes, view, times)
 
 
-def draw_samples(
-    axes: Axes, view: WaveformView, times: tuple[float, float], *, dot: float, thin: float = 1.0
-) -> None:
+def draw_samples(axes: Axes, view: WaveformView, times: tuple[float, float], *, dot: float, thin: float = 1.0) -> None:
     """Draws baseline, gaps, returns, pulses, fit and samples; dot: size of a sample; thin: factor of all lines."""
     axes.axhline(view.baseline, color=GREY, linewidth=0.8 * thin, zorder=1)
     _, start, end = find_stretches(np.isnan(view.samples)[None])  # between two recordings of a packet
@@ -245,9 +243,7 @@ def draw_detector(axes: Axes, seen: DetectorSignal, times: tuple[float, float], 
     axes.text(0.995, 0.97, wrapped, transform=axes.transAxes, ha="right", va="top", fontsize=7.5, color=GREY)
 
 
-def _draw_residual(
-    axes: Axes, view: WaveformView, times: tuple[float, float], height: float | None = None
-) -> None:
+def _draw_residual(axes: Axes, view: WaveformView, times: tuple[float, float], height: float | None = None) -> None:
     """Draws the residual of each sample as a line from 0.
 
     height: half that of a small panel [noise std], with larger residuals in red up to its edge; None: a large panel.

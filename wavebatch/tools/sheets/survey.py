@@ -158,22 +158,13 @@ def _draw_survey(survey: Survey) -> Iterator[Picture]:
         yield from draw_counts(counts, title="Waveforms of the survey", label="echoes in them")
 
 
-def write_survey_page(
-    target: Path, survey: Survey, document: Mapping[str, Any], strips: Sequence[Path], **reading: Any
-) -> None:
-    """Write the page of a survey.
+def survey_page(
+    survey: Survey, document: Mapping[str, Any], strips: Sequence[Path], **reading: Any
+) -> Iterator[Part]:
+    """Yield the parts of the page of a survey.
 
     document: as `survey --json` prints it. strips: those that were surveyed. reading: direction and headerless.
     """
-    from wavebatch.tools.sheets.page import write_page
-
-    title = f"wavebatch survey: {strips[0].name if len(strips) == 1 else f'{len(strips)} strips'}"
-    write_page(target, title, _page_parts(survey, document, strips, reading))
-
-
-def _page_parts(
-    survey: Survey, document: Mapping[str, Any], strips: Sequence[Path], reading: Mapping[str, Any]
-) -> Iterator[Part]:
     from wavebatch.surveying.choose_chain import choose_chain
     from wavebatch.tools.plots.charts import draw_waveforms
 
@@ -208,16 +199,14 @@ def calibration_sheet(flight: FlightCalibration) -> Sheet:
     return Sheet("Calibration", [*_list_facts(found), *_list_tables(flight), drawn])
 
 
-def write_calibrate_page(target: Path, flight: FlightCalibration) -> None:
-    """Write the page of a calibration of one strip or of several."""
+def calibration_page(flight: FlightCalibration) -> list[Part]:
+    """Return the parts of the page of a calibration of one strip or of several."""
     from wavebatch.surveying.calibrating.calibration_files import format_calibration
-    from wavebatch.tools.sheets.page import write_page
 
     found = flight.calibration
     days = [Fact("day of the flight", found.flight or "not in the strip"), Fact("calibrated on", found.date)]
     provenance = Sheet("Provenance", [Fact("wavebatch", __version__), *days, Code(format_calibration(found))])
-    parts = [*(Note(words, "warning") for words in found.notes), *calibration_sheet(flight).parts, provenance]
-    write_page(target, f"wavebatch calibrate: {found.strip or 'strips'}", parts)
+    return [*(Note(words, "warning") for words in found.notes), *calibration_sheet(flight).parts, provenance]
 
 
 def _list_facts(found: Calibration) -> Iterator[Fact]:

@@ -16,13 +16,10 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import Range, check_options, option
-from wavebatch.core.units import HALF_C, QUANTISATION_STD
+from wavebatch.core.units import AIR_SPEED, QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.strip.packets import MAX_SAMPLES
 from wavebatch.kernels.fit.pulse_shape import fit_one_gaussian
-
-AIR_SPEED = 0.9997 * HALF_C
-"""One-way metres per two-way ns in air, as vendors store it."""
 
 EAST, NORTH, GROUND = 500_000.0, 5_400_000.0, 120.0
 """South-west corner and height of the simulated land [m], UTM zone 32 north."""

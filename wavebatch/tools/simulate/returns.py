@@ -102,9 +102,7 @@ class SynthesisOptions:
         0.0, "Standard deviation of the noise before rounding [DN].", form="DN"
     )
     seed: int = 0
-    internal: bool = option(
-        True, "Store packets in the file or in a .wdp file.", opposite="external", unset="internal"
-    )
+    internal: bool = option(True, "Store packets in the file or in a .wdp file.", opposite="external", unset="internal")
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -314,9 +312,7 @@ class DiscreteReceiver(CheckedOptions):
     threshold: Annotated[float, Range(0.0, 1e10)] = option(
         12.0, "Discrete: amplitude that triggers a return [DN].", form="DN", unset="12"
     )
-    most: Annotated[int, Range(1, 15)] = option(
-        4, "Discrete: most returns per pulse.", name="most-returns", unset="4"
-    )
+    most: Annotated[int, Range(1, 15)] = option(4, "Discrete: most returns per pulse.", name="most-returns", unset="4")
 
     def list_returns(self, truth: EchoTable, n: int) -> Returns:
         """The returns that the echoes of n pulses fire."""

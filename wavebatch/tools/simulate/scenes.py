@@ -21,11 +21,10 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, nearest
 from wavebatch.core.frozen import frozen
-from wavebatch.core.units import FWHM_PER_SIGMA, C
+from wavebatch.core.units import AIR_SPEED, FWHM_PER_SIGMA, C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.tools.simulate.render import (
-    AIR_SPEED,
     GROUND,
     FlightLine,
     PulseModel,

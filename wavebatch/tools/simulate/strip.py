@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,7 +27,6 @@ from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import CheckedOptions, Range, option
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.npz import NpzWriter, read_array_header, read_array_text, reading_npz
-from wavebatch.files.disk.publish import Draft
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.las.header import WITHOUT_WAVES, LasHeader, build_dtype, field_names
 from wavebatch.files.las.write_points import PointFile
@@ -69,20 +68,6 @@ _MOST_TEXT = 4 << 20
 
 _LARGEST = 1e30
 """Largest value that is taken for a true one; sums and squares of larger ones overflow."""
-
-
-class TruthWriter(NpzWriter):
-    """Takes columns block by block and writes them as one .npz; memory does not grow with their length.
-
-    Raises InputError where it cannot write.
-    """
-
-    def __init__(self, target: Path, *, overwrite: bool = False) -> None:
-        super().__init__(target, _DTYPES, overwrite=overwrite)
-
-    def complete(self, meta: Mapping[str, Any]) -> Draft:
-        """Writes the .npz; meta: plain values, stored as JSON in the array `meta`."""
-        return super().complete({_META: json.dumps(meta, sort_keys=True)})
 
 
 class TruthReader(Closing):
@@ -172,14 +157,10 @@ class StripOptions(CheckedOptions):
     version: Literal["1.3", "1.4"] | None = option(
         None, "LAS version.", name="las-version", unset="1.3 for point formats 4 and 5, else 1.4"
     )
-    internal: bool = option(
-        True, "Store packets in the file or in a .wdp file.", opposite="external", unset="internal"
-    )
+    internal: bool = option(True, "Store packets in the file or in a .wdp file.", opposite="external", unset="internal")
     scale: Annotated[float, Range(1e-5, 1.0)] = option(0.001, "Unit of the stored coordinates [m].")
     without_waveform: Annotated[float, Range(0.0, 1.0)] = option(0.01, "Share of the pulses without a packet.")
-    keep_empty: bool = option(
-        True, "Keep or leave out pulses without an echo.", opposite="drop-empty", unset="keep"
-    )
+    keep_empty: bool = option(True, "Keep or leave out pulses without an echo.", opposite="drop-empty", unset="keep")
     toward: bool = option(
         True, "Direction of the packet vectors: toward or away from the sensor.", opposite="away", unset="toward"
     )
@@ -240,7 +221,7 @@ def simulate_strip(
     parts = _simulate_parts(scene, pulses, seed, flight, progress)
     summary, whole = StripSummary(), seed_block(scene)
     with (
-        TruthWriter(truth, overwrite=overwrite) if truth else nullcontext() as truth_writer,
+        NpzWriter(truth, _DTYPES, overwrite=overwrite) if truth else nullcontext() as truth_writer,
         FullwaveWriter(
             Path(target), version=options.las_version, point_format=options.point_format, internal=options.internal,
             digitizers=[scene.recording.digitizer], scales=(options.scale,) * 3, offsets=(EAST, NORTH, 0.0),
@@ -274,7 +255,8 @@ def simulate_strip(
             summary.points += len(points)
             summary.echoes += len(kept)
         if truth_writer:
-            writer.drafts.insert(0, truth_writer.complete(_describe(scene, seed, summary)))
+            meta = json.dumps(_describe(scene, seed, summary), sort_keys=True)
+            writer.drafts.insert(0, truth_writer.complete({_META: meta}))
         writer.commit()
     return summary
 
