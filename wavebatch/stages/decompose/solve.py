@@ -376,11 +376,10 @@ def _fit_again(
     some = some._replace(std=(some.std * factor).astype(np.float32))
     windows = Clusters(place, clusters.low[rows], clusters.high[rows], np.cumsum(old.number) - old.number, old.number)
     new = decompose_clusters(some, Candidates(place[old.cluster], time, amplitude, width), windows, settings)
-    each = factor[new.cluster]
+    each = factor[new.cluster, None]
     return new._replace(
-        misfit=new.misfit * each, cost=new.cost * factor**2, errors=new.errors / each[:, None],
-        shared=new.shared / each[:, None] ** 2,
-    )  # fmt: skip
+        misfit=new.misfit * factor, cost=new.cost * factor**2, errors=new.errors / each, shared=new.shared / each**2
+    )
 
 
 def _replace_clusters(solution: Solution, rows: np.ndarray, new: Solution) -> Solution:
