@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.trajectory import ADJUSTED
+from wavebatch.core.trajectory import ADJUSTED, Trajectory
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
 from wavebatch.files.strip.reader import MOST_SLICES, RAYS_PER_SLICE, RaySample, StripReader, sample_rays
+from wavebatch.kernels.physics.radiometry import mean_haze
 from wavebatch.surveying.sensor import (
     UNKNOWN,
     SensorRequest,
@@ -134,6 +135,14 @@ def test_gaps_are_told(tmp_path, wide_strip):
     told = find(wide_strip, trajectory=write_trajectory(tmp_path / "t.csv", stop=0.3)).describe()
     assert told["share_covered"] == pytest.approx(0.45, abs=0.05)
     assert len(told["gaps_s"]) == 1
+
+
+def test_haze_lies_between_ground_and_sensor():
+    """By a trajectory it is known how high above the sea; else the ground lies there."""
+    path = Trajectory.build(np.arange(3.0), np.arange(3.0)[:, None] * [60.0, 0, 0] + [0, 0, 1500])
+    assert SensorSource("trajectory", path, distance=1000.0).haze == mean_haze(500.0, 1500.0)
+    assert SensorSource("direction vectors", distance=1000.0).haze == mean_haze(0.0, 1000.0) > 0.9
+    assert SensorSource("none").haze == 1.0
 
 
 @pytest.mark.parametrize(
