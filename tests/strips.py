@@ -2,7 +2,8 @@
 
 import io
 import struct
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import lazrs
@@ -157,6 +158,19 @@ def add_record(path: Path, record: Vlr) -> None:
         struct.pack_into(kind, content, place, start + len(new) if start else 0)
     struct.pack_into("<I", content, 100, struct.unpack_from("<I", content, 100)[0] + 1)
     path.write_bytes(content[:size] + new + content[size:])
+
+
+def take_turns(path: Path, edit_points: Callable) -> Path:
+    """Gives the pulses one of two equal digitizers in turn: blocks have them in another order than the file."""
+
+    def change(points: np.ndarray) -> np.ndarray:
+        points["wavepacket_index"] *= 1 + np.unique(points["gps_time"], return_inverse=True)[1].astype(np.uint8) % 2
+        return points
+
+    edit_points(path, path, change)
+    (first,) = [vlr for vlr in read_header(path).vlrs if vlr.record_id == 100]
+    add_record(path, replace(first, record_id=101))
+    return path
 
 
 def cut_strip(source: Path, target: Path, points: int) -> Path:

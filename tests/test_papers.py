@@ -66,7 +66,7 @@ def test_papers_are_reproduced(name, seed):
             assert any(abs(abs(float(one)) - abs(float(figure))) <= half for one in shown), figure
 
 
-def test_a_figure_outside_its_band_fails(load, monkeypatch, capsys):
+def test_a_figure_outside_its_band_fails(load, capsys):
     table = load("table")
 
     def measure(number, seed):
@@ -77,15 +77,15 @@ def test_a_figure_outside_its_band_fails(load, monkeypatch, capsys):
         made.add("told only", number + seed)
         return [made, "a text"]
 
-    monkeypatch.setattr(sys, "argv", ["x", "--seed", "3", "--number", "4"])
-    assert table.main(measure, "Things.", 10) == 1
+    words = ["--seed", "3", "--number", "4"]
+    assert table.main(measure, "Things.", 10, words) == 1
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[-1] for line in lines[1:5]] == ["ok", "FAIL", "FAIL", "-"]
     assert lines[2].split() == ["bad", "-", "1.0", "1.5", "0.8..1.2", "FAIL"]
     assert lines[4].split()[-2] == "7.0"
     assert lines[6] == "a text"
     assert lines[-3:] == ["2 figures not accepted", "  things: bad", "  things: unknown"]
-    assert table.main(lambda number, seed: [], "Things.", 10) == 0
+    assert table.main(lambda number, seed: [], "Things.", 10, words) == 0
 
 
 def test_tables_say_where_their_inputs_come_from(load):
@@ -241,11 +241,11 @@ def test_the_page_is_shown_by_a_browser_without_complaints(load, tmp_path, monke
 def test_an_older_page_is_replaced_and_another_file_is_kept(load, tmp_path, monkeypatch):
     page = load("page")
     monkeypatch.setattr(page, "build", lambda *rest: (["<p>x</p>"], True))
-    monkeypatch.setattr("sys.argv", ["page.py", "-o", str(tmp_path / "p.html")])
-    assert page.main() == page.main() == 0 and "<p>x</p>" in (tmp_path / "p.html").read_text()
+    words = ["-o", str(tmp_path / "p.html")]
+    assert page.main(words) == page.main(words) == 0 and "<p>x</p>" in (tmp_path / "p.html").read_text()
     (tmp_path / "p.html").write_text("mine")
     with pytest.raises(page.ConfigError, match="is no report"):
-        page.main()
+        page.main(words)
 
 
 def test_long_tables_are_folded_unless_a_figure_is_not_accepted(load):

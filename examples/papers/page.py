@@ -328,14 +328,14 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[list[Part | str],
     return [*front, *parts], fine and not (drawing and errors)
 
 
-def main() -> int:
-    """Reads the options and writes the page."""
+def main(words: Sequence[str] | None = None) -> int:
+    """Reads the options, those of the command line where no words are given, and writes the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("papers.html"), help="page to write")
     parser.add_argument("--seed", type=int, default=0, help="of all simulations (default 0)")
     parser.add_argument("--number", type=int, help="waveforms per script (default: each script's)")
     parser.add_argument("--pulses", type=int, default=5000, help="pulses of the strips in the pictures (default 5000)")
-    options = parser.parse_args()
+    options = parser.parse_args(words)
     check_page(options.output)
     parts, fine = build(options.number, options.pulses, options.seed)
     write_page(options.output, "The papers, reproduced", parts)

@@ -107,13 +107,18 @@ def format_band(low: float, high: float, digits: int) -> str:
     return f"{format_value(low, digits)}..{format_value(high, digits)}"
 
 
-def main(measure: Callable[[int, int], list[Table | str]], doc: str, number: int) -> int:
-    """Prints the tables of `measure(number, seed)`; 1 where a figure is not accepted, else 0."""
+def main(
+    measure: Callable[[int, int], list[Table | str]], doc: str, number: int, words: Sequence[str] | None = None
+) -> int:
+    """Prints the tables of `measure(number, seed)`; 1 where a figure is not accepted, else 0.
+
+    words: options; those of the command line where there are none.
+    """
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0, help="of the simulation (default 0)")
     parser.add_argument("--number", type=int, default=number, help=f"waveforms, or pulses (default {number})")
     parser.add_argument("--json", type=Path, help="write the tables to this file, too")
-    options = parser.parse_args()
+    options = parser.parse_args(words)
     tables = measure(options.number, options.seed)
     print("\n\n".join(str(table) for table in tables))
     failures = [f"{t.title}: {name}" for t in tables if isinstance(t, Table) for name in t.failures]

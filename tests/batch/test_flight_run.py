@@ -9,6 +9,7 @@ from batch_tools import read_cloud, read_outputs
 from commands import run_command
 from helpers_scenes import make_scene
 
+import wavebatch as wb
 from wavebatch.surveying.system_file import format_survey, load_survey
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 
@@ -139,12 +140,13 @@ def test_a_survey_of_which_no_cloud_comes_is_not_kept(strips, flown, tmp_path):
     assert _run(strips["c"], "-o", folder, *wrong).exit_code in (2, 4) and read_outputs(folder) == before
 
 
-def test_a_survey_of_an_interrupted_run_is_kept_for_the_next(strips, tmp_path, monkeypatch):
-    def interrupt(self):
-        raise KeyboardInterrupt
+def test_a_survey_of_an_interrupted_run_is_kept_for_the_next(strips, tmp_path):
+    def interrupt(event):
+        if event["event"] == "start":
+            raise KeyboardInterrupt
 
-    monkeypatch.setattr("wavebatch.batch.run._Batch.run", interrupt)
-    assert _run(strips["a"], "-o", tmp_path, "--survey", "flight", "--profile", "fast").exit_code != 0
+    with pytest.raises(KeyboardInterrupt):
+        wb.run(strips["a"], tmp_path, survey="flight", chain="fast", on_event=interrupt)
     assert [path.name for path in tmp_path.iterdir()] == ["flight.system.toml"]
 
 

@@ -12,7 +12,7 @@ import laspy
 import numpy as np
 import pytest
 from commands import run_command
-from strips import descriptor, make_raw, vlr
+from strips import descriptor, make_raw, take_turns, vlr
 
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob, choose_columns
@@ -36,12 +36,13 @@ CHAIN = "".join(f'[[chain]]\nstage = "{name}"\n' for name in (*STAGES_OF_CHAIN, 
 
 
 @pytest.fixture(scope="module")
-def strips(tmp_path_factory):
-    """A slope and a town of known surfaces, and the chain."""
+def strips(tmp_path_factory, edit_points):
+    """A slope, whose pulses have one of two digitizers in turn, and a town of known surfaces, and the chain."""
     folder = tmp_path_factory.mktemp("strips")
     (folder / "chain.toml").write_text(CHAIN)
     for scene in ("slope", "urban"):
         simulate_strip(scene, folder / f"{scene}.las", pulses=12_000, seed=5)
+    take_turns(folder / "slope.las", edit_points)
     return folder
 
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from batch_tools import make_job, read_cloud, run_one
 
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.output_rows import assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.batch.run import run_batch
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.echoes import COLUMNS, PASSED_THROUGH, Column, EchoFlag
 from wavebatch.core.errors import StageError
@@ -260,6 +262,18 @@ def test_counts_are_those_of_a_loop(spoilt, tmp_path):
     }
     for name, number in expected.items():
         assert report.count(name) == number, name
+
+
+@pytest.mark.parametrize("points", ["echoes", "returns"])
+def test_counts_do_not_depend_on_the_units(spoilt, tmp_path, points):
+    """Units read packets of each other; each echo counts in one of them."""
+    counts = []
+    for unit_points in (None, 100):
+        job = dataclasses.replace(make_job(spoilt, points=points), unit_points=unit_points)
+        (outcome,) = run_batch([job], RunOptions(tmp_path / str(unit_points))).outcomes
+        assert outcome.error is None
+        counts.append(outcome.report.counts)
+    assert counts[0] == counts[1]
 
 
 def test_return_numbers_beyond_the_point_format_are_cut_and_flagged(tiny_strip, edit_points, tmp_path):

@@ -1,13 +1,16 @@
 """`wavebatch run` with calibration, trajectory and neither: columns, report, the same bytes for any jobs and blocks."""
 
 import json
+import shutil
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
 from commands import run_command
+from strips import take_turns
 
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Radiometry, SystemPulse
@@ -83,10 +86,11 @@ def test_errors_of_level_reflectances_take_the_slopes_of_the_strip(
 
 
 @pytest.mark.slow
-def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, tmp_path_factory, wide_strip, calibration):
+def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, tmp_path_factory, edit_points, wide_strip, calibration):
     plain = tmp_path_factory.mktemp("wide")
+    strip = take_turns(Path(shutil.copy(wide_strip, plain / "s.las")), edit_points)
     for folder, options in ((plain, ()), (tmp_path, ("--jobs", "2", "--block-size", "999"))):
-        done = run(wide_strip, "-o", folder, "--profile", "fast", "--calibration", calibration, *options)
+        done = run(strip, "-o", folder, "--profile", "fast", "--calibration", calibration, *options)
         assert done.exit_code == 0, done.output
     assert next(tmp_path.glob("*.laz")).read_bytes() == next(plain.glob("*.laz")).read_bytes()
     told = report(plain)
@@ -148,10 +152,13 @@ def test_heights_of_another_kind_are_told(tmp_path, tiny_strip):
     head, *rows = path.read_text().splitlines()
     raised = [f"{left},{float(height) + 45.0}" for left, _, height in (row.rpartition(",") for row in rows)]
     path.write_text("\n".join([head, *raised]))
-    done = run(tiny_strip, "-o", tmp_path / "out", "--profile", "fast", "--trajectory", path)
+    arguments = (tiny_strip, "-o", tmp_path / "out", "--profile", "fast", "--trajectory", path)
+    done = run(*arguments)
     assert done.exit_code == 0, done.output
     (remark,) = report(tmp_path / "out")["remarks"]
     assert remark.startswith("range: by the trajectory echoes are 4") and "geoid" in remark and remark in done.stderr
+    write_trajectory(path)  # under the same name
+    assert run(*arguments, "--resume").exit_code == 0 and not report(tmp_path / "out")["remarks"]
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from writer_tools import data_file
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.strip import packets
+from wavebatch.files.strip.packet_check import DirectionTally, decide_direction, is_strange
 from wavebatch.files.strip.packets import PacketFile, PacketPlace
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scanner import ScanSizes
@@ -351,6 +352,16 @@ def test_few_packets_prove_nothing(strips, tmp_path, edit_points):
     assert not find_stranger(strip)
 
 
+@pytest.mark.parametrize(("location", "intensity"), [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_any_tie_of_returns_to_packets_makes_them_own(rng, location, intensity):
+    """Also one that is upside down."""
+    height, where = rng.uniform(50, 100, 300), rng.uniform(0, 50, 300)
+    place = location * where if location else rng.uniform(0, 50, 300)
+    light = intensity * height if intensity else rng.uniform(0, 50, 300)
+    table = np.column_stack([height, where, place, light, *rng.uniform(0.1, 0.5, (2, 300)), np.ones(300)])
+    assert is_strange(table) == (not location and not intensity)
+
+
 def scan_of(path, **options):
     with StripReader(path, **options) as reader, reader.scan() as scan:
         return scan
@@ -383,6 +394,13 @@ def test_witnesses_that_contradict_each_other_are_refused_unless_overridden(tmp_
     assert (scan.vectors.direction, scan.problems) == ("toward", ())
     assert "--direction toward overrides" in scan.warnings[0]
     assert scan_of(path, direction="away").vectors.direction == "away"
+
+
+@pytest.mark.parametrize(("pairs", "problems"), [(2, 0), (3, 1)])
+def test_fewer_than_three_pairs_do_not_contradict_heights(pairs, problems):
+    tally = DirectionTally("stored", pairs=[0, pairs], heights=[50, 0], ratios=[np.ones(50)])
+    found = decide_direction(tally, "auto")
+    assert len(found.problems) == problems and (problems or found.direction == "toward")
 
 
 def test_vectors_that_say_nothing_are_refused_unless_overridden(tmp_path):

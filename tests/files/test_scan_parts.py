@@ -77,10 +77,20 @@ def test_parts_of_shuffled_points_too(tmp_path, edit_points, distance):
     simulate_strip("forest", tmp_path / "a.las", pulses=2500, seed=4)
 
     def move(points):
-        return points[np.argsort(np.arange(len(points)) + draw.uniform(0, distance, len(points)))]
+        moved = points[np.argsort(np.arange(len(points)) + draw.uniform(0, distance, len(points)))]
+        moved["wavepacket_index"][5::300] = 9  # no descriptor; the first of all parts is named
+        return moved
 
     edit_points(tmp_path / "a.las", tmp_path / "b.las", move)
     assert any(check(tmp_path / "b.las")["context"])
+
+
+def test_packets_whose_points_lie_further_apart_than_the_window_are_suspect():
+    near = scanner.NearSharing(0, 1024, Spool(2, np.dtype("u1")), ScanSizes(window=10, bins=1))
+    for index, is_suspect in (([0, 4, 9], False), ([10], True)):
+        keys, own = np.arange(len(index), dtype=np.uint64) << np.uint64(8), np.ones(len(index), bool)
+        near.add(keys, np.array(index), np.zeros(len(index), int), own, lambda rows: np.empty(len(rows), "u1"))
+        assert near.suspects()[0] == is_suspect
 
 
 def test_a_part_of_few_points_before_a_border_is_not_cut_off(strip):

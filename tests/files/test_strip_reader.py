@@ -11,6 +11,7 @@ from writer_tools import data_file, read_raw
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import protecting, refuse_input
+from wavebatch.files.strip.packet_check import Reason
 from wavebatch.files.strip.reader import LONG_SAMPLES, StripReader
 from wavebatch.files.strip.scanner import ScanSizes
 
@@ -146,6 +147,15 @@ def test_a_border_cuts_runs_that_are_not_pulses(tmp_path):
     assert len(read_all(tmp_path / "a.las", unit_points=64)) == 100
 
 
+@pytest.mark.parametrize(("length", "border"), [(63, 95), (64, 64)])
+def test_a_run_of_63_points_may_be_a_pulse(tmp_path, length, border):
+    raw = make_raw(100, most_returns=1)
+    raw.points["gps_time"] = np.arange(100)
+    raw.points["gps_time"][32 : 32 + length] = 32
+    with StripReader(raw.write(tmp_path / "a.las"), unit_points=64) as reader, reader.scan() as scan:
+        assert scan.borders.tolist() == [0, border, 100]
+
+
 def test_context_gives_returns_of_other_units(tmp_path):
     raw = make_raw(64, most_returns=1)
     points = np.concatenate([raw.points, raw.points])
@@ -248,10 +258,12 @@ def test_too_many_points_on_one_packet_are_broken_wherever_they_are(tmp_path):
     raw = make_raw(1000, most_returns=1)
     bad = np.arange(0, 1000, 25)
     raw.points["wavepacket_offset"][bad] = 60
+    raw.points["wavepacket_size"][bad[3]] = 0  # has none
     raw.write(tmp_path / "a.las")
     for sizes in (ScanSizes(), ScanSizes(window=64)):
         with StripReader(tmp_path / "a.las", unit_points=64, sizes=sizes) as reader, reader.scan() as scan:
-            assert (scan.broken, scan.with_waveform, scan.packets) == (40, 960, 960)
+            assert (scan.broken, scan.without_waveform, scan.with_waveform, scan.packets) == (39, 1, 960, 960)
+            assert scan.reasons == {Reason.OVERFULL: (39, 0)}
             flags = np.concatenate([reader.read_unit(n, scan).point_flags for n in range(reader.unit_count())])
             assert np.flatnonzero(flags).tolist() == bad.tolist()
             assert reader.read_unit(3, scan).context.size == 0

@@ -1,5 +1,6 @@
 """Energies of pulses in a calibration and in the strips that run with it: their mean counts, what lacks is an error."""
 
+import struct
 from dataclasses import replace
 
 import laspy
@@ -108,6 +109,26 @@ def test_logs_that_stand_still_or_drift_alone_are_named_and_in_the_error(tmp_pat
     off, stated, line = judge(tmp_path, flickering / "a.las", flickering / "with.toml", "--energy", log)
     assert said in line and (said or "--energy log.csv" not in line)
     assert np.mean(np.abs(off) < stated) > 0.6
+
+
+@pytest.mark.parametrize(
+    ("weak", "error"), [(0.75, 1 / 3), pytest.param(1.0, 0.065, marks=pytest.mark.slow)]
+)
+def test_pulses_whose_energy_is_not_logged_have_an_error_by_their_light(tmp_path, flickering, rng, weak, error):
+    """They counted as of mean energy: a laser that was 25 % weaker there had 5 % of error, in silence."""
+    gone = rng.uniform(size=8000) < 0.4
+    strip = write_strip(tmp_path / "s.las", GROUND, replace(FLICKERS, time=START + 600), 8000, seed=6,
+                        light=lambda seconds: np.where(gone, weak, 1.0))  # fmt: skip
+    content = bytearray(strip.read_bytes())
+    (begin,), (length,) = struct.unpack_from("<I", content, 96), struct.unpack_from("<H", content, 105)
+    for row in np.flatnonzero(gone).tolist():
+        content[begin + (row + 1) * length - 4 : begin + (row + 1) * length] = bytes(4)
+    strip.write_bytes(content)
+    off, stated, said = judge(tmp_path / "out", strip, flickering / "with.toml")
+    assert "of the pulses have none and count as of mean energy: by their light beside that of the others" in said
+    unknown = stated > np.median(stated) + 0.01
+    assert 0.3 < unknown.mean() < 0.5 and np.median(stated[unknown]) == pytest.approx(error, abs=0.03)
+    assert np.mean(np.abs(off / (1 + off))[unknown] < 1.1 * stated[unknown]) > 0.6
 
 
 @pytest.mark.slow

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.trajectory import ADJUSTED
+from wavebatch.core.trajectory import ADJUSTED, Trajectory
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
 from wavebatch.files.strip.reader import MOST_SLICES, RAYS_PER_SLICE, RaySample, StripReader, sample_rays
+from wavebatch.kernels.physics.radiometry import mean_haze
 from wavebatch.surveying.sensor import (
     UNKNOWN,
     SensorRequest,
@@ -136,6 +137,14 @@ def test_gaps_are_told(tmp_path, wide_strip):
     assert len(told["gaps_s"]) == 1
 
 
+def test_haze_lies_between_ground_and_sensor():
+    """By a trajectory it is known how high above the sea; else the ground lies there."""
+    path = Trajectory.build(np.arange(3.0), np.arange(3.0)[:, None] * [60.0, 0, 0] + [0, 0, 1500])
+    assert SensorSource("trajectory", path, distance=1000.0).haze == mean_haze(500.0, 1500.0)
+    assert SensorSource("direction vectors", distance=1000.0).haze == mean_haze(0.0, 1000.0) > 0.9
+    assert SensorSource("none").haze == 1.0
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -171,15 +180,15 @@ def about(axis, degrees):
     return turn
 
 
-def flight_of_turned_vectors(turn, view=30.0, pairs=400):
-    """A flight over hills of 20 m, 700 m high, in centimetres, and some pairs of returns."""
+def flight_of_turned_vectors(turn, view=30.0, pairs=400, along=0.0):
+    """A flight over hills of 20 m, and others `along` it, 700 m high, in centimetres, and some pairs of returns."""
     rng = np.random.default_rng(9)
     time = START_TIME + np.sort(rng.uniform(0.0, 3.0, 8000))
     seconds = time - START_TIME
     across = np.tan(np.radians(view / 2)) * (1.0 - 2.0 * (50.0 * seconds % 1.0))
     unit = np.stack([np.full(8000, 0.05), across, np.full(8000, -1.0)], axis=1)
     unit /= np.linalg.norm(unit, axis=1)[:, None]
-    distance = (700.0 + 20.0 * np.sin(30.0 * across)) / -unit[:, 2]
+    distance = (700.0 + 20.0 * np.sin(30.0 * across) + along * np.sin(7.0 * seconds)) / -unit[:, 2]
     ground = np.stack([60.0 * seconds, 0.0 * seconds, 700.0 + 0.0 * seconds], 1) + distance[:, None] * unit
     vector = unit @ turn.T
     some = np.sort(rng.choice(8000, pairs, replace=False))
@@ -206,10 +215,26 @@ def test_vectors_that_are_turned_against_their_points_are_found(axis, degrees):
         assert facts["turned_error_deg"] < (0.002 if pairs else 0.1)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("degrees", [0.0, 0.3])
+def test_rolling_ground_shows_a_turn_about_any_axis_and_ranges_are_right_then(axis, degrees):
+    """A turn across the flight was taken for a shift of the sensor, and ranges were off by metres, or their errors."""
+    vectors, none = flight_of_turned_vectors(about(axis, degrees), pairs=0, along=15.0)
+    found = estimate_path(vectors, "direction vectors", none)
+    facts = dict(found.facts)
+    assert facts["is_turned"] == bool(degrees)
+    assert abs(facts["turned_deg"] - degrees) < 1.5 * facts["turned_error_deg"] < 0.12
+    seconds = vectors.time - START_TIME
+    off = np.linalg.norm(vectors.point - found.trajectory.at(vectors.time), axis=1) - np.linalg.norm(
+        vectors.point - np.stack([60.0 * seconds, 0.0 * seconds, 700.0 + 0.0 * seconds], axis=1), axis=1
+    )
+    assert np.sqrt(np.mean(off**2)) < found.error + 0.01 < 0.15
+
+
 def test_vectors_of_which_nothing_is_known_may_be_turned_as_far_as_a_mounting():
     vectors, pairs = flight_of_turned_vectors(about(0, 0.5), pairs=15)
-    facts, off = find_turn(vectors, pairs, [])
-    assert off == facts["turned_deg"] == 0.0 and not facts["is_turned"]
+    facts, turned, off = find_turn(vectors, pairs, [])
+    assert off == facts["turned_deg"] == 0.0 and not turned.any() and not facts["is_turned"]
     assert facts["turned_error_deg"] == pytest.approx(np.degrees(0.0025), abs=0.01)
 
 

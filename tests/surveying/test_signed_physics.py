@@ -24,9 +24,9 @@ def call(*arguments):
 
 def write_calibration(path, flight, *, divergence=None, shot_energy=0.0):
     path.write_text(
-        f'schema = "wavebatch.calibration/1"\nconstant = {float(flight.constant)!r}\nrelative_error = 0.0\n'
+        f'schema = "wavebatch.calibration/1"\nconstant = {float(flight.constant)!r}\nrelative_error = 1e-9\n'
         f"attenuation_db_km = {flight.air}\ndivergence_mrad = {float(divergence or flight.divergence)}\n"
-        f"[[channel]]\ndigitizer = 1\nconstant = {float(flight.constant)!r}\nrelative_error = 0.0\n"
+        f"[[channel]]\ndigitizer = 1\nconstant = {float(flight.constant)!r}\nrelative_error = 1e-9\n"
         f"shot_energy = {float(shot_energy)}\n"
     )
     return path

@@ -306,7 +306,8 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         where = f": {seen:.0f} m above the points" if seen else ""
         lines.append(f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}")
     unseen = 0.0 if sensor.kind == "trajectory" else dict(sensor.facts).get("turned_error_deg", 0.0)
-    if "incidence_angle_normals" in prepared.job.chain.makes and unseen > UNSEEN_TURN:
+    second = prepared.second_step
+    if second is not None and "incidence_angle_normals" in second.stage.makes and unseen > UNSEEN_TURN:
         lines.append(
             "incidence_angle_normals: this strip does not show well whether its packet vectors are turned against the "
             f"points: the errors hold {sensor.turned:.1g} degrees of it; --trajectory would show it"
@@ -322,7 +323,10 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         lines.append(f"--where: {last} of the {lost} points that it leaves out are the last echo of their pulse, often "
                      "the ground: return numbers stay those of the whole pulse")  # fmt: skip
     lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
+    wanted = {*prepared.job.columns, *prepared.needed}
     for column, counts in sorted(report.no_data.items()):
+        if column not in wanted:
+            continue
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:
             lines.append(_explain(prepared, report, column, counts))

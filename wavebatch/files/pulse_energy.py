@@ -72,8 +72,9 @@ class PulseEnergy:
     """Share of the sampled points whose energy is known."""
     error_field: str | None = None
     """Field of the standard deviations, in the unit of the source; None where they are not known."""
-    fills: bool = False
-    """A pulse of unknown energy counts as one of mean energy, as it would without energies; else it has no data."""
+    fills: float | None = None
+    """A pulse of unknown energy counts as one of mean energy, as it would without energies, with this relative error;
+    None: it has no data."""
 
     @property
     def level(self) -> float:
@@ -103,9 +104,9 @@ class PulseEnergy:
         if self.error_field is not None:
             error = records[self.error_field].astype(np.float64) / whole
             error = np.where((error >= 0) & (error < LARGEST), error, 0.0)
-        if self.fills and np.isnan(energy).any():
+        if self.fills is not None and np.isnan(energy).any():
             unknown = np.isnan(energy)
-            error = np.where(unknown, self.spread * self.level, 0.0 if error is None else error)
+            error = np.where(unknown, self.fills * self.level, 0.0 if error is None else error)
             energy = np.where(unknown, self.level, energy)
         if self.missed:
             error = np.hypot(0.0 if error is None else error, self.missed * energy)
@@ -179,7 +180,7 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
     spread = float(there.std() / mean) if len(there) else 0.0
     known = len(there) / max(len(values), 1)
     shots = float(np.sqrt(0.5 * np.mean(np.diff(there) ** 2)) / mean) if len(there) > 1 else 0.0
-    return replace(found, mean=mean, spread=spread, shots=shots, known=known, fills=request is None)
+    return replace(found, mean=mean, spread=spread, shots=shots, known=known, fills=None if request else spread)
 
 
 def find_column(reader: StripReader, request: str) -> PulseEnergy | None:

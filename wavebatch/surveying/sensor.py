@@ -78,6 +78,9 @@ SURE_TURN, LEAST_TURN = 5.0, 5e-4
 """Errors from which packet vectors are said to be turned against their points, and least angle that counts [rad]: by
 it, an echo 20 m from its return is 1 cm off, as coordinates are rounded."""
 
+TURN_ROUNDS = 10
+"""Rounds in which a turn and how large turns are, of which it is the one known, are found: each halves what is left."""
+
 HEIGHT_ERROR = 0.05
 """Error of the range, relative, where only the height of the flight is known; and scatter of the points' heights, over
 it, from which one height for all is doubted."""
@@ -419,7 +422,9 @@ def _compare_ranges(
     return round(float(np.median(longer)), 3), error, round(path.error, 6)
 
 
-def find_turn(vectors: RaySample, pairs: RaySample, fits: Sequence[SensorFit]) -> tuple[dict[str, Any], float]:
+def find_turn(
+    vectors: RaySample, pairs: RaySample, fits: Sequence[SensorFit]
+) -> tuple[dict[str, Any], np.ndarray, float]:
     """Find by how much packet vectors are turned against the points, alike in the whole strip.
 
     Parameters
@@ -435,9 +440,11 @@ def find_turn(vectors: RaySample, pairs: RaySample, fits: Sequence[SensorFit]) -
     facts : dict
         TURNED: angle between vectors and rays [deg]; its error, with what nothing shows; and whether
         chance does not explain it.
+    turn : float64 (3,)
+        Of the vectors, about the axes; 0 where chance explains it [rad].
     off : float
-        By how much that makes ranges wrong, which count from where rays seem to meet, root mean square [m]; 0 for an
-        angle below LEAST_TURN.
+        How wrong ranges are, which count from where rays meet, root mean square [m]: once the vectors are turned back,
+        where chance does not explain it; else as they are, 0 for an angle below LEAST_TURN.
 
     Notes
     -----
@@ -454,29 +461,38 @@ def find_turn(vectors: RaySample, pairs: RaySample, fits: Sequence[SensorFit]) -
             end = fit.centre + fit.half
     if parts:
         each, sides, floors, shifts = (np.stack(values) for values in zip(*parts, strict=True))
-        total, floor, shift = each.sum(axis=0), floors.mean(axis=0), shifts.mean(axis=0)
-        seen = np.linalg.pinv(total, hermitian=True) @ sides.sum(axis=0)
-        off = sides - each @ seen
-        apart = np.einsum("wi,wij,wj->", off, np.linalg.pinv(each, hermitian=True), off)
-        total = total / max(1.0, apart / max(3 * len(parts) - 3, 1))
-        both = total @ np.linalg.pinv(total + floor, hermitian=True) @ floor
-        known, right = known + both, right + both @ seen
+        shift = shifts.mean(axis=0)
+        # Mirrors do the same in all windows; by relief alone each window has a floor of its own.
+        for kind, count in enumerate((1, len(parts))):
+            total, floor = each[:, kind].sum(axis=0), count * floors[:, kind].mean(axis=0)
+            seen = np.linalg.pinv(total, hermitian=True) @ sides[:, kind].sum(axis=0)
+            off = sides[:, kind] - each[:, kind] @ seen
+            apart = np.einsum("wi,wij,wj->", off, np.linalg.pinv(each[:, kind], hermitian=True), off)
+            total = total / max(1.0, apart / max(3 * len(parts) - 3, 1))
+            both = total @ np.linalg.pinv(total + floor, hermitian=True) @ floor
+            known, right = known + both, right + both @ seen
     by_pairs, side = _turn_by_pairs(pairs)
     known = known + by_pairs
     # Within MOUNTING what is seen counts as it is. What is not seen is half of that, since a limit is two standard
-    # deviations, or all of it where vectors are turned.
+    # deviations; where vectors are turned it is as large as what is seen, and MOUNTING at least.
     error = np.linalg.inv(known + np.eye(3) / MOUNTING**2)
     turn = error @ (right + side)
-    moved = float(turn @ known @ turn) > SURE_TURN**2
-    error = error if moved and turn @ turn > LEAST_TURN**2 else np.linalg.inv(known + np.eye(3) * (2.0 / MOUNTING) ** 2)
+    moved = turn @ known @ turn > SURE_TURN**2 and turn @ turn > LEAST_TURN**2
+    for _ in range(TURN_ROUNDS if moved else 0):
+        error = np.linalg.inv(known + np.eye(3) / (MOUNTING**2 + turn @ turn))
+        turn = error @ (right + side)
+    error = error if moved else np.linalg.inv(known + np.eye(3) * (2.0 / MOUNTING) ** 2)
     with np.errstate(invalid="ignore", divide="ignore"):
         unit = vectors.direction / np.sqrt((vectors.direction**2).sum(axis=1))[:, None]
     unit = unit[np.isfinite(unit[:, 0])]
     across = np.eye(3) - unit.T @ unit / max(len(unit), 1)
     angle, doubt = float(np.sqrt(turn @ across @ turn)), float(np.sqrt(0.5 * np.sum(across * error)))
-    values = (round(float(np.degrees(angle)), 4), round(float(np.degrees(doubt)), 4), moved and angle > LEAST_TURN)
+    moved = bool(moved and angle > LEAST_TURN)
+    values = (round(float(np.degrees(angle)), 4), round(float(np.degrees(doubt)), 4), moved)
     facts = dict(zip(TURNED, values, strict=True))
-    return facts, float(np.sqrt(np.mean((unit @ shift @ turn) ** 2))) if angle > LEAST_TURN else 0.0
+    left = error if moved else np.outer(turn, turn) * (angle > LEAST_TURN)
+    off = float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", unit @ shift, left, unit @ shift))))
+    return facts, turn * moved, off
 
 
 def _turn_by_pairs(pairs: RaySample) -> tuple[np.ndarray, np.ndarray]:
@@ -562,10 +578,14 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     path = Trajectory.build(time, xyz, velocity, gap=(max(WIDER) + 1) * NODE_SECONDS)
     distance = round(float(np.median([fit.distance for fit, _, _ in found])), 2)
     error, facts = _overall_error(found, rays), _describe(found, path, rays)
-    if pairs is not None:
-        shown, off = find_turn(rays, pairs, [fit for fit, _, _ in found])
-        error, facts = float(np.hypot(error, off)), (*facts, *shown.items())
-    return SensorSource(kind, path, distance=distance, error=error, facts=facts)
+    source = SensorSource(kind, path, distance=distance, error=error, facts=facts)
+    if pairs is None:
+        return source
+    shown, turn, off = find_turn(rays, pairs, [fit for fit, _, _ in found])
+    back = np.cross(rays.direction, turn)
+    straight = rays._replace(direction=rays.direction + back + 0.5 * np.cross(back, turn))
+    source = (estimate_path(straight, kind) if turn.any() else None) or source
+    return replace(source, error=float(np.hypot(source.error, off)), facts=(*source.facts, *shown.items()))
 
 
 def _fit_window(rays: RaySample, cells: np.ndarray, node: float) -> tuple[SensorFit | None, float, float]:

@@ -37,6 +37,13 @@ SCANNER = 0.01
 """Rays of a scanner miss the point from which they leave by so much [m], beyond what a shift explains: what its mirrors
 do is no turn. RIEGL's rays of a polygon miss it by less than .1 mm, Leica's of a swinging mirror by 6 mm at most."""
 
+STILL = 1e-4
+"""Shifts along the rays move nothing: what turns rays by less than this share of the others is chance."""
+
+BENDS = 6
+"""Powers of the angle across the flight, less one, by which what mirrors do is described: of five, those of Leica leave
+less than a tenth of a millimetre."""
+
 CLIP = 4.0 * MAD_TO_STD
 """Residuals above this many medians are outliers: four robust standard deviations."""
 _ROUNDS = 3
@@ -75,14 +82,15 @@ class SensorFit(NamedTuple):
 
 
 class TurnSeen(NamedTuple):
-    """What a window shows of a turn of its directions about the three axes [rad]."""
+    """What a window shows of a turn of its directions about the three axes [rad]: of all that a turn does to rays, and
+    of what it does to those of one angle across the flight, where the ground is nearer or farther."""
 
     information: np.ndarray
-    """Inverse of the covariance, float64 (3, 3)."""
+    """Inverse of the covariance, float64 (2, 3, 3)."""
     right: np.ndarray
-    """Information times the turn, float64 (3,)."""
+    """Information times the turn, float64 (2, 3)."""
     floor: np.ndarray
-    """Most information of rays that miss their point by SCANNER, however many they are, float64 (3, 3)."""
+    """Most information of rays that miss their point by SCANNER, however many they are, float64 (2, 3, 3)."""
     shift: np.ndarray
     """By how much the sensor seems to be moved, per turn, float64 (3, 3) [m/rad]."""
 
@@ -246,15 +254,28 @@ def measure_turn(
     moves = (across[:, :, None, :] * powers[:, None, :, None]).reshape(3 * len(q), -1)
     turns = (np.cross(np.eye(3), q[:, None]).transpose(0, 2, 1) * root[:, :, None]).reshape(-1, 3)
     off = np.column_stack([turns, ((r - q * np.einsum("ni,ni->n", q, r)[:, None]) * root).ravel()])
-    explained = np.linalg.lstsq(moves, off, rcond=None)[0]
-    off -= moves @ explained
+    explained = np.linalg.lstsq(moves, off, rcond=STILL)[0]
+    # What mirrors do is a function of the angle across the flight: by relief alone a turn is something else.
+    angle, axes = _find_across(unit)
+    bends = np.vander(angle / max(float(np.abs(angle).max()), 1e-9), BENDS, increasing=True)[:, 1:]
+    mirror = ((across @ axes)[:, :, None, :] * bends[:, None, :, None]).reshape(3 * len(q), -1)
+    parts = [_see_turn(off, some, root, (time, unit), fit.distance) for some in (moves, np.hstack([moves, mirror]))]
+    information, right, floor = (np.stack(values) for values in zip(*parts, strict=True))
+    return TurnSeen(information, right, floor, explained[:3, :3])
+
+
+def _see_turn(
+    off: np.ndarray, moves: np.ndarray, root: np.ndarray, rays: tuple[np.ndarray, np.ndarray], distance: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Information of a turn, its right side and its floor, as `TurnSeen`, of what `moves` do not explain of `off`: what
+    a turn does to the rays, and what they miss."""
+    off = off - moves @ np.linalg.lstsq(moves, off, rcond=STILL)[0]
     normal, right = off[:, :3].T @ off[:, :3], off[:, :3].T @ off[:, 3]
     left = (off[:, 3] - off[:, :3] @ (np.linalg.pinv(normal, hermitian=True) @ right)).reshape(-1, 3)
     kept = int((root > 0).sum())
-    variance = float((left * left).sum()) / max(2 * kept - moves.shape[1] - 3, 1) * _redundancy(time, unit, left)
+    variance = float((left * left).sum()) / max(2 * kept - moves.shape[1] - 3, 1) * _redundancy(*rays, left)
     variance = max(variance, 1e-30)
-    floor = normal / kept * (fit.distance / SCANNER) ** 2
-    return TurnSeen(normal / variance, right / variance, floor, explained[:3, :3])
+    return normal / variance, right / variance, normal / kept * (distance / SCANNER) ** 2
 
 
 def _nothing(order: int, pulses: int) -> SensorFit:
@@ -345,10 +366,18 @@ def _redundancy(time: np.ndarray, unit: np.ndarray, left: np.ndarray) -> float:
     Errors of attitude, mounting and motion are alike in neighbouring pulses, so that many pulses do not average them
     out. The residuals' autocorrelation shows it, in the order of time and in that of the direction across the flight.
     """
-    off = unit - unit.mean(axis=0)
-    across = off @ np.linalg.eigh(off.T @ off)[1][:, -1]
-    by_time, by_angle = (_sum_correlation(left[np.argsort(order, kind="stable")]) for order in (time, across))
+    orders = time, _find_across(unit)[0]
+    by_time, by_angle = (_sum_correlation(left[np.argsort(order, kind="stable")]) for order in orders)
     return max(np.sqrt(by_time), 1.0 + SYSTEMATIC**2 * (by_angle - 1.0))
+
+
+def _find_across(unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles across the flight from the middle of the swath, float64 (n,) [rad], and the axes across and along it, to
+    which the middle ray is perpendicular, float64 (3, 2)."""
+    mean = unit.mean(axis=0)
+    off = unit - mean
+    across = np.linalg.eigh(off.T @ off)[1][:, -1]
+    return off @ across, np.stack([across, np.cross(across, mean)], axis=1)
 
 
 def _sum_correlation(values: np.ndarray) -> float:

@@ -19,7 +19,14 @@ from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.matching.setting import SCANNERS, take_off_level, weigh_alike
+from wavebatch.surveying.matching.setting import (
+    LIKELY,
+    QUANTILES,
+    SCANNERS,
+    compare_scenes,
+    take_off_level,
+    weigh_alike,
+)
 
 OTHER_UNIT = 3.0
 """Ratio of mean energies from which a log is in another unit: lasers lose a half of their energy at most."""
@@ -108,11 +115,22 @@ def take_energies(
                 f"{reader.facts.path}: --energy {energy.source} contradicts the strip: {doubt}; check its times, or "
                 "leave it out"
             )
-        growth = _compare_drift(reader, scan, energy)
+        growth = _compare_drift(_read_places(reader, scan, energy), energy.shots)
         if growth > LEAST_SAID:
             notes.append(
                 f"--energy {energy.source}: its slow changes along the strip are not proved by the strip's brightness: "
                 f"the error of the constant grows by {100 * growth:.1f} %"
+            )
+    elif energy is not None and energy.known < 1.0:
+        chance = Calibration.change_chance if calibration is None else calibration.change_chance
+        places = _read_places(reader, scan, replace(energy, fills=None))
+        more = _compare_unknown(np.concatenate([np.empty((4, 0)), *places], axis=1), chance)
+        energy = replace(energy, fills=math.hypot(energy.fills or 0.0, more))
+        if more > LEAST_SAID:
+            notes.append(
+                f"{energy.source}: {1.0 - energy.known:.0%} of the pulses have none and count as of mean energy: by "
+                f"their light beside that of the others, {100 * more:.1f} % of error hold it; --energy "
+                f"{energy.source} gives them no values"
             )
     apart = _find_alternation(pulses)
     if apart:
@@ -206,25 +224,44 @@ def _find_alternation(pulses: np.ndarray) -> float:
     return most
 
 
-def _compare_drift(reader: StripReader, scan: StripScan, energy: PulseEnergy) -> float:
-    """Error by slow changes of the log that the strip's brightness does not follow, relative."""
+def _read_places(reader: StripReader, scan: StripScan, energy: PulseEnergy) -> list[np.ndarray]:
+    """Waveforms at places along the strip, each as `_join`."""
     found = []
     numbers = even_places(reader.unit_count(), PLACES).tolist()
     for number in numbers:
         unit = reader.read_unit(number, scan)
         for part in np.array_split(np.flatnonzero(unit.packets.owned), -(-PLACES // len(numbers))):
-            with np.errstate(invalid="ignore", divide="ignore"):
-                pulses = _join(reader, unit, part[even_places(len(part), OF_PLACE)], energy)
-                both = np.log(pulses[1:3])
-            both = both[:, np.isfinite(both).all(axis=0)]
-            if both.size:
-                found.append(np.median(both, axis=1))
+            found.append(_join(reader, unit, part[even_places(len(part), OF_PLACE)], energy))
+    return found
+
+
+def _compare_unknown(pulses: np.ndarray, chance: float) -> float:
+    """Error of pulses of unknown energy by their light beside that of the others, relative; pulses: as `_join`."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unknown, light = np.isnan(pulses[2]), np.log(pulses[1] / np.nan_to_num(pulses[2], nan=1.0))
+    parts = [light[rows & np.isfinite(light)] for rows in (unknown, ~unknown)]
+    if min(map(len, parts)) < LEAST_COMPARED:
+        return 0.0
+    change = compare_scenes(*(np.quantile(part, QUANTILES) for part in parts), chance=chance)
+    return math.expm1(max(change.error, abs(change.shift) * (change.chance > LIKELY)))
+
+
+def _compare_drift(places: list[np.ndarray], shots: float) -> float:
+    """Error by slow changes of the log that the strip's brightness does not follow, relative; places: as `_join`;
+    shots: scatter of the log from shot to shot, relative."""
+    found = []
+    for pulses in places:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            both = np.log(pulses[1:3])
+        both = both[:, np.isfinite(both).all(axis=0)]
+        if both.size:
+            found.append(np.median(both, axis=1))
     light, sent = np.array(found).T if found else np.empty((2, 0))
     if len(sent) < LEAST_PLACES:
         return 0.0
     sent, light = sent - sent.mean(), light - light.mean()
     # Medians of OF_PLACE pulses scatter by themselves: only what is beyond that is slow.
-    slow = math.sqrt(max(float(np.mean(sent**2)) - 1.57 * energy.shots**2 / OF_PLACE, 0.0))
+    slow = math.sqrt(max(float(np.mean(sent**2)) - 1.57 * shots**2 / OF_PLACE, 0.0))
     if not slow:
         return 0.0
     slope = float(sent @ light / (sent @ sent))

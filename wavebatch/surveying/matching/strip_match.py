@@ -341,6 +341,7 @@ def match_strip(
     docs/algorithms.md 5.2.
     """
     warnings = list(doubt_calibration(calibration))
+    calibration = calibration.widened(0.0 if _least_error(calibration) else UNSTATED)
     if not any(row.is_described for row in calibration.channels):
         return calibration, tuple(warnings)
     if calibration.haze and attenuation is None:
@@ -370,7 +371,6 @@ def match_strip(
         reasons, notes = [*reasons, *lines], [*notes, *hidden]
     warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
-    growth = math.hypot(growth, 0.0 if _least_error(calibration) else UNSTATED)
     rows: list[ChannelConstant] = []
     missing: dict[int, str] = {}
     pulses = _find_pulses(calibration, reader, scan, system, sensor)
