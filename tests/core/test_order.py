@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.core.order import distinct, find_order, group_medians, median, quantile
+from wavebatch.core.order import distinct, find_order, group_medians, known_median, median, quantile
 
 
 def test_any_rows_get_the_order_of_a_full_sort(rng):
@@ -56,3 +56,14 @@ def test_the_median_of_nan_or_of_nothing_is_nan():
     assert np.isnan(median(np.array([1.0, np.nan, 2.0])))
     assert np.isnan(median(np.empty(0)))
     np.testing.assert_array_equal(median(np.array([[1.0, np.nan], [3.0, 4.0]]), 0), [2.0, np.nan])
+
+
+@pytest.mark.filterwarnings("ignore:All-NaN slice")
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(1, 3), (2, 9), (11, 40), (700, 5)])
+def test_the_median_of_known_values_has_the_bits_of_numpy(dtype, shape, rng):
+    for share in (0.0, 0.1, 0.6, 1.0):
+        values = (rng.normal(0, 40, shape) + 100).astype(dtype)
+        values[rng.random(shape) < share] = np.nan
+        for axis in (0, 1):
+            np.testing.assert_array_equal(known_median(values, axis), np.nanmedian(values, axis=axis), strict=True)

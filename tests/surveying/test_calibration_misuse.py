@@ -403,6 +403,9 @@ def test_a_wrong_pulse_zone_is_refused(tmp_path, off, said):
                 "-o", tmp_path / "cal.toml")  # fmt: skip
     assert done.exit_code == (1 if said else 0) and said in done.stderr
     assert said == JUMP or ("its ground is bent across the flight" in done.stderr) == bool(said)
+    # Without a calibration ranges were off by 600 m, in silence.
+    done = call("run", tmp_path / "s.las", "-o", tmp_path, "--columns", "range,range_error")
+    assert done.exit_code == 0 and said in done.stderr and ("of another pulse" in done.stderr) == bool(said)
 
 
 @pytest.mark.slow
@@ -722,6 +725,8 @@ def test_other_air_on_the_day_of_the_calibration_is_named_and_in_the_error(tmp_p
     cloud = wb.read_cloud(tmp_path / "a.laz")
     stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
     assert stated == pytest.approx(np.hypot(0.031, 4.6e-4 * 703 * (given - 0.22)), abs=0.004)
+    # No remark about reflectances and normals, which are not written.
+    assert not [one for one in json.loads((tmp_path / "a.report.json").read_text())["remarks"] if "none of" in one]
 
 
 @pytest.mark.slow

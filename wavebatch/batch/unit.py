@@ -38,8 +38,10 @@ from wavebatch.files.strip.scanner import ScanPart
 from wavebatch.kernels.geometry.normals import find_edges
 from wavebatch.stages.attribute.radiometry import REFLECTANCES, hide_edges
 from wavebatch.stages.chain import Chain, Solved, Step
+from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import ChainChoice, try_chain, without_columns
 from wavebatch.surveying.flat_ground import angle_parameters, choose_radius, measure_slope, sample_reference
+from wavebatch.surveying.matching.setting import doubt_zone
 from wavebatch.surveying.prepare import prepare
 from wavebatch.surveying.sensor import UNKNOWN, SensorSource, judge_scale, refuse_units
 
@@ -191,6 +193,8 @@ def prepare_strip(job: StripJob, parts: Sequence[ScanPart] = ()) -> Prepared:
             surveyed = Seconds.now()
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
+            if job.calibration is None and needs_sensor(job.chain):
+                doubts += StripWarning.of("zone", doubt_zone(reader, scan, sensor))
             if job.options.points == "echoes":
                 doubts += StripWarning.of("units", judge_scale(reader, scan))
             # A flight height that contradicts the packet vectors, which are more exact and are used in its place.

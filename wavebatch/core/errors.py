@@ -58,6 +58,7 @@ WARNINGS = {
     "energy": "the energies of the pulses are not known as those of the calibration are",
     "reflectance": "more reflectances above 1 than surfaces explain",
     "beam": "the divergence contradicts the widths of the echoes",
+    "zone": "echoes may have been taken for those of another pulse, so that ranges are off by hundreds of metres",
     "units": "coordinates may be in other units than the vectors of the packets",
     "dropped-records": "records of the strip that its cloud does not have",
 }

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.order import median
+from wavebatch.core.order import known_median, median
 from wavebatch.core.units import MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.library import Samples
@@ -160,6 +160,6 @@ def _tail_of_recorded(block: WaveformBlock, samples: int) -> tuple[np.ndarray, n
     end = np.where(recorded & (behind <= samples), block.samples, np.float32(np.nan)).T.astype(np.float32)
     number = np.isfinite(end).sum(axis=0)
     end[:, number == 0] = block.samples[number == 0].T
-    baseline = np.nanmedian(end, axis=0)
+    baseline = known_median(end, 0)
     deviation = np.nan_to_num(end - baseline)
     return baseline, np.sqrt(sum_samples(deviation * deviation) / np.maximum(number - 1, 1)), number

@@ -28,7 +28,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.frozen import changeable, frozen
-from wavebatch.core.order import distinct, even_places, median, quantile
+from wavebatch.core.order import distinct, even_places, known_median, median, quantile
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen_integers
@@ -225,12 +225,11 @@ def size_of_sample(longest: int) -> int:
 def is_strange(table: np.ndarray) -> bool:
     """Return whether nothing ties returns, f8 (m, 7) of `compare_returns`, to their packets, though own ones would."""
     # In a packet of noise the highest sample is as far above the median as the lowest one below it.
-    table = table[table[:, _HIGHEST] > 2.0 * np.median(table[:, _DEPTH])] if len(table) else table
+    table = table[table[:, _HIGHEST] > 2.0 * median(table[:, _DEPTH])] if len(table) else table
     if len(table) < LEAST_PACKETS:
         return False
     # Where all returns lie at one place, own packets would look the same; intensities alone may be scaled.
-    low, high = np.quantile(table[:, _LOCATION], (0.25, 0.75))
-    if high - low < 1.0:
+    if quantile(table[:, _LOCATION], 0.75) - quantile(table[:, _LOCATION], 0.25) < 1.0:
         return False
     gains, possible = table[:, _OWN] - table[:, _OTHERS], 1.0 - table[:, _OTHERS].mean()
     error = 4.0 * gains.std() / np.sqrt(len(gains))
@@ -284,7 +283,7 @@ def _compare(group: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Iterator
     first = 0
     for samples, place, strength in group:
         last = first + len(samples)
-        height, level = samples.max(axis=1).astype(float), np.median(samples, axis=1)
+        height, level = samples.max(axis=1).astype(float), median(samples, axis=1)
         height -= level
         found = np.stack([_read_height(samples, at[first:last]) - level for at in sets]) / np.maximum(height, 1.0)
         table = [height, samples.argmax(axis=1), place, strength, found[0], found[1:].mean(axis=0)]
@@ -597,7 +596,7 @@ class _Votes:
                 values[fill] = np.nan
         gaps = np.isnan(values)
         values[gaps.all(axis=1)] = 0.0  # nothing but fill: no vote
-        values -= np.nanmedian(values, axis=1, keepdims=True) if gaps.any() else median(values, axis=1)[:, None]
+        values -= (known_median if gaps.any() else median)(values, 1)[:, None]
         np.nan_to_num(values, copy=False)
         up, down = values.max(axis=1), -values.min(axis=1)
         self.up += int(np.count_nonzero((up >= LEAST_HEIGHT) & (up >= CLEAR * down)))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.core.order import median, quantile
+from wavebatch.core.order import known_median, median, quantile
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR, QUANTISATION_STD
 from wavebatch.kernels.elementary import exp, log, solve
 from wavebatch.kernels.library import call
@@ -154,7 +154,7 @@ def estimate_noise(
         return PooledNoise(0.0, QUANTISATION_STD, 0.0, 0.0)
     if missing is not None:
         signal = np.where(missing, np.float32(np.nan), signal)
-        signal = np.where(missing, np.nanmedian(signal, axis=0), signal)
+        signal = np.where(missing, known_median(signal, 0), signal)
     signal = signal.astype(np.float32)
     known = _estimate_from(signal, reach, limit, missing, recovery) if recovery else None
     if known is not None and known.share > 0:

@@ -13,7 +13,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.order import even_places, robust_std
-from wavebatch.core.units import ADJUSTED, HALF_C, MEDIAN_ERROR, WEEK, date_gps
+from wavebatch.core.units import ADJUSTED, AIR_ATTENUATION, HALF_C, MEDIAN_ERROR, WEEK, date_gps
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen_integers
 from wavebatch.files.las.header import decode_text
@@ -295,6 +295,15 @@ def measure_setting(
     fading = [NO_CHANGE, *(_find_fading(rows[0], rows[1], rows[2:4], chance=chance) for rows in known.values())]
     fades = max(fading, key=lambda one: one.error)
     return Setting(rate, brightest, scenes, places, _find_right(every), fades, zone)
+
+
+def doubt_zone(reader: StripReader, scan: StripScan, sensor: SensorSource) -> tuple[str, ...]:
+    """Return the line about ranges of another pulse, of a strip without a calibration, which would be refused."""
+    try:
+        measure_setting(reader, scan, sensor, AIR_ATTENUATION)
+    except InputError as error:
+        return (str(error).removeprefix(f"{reader.facts.path}: "),)
+    return ()
 
 
 def _find_right(rows: np.ndarray) -> tuple[float, float]:
