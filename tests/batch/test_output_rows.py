@@ -16,6 +16,7 @@ from wavebatch.core.errors import StageError
 from wavebatch.files.las.header import split_numbers
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE
+from wavebatch.tools.simulate import simulate_strip
 
 
 def _spoil(points):
@@ -265,11 +266,18 @@ def test_counts_are_those_of_a_loop(spoilt, tmp_path):
 
 
 @pytest.mark.parametrize("points", ["echoes", "returns"])
-def test_counts_do_not_depend_on_the_units(spoilt, tmp_path, points):
-    """Units read packets of each other; each echo counts in one of them."""
-    counts = []
+def test_counts_do_not_depend_on_the_units(edit_points, tmp_path, points):
+    """Units read packets of each other, also echoes that are no return; each counts in one of them."""
+
+    def change(rows):
+        number, total = split_numbers(rows)
+        rows["wavepacket_index"][(number == 2) & (total > 2)] = 0
+        return rows[np.random.default_rng(1).permutation(len(rows))]
+
+    simulate_strip("forest", tmp_path / "a.las", pulses=400, seed=2)
+    strip, counts = edit_points(tmp_path / "a.las", tmp_path / "b.las", change), []
     for unit_points in (None, 100):
-        job = dataclasses.replace(make_job(spoilt, points=points), unit_points=unit_points)
+        job = dataclasses.replace(make_job(strip, points=points), unit_points=unit_points)
         (outcome,) = run_batch([job], RunOptions(tmp_path / str(unit_points))).outcomes
         assert outcome.error is None
         counts.append(outcome.report.counts)

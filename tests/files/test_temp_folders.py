@@ -121,6 +121,13 @@ def test_without_a_place_the_spool_says_so(no_place):
         spool.append(np.array([0, 1]), np.array([5, 6]))
 
 
+def test_a_spool_keeps_what_came_after_its_last_segment():
+    with temp_store.Spool(1, np.dtype("<i8"), memory=64) as spool:
+        for entries in (np.arange(8), np.arange(8, 10)):
+            spool.append(np.zeros(len(entries), np.int64), entries)
+        assert spool.path is not None and spool.read(0).tolist() == list(range(10))
+
+
 def test_a_spool_that_travels_takes_a_file_or_its_entries_with_it(tmp_path):
     temp_store.use_scratch(tmp_path / "missing")
     try:
