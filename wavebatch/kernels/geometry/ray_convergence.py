@@ -44,6 +44,13 @@ BENDS = 6
 """Number of powers of the angle across the flight, with the constant, by which what mirrors do is described: rays that
 are bent to and fro by 5 mm, one and a half times over the swath, hide no turn over rolling ground."""
 
+CLIP = 4.0 * MAD_TO_STD
+"""Residuals above this many medians are outliers: four robust standard deviations."""
+_ROUNDS = 3
+"""Rounds of the linear solution, each with new weights."""
+_STEPS = 6
+"""Largest number of Gauss-Newton steps."""
+
 
 class SensorFit(NamedTuple):
     """The path of the sensor in a window."""
