@@ -44,9 +44,10 @@ def test_flags_are_those_of_a_loop(table, rng):
     samples = np.clip(rng.normal(20, 2, (N, S)), 0, 255)
     for w, time, sigma in zip(table.waveform, table.time, table.sigma, strict=True):
         samples[w] += 300 * (rng.random() < 0.3) * np.exp(-0.5 * ((np.arange(S) - time) / sigma) ** 2)
-    block = WaveformBlock.from_samples(np.clip(np.rint(samples), 0, 255).astype(np.uint8))
     missing = np.zeros((N, S), bool)
     missing[::3, 25:33] = True
+    samples[missing] = 255  # which is no light
+    block = WaveformBlock.from_samples(np.clip(np.rint(samples), 0, 255).astype(np.uint8))
     block = replace(block, missing=missing)
     strong = rng.random(len(table)) < 0.15
     amplitude = np.where(strong, rng.uniform(1400, 1900, len(table)), table.amplitude)

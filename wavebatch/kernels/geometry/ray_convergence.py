@@ -41,8 +41,8 @@ STILL = 1e-4
 """Shifts along the rays move nothing: what turns rays by less than this share of the others is chance."""
 
 BENDS = 6
-"""Powers of the angle across the flight, less one, by which what mirrors do is described: of five, those of Leica leave
-less than a tenth of a millimetre."""
+"""Number of powers of the angle across the flight, with the constant, by which what mirrors do is described: rays that
+are bent to and fro by 5 mm, one and a half times over the swath, hide no turn over rolling ground."""
 
 CLIP = 4.0 * MAD_TO_STD
 """Residuals above this many medians are outliers: four robust standard deviations."""

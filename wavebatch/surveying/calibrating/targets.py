@@ -374,7 +374,7 @@ def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None
     errors = [MEDIAN_ERROR * s / np.sqrt(len(p)) for s, p in zip(spreads, parts, strict=True)]
     off = middle[0] / middle[1] - 1.0
     if abs(off) >= max(LEAST_EDGE, EDGE_SIGMA * float(np.hypot(*errors))):
-        return float(off), abs(float(off))
+        return float(off), abs(middle[0] - middle[1])  # over the median of all, which is the constant
     few = LEAST_ECHOES // 2
     core = float(np.median(constant[np.argsort(depth)[-few:]]))
     off = float(np.median(constant)) / core - 1.0
