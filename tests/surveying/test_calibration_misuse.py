@@ -15,14 +15,14 @@ from tests import footprints
 from tests.facet_strips import C_AIR, EAST, NORTH, START, Facet, Sensor, box, path_of, write_strip, write_trajectory
 from tests.footprints import Flight, Plane
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.waveforms import SystemPulse
+from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.physics.radiometry import judge_energies
 from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_files import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.strip_echoes import CalibrationOptions
-from wavebatch.surveying.calibration import Calibration, ChannelConstant
-from wavebatch.surveying.matching import setting
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
+from wavebatch.surveying.matching import setting, strip_match
 from wavebatch.surveying.matching.setting import NO_CHANGE, Change, Setting, keep_places, weigh_alike, weigh_change
 from wavebatch.surveying.matching.strip_match import compare_setting, judge_fading
 
@@ -916,3 +916,32 @@ def test_clear_air_takes_less_of_long_waves_unless_its_attenuation_is_given():
     assert CalibrationOptions().air == 0.22
     assert CalibrationOptions(wavelength=1550.0).air < 0.22 < CalibrationOptions(wavelength=532.0).air
     assert CalibrationOptions(wavelength=532.0, attenuation=0.1).air == 0.1
+
+
+@pytest.mark.parametrize("away", [300.0, 4000.0])
+def test_a_strip_nearer_or_farther_than_the_calibration_is_named_and_in_the_error(away):
+    header = SimpleNamespace(point_count=0, system_identifier=b"", generating_software=b"")
+    strip = SimpleNamespace(facts=SimpleNamespace(header=header))
+    known, seen = Calibration(1.0, 0.02, attenuation=0.3, distance=1000.0), sensor.SensorSource("none", distance=away)
+    grown, later, lines = strip_match.find_growth(known, strip, seen, 0.3, other=False)
+    assert not later and "measured at 1000 m, this strip is" in lines[0]
+    air = 2e-4 * np.log(10.0) * strip_match.AIR_DOUBT * 0.3
+    assert grown == pytest.approx(air * abs(away - 1000.0))
+    # Another strip of that day, whose air is not given: it may have been other air on all of its way.
+    other = strip_match.find_growth(known, strip, seen, None, other=True)[0]
+    assert other == pytest.approx(np.sqrt(grown**2 + 0.5 * strip_match.OTHER_DAY**2 + (air * away) ** 2))
+
+
+@pytest.mark.parametrize(("name", "value"), [("spacing_ns", 0.9), ("spacing_ns", 1.1), ("gain", 0.9), ("gain", 1.1)])
+def test_a_channel_recorded_otherwise_in_either_direction_has_no_constant(name, value):
+    row = ChannelConstant(1, 0, 1.0, 0.02, bits=8, spacing_ns=1.0, gain=1.0)
+    digitizer = Digitizer(index=1, bits=8, n_samples=80, spacing=1.0, gain=1.0, offset=0.0)
+    assert not strip_match._contradict(row, digitizer, 4.0)
+    assert "digitizer 1 has" in strip_match._contradict(replace(row, **{name: value}), digitizer, 4.0)
+
+
+def test_a_strip_takes_its_own_constant_and_not_that_of_another_one():
+    rows = [ChannelConstant(1, 0, 1.0, 0.02)]
+    strips = tuple(StripConstant(name, name, 1, 0, value, 0.01) for name, value in (("a", 1.1), ("b", 0.9)))
+    taken = {key: next(strip_match._take_strip_constants(strips, rows, key)).constant for key in "abc"}
+    assert taken == {"a": 1.1, "b": 0.9, "c": 1.0}
