@@ -491,7 +491,7 @@ def find_turn(
     values = (round(float(np.degrees(angle)), 4), round(float(np.degrees(doubt)), 4), moved)
     facts = dict(zip(TURNED, values, strict=True))
     left = error if moved else np.outer(turn, turn) * (angle > LEAST_TURN)
-    off = float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", unit @ shift, left, unit @ shift))))
+    off = float(np.sqrt(np.sum(np.einsum("ni,ij,nj->n", unit @ shift, left, unit @ shift)) / max(len(unit), 1)))
     return facts, turn * moved, off
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.order import even_places, robust_std
+from wavebatch.core.order import even_places, known_median, robust_std
 from wavebatch.core.units import ADJUSTED, AIR_ATTENUATION, HALF_C, MEDIAN_ERROR, WEEK, date_gps
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen_integers
@@ -276,11 +276,13 @@ def measure_setting(
         if block.sensor is None:
             continue
         above = take_off_level(block)
-        time = block.spacing * np.nanargmax(above, axis=1)
+        time = block.spacing * np.argmax(np.nan_to_num(above, nan=-np.inf), axis=1)
         away = block.origin + block.direction * time[:, None] - block.sensor
         distance = np.sqrt((away * away).sum(axis=1))
-        whole = np.nansum(above, axis=1) * distance**2 / transmit(distance, attenuation) / energy
-        rows = np.stack([block.gps_time, whole, *(away + block.sensor).T, -away[:, 2] / distance, *block.sensor.T[:2]])
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            whole = np.nansum(above, axis=1) * distance**2 / transmit(distance, attenuation) / energy
+            down = -away[:, 2] / distance
+        rows = np.stack([block.gps_time, whole, *(away + block.sensor).T, down, *block.sensor.T[:2]])
         scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
         for number in np.unique(scanner).tolist():
             parts.setdefault((block.digitizer.index, number), []).append(rows[:, (whole > 0) & (scanner == number)])
@@ -444,7 +446,7 @@ def take_off_level(block: WaveformBlock) -> np.ndarray:
     samples = block.samples.astype(np.float32)
     if block.missing is not None:
         samples[block.missing] = np.nan
-    return samples - np.nanmedian(samples, axis=1)[:, None]
+    return samples - known_median(samples, 1)[:, None]
 
 
 def _measure_rate(reader: StripReader) -> float | None:
