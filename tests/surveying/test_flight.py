@@ -100,8 +100,10 @@ def test_only_strips_whose_echoes_were_compared_are_not_compared_again(strips, f
             assert "those of the flight 9.00 ns" in hold_strip(reader, scan, replace(wrong, fingerprint=others))
 
 
-def test_a_share_with_too_few_echoes_is_no_comparison(strips):
-    few = survey_flight(read_samples([strips[name] for name in FLIGHT], waveforms=30))
+@pytest.mark.parametrize("waveforms", [30, 900])
+def test_a_share_with_too_few_echoes_or_waveforms_is_no_comparison(strips, waveforms):
+    """By 64 waveforms of roofs, a receiver that clips and a pulse 10 % narrower were not seen."""
+    few = survey_flight(read_samples([strips[name] for name in FLIGHT], waveforms=waveforms))
     assert few.misfits == [] and not any(strip["compared"] for strip in few.saved.fingerprint["strips"])
 
 

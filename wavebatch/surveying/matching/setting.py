@@ -270,6 +270,23 @@ def measure_setting(
 ) -> Setting:
     """Measure the setting of a strip; attenuation: of the air, one way [dB/km], energy: by which light is divided;
     chance: of a laser that fades, before the light is seen."""
+    known = _read_rows(reader, scan, sensor, attenuation, energy)
+    rate = _measure_rate(reader)
+    every = np.concatenate([np.empty((8, 0)), *known.values()], axis=1)
+    zone = _find_zone(reader, every, 1e9 * HALF_C / rate) if known and rate else None
+    brightest = {channel: float(np.quantile(rows[1], BRIGHT)) for channel, rows in known.items()}
+    scenes = {channel: _describe_scene(rows[1]) for channel, rows in known.items()}
+    places = {channel: _list_places(*rows[[2, 3, 1, 0]]) for channel, rows in known.items()}
+    fading = [NO_CHANGE, *(_find_fading(rows[0], rows[1], rows[2:4], chance=chance) for rows in known.values())]
+    fades = max(fading, key=lambda one: one.error)
+    return Setting(rate, brightest, scenes, places, _find_right(every), fades, zone)
+
+
+def _read_rows(
+    reader: StripReader, scan: StripScan, sensor: SensorSource, attenuation: float, energy: float = 1.0
+) -> dict[_Channel, np.ndarray]:
+    """Of a sample of each channel, f8 (8, n): time, light, place of the brightest sample, cosine of the ray's angle to
+    the vertical, and x and y of the sensor."""
     parts: dict[_Channel, list[np.ndarray]] = {}
     for block in reader.sample_blocks(scan, SAMPLE):
         block = sensor.fill(block)
@@ -287,24 +304,22 @@ def measure_setting(
         for number in np.unique(scanner).tolist():
             parts.setdefault((block.digitizer.index, number), []).append(rows[:, (whole > 0) & (scanner == number)])
     joined = {channel: np.concatenate(some, axis=1) for channel, some in parts.items()}
-    known = {channel: rows for channel, rows in joined.items() if rows.size}
-    rate = _measure_rate(reader)
-    every = np.concatenate([np.empty((8, 0)), *known.values()], axis=1)
-    zone = _find_zone(reader, every, 1e9 * HALF_C / rate) if known and rate else None
-    brightest = {channel: float(np.quantile(rows[1], BRIGHT)) for channel, rows in known.items()}
-    scenes = {channel: _describe_scene(rows[1]) for channel, rows in known.items()}
-    places = {channel: _list_places(*rows[[2, 3, 1, 0]]) for channel, rows in known.items()}
-    fading = [NO_CHANGE, *(_find_fading(rows[0], rows[1], rows[2:4], chance=chance) for rows in known.values())]
-    fades = max(fading, key=lambda one: one.error)
-    return Setting(rate, brightest, scenes, places, _find_right(every), fades, zone)
+    return {channel: rows for channel, rows in joined.items() if rows.size}
 
 
 def doubt_zone(reader: StripReader, scan: StripScan, sensor: SensorSource) -> tuple[str, ...]:
     """Return the line about ranges of another pulse, of a strip without a calibration, which would be refused."""
+    rate = _measure_rate(reader)
+    if not rate or not 0.0 < 1e9 * HALF_C / rate < np.inf:
+        return ()
+    rows = np.concatenate([np.empty((8, 0)), *_read_rows(reader, scan, sensor, AIR_ATTENUATION).values()], axis=1)
+    if not rows.size:
+        return ()
     try:
-        measure_setting(reader, scan, sensor, AIR_ATTENUATION)
+        _find_zone(reader, rows, 1e9 * HALF_C / rate)
     except InputError as error:
-        return (str(error).removeprefix(f"{reader.facts.path}: "),)
+        line = str(error).removeprefix(f"{reader.facts.path}: ")
+        return (f"{line}; a valley or a ridge along the flight looks alike",)
     return ()
 
 

@@ -473,7 +473,7 @@ class Worker(Closing):
         while not wait_uninterrupted([call.future], PATIENCE):
             self._process.look()
             if not self._process.serves:  # it died before it took the call
-                end_future(call.future, error=WorkerDied())
+                end_future(call.future, error=WorkerDied("the measuring process ended"))
         return call.future.result()
 
     def close(self) -> None:
