@@ -5,12 +5,13 @@ import pytest
 from helpers_scenes import CANOPY_NOISE, CANOPY_SIGMA, grow_canopy
 from strangers import judge_strip
 
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import ReceiverNoise, SystemPulse, WaveformBlock
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import choose_chain
 from wavebatch.surveying.measuring.learn_pulse import find_clear
-from wavebatch.surveying.measuring.misfit import measure_tail
+from wavebatch.surveying.measuring.misfit import cover_fits, measure_tail
 from wavebatch.surveying.systems.known_systems import compare_pulses
 
 
@@ -94,6 +95,16 @@ def test_a_layer_below_every_echo_is_no_tail(is_tail):
     system = SystemPulse(sigma_ref=width, noise=ReceiverNoise(baseline=12.0, std=1.0))
     tail = measure_tail(block, system, find_clear(block, system)).tail_misfit
     assert dict(tail).get(5 * width, 0.0) == (pytest.approx(0.05, rel=0.1) if is_tail else 0.0)
+
+
+@pytest.mark.parametrize(("alone", "raised"), [(1.0, False), (3.0, True)])
+def test_fits_of_echoes_alone_decide_whether_the_misfit_is_raised(alone, raised):
+    """Close neighbours that are not found are left of the others too."""
+    waveform = np.r_[np.arange(30), np.repeat(np.arange(30, 60), 2)]
+    table = EchoTable.build(waveform, np.arange(90) * 20.0, np.full(90, 200.0), np.full(90, 2.0),
+                            residual=np.where(waveform < 30, alone, 3.0))  # fmt: skip
+    system = SystemPulse(sigma_ref=2.0, noise=ReceiverNoise(baseline=12.0, std=1.0))
+    assert (cover_fits(system, table, 1.0)[0] > 0) == raised
 
 
 @pytest.mark.quick_cases("1398")
