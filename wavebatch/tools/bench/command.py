@@ -216,8 +216,10 @@ def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
 
     chosen: the chains of each strip.
     """
-    same = (name for name in chosen[0] if all(effective(each[name]) == effective(each[AUTO]) for each in chosen))
-    return next((name for name in same if name != AUTO), None)
+    for name in chosen[0]:
+        if name != AUTO and all(AUTO in each and effective(each[name]) == effective(each[AUTO]) for each in chosen):
+            return name
+    return None
 
 
 def list_methods() -> dict[str, Chain]:
