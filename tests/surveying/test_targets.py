@@ -11,6 +11,7 @@ from commands import run_command as call
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.planes import fit_planes
+from wavebatch.surveying.calibrating import targets as targets_module
 from wavebatch.surveying.calibrating.calibration_files import (
     Target,
     format_calibration,
@@ -204,3 +205,11 @@ def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_chan
     assert np.median(rho[index & (rho != -9999)]) == pytest.approx(GROUND_REFLECTS, rel=0.02)
     level = rho[index & (rho != -9999)]
     assert MAD_TO_STD * np.median(np.abs(level / GROUND_REFLECTS - 1)) < 0.05
+
+
+def test_the_error_of_an_outline_of_another_surface_is_over_the_constant_of_all_echoes():
+    """Five times as dark outside: 4 in place of 1.33 said that nothing is known."""
+    depth = np.linspace(0.0, 1.0, 200)
+    constant = np.where(depth < 0.5, 5.0, 1.0) / 3.0 * (1 + 0.01 * np.random.default_rng(1).standard_normal(200))
+    edge, error = targets_module._compare_edge(constant, depth)
+    assert edge == pytest.approx(4.0, rel=0.02) and error == pytest.approx(4.0 / 3.0, rel=0.02)
