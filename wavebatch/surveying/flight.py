@@ -203,9 +203,13 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     used = {index: kind for index, kind in kinds.items() if any(block.digitizer.index == index for block in blocks)}
     figures = replace(survey.figures, look=whole, kinds=used, flight_strips=float(len(group)))
     # Of 64 waveforms the clip level is seldom seen, and widths are known to no 6 %: strangers over roofs passed.
-    enough = {sample.path for sample in samples if sum(map(len, sample.blocks)) >= HELD}
-    known = {strip.path for strip in held if strip.fits and strip.look is not None and strip.look.width}
-    identity = {"strips": [_identify(sample.fingerprint, sample.path in known & enough) for sample in group]}
+    # Of 64 waveforms the clip level is seldom seen, and widths are known to no 6 %: strangers over roofs passed.
+    compared = {
+        sample.path
+        for sample, strip in zip(samples, held, strict=True)
+        if strip.fits and strip.look is not None and strip.look.width and sum(map(len, sample.blocks)) >= HELD
+    }
+    identity = {"strips": [_identify(sample.fingerprint, sample.path in compared) for sample in group]}
     name = group[0].path.name if len(samples) == 1 else f"{len(group)} strips"
     return Flight(SavedSurvey(replace(survey, figures=figures), name, identity), tuple(held))
 
