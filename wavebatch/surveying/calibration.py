@@ -264,6 +264,10 @@ class Calibration:
 
     def describe(self) -> dict[str, Any]:
         """Return the calibration as plain values for reports."""
+        strips: Any = [asdict(row) for row in self.strips]
+        if len(strips) > _MOST_DESCRIBED:  # every cloud of a flight holds this description
+            text = repr([tuple(row.values()) for row in strips])
+            strips = {"number": len(strips), "sha256": hashlib.sha256(text.encode(errors="replace")).hexdigest()}
         return {
             "constant": None if math.isnan(self.constant) else self.constant,
             "relative_error": self.relative_error,
@@ -273,15 +277,8 @@ class Calibration:
             **({"scan_angle_terms": list(self.swath)} if self.swath else {}),
             **{name: getattr(self, name) for name in _REPORTED},
             "channels": [asdict(row) for row in self.channels],
-            "strips": self._describe_strips(),
+            "strips": strips,
         }
-
-    def _describe_strips(self) -> Any:
-        """The constants of single strips, or their number and hash: every cloud of a flight holds this description."""
-        if len(self.strips) <= _MOST_DESCRIBED:
-            return [asdict(row) for row in self.strips]
-        text = repr([tuple(asdict(row).values()) for row in self.strips])
-        return {"number": len(self.strips), "sha256": hashlib.sha256(text.encode(errors="replace")).hexdigest()}
 
 
 _CHOSEN: dict[str, dict[str, Any]] = {"attribute.incidence_angle_normals": {"radius": 0.0}}

@@ -70,9 +70,11 @@ def decide(survey: Survey) -> tuple[Decision, ...]:
 
 
 def _decide_growth(survey: Survey) -> Decision:
-    share, filled = _overlapped(survey)
-    if not filled or all(decision.part != Part.GROWTH for decision in survey.decisions):
+    empty, overlapped = survey.figures.empty_share, survey.figures.overlapped_share
+    filled = 0.0 if empty is None else (1.0 - empty) * survey.waveforms
+    if overlapped is None or filled < 1 or all(decision.part != Part.GROWTH for decision in survey.decisions):
         return Decision(Part.GROWTH, True, "the survey does not say how many echoes overlap")
+    share = min(overlapped * survey.waveforms / filled, 1.0)
     number = share * filled
     # Upper limit of the share: two standard deviations of the count above it, and at least six waveforms more, because
     # a small sample without overlaps proves little: with four, tiles of 1,000 waveforms grew or not by one pair.
@@ -80,15 +82,6 @@ def _decide_growth(survey: Survey) -> Decision:
     found = f"of the {filled:.0f} waveforms with echoes {100 * share:.2f} % hold overlapping ones"
     limit = f"at most {100 * most:.2f} % by this sample, the limit is {100 * LOST:g} %"
     return Decision(Part.GROWTH, most >= LOST, f"{found}; {limit}")
-
-
-def _overlapped(survey: Survey) -> tuple[float, float]:
-    """Share of overlapped ones among the waveforms with echoes, and the number of these in the sample."""
-    empty, overlapped = survey.figures.empty_share, survey.figures.overlapped_share
-    filled = 0.0 if empty is None else (1.0 - empty) * survey.waveforms
-    if overlapped is None or filled < 1:
-        return 1.0, 0.0
-    return min(overlapped * survey.waveforms / filled, 1.0), filled
 
 
 def chain_text(survey: Survey) -> str:
@@ -110,17 +103,14 @@ def chain_text(survey: Survey) -> str:
         format_step("attribute.amplitude", {}),
     ]
     lines += [format_step("attribute.echo_width", {})] if width.needed else [_comment(width), ""]
-    lines += [_comment(decisions[Part.ANGLE]), ""] if Part.ANGLE in decisions else _explain_angle(survey)
+    if Part.ANGLE in decisions:
+        lines += [_comment(decisions[Part.ANGLE]), ""]
+    elif any(decision.part == Part.ANGLE and decision.needed for decision in survey.decisions):
+        # Widths say that surfaces slope.
+        needs = "it needs the divergence of the beam, which no strip holds"
+        add = 'with it, add "attribute.incidence_angle" with divergence = MRAD after attribute.position'
+        lines += [f"# {Part.ANGLE}: not in this chain: {needs};", f"# {add}.", ""]
     return "\n".join([*lines, format_step("attribute.position", {})])
-
-
-def _explain_angle(survey: Survey) -> list[str]:
-    """Why angles are not in the chain although widths say that surfaces slope."""
-    if not any(decision.part == Part.ANGLE and decision.needed for decision in survey.decisions):
-        return []
-    needs = "it needs the divergence of the beam, which no strip holds"
-    add = 'with it, add "attribute.incidence_angle" with divergence = MRAD after attribute.position'
-    return [f"# {Part.ANGLE}: not in this chain: {needs};", f"# {add}.", ""]
 
 
 def _comment(decision: Decision) -> str:
@@ -289,17 +279,14 @@ def _choose_by_tolerance(block: WaveformBlock | None, found: Survey, tolerance: 
     good = [prediction for prediction in fitting if prediction.range_error <= tolerance]
     if not good:
         errors = ", ".join(
-            f"{one.name} {one.range_error:.3g} m" + ("" if one in fitting else f" ({_in_words(one)})")
+            f"{one.name} {one.range_error:.3g} m"
+            + ("" if one in fitting else f" ({100 * one.false_share:.0f} % of its echoes would be false)")
             for one in predictions
         )
         raise ConfigError(
             f"{strip}: no shipped chain meets a tolerance of {tolerance:g} m; predicted errors are {errors}: allow more"
         )
     return ChainChoice(chains[good[0].name], found, predictions=tuple(predictions))
-
-
-def _in_words(prediction: Prediction) -> str:
-    return f"{100 * prediction.false_share:.0f} % of its echoes would be false"
 
 
 def try_chain(reader: StripReader, scan: StripScan, choice: ChainChoice, request: Request) -> ChainChoice:

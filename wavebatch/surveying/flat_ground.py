@@ -216,18 +216,15 @@ def sample_slopes(reader: StripReader, scan: StripScan, fill: SensorSource, n_wa
         rows = rows[:: max(len(rows) * len(chosen) // max(n_waveforms, 1), 1)]
         around, radius = _surround(_list_places(reader, unit))
         for block, _ in reader.read_rows(unit, rows, 4096):
-            yield _measure_slopes(fill.fill(block), around, radius)
-
-
-def _measure_slopes(block: WaveformBlock, around: Surroundings, radius: float) -> Slopes:
-    """The slopes at the last return of each waveform."""
-    place = np.full((len(block), 3), np.nan)
-    if block.returns is not None:
-        place[block.returns.waveform] = block.returns.xyz
-    (angle, error), _ = measure_normals(
-        place, block.direction, around, radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR
-    )
-    return Slopes(block, *(np.radians(values.astype(np.float64)) for values in (angle, error)))
+            # At the last return of each waveform.
+            block = fill.fill(block)
+            place = np.full((len(block), 3), np.nan)
+            if block.returns is not None:
+                place[block.returns.waveform] = block.returns.xyz
+            (angle, error), _ = measure_normals(
+                place, block.direction, around, radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR
+            )
+            yield Slopes(block, *(np.radians(values.astype(np.float64)) for values in (angle, error)))
 
 
 def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: float) -> GroundReference:
@@ -273,18 +270,6 @@ def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:
     if len(variance) < ENOUGH_TO_LEARN:
         return replace(system, widths=replace(system.widths, error=np.inf))
     # The survey's pulse may include slopes, so the true one can be narrower, but never wider.
-    level, level_err = _find_level(variance, error)
-    level = min(level, 0.0)
-    below = variance < level
-    ratio = np.median(((level - variance[below]) / error[below]) ** 2) / SQUARED_NORMAL_MEDIAN if below.any() else 1.0
-    excess = np.median(error[below] ** 2) * max(float(ratio) - 1.0, 0.0) if below.any() else 0.0
-    scatter = float(np.sqrt(excess) / (2.0 * system.sigma_ref))
-    level_err = float(np.hypot(level_err, 2.0 * square * np.median(lever) * system.radiometry.divergence_error))
-    return replace(system, widths=LevelWidths(level, level_err, scatter))
-
-
-def _find_level(variance: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """The mode of variances (n,), then the mean of those within two errors of it, until it stays; its error."""
     level, level_err = _find_mode(variance), float(np.median(error))
     for _ in range(ROUNDS):
         near = np.abs(variance - level) < 2.0 * error
@@ -293,7 +278,13 @@ def _find_level(variance: np.ndarray, error: np.ndarray) -> tuple[float, float]:
         weight = error[near] ** -2.0
         level = float((weight * variance[near]).sum() / weight.sum())
         level_err = float(weight.sum() ** -0.5)
-    return level, level_err
+    level = min(level, 0.0)
+    below = variance < level
+    ratio = np.median(((level - variance[below]) / error[below]) ** 2) / SQUARED_NORMAL_MEDIAN if below.any() else 1.0
+    excess = np.median(error[below] ** 2) * max(float(ratio) - 1.0, 0.0) if below.any() else 0.0
+    scatter = float(np.sqrt(excess) / (2.0 * system.sigma_ref))
+    level_err = float(np.hypot(level_err, 2.0 * square * np.median(lever) * system.radiometry.divergence_error))
+    return replace(system, widths=LevelWidths(level, level_err, scatter))
 
 
 def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:

@@ -203,7 +203,6 @@ def survey_flight(samples: Sequence[StripSample], *, spread: Spread = map) -> Fl
     used = {index: kind for index, kind in kinds.items() if any(block.digitizer.index == index for block in blocks)}
     figures = replace(survey.figures, look=whole, kinds=used, flight_strips=float(len(group)))
     # Of 64 waveforms the clip level is seldom seen, and widths are known to no 6 %: strangers over roofs passed.
-    # Of 64 waveforms the clip level is seldom seen, and widths are known to no 6 %: strangers over roofs passed.
     compared = {
         sample.path
         for sample, strip in zip(samples, held, strict=True)

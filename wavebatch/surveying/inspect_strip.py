@@ -102,20 +102,18 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
         problems.append(_without_name(path, error))
     else:
         problems += () if scan.stranger else doubt_packets(facts, *_match_returns(reader, scan))
-    notes = [*_note_descriptors(facts, scan), *scan.notes, *audit_header(reader, scan)]
+    notes = [
+        f"descriptor {index} has gain 0; counts are used as they are"
+        for index in scan.by_descriptor
+        if index in facts.digitizers and facts.digitizers[index].gain == 0
+    ]
+    if not scan.with_waveform + scan.broken:
+        notes.append("no point has a waveform; every point would be passed through")
+    notes += [*scan.notes, *audit_header(reader, scan)]
     summary = ", ".join(f"{n} {name}{'s' * (n != 1)}" for n, name in ((scan.points, "point"), (scan.packets, "packet")))
     if scan.packets:
         summary += f", vectors {scan.vectors.direction} the sensor"
     return Findings(str(path), tuple(problems), tuple(notes), summary)
-
-
-def _note_descriptors(facts: StripFacts, scan: StripScan) -> Iterator[str]:
-    for index in scan.by_descriptor:
-        digitizer = facts.digitizers.get(index)
-        if digitizer and digitizer.gain == 0:
-            yield f"descriptor {index} has gain 0; counts are used as they are"
-    if not scan.with_waveform + scan.broken:
-        yield "no point has a waveform; every point would be passed through"
 
 
 def audit_header(reader: StripReader, scan: StripScan) -> Iterator[str]:

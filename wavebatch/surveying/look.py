@@ -89,23 +89,18 @@ def pool_blocks(group: list[WaveformBlock]) -> WaveformBlock:
     """Waveforms of blocks (of one kind of digitizer) as one block, without geometry; short ones are filled up."""
     length = max(block.samples.shape[1] for block in group)
     digitizer = replace(max(group, key=weigh).digitizer, n_samples=length)
-    samples = np.concatenate([_fill_up(block.samples, length) for block in group])
-    missing = np.concatenate([_missing(block, length) for block in group])
-    pooled = WaveformBlock.from_samples(samples, spacing=digitizer.spacing, bits=digitizer.bits)
+    filled, gone = [], []
+    for block in group:
+        lack = length - block.samples.shape[1]
+        # With the waveform's least count, which is no signal.
+        fill = np.repeat(block.samples.min(axis=1)[:, None], lack, axis=1)
+        filled.append(np.hstack([block.samples, fill]))
+        missing = np.ones((len(block), length), bool)
+        missing[:, : block.samples.shape[1]] = False if block.missing is None else block.missing
+        gone.append(missing)
+    pooled = WaveformBlock.from_samples(np.concatenate(filled), spacing=digitizer.spacing, bits=digitizer.bits)
+    missing = np.concatenate(gone)
     return replace(pooled, digitizer=digitizer, missing=missing if missing.any() else None)
-
-
-def _fill_up(samples: np.ndarray, length: int) -> np.ndarray:
-    """Samples (n, s) with columns added up to `length`, each the waveform's least count, which is no signal."""
-    lack = length - samples.shape[1]
-    return samples if not lack else np.hstack([samples, np.repeat(samples.min(axis=1)[:, None], lack, axis=1)])
-
-
-def _missing(block: WaveformBlock, length: int) -> np.ndarray:
-    """Samples of a block that were not recorded, once it is filled up to `length`: bool (n, length)."""
-    missing = np.ones((len(block), length), bool)
-    missing[:, : block.samples.shape[1]] = False if block.missing is None else block.missing
-    return missing
 
 
 def weigh(block: WaveformBlock) -> int:
@@ -173,7 +168,15 @@ def glance_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Glance | 
     block = _pool_main(blocks, system)
     if block is None:
         return None
-    plain, lone, width = _find_width(block, system.sigma_ref)
+    # With the flight's width this takes half as long as to measure one; where echoes contradict it, it is done.
+    plain = measure_quiet(block, system.sigma_ref / block.spacing)
+    for measured in False, True:
+        if measured:
+            plain = measure_gaussian(block, system.sigma_ref / block.spacing)
+        lone = find_lone(block, plain, most=len(block))
+        width = find_edge(lone.sigma) if len(lone) >= FEW else 0.0
+        if abs(width / plain.sigma_ref - 1.0) <= FAR_OFF:
+            break
     level = describe_level(block, plain)
     quiet = plain.noise.by_kind.get("quiet", 0.0)
     if quiet:
@@ -217,22 +220,6 @@ def look_at(blocks: Sequence[WaveformBlock], system: SystemPulse, seen: Glance |
     noise = seen.look.level.std / strong.amplitude.astype(np.float64)
     left = quantile(fit_alone(block, with_pulse(seen.plain, system), strong)[0] ** 2 - noise**2, 0.25)
     return replace(seen.look, misfit=float(np.sqrt(max(left, 0.0))))
-
-
-def _find_width(block: WaveformBlock, expected: float) -> tuple[SystemPulse, EchoTable, float]:
-    """A Gaussian and the noise, the lone echoes, and the width of the narrowest that repeat [ns]; 0: too few.
-
-    With the width of the flight this takes half as long as to measure one; where the echoes contradict it, it is done.
-    """
-    plain = measure_quiet(block, expected / block.spacing)
-    for measured in False, True:
-        if measured:
-            plain = measure_gaussian(block, expected / block.spacing)
-        lone = find_lone(block, plain, most=len(block))
-        width = find_edge(lone.sigma) if len(lone) >= FEW else 0.0
-        if abs(width / plain.sigma_ref - 1.0) <= FAR_OFF:
-            break
-    return plain, lone, width
 
 
 def compare_looks(own: Look, whole: Look, system: SystemPulse, wider: float = WIDER) -> str:

@@ -254,7 +254,11 @@ def _measure_class(
     """
     nothing, source = np.zeros(len(_MIDDLE)), number > 2 if company else number == 2
     pick = np.flatnonzero(source & ((echoes.flags & np.uint16(_CUT)) == 0))
-    near = _count_near(echoes, source, system.sigma_ref)
+    near = 0
+    for step in (1, 2, 3):
+        gap = (echoes.time[step:] - echoes.time[:-step]) / system.sigma_ref
+        same = (echoes.waveform[step:] == echoes.waveform[:-step]) & source[step:]
+        near += int(np.count_nonzero(same & (gap >= NEAR) & (gap < FAR)))
     if len(pick) < FEW or not near:
         return nothing
     excess, shift = _hide_pairs(block, system, echoes.take(pick))
@@ -268,16 +272,6 @@ def _measure_class(
     hidden = expected * np.histogram(excess, EXCESS)[0]
     moved = expected * np.histogram(excess, EXCESS, weights=shift**2 / np.maximum(excess, EXCESS[0]))[0]
     return moved / np.maximum(np.maximum(there, hidden), 1.0)
-
-
-def _count_near(echoes: EchoTable, source: np.ndarray, width: float) -> int:
-    """Pairs of echoes of one waveform from NEAR to FAR apart."""
-    total = 0
-    for step in (1, 2, 3):
-        gap = (echoes.time[step:] - echoes.time[:-step]) / width
-        same = (echoes.waveform[step:] == echoes.waveform[:-step]) & source[step:]
-        total += int(np.count_nonzero(same & (gap >= NEAR) & (gap < FAR)))
-    return total
 
 
 def _hide_pairs(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[np.ndarray, np.ndarray]:

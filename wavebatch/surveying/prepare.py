@@ -108,7 +108,13 @@ def prepare(
     ConfigError
         Where no chain meets the tolerance.
     """
-    stranger, forced = _hold(reader, scan, request)
+    stranger = forced = ""  # why it does not belong to its flight, and what contradicts a saved survey
+    if request.system is not None and request.flight:
+        from wavebatch.surveying.flight import hold_strip  # and with it the survey
+
+        stranger = hold_strip(reader, scan, request.system)
+    elif request.system is not None:
+        forced = check_saved(reader, scan, request.system.survey, force=request.force)
     used = replace(request, system=None) if stranger else request
     choice = make_choice(reader, scan, chain, used)
     if extend is not None and used.describe(chain) is not None:
@@ -127,17 +133,6 @@ def prepare(
     level = None if sent.energy is None else sent.energy.level
     fitted, doubts = match_strip(calibration, reader, scan, system, source, choice.chain, air, level)
     return Setup(choice, source, sent.widen(fitted), sent, doubts, stranger, forced)
-
-
-def _hold(reader: StripReader, scan: StripScan, request: Request) -> tuple[str, str]:
-    """Why the strip does not belong to the flight whose survey is given, and what contradicts a saved survey."""
-    if request.system is None:
-        return "", ""
-    if request.flight:
-        from wavebatch.surveying.flight import hold_strip  # and with it the survey
-
-        return hold_strip(reader, scan, request.system), ""
-    return "", check_saved(reader, scan, request.system.survey, force=request.force)
 
 
 def _find_sensor(

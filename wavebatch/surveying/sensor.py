@@ -365,7 +365,19 @@ def _from_file(
     seen = estimate_path(rays, "direction vectors", pairs)
     shown = dict(seen.facts if seen else ())
     farther, range_error_m, vectors_error = _compare_ranges(distance, rays, seen)
-    late, behind = (None, None) if seen is None or seen.trajectory is None else _find_lag(known, seen.trajectory)
+    late = behind = None
+    if seen is not None and seen.trajectory is not None:
+        # By how much the trajectory comes later than the path by the packet vectors, in s and in m along the flight.
+        by_vectors = seen.trajectory
+        step = known.at(by_vectors.time + 0.5 * NODE_SECONDS) - known.at(by_vectors.time - 0.5 * NODE_SECONDS)
+        square = np.einsum("ni,ni->n", step, step)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            lag = NODE_SECONDS * np.einsum("ni,ni->n", by_vectors.xyz - known.at(by_vectors.time), step) / square
+        there = np.isfinite(lag)
+        if there.any():
+            middle = float(np.median(lag[there]))
+            late = round(middle, 4)
+            behind = round(middle * float(np.sqrt(np.median(square[there]))) / NODE_SECONDS, 3)
     distance = distance[np.isfinite(distance)]
     facts = {
         "file": path.name,
@@ -390,19 +402,6 @@ def _from_file(
         vectors_error=vectors_error,
         facts=tuple(facts.items()),
     )
-
-
-def _find_lag(known: Trajectory, path: Trajectory) -> tuple[float | None, float | None]:
-    """By how much a trajectory comes later than the path by the packet vectors, in s and in m along the flight."""
-    step = known.at(path.time + 0.5 * NODE_SECONDS) - known.at(path.time - 0.5 * NODE_SECONDS)
-    square = np.einsum("ni,ni->n", step, step)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        late = NODE_SECONDS * np.einsum("ni,ni->n", path.xyz - known.at(path.time), step) / square
-    there = np.isfinite(late)
-    if not there.any():
-        return None, None
-    middle = float(np.median(late[there]))
-    return round(middle, 4), round(middle * float(np.sqrt(np.median(square[there]))) / NODE_SECONDS, 3)
 
 
 def _compare_ranges(
@@ -565,10 +564,25 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
         return None
     found: list[tuple[SensorFit, np.ndarray, np.ndarray]] = []
     for node in nodes.tolist():
-        fit, low, high = _fit_window(rays, cells, node)
-        if fit is not None:
-            times = _node_times(nodes, node, low, high, origin + (node + 0.5) * NODE_SECONDS)
-            found.append((fit, times, np.clip(times, low, high)))
+        own = np.searchsorted(cells, [node, node + 1])
+        low, high = float(rays.time[own[0]]), float(rays.time[own[1] - 1])
+        for reach in WIDER:  # the smallest window that gives a fit
+            start, stop = np.searchsorted(cells, [node - reach, node + reach + 1])
+            rows = np.arange(start, stop, max(1, (stop - start) // MOST_RAYS))
+            fit = fit_best(rays.time[rows], rays.point[rows], rays.direction[rows], rays.weight[rows])
+            if fit is not None:
+                break
+        if fit is None:
+            continue
+        # It is used at the middle of the node, and beyond the ends of its rays where it has no neighbour.
+        middle = origin + (node + 0.5) * NODE_SECONDS
+        places = [middle] if low <= middle <= high else [low, high]
+        if not np.any(nodes == node - 1):
+            places += [low - BEYOND, low]
+        if not np.any(nodes == node + 1):
+            places += [high, high + BEYOND]
+        times = np.unique(places)
+        found.append((fit, times, np.clip(times, low, high)))
     if not found:
         return None
     time, inside = (np.concatenate([part[i] for part in found]) for i in (1, 2))
@@ -588,29 +602,6 @@ def estimate_path(rays: RaySample, kind: str, pairs: RaySample | None = None) ->
     return replace(source, error=float(np.hypot(source.error, off)), facts=(*source.facts, *shown.items()))
 
 
-def _fit_window(rays: RaySample, cells: np.ndarray, node: float) -> tuple[SensorFit | None, float, float]:
-    """The fit around a node from the smallest window that gives one, and first and last time of the node's rays."""
-    own = np.searchsorted(cells, [node, node + 1])
-    low, high = float(rays.time[own[0]]), float(rays.time[own[1] - 1])
-    for reach in WIDER:
-        start, stop = np.searchsorted(cells, [node - reach, node + reach + 1])
-        rows = np.arange(start, stop, max(1, (stop - start) // MOST_RAYS))
-        fit = fit_best(rays.time[rows], rays.point[rows], rays.direction[rows], rays.weight[rows])
-        if fit is not None:
-            return fit, low, high
-    return None, low, high
-
-
-def _node_times(nodes: np.ndarray, node: float, low: float, high: float, middle: float) -> np.ndarray:
-    """Times at which a node's fit is used: its middle, and beyond the ends of its rays where it has no neighbour."""
-    times = [middle] if low <= middle <= high else [low, high]
-    if not np.any(nodes == node - 1):
-        times += [low - BEYOND, low]
-    if not np.any(nodes == node + 1):
-        times += [high, high + BEYOND]
-    return np.unique(times)
-
-
 def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: RaySample) -> float:
     """Root mean square of the range's error over all windows [m]: what the fits say, and what they contradict."""
     squares, apart = [], []
@@ -622,20 +613,17 @@ def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: 
         squares.append(np.mean(range_error(fit, at, direction) ** 2))
         later = found[number + 1][0] if number + 1 < len(found) else None
         if later is not None and later.centre - fit.centre <= fit.half + later.half:
-            apart.append(np.mean((direction @ _contradiction(fit, later)) ** 2))
+            # Difference of their positions in the middle of what they share [m].
+            low = max(fit.centre - fit.half, later.centre - later.half)
+            high = min(fit.centre + fit.half, later.centre + later.half)
+            middle = np.array([0.5 * (low + high)])
+            off = (sensor_at(later, middle)[0] - sensor_at(fit, middle)[0])[0]
+            apart.append(np.mean((direction @ off) ** 2))
     if len(apart) >= LEAST_OVERLAPS:
         motion = 0.5 * np.mean(apart)  # both windows are off
     else:
         motion = (JERK * JERK_LEFT * max(fit.half for fit, _, _ in found) ** 3) ** 2
     return float(np.sqrt(np.mean(squares) + motion))
-
-
-def _contradiction(fit: SensorFit, later: SensorFit) -> np.ndarray:
-    """Difference of the positions from two overlapping windows, in the middle of what they share [m]."""
-    low = max(fit.centre - fit.half, later.centre - later.half)
-    high = min(fit.centre + fit.half, later.centre + later.half)
-    middle = np.array([0.5 * (low + high)])
-    return (sensor_at(later, middle)[0] - sensor_at(fit, middle)[0])[0]
 
 
 def _describe(

@@ -87,15 +87,14 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
     if not joined:
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0)
     seams = find_seams(joined)
-    found = _survey_joined([mark_seam(block, seams) for block in joined], learn=learn)
-    others = {index: replace(own, seams=seams) for index, own in found.system.digitizers.items()}
-    decisions = (*found.decisions, *_decide_seams(seams))
-    return replace(found, system=replace(found.system, seams=seams, digitizers=others), decisions=decisions)
-
-
-def _survey_joined(joined: list[WaveformBlock], *, learn: bool) -> Survey:
-    """As `survey_blocks`, from one block per descriptor whose seams are marked."""
-    groups = _group_descriptors(joined)
+    # Descriptors that differ in length only are pooled, the largest first.
+    kinds: dict[tuple[float, ...], list[WaveformBlock]] = {}
+    for block in joined:
+        digitizer = block.digitizer
+        kind = (digitizer.bits, digitizer.spacing, digitizer.gain, digitizer.offset)
+        kinds.setdefault(kind, []).append(mark_seam(block, seams))
+    groups = [(pool_blocks(members), members) for members in kinds.values()]
+    groups.sort(key=lambda group: weigh(group[0]), reverse=True)
     (main, members), *others = groups
     begin = measure_begin(main)
     strangers = find_strangers(members, begin) if len(members) > 1 else {}
@@ -109,19 +108,15 @@ def _survey_joined(joined: list[WaveformBlock], *, learn: bool) -> Survey:
     found = _survey(main, plain, learn=learn)
     _note_counts(found.figures, raw)
     found.figures.descriptors_pooled = float(len(members))
-    if not others:
-        return found
-    return _add_digitizers(found, plain, main, others, strangers, learn=learn)
-
-
-def _group_descriptors(joined: list[WaveformBlock]) -> list[tuple[WaveformBlock, list[WaveformBlock]]]:
-    """Descriptors that differ in length only, pooled, with the blocks they were pooled from; the largest first."""
-    kinds: dict[tuple[float, ...], list[WaveformBlock]] = {}
-    for block in joined:
-        digitizer = block.digitizer
-        kinds.setdefault((digitizer.bits, digitizer.spacing, digitizer.gain, digitizer.offset), []).append(block)
-    groups = [(pool_blocks(members), members) for members in kinds.values()]
-    return sorted(groups, key=lambda group: weigh(group[0]), reverse=True)
+    if others:
+        found = _add_digitizers(found, plain, main, others, strangers, learn=learn)
+    systems = {index: replace(own, seams=seams) for index, own in found.system.digitizers.items()}
+    decisions = list(found.decisions)
+    for length, at in sorted(seams.items()):
+        reason = f"packets of {length} samples are interpolated at sample {at}: two recordings meet there"
+        decisions.append(Decision("seam left out", True, reason))
+    system = replace(found.system, seams=seams, digitizers=systems)
+    return replace(found, system=system, decisions=tuple(decisions))
 
 
 def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int, str]:
@@ -354,10 +349,14 @@ def _decide(
     saturated, system_like = figures.saturated_share or 0.0, figures.system_width_share or 0.0
     learned = len(system.components)
     inverted = "the signal goes down from its baseline: counts are mirrored when they are read"
+    skew = "no pulse was learned"
+    if figures.misfit_skewed is not None:
+        misfit = f"it misses the stacked echoes by {figures.misfit_skewed:.4f} of the amplitude"
+        skew = f"with kappa {figures.kappa:z.3f} {misfit}"
     return (
         *((Decision(Part.INVERTED, True, inverted),) if figures.inverted else ()),
         Decision(Part.PULSE, learned > 1, _explain_pulse(candidates)),
-        Decision(Part.SKEW, system.kappa != 0, _explain_skew(system, figures)),
+        Decision(Part.SKEW, system.kappa != 0, skew),
         Decision(Part.GROWTH, share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
         Decision(Part.PRIOR, share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (limit 40 %)"),
         Decision(
@@ -398,13 +397,6 @@ def _decide_defects(defects: Defects) -> Iterator[Decision]:
         yield Decision("start left out", True, f"the first {defects.transient:g} ns of the waveforms jump")
 
 
-def _decide_seams(seams: Mapping[int, int]) -> Iterator[Decision]:
-    """Where packets hold two recordings with an interpolated sample between them."""
-    for length, at in sorted(seams.items()):
-        reason = f"packets of {length} samples are interpolated at sample {at}: two recordings meet there"
-        yield Decision("seam left out", True, reason)
-
-
 def _explain_pulse(candidates: tuple[Tried, ...]) -> str:
     """Why the pulse is the one that it is."""
     if not candidates:
@@ -415,11 +407,3 @@ def _explain_pulse(candidates: tuple[Tried, ...]) -> str:
     text += "".join(f", {one.nats:.1f} with {one.name}" for one in others[:2])
     shorter = any(one.longer_by < -SURE for one in others)
     return text + ("; a shorter one saves too little per echo, or needs more echoes" if shorter else "")
-
-
-def _explain_skew(system: SystemPulse, figures: Figures) -> str:
-    """Why the pulse is, or is not, skewed."""
-    if figures.misfit_skewed is None:
-        return "no pulse was learned"
-    misfit, kappa = figures.misfit_skewed, figures.kappa
-    return f"with kappa {kappa:z.3f} it misses the stacked echoes by {misfit:.4f} of the amplitude"

@@ -140,17 +140,12 @@ def measure_ties(rows: np.ndarray, size: float, slope: float | None = None, righ
     centre = (np.floor(rows["xyz"][at, :2] / size) + 0.5) * size
     height, _ = group_medians(off, group)
     error = MEDIAN_ERROR * np.maximum(spread, 1e-3) / np.sqrt(number)
-    view = _describe_view(rows, facing, at + number // 2, rights)
+    middles = at + number // 2
+    view = np.empty(len(middles), VIEW)
+    view["angle"] = np.nan if rights is None else angle_across(rows["ray"][middles], rights[rows["source"][middles]])
+    view["incidence"] = np.arccos(np.clip(facing[middles], 0.0, 1.0))
+    view["distance"], view["time"] = rows["distance"][middles], rows["time"][middles]
     return Ties(cells, rows["source"][at], middle, error, height, tilt[at], centre.astype(np.float64), size, view)
-
-
-def _describe_view(rows: np.ndarray, facing: np.ndarray, at: np.ndarray, rights: np.ndarray | None) -> np.ndarray:
-    """How the rows `at` were seen, array of VIEW."""
-    view = np.empty(len(at), VIEW)
-    view["angle"] = np.nan if rights is None else angle_across(rows["ray"][at], rights[rows["source"][at]])
-    view["incidence"] = np.arccos(np.clip(facing[at], 0.0, 1.0))
-    view["distance"], view["time"] = rows["distance"][at], rows["time"][at]
-    return view
 
 
 def _keep_shared(rows: np.ndarray, cell: np.ndarray, *more: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -289,24 +284,29 @@ def adjust_constants(
         # Errors of fits are in the residuals already: the larger of the two is what a row is known to.
         spread = np.maximum(error, scatter)
         weight = spread**-2.0 * np.minimum(1.0, HUBER * scatter / np.maximum(np.abs(rest), 1e-12))
-    again = equations.resample(weight, ties.centre[use], trials)
+    # Errors: blocks of cells are drawn again, and targets change by their errors.
+    rng = np.random.default_rng(0)
+    _, block = np.unique(np.floor(ties.centre[use] / BLOCK), axis=0, return_inverse=True)
+    blocks = int(block.max(initial=-1)) + 1
+    again = np.empty((trials, equations.design.shape[1]))
+    given, stated = equations.anchors.value, equations.anchors.error
+    for row in again:
+        drawn = np.bincount(rng.integers(0, max(blocks, 1), blocks), minlength=blocks).astype(float)
+        # A little of every block stays: without it a source that few blocks tie could be lost.
+        part = weight * np.maximum(drawn[block.ravel()], 1e-3) if blocks else weight
+        moved = replace(equations.anchors, value=given + stated * rng.standard_normal(len(given)))
+        row[:] = replace(equations, anchors=moved).solve(part)
     residual = np.full(len(ties.cell), np.nan)
     residual[use] = rest
-    errors = _errors(equations.design, source, again, n) if trials else np.full(n, np.nan)
     number = np.bincount(source, minlength=n)
+    errors = np.std(again[:, :n], axis=0, ddof=1) if trials else np.full(n, np.nan)
+    if trials and columns.shape[1] and len(cell):
+        # Of sources with ties: of the constants and the terms over these.
+        square = np.var(equations.design @ np.nan_to_num(again).T, axis=1, ddof=1)
+        errors = np.where(number > 0, np.sqrt(np.bincount(source, square, n) / np.maximum(number, 1)), errors)
     return Adjustment(
         found[:n], errors, again[:, :n], number, residual, _excess(rest, cell, error), found[n:], again[:, n:]
     )
-
-
-def _errors(design: csr_array, source: np.ndarray, trials: np.ndarray, n: int) -> np.ndarray:
-    """Standard deviations f8 (n,) of the constants; of sources with ties, of constants and terms over their ties."""
-    error = np.std(trials[:, :n], axis=0, ddof=1)
-    if trials.shape[1] > n and design.shape[0]:
-        square = np.var(design @ np.nan_to_num(trials).T, axis=1, ddof=1)
-        count = np.bincount(source, minlength=n)
-        error = np.where(count > 0, np.sqrt(np.bincount(source, square, n) / np.maximum(count, 1)), error)
-    return error
 
 
 def _excess(rest: np.ndarray, cell: np.ndarray, error: np.ndarray) -> float:
@@ -369,21 +369,6 @@ class _Equations:
         bright = self.value + self.design @ np.nan_to_num(found)
         mean = np.bincount(self.cell, weight * bright) / np.maximum(np.bincount(self.cell, weight), 1e-300)
         return bright - mean[self.cell]
-
-    def resample(self, weight: np.ndarray, centre: np.ndarray, trials: int) -> np.ndarray:
-        """Solutions with blocks of cells drawn again, and targets changed by their errors; f8 (trials, n + m)."""
-        rng = np.random.default_rng(0)
-        _, block = np.unique(np.floor(centre / BLOCK), axis=0, return_inverse=True)
-        blocks = int(block.max(initial=-1)) + 1
-        found = np.empty((trials, self.design.shape[1]))
-        value, error = self.anchors.value, self.anchors.error
-        for row in found:
-            drawn = np.bincount(rng.integers(0, max(blocks, 1), blocks), minlength=blocks).astype(float)
-            # A little of every block stays: without it a source that few blocks tie could be lost.
-            part = weight * np.maximum(drawn[block.ravel()], 1e-3) if blocks else weight
-            moved = replace(self.anchors, value=value + error * rng.standard_normal(len(value)))
-            row[:] = replace(self, anchors=moved).solve(part)
-        return found
 
 
 HEIGHT_DOUBT, LEAST_HEIGHT = 5.0, 0.05

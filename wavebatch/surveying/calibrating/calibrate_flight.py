@@ -46,7 +46,7 @@ from wavebatch.surveying.calibrating.targets import (
     describe_channel,
     measure_ranging,
 )
-from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult, check_attenuation
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, check_attenuation
 from wavebatch.surveying.matching.setting import PLACES, SCANNERS, number_channel, see_channels
 from wavebatch.surveying.matching.strip_energies import StripEnergies
 
@@ -132,6 +132,14 @@ def read_strip(
         except InputError as error:
             refused = str(error)
         distance = np.array([source.sensor.distance or math.inf])
+        # How each channel saw the targets in the middle; good targets are level.
+        on, views = np.concatenate(on_targets), {}
+        for channel in np.unique(on["channel"]).tolist():
+            mine, view = on[on["channel"] == channel], np.zeros(1, VIEW)[0]
+            view["angle"] = np.median(angle_across(mine["ray"], source.setting.right))
+            view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
+            view["distance"], view["time"] = np.median(mine["distance"]), np.median(mine["time"])
+            views[channel] = view
         return FlightStrip(
             path=path,
             sha256=take_fingerprint(path, source.reader.facts.packets.file)["sha256_sampled"],
@@ -141,21 +149,9 @@ def read_strip(
             ranging=math.hypot(measure_ranging(source.sensor, distance, source.air), source.sent.growth),
             sent=source.sent,
             ties=ties,
-            seen=_see_targets(on_targets, source.setting.right),
+            seen=views,
             right=source.setting.right,
         )
-
-
-def _see_targets(on_targets: Sequence[np.ndarray], right: tuple[float, float]) -> dict[int, np.void]:
-    """How each channel saw the targets in the middle, as VIEW; good targets are level."""
-    rows, seen = np.concatenate(on_targets), {}
-    for channel in np.unique(rows["channel"]).tolist():
-        mine, view = rows[rows["channel"] == channel], np.zeros(1, VIEW)[0]
-        view["angle"] = np.median(angle_across(mine["ray"], right))
-        view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
-        view["distance"], view["time"] = np.median(mine["distance"]), np.median(mine["time"])
-        seen[channel] = view
-    return seen
 
 
 class _TieArea:
@@ -198,17 +194,15 @@ def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> t
         for contains, some in zip(inside, on_targets, strict=True):
             if sum(map(len, some)) < MOST_ECHOES:
                 some.append(rows[contains(rows["xyz"])])
-        parts.append(_shorten(rows[area.contains(rows["xyz"]) & np.isfinite(rows["light_err"])], area.origin))
+        # Ties, with channels as sources.
+        tied = rows[area.contains(rows["xyz"]) & np.isfinite(rows["light_err"])]
+        short = np.empty(len(tied), TIE)
+        short["xyz"] = tied["xyz"] - [*area.origin, 0.0]
+        short["source"] = tied["channel"]
+        for name in ("ray", "light", "distance", "time"):
+            short[name] = tied[name]
+        parts.append(short)
     return [np.concatenate(some)[:MOST_ECHOES] for some in on_targets], np.concatenate(parts)
-
-
-def _shorten(rows: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    short = np.empty(len(rows), TIE)
-    short["xyz"] = rows["xyz"] - [*origin, 0.0]
-    short["source"] = rows["channel"]
-    for name in ("ray", "light", "distance", "time"):
-        short[name] = rows[name]
-    return short
 
 
 LEAST_SPREAD = 0.01
@@ -271,7 +265,12 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
     most = float(np.abs(ties.view["angle"]).max(initial=0.0))
     columns, edge = swath_columns(ties.view["angle"], most or 1.0), np.inf
     at_targets = np.nan_to_num(swath_columns(seen["angle"], most or 1.0))
-    odd = _tells_sides(ties, anchors, columns)
+    # Do constants and a term that is alike on both sides stand for one that falls from side to side?
+    # They do where headings are alike, and where two strips of opposite headings overlap.
+    falling = replace(ties, value=columns[:, 2], error=np.full(len(columns), 1e-3))
+    free = Anchors(0.0 * anchors.value, 1e3 * np.ones(len(anchors.value)), np.zeros((len(anchors.value), 2)))
+    rest = adjust_constants(falling, free, columns[:, :2], 0).residual
+    odd = bool(len(rest) and np.nanstd(rest) > LEAST_LEFT)
     used = 3 if odd else 2
     adjusted = adjust_constants(ties, replace(anchors, columns=at_targets[:, :used]), columns[:, :used])
     if len(ties.cell):
@@ -285,15 +284,6 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
         return adjusted, (most, *map(float, adjusted.terms)), None
     other = adjust_constants(ties, replace(anchors, columns=at_targets[:, 2:]), columns[:, 2:], 0)
     return adjusted, (most, *map(float, adjusted.terms), 0.0), _leave_open(ties, adjusted, other, columns[:, 2])
-
-
-def _tells_sides(ties: Ties, anchors: Anchors, columns: np.ndarray) -> bool:
-    """Whether constants and a term that is alike on both sides cannot stand for one that falls from side to side: they
-    can where headings are alike, and where two strips of opposite headings overlap."""
-    side = replace(ties, value=columns[:, 2], error=np.full(len(columns), 1e-3))
-    free = Anchors(0.0 * anchors.value, 1e3 * np.ones(len(anchors.value)), np.zeros((len(anchors.value), 2)))
-    rest = adjust_constants(side, free, columns[:, :2], 0).residual
-    return bool(len(rest) and np.nanstd(rest) > LEAST_LEFT)
 
 
 def _leave_open(ties: Ties, adjusted: Adjustment, other: Adjustment, side: np.ndarray) -> float:
@@ -402,7 +392,17 @@ def calibrate_flight(
     """
     options = options or CalibrationOptions()
     check_attenuation(options.air)
-    _refuse_zones(paths)
+    # Strips of several CRSs are refused: places with equal coordinates would be tied.
+    named = [(path, describe_crs(path).name) for path in paths]
+    for coded in (True, False):
+        # By codes where files have them: names of one CRS differ from program to program.
+        some = {
+            name.rpartition("EPSG:")[2]: (path, name) for path, name in named if name and coded == ("EPSG:" in name)
+        }
+        if len(some) > 1:
+            (path, first), (second, other) = list(some.values())[:2]
+            problem = f"its coordinates are in {other}, those of {path.name} in {first}"
+            raise InputError(f"{second}: {problem}: project the strips to one CRS, or calibrate them separately")
     boxes = [(np.array(one.mins[:2]), np.array(one.maxs[:2])) for one in map(read_header, paths)]
     strips: list[FlightStrip] = []
     for i, path in enumerate(paths):
@@ -417,8 +417,22 @@ def calibrate_flight(
     if len(sources) == 1 and not options.scan_angle:
         return FlightCalibration(good[0].widened(bent))
     rights = np.array([source.strip.right for source in sources])
-    ties = _tie(sources, rights)
-    anchors, seen = _list_given(sources, options)
+    parts = [np.empty(0, TIE)]
+    for number, source in enumerate(sources):
+        rows = source.strip.ties[source.strip.ties["source"] == source.channel]
+        rows["source"] = number
+        parts.append(rows)
+    rows = np.concatenate(parts)
+    ties = measure_ties(rows, choose_size(rows), rights=rights)
+    value, error = np.full((2, len(sources)), np.nan)
+    seen = np.full(len(sources), np.nan, VIEW)
+    for number, source in enumerate(sources):
+        given, found = source.given, source.strip.found
+        if given is not None and found is not None:
+            rest = given.relative_error**2 - _reflectance_error([found], options) ** 2
+            value[number], error[number] = math.log(given.constant), math.sqrt(max(rest, 1e-6))
+            seen[number] = source.strip.seen[source.channel]
+    anchors = Anchors(value, error)
     swath: tuple[float, ...] = ()
     open_error = None
     if options.scan_angle:
@@ -446,20 +460,6 @@ def calibrate_flight(
     return FlightCalibration(replace(calibration.widened(bent), notes=(*notes, *more)), pairs, ties.size)
 
 
-def _refuse_zones(paths: Sequence[Path]) -> None:
-    """Raise InputError where strips name different CRSs: places with equal coordinates would be tied."""
-    named = [(path, describe_crs(path).name) for path in paths]
-    for coded in (True, False):
-        # By codes where files have them: names of one CRS differ from program to program.
-        some = {
-            name.rpartition("EPSG:")[2]: (path, name) for path, name in named if name and coded == ("EPSG:" in name)
-        }
-        if len(some) > 1:
-            (path, one), (second, other) = list(some.values())[:2]
-            problem = f"its coordinates are in {other}, those of {path.name} in {one}"
-            raise InputError(f"{second}: {problem}: project the strips to one CRS, or calibrate them separately")
-
-
 def _is_covered(row: ChannelConstant, channels: Sequence[ChannelConstant]) -> bool:
     """Whether a run takes the constant of other channels for this one, which differs in its samples per waveform only:
     see `strip_match`."""
@@ -484,31 +484,6 @@ def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) 
     return calibration.widened(spread), [note] if spread > stated else []
 
 
-def _tie(sources: Sequence[Source], rights: np.ndarray) -> Ties:
-    """The tie cells of all sources."""
-    parts = [np.empty(0, TIE)]
-    for number, source in enumerate(sources):
-        rows = source.strip.ties[source.strip.ties["source"] == source.channel]
-        rows["source"] = number
-        parts.append(rows)
-    rows = np.concatenate(parts)
-    return measure_ties(rows, choose_size(rows), rights=rights)
-
-
-def _list_given(sources: Sequence[Source], options: CalibrationOptions) -> tuple[Anchors, np.ndarray]:
-    """Constants by targets with their errors without that of the reflectance, which strips that see the same targets
-    share; and how each source saw its targets, array of VIEW (n,), NaN without."""
-    value, error = np.full((2, len(sources)), np.nan)
-    seen = np.full(len(sources), np.nan, VIEW)
-    for number, source in enumerate(sources):
-        given, found = source.given, source.strip.found
-        if given is not None and found is not None:
-            rest = given.relative_error**2 - _reflectance_error([found], options) ** 2
-            value[number], error[number] = math.log(given.constant), math.sqrt(max(rest, 1e-6))
-            seen[number] = source.strip.seen[source.channel]
-    return Anchors(value, error), seen
-
-
 def _reflectance_error(found: Sequence[Calibration], options: CalibrationOptions) -> float:
     """What the reflectance's error does to the constants: targets that several strips saw count once."""
     names = {(row.name, not options.column and row.reflectance)
@@ -526,7 +501,11 @@ def _assemble(
     known = np.isfinite(adjusted.value)
     channels: list[ChannelConstant] = []
     rows: list[StripConstant] = []
-    scatter = _drift_scatter(of[known], adjusted.value[known])
+    # Between strips of one channel; 0 where no channel has two.
+    parts = [adjusted.value[known & (of == channel)] for channel in np.unique(of[known])]
+    freedom = sum(len(part) - 1 for part in parts)
+    squares = sum(float(np.sum((part - part.mean()) ** 2)) for part in parts)
+    scatter = math.sqrt(squares / freedom) if freedom else 0.0
     for channel in np.unique(of[known]):
         mine = np.flatnonzero(known & (of == channel))
         some = [sources[k] for k in mine.tolist()]
@@ -535,95 +514,68 @@ def _assemble(
         apart = float(np.std(adjusted.value[mine], ddof=1)) if len(mine) > 1 else scatter
         ranging = float(np.mean([source.strip.ranging for source in some]))
         error = float(np.sqrt(np.std(trials.mean(axis=1), ddof=1) ** 2 + shared**2 + apart**2 + ranging**2))
-        channels.append(_describe_row(some, math.exp(mean), error))
-        rows += _list_strips(some, mine, adjusted, shared)
+        first = some[0].row
+        for path, own in ((source.strip.path, source.row) for source in some):
+            if (own.bits, own.spacing_ns, own.gain) != (first.bits, first.spacing_ns, first.gain):
+                raise InputError(
+                    f"{path}: digitizer {own.digitizer} records in another way than that of "
+                    f"{some[0].strip.path.name}: another sensor or other settings; calibrate these strips separately"
+                )
+        seen = [source.given for source in some if source.given is not None]
+        channels.append(replace(
+            first,
+            constant=math.exp(mean),
+            relative_error=error,
+            spread=max((own.spread for own in seen), default=0.0),
+            echoes=sum(own.echoes for own in seen),
+            shot_energy=max((own.shot_energy for own in seen), default=0.0),
+            pulse_ns=float(np.median([source.row.pulse_ns for source in some])),
+        ))
+        errors = np.std(trials - trials.mean(axis=1)[:, None], axis=0, ddof=1)
+        drifts = np.expm1(adjusted.value[mine] - adjusted.value[mine].mean())
+        for source, k, drift, drift_error in zip(some, mine, drifts, errors, strict=True):
+            rows.append(StripConstant(
+                strip=source.strip.path.name,
+                sha256=source.strip.sha256,
+                digitizer=source.row.digitizer,
+                scanner=source.row.scanner,
+                constant=math.exp(adjusted.value[k]),
+                relative_error=float(np.sqrt(adjusted.error[k] ** 2 + shared**2 + source.strip.ranging**2)),
+                drift=float(drift),
+                drift_error=float(drift_error),
+                ties=int(adjusted.ties[k]),
+            ))
     constants = np.array([row.constant for row in channels])
     error = float(np.hypot(np.std(constants) / constants.mean(), max(row.relative_error for row in channels)))
+    # Places are as bright as they are by the mean constants of their channels.
+    gain = {(row.sha256, number_channel(row.digitizer, row.scanner)): math.log1p(row.drift) for row in rows}
+    places = []
+    for found in good:
+        part = np.reshape(found.places, (-1, 4))
+        part[:, 3] += [gain.get((found.fingerprint["sha256_sampled"], channel), 0.0) for channel in part[:, 0]]
+        places.append(part)
+    joined = np.concatenate(places)
     return replace(
         good[0],
         constant=float(np.median(constants)),
         relative_error=error,
         strip=", ".join(strip.path.name for strip in strips),
         conditions=good[0].conditions if len(strips) == 1 else f"{len(strips)} strips, {good[0].conditions}",
-        targets=tuple(_list_targets(strips)),
+        targets=tuple(
+            # Those without any echo on a strip of several are left out.
+            row if len(strips) == 1 else replace(row, name=f"{row.name} on {strip.path.name}")
+            for strip in strips
+            if strip.found
+            for row in strip.found.targets
+            if len(strips) == 1 or row.echoes
+        ),
         channels=tuple(channels),
         strips=tuple(rows),
-        places=_join_places(good, rows),
+        places=tuple(joined[even_places(len(joined), PLACES)].ravel().tolist()),
         notes=tuple(
             note if len(strips) == 1 else f"{strip.path.name}: {note}"
             for strip in strips
             if strip.found
             for note in strip.found.notes
         ),
-    )
-
-
-def _join_places(good: Sequence[Calibration], rows: Sequence[StripConstant]) -> tuple[float, ...]:
-    """Ground of the strips with targets, as bright as it is by the mean constants of their channels."""
-    drift = {(row.sha256, number_channel(row.digitizer, row.scanner)): math.log1p(row.drift) for row in rows}
-    parts = []
-    for found in good:
-        part = np.reshape(found.places, (-1, 4))
-        part[:, 3] += [drift.get((found.fingerprint["sha256_sampled"], channel), 0.0) for channel in part[:, 0]]
-        parts.append(part)
-    joined = np.concatenate(parts)
-    return tuple(joined[even_places(len(joined), PLACES)].ravel().tolist())
-
-
-def _list_strips(
-    some: Sequence[Source], mine: np.ndarray, adjusted: Adjustment, shared: float
-) -> Iterator[StripConstant]:
-    """The constants of one channel on each strip; mine: numbers of its sources, shared: error of the reflectance."""
-    values, trials = adjusted.value[mine], adjusted.trials[:, mine]
-    errors = np.std(trials - trials.mean(axis=1)[:, None], axis=0, ddof=1)
-    for source, k, drift, error in zip(some, mine, np.expm1(values - values.mean()), errors, strict=True):
-        yield StripConstant(
-            strip=source.strip.path.name,
-            sha256=source.strip.sha256,
-            digitizer=source.row.digitizer,
-            scanner=source.row.scanner,
-            constant=math.exp(adjusted.value[k]),
-            relative_error=float(np.sqrt(adjusted.error[k] ** 2 + shared**2 + source.strip.ranging**2)),
-            drift=float(drift),
-            drift_error=float(error),
-            ties=int(adjusted.ties[k]),
-        )
-
-
-def _drift_scatter(channel: np.ndarray, value: np.ndarray) -> float:
-    """Standard deviation of the logarithms of a channel's constants between strips; 0 where no channel has two."""
-    parts = [value[channel == one] for one in np.unique(channel)]
-    freedom = sum(len(part) - 1 for part in parts)
-    squares = sum(float(np.sum((part - part.mean()) ** 2)) for part in parts)
-    return math.sqrt(squares / freedom) if freedom else 0.0
-
-
-def _list_targets(strips: Sequence[FlightStrip]) -> Iterator[TargetResult]:
-    """What the targets gave on each strip; those without any echo on a strip of several are left out."""
-    for strip in strips:
-        for row in strip.found.targets if strip.found else ():
-            if len(strips) == 1:
-                yield row
-            elif row.echoes:
-                yield replace(row, name=f"{row.name} on {strip.path.name}")
-
-
-def _describe_row(some: Sequence[Source], constant: float, error: float) -> ChannelConstant:
-    """The row of a channel with how it records, and what targets say of its scatter; InputError for two recordings."""
-    first = some[0].row
-    for path, row in ((source.strip.path, source.row) for source in some):
-        if (row.bits, row.spacing_ns, row.gain) != (first.bits, first.spacing_ns, first.gain):
-            raise InputError(
-                f"{path}: digitizer {row.digitizer} records in another way than that of "
-                f"{some[0].strip.path.name}: another sensor or other settings; calibrate these strips separately"
-            )
-    seen = [source.given for source in some if source.given is not None]
-    return replace(
-        first,
-        constant=constant,
-        relative_error=error,
-        spread=max((row.spread for row in seen), default=0.0),
-        echoes=sum(row.echoes for row in seen),
-        shot_energy=max((row.shot_energy for row in seen), default=0.0),
-        pulse_ns=float(np.median([source.row.pulse_ns for source in some])),
     )

@@ -91,7 +91,15 @@ def parse_calibration(text: str, name: str) -> Calibration:
     table = toml_file.parse_toml(text, name)
     table.check_kind("calibration")
     table.check_schema(CALIBRATION_SCHEMA)
-    swath = _read_swath(table.table("scan_angle")) if "scan_angle" in table.values else ()
+    swath: tuple[float, ...] = ()
+    if "scan_angle" in table.values:
+        angles = table.table("scan_angle")
+        angles.check_keys(_SWATH)
+        older = {"odd": 0.0}  # files that have none
+        most, *terms = (
+            angles.number(key, *limits, default=older.get(key, toml_file.REQUIRED)) for key, limits in _SWATH.items()
+        )
+        swath = (math.radians(most), *terms)
     fingerprint = dict(table.table("fingerprint", {}).values)
     others = ("schema", "version", _SECTION, "scan_angle", "target", "fingerprint")
     found = replace(toml_file.read_record(Calibration, table, also=others), swath=swath, fingerprint=fingerprint)
@@ -110,25 +118,14 @@ def parse_calibration(text: str, name: str) -> Calibration:
             raise ConfigError(f"{where}: digitizer {channel[0]} with scanner channel {channel[1]} has two tables")
         known.add(channel)
     if _SECTION in table.values:
-        _check_section(table.number(_SECTION, 0.0, 1e30), found, name)
+        # C_cal must follow from the other two: else one was changed by hand.
+        section = table.number(_SECTION, 0.0, 1e30)
+        expected = found.section_constant
+        if expected is None or abs(section - expected) > 1e-3 * expected:
+            wanted = "no divergence_mrad" if expected is None else f"{expected!r} by constant and divergence_mrad"
+            problem = f"section_constant is {section!r}, but there is {wanted}"
+            raise ConfigError(f"{name}: {problem}; correct these, or leave section_constant out")
     return found
-
-
-def _read_swath(table: toml_file.TomlTable) -> tuple[float, ...]:
-    table.check_keys(_SWATH)
-    even = {key: limits for key, limits in _SWATH.items() if key != "odd"}
-    most, *terms = (table.number(key, low, high) for key, (low, high) in even.items())
-    terms.append(table.number("odd", *_SWATH["odd"], default=0.0))  # older files have none
-    return (math.radians(most), *terms)
-
-
-def _check_section(section: float, found: Calibration, name: str) -> None:
-    """Raise ConfigError where C_cal does not follow from the other two: one was changed by hand."""
-    expected = found.section_constant
-    if expected is None or abs(section - expected) > 1e-3 * expected:
-        wanted = "no divergence_mrad" if expected is None else f"{expected!r} by constant and divergence_mrad"
-        problem = f"section_constant is {section!r}, but there is {wanted}"
-        raise ConfigError(f"{name}: {problem}; correct these, or leave section_constant out")
 
 
 _CORNERS = 64
@@ -211,7 +208,14 @@ def load_targets(path: Path | str) -> list[Target]:
     file = None
     try:
         if text.lstrip().startswith("{"):
-            rows, file = _read_geojson(text, path)
+            rows = []
+            features, file = read_features(text, path)
+            for properties, rings in features:
+                if len(rings) > 1:
+                    problem = f"a target has {len(rings)} rings"
+                    raise ConfigError(f"{path}: {problem}; make every part a target, without holes")
+                corners = " ".join(f"{float(x)!r} {float(y)!r}" for x, y in rings[0])
+                rows.append({**properties, "vertices": corners})
         else:
             rows = list(csv.DictReader(lines))
     except csv.Error as error:
@@ -227,17 +231,6 @@ def load_targets(path: Path | str) -> list[Target]:
                 f"{path}: targets {first} and {number} are one target: its reflectance would count twice; leave one out"
             )
     return targets
-
-
-def _read_geojson(text: str, path: Path | str) -> tuple[list[dict[str, Any]], AreaFile]:
-    rows = []
-    features, file = read_features(text, path)
-    for properties, rings in features:
-        if len(rings) > 1:
-            raise ConfigError(f"{path}: a target has {len(rings)} rings; make every part a target, without holes")
-        corners = " ".join(f"{float(x)!r} {float(y)!r}" for x, y in rings[0])
-        rows.append({**properties, "vertices": corners})
-    return rows, file
 
 
 def _read_target(row: Mapping[str, Any], where: str) -> Target:

@@ -165,17 +165,13 @@ def open_source(path: Path, options: CalibrationOptions) -> Iterator[EchoSource]
         if column and given is None:
             hint = name_columns(reader, column)
             raise InputError(f"{path}: --from-column: no extra byte is called {column!r}; {hint}")
-        chain = with_energy(setup.chain)
+        # Without the physical attributes, and with the energy of each echo.
+        needed = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
+        steps = [step for step in setup.chain.steps if step.stage.kind != "attribute" or step.stage.name in needed]
+        have = {step.stage.name for step in steps}
+        steps += [Step(STAGES[name]) for name in ("attribute.position", f"attribute.{_LIGHT}") if name not in have]
+        chain = replace(setup.chain, steps=tuple(steps))
         yield EchoSource(reader, scan, setup.choice, chain, system, setup.sensor, setting, sent, air, haze, given)
-
-
-def with_energy(chain: Chain) -> Chain:
-    """Return the chain without its physical attributes, and with the energy of each echo."""
-    needed = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
-    steps = [step for step in chain.steps if step.stage.kind != "attribute" or step.stage.name in needed]
-    have = {step.stage.name for step in steps}
-    steps += [Step(STAGES[name]) for name in ("attribute.position", f"attribute.{_LIGHT}") if name not in have]
-    return replace(chain, steps=tuple(steps))
 
 
 def take_clean(block: WaveformBlock, echoes: EchoTable, given: np.ndarray | None = None) -> np.ndarray:

@@ -250,7 +250,11 @@ def measure_target(
     constant = 4.0 * bright * np.cos(angle[used]) / rows["light"][used]
     _, channel = np.unique(rows["channel"][used], return_inverse=True)
     relative = constant / group_medians(constant, channel)[0][channel]
-    (edge, edge_err), (strange, strange_err) = _compare_edge(relative, depth[used]), _share_strange(relative)
+    edge, edge_err = _compare_edge(relative, depth[used])
+    off = np.abs(relative / np.median(relative) - 1.0)
+    other_surface = off > max(STRANGE_SIGMA * MAD_TO_STD * float(np.median(off)), LEAST_EDGE)
+    strange = float(np.mean(other_surface))
+    strange_err = float(np.median(off[other_surface])) if strange > MOST_STRANGE else 0.0
     result = replace(
         summarise(blank, constant),
         incidence_deg=float(np.degrees(np.median(angle[used]))),
@@ -341,14 +345,6 @@ def summarise(blank: TargetResult, constant: np.ndarray) -> TargetResult:
     """Return the result with number, median and relative robust spread of constants (n,), n > 0."""
     middle = float(np.median(constant))
     return replace(blank, echoes=len(constant), constant=middle, spread=robust_std(constant) / middle)
-
-
-def _share_strange(constant: np.ndarray) -> tuple[float, float]:
-    """Share of echoes whose constant is that of another surface, and the error that follows."""
-    off = np.abs(constant / np.median(constant) - 1.0)
-    strange = off > max(STRANGE_SIGMA * MAD_TO_STD * float(np.median(off)), LEAST_EDGE)
-    share = float(np.mean(strange))
-    return share, float(np.median(off[strange])) if share > MOST_STRANGE else 0.0
 
 
 def _compare_parts(constant: np.ndarray, xyz: np.ndarray) -> float:
@@ -475,7 +471,31 @@ def build_calibration(
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])
     ranging = math.hypot(measure_ranging(source.sensor, used["distance"], source.air), source.sent.growth)
-    bent, compressed = _compare_compression(source, used)
+    # By how much constants are off for echoes that a compressing receiver makes darker or brighter than the
+    # targets, relative, and the lines about it, or about targets that do not show it.
+    bent, compressed = 0.0, []
+    for number, loss in find_compression(source.reader, source.scan, source.system).items():
+        lit = used["amplitude"][used["channel"] == number]
+        if not len(lit):
+            continue
+        growth = loss.compare(lit)
+        bent = max(bent, growth)
+        (low, high), (dark, bright) = (np.quantile(one, MOST).tolist() for one in (loss.amplitude, lit))
+        which = f"digitizer {number // SCANNERS}"
+        which += f", scanner channel {number % SCANNERS}," if number % SCANNERS else ""
+        if growth > LEAST_BENT:
+            off = [loss.factor * (float(np.mean(lit)) - amplitude) for amplitude in (low, high)]
+            compressed.append(
+                f"the receiver of {which} compresses, by the shape of its echoes: those of "
+                f"{low:.0f} to {high:.0f} DN are {off[0]:+.1%} to {off[1]:+.1%} off against the targets': the error of "
+                f"the constant grows by {growth:.1%}; take targets as bright as the surfaces that you measure"
+            )
+        elif max(dark / low, high / bright) > UNLIKE_TARGETS:
+            compressed.append(
+                f"the targets of {which} are {dark:.0f} to {bright:.0f} DN bright, its echoes {low:.0f} to {high:.0f} "
+                "DN: that its receiver weakens no strong light is assumed, and not in the error; take a dark and a "
+                "bright target"
+            )
     channels = tuple(
         describe_channel(replace(row, relative_error=math.hypot(row.relative_error, ranging)), source)
         for row in _measure_channels(measured)
@@ -520,35 +540,6 @@ def measure_ranging(sensor: SensorSource, distance: np.ndarray, attenuation: flo
     """Return the relative error of the constant from that of the sensor's position, which all echoes share."""
     middle = np.array([np.median(distance)])
     return float(np.nan_to_num(backscatter_error(np.zeros(1), middle, sensor.error, 0.0, attenuation)[0]))
-
-
-def _compare_compression(source: EchoSource, used: np.ndarray) -> tuple[float, list[str]]:
-    """By how much constants are off for echoes that a compressing receiver makes darker or brighter than the targets,
-    relative, and the lines about it, or about targets that do not show it; used: array of ECHO."""
-    most, lines = 0.0, []
-    for channel, found in find_compression(source.reader, source.scan, source.system).items():
-        targets = used["amplitude"][used["channel"] == channel]
-        if not len(targets):
-            continue
-        growth = found.compare(targets)
-        most = max(most, growth)
-        (low, high), (dark, bright) = (np.quantile(one, MOST).tolist() for one in (found.amplitude, targets))
-        which = f"digitizer {channel // SCANNERS}"
-        which += f", scanner channel {channel % SCANNERS}," if channel % SCANNERS else ""
-        if growth > LEAST_BENT:
-            off = [found.factor * (float(np.mean(targets)) - amplitude) for amplitude in (low, high)]
-            lines.append(
-                f"the receiver of {which} compresses, by the shape of its echoes: those of "
-                f"{low:.0f} to {high:.0f} DN are {off[0]:+.1%} to {off[1]:+.1%} off against the targets': the error of "
-                f"the constant grows by {growth:.1%}; take targets as bright as the surfaces that you measure"
-            )
-        elif max(dark / low, high / bright) > UNLIKE_TARGETS:
-            lines.append(
-                f"the targets of {which} are {dark:.0f} to {bright:.0f} DN bright, its echoes {low:.0f} to {high:.0f} "
-                "DN: that its receiver weakens no strong light is assumed, and not in the error; take a dark and a "
-                "bright target"
-            )
-    return most, lines
 
 
 def _measure_channels(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndarray]]) -> list[ChannelConstant]:

@@ -340,7 +340,16 @@ def _find_zone(reader: StripReader, rows: np.ndarray, size: float) -> Zone:
     cosine.
     """
     rows, found = rows[:, np.argsort(rows[0], kind="stable")], []
-    if _jumps(rows, size):
+    # Pulses lie whole zones off their neighbours, or groups of them off the next.
+    groups = np.array_split(rows, max(rows.shape[1] // NEAR_PULSES, 1), axis=1)
+    height = np.array([np.median(group[4]) for group in groups])
+    zones = np.concatenate([(group[4] - at) / group[5] for group, at in zip(groups, height, strict=True)]) / size
+    whole = _is_whole(zones)
+    steps = np.diff(height)[np.diff([np.median(group[0]) for group in groups]) < NEAR_TIME] / size
+    between = np.mean(np.abs(zones - np.rint(zones)) > 0.25)
+    mixed = np.mean(whole) > LEAST_OFF and between < MOST_BETWEEN * np.mean(whole)
+    lone = np.abs(steps) > LONE_STEP * np.median(np.abs(steps)) if len(steps) else False
+    if mixed or (_is_whole(steps) & lone).any():
         raise InputError(
             f"{reader.facts.path}: heights of neighbouring pulses jump by a whole number of the {size:.0f} m between "
             f"two pulses: {OTHER_PULSE}"
@@ -358,19 +367,6 @@ def _find_zone(reader: StripReader, rows: np.ndarray, size: float) -> Zone:
             f"{'short' if off > 0 else 'long'}, {abs(number)} x the {size:.0f} m between two pulses: {OTHER_PULSE}"
         )
     return Zone(size, off, error)
-
-
-def _jumps(rows: np.ndarray, size: float) -> bool:
-    """Whether pulses lie whole zones off their neighbours, or groups of them off the next; rows as `_find_zone`."""
-    groups = np.array_split(rows, max(rows.shape[1] // NEAR_PULSES, 1), axis=1)
-    height = np.array([np.median(group[4]) for group in groups])
-    off = np.concatenate([(group[4] - at) / group[5] for group, at in zip(groups, height, strict=True)]) / size
-    whole = _is_whole(off)
-    steps = np.diff(height)[np.diff([np.median(group[0]) for group in groups]) < NEAR_TIME] / size
-    between = np.mean(np.abs(off - np.rint(off)) > 0.25)
-    mixed = np.mean(whole) > LEAST_OFF and between < MOST_BETWEEN * np.mean(whole)
-    lone = np.abs(steps) > LONE_STEP * np.median(np.abs(steps)) if len(steps) else False
-    return bool(mixed or (_is_whole(steps) & lone).any())
 
 
 def _is_whole(zones: np.ndarray) -> np.ndarray:

@@ -106,7 +106,10 @@ def take_energies(
     docs/algorithms.md 5.2.
     """
     energy, notes = find_pulse_energy(reader, scan, request), []
-    pulses = _read_neighbours(reader, scan, energy)
+    pulses = np.empty((4, 0))
+    if reader.unit_count():  # the middle of the strip
+        unit = reader.read_unit(reader.unit_count() // 2, scan)
+        pulses = _join(reader, unit, np.flatnonzero(unit.packets.owned)[:NEIGHBOURS], energy)
     growth = 0.0
     if energy is not None and request is not None:
         doubt = judge_energies(pulses[1], pulses[2])
@@ -187,14 +190,6 @@ def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[floa
         f"calibration by {100 * scatter:.1f} %: is the log stuck? The rest is in the error"
     )
     return lacks, line if lacks > LEAST_SAID else ""
-
-
-def _read_neighbours(reader: StripReader, scan: StripScan, energy: PulseEnergy | None) -> np.ndarray:
-    """Neighbouring waveforms in the middle of the strip, as `_join`."""
-    if not reader.unit_count():
-        return np.empty((4, 0))
-    unit = reader.read_unit(reader.unit_count() // 2, scan)
-    return _join(reader, unit, np.flatnonzero(unit.packets.owned)[:NEIGHBOURS], energy)
 
 
 def _join(reader: StripReader, unit: Unit, rows: np.ndarray, energy: PulseEnergy | None) -> np.ndarray:

@@ -20,7 +20,7 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.core.waveforms import Digitizer, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -65,25 +65,6 @@ FROM_START = 2.0 / 3.0**0.5
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.5
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
 one, other surfaces the other."""
-
-
-def doubt_calibration(calibration: Calibration) -> Iterator[str]:
-    """Yield what makes a calibration doubtful for any strip."""
-    if not any(row.is_described for row in calibration.channels):
-        yield (
-            "calibration: the file does not say which sensor it was measured with (an earlier version wrote it), so "
-            "it cannot be compared with this strip; measure it again with `wavebatch calibrate`"
-        )
-    if not _least_error(calibration):
-        yield (
-            f"calibration: its relative_error is 0, but no constant is known exactly: {UNSTATED:.0%} is taken; put the "
-            "error of the targets into the file"
-        )
-
-
-def _least_error(calibration: Calibration) -> float:
-    """The least relative error of its constants."""
-    return min([calibration.relative_error, *(row.relative_error for row in calibration.channels)])
 
 
 def find_growth(
@@ -255,34 +236,6 @@ def judge_fading(
     ]
 
 
-def compare_air(
-    calibration: Calibration, reader: StripReader, sensor: SensorSource, attenuation: float | None, warnings: list[str]
-) -> float:
-    """Relative error of a strip of the calibration's day that is given other air than the calibration had."""
-    day = settings.read_day(reader)
-    if attenuation is None or not sensor.distance or (day and calibration.flight and day != calibration.flight):
-        return 0.0
-    off = 2.0e-4 * math.log(10.0) * sensor.distance * (attenuation - calibration.attenuation)
-    if abs(off) < LEAST_AIR:
-        return 0.0
-    warnings.append(
-        f"calibration: --attenuation {attenuation:g} dB/km contradicts the {calibration.attenuation:.2g} dB/km with "
-        f"which the constant was measured on the same day: light changes by {100 * math.expm1(off):+.0f} %, which is "
-        "in the error; give `wavebatch calibrate` the same --attenuation"
-    )
-    return abs(off)
-
-
-def compare_divergence(calibration: Calibration, system: SystemPulse) -> Iterator[str]:
-    """Yield the sentence about a divergence that is not that of the calibration."""
-    own, other = system.radiometry.divergence, calibration.divergence
-    if own is not None and other is not None and abs(own / other - 1.0) > SAME_DIVERGENCE:
-        yield (
-            f"calibration: measured with a divergence of {other:g} mrad, the survey has {own:g} mrad, which is used: "
-            f"one of the two makes cross sections {100 * abs((own / other) ** 2 - 1):.0f} % wrong"
-        )
-
-
 OTHER_WIDTH, NEAR_WIDTH = 1.25, 1.03
 """Ratios of the pulse widths of calibration and strip: above the first it is another pulse, above the second it may be
 one, and the error grows by the difference. Surveys of a sensor's strips agree within 2 % where ground is not steep."""
@@ -340,9 +293,20 @@ def match_strip(
     -----
     docs/algorithms.md 5.2.
     """
-    warnings = list(doubt_calibration(calibration))
-    calibration = calibration.widened(0.0 if _least_error(calibration) else UNSTATED)
-    if not any(row.is_described for row in calibration.channels):
+    warnings: list[str] = []
+    described = any(row.is_described for row in calibration.channels)
+    if not described:
+        warnings.append(
+            "calibration: the file does not say which sensor it was measured with (an earlier version wrote it), so "
+            "it cannot be compared with this strip; measure it again with `wavebatch calibrate`"
+        )
+    if not min([calibration.relative_error, *(row.relative_error for row in calibration.channels)]):
+        warnings.append(
+            f"calibration: its relative_error is 0, but no constant is known exactly: {UNSTATED:.0%} is taken; put the "
+            "error of the targets into the file"
+        )
+        calibration = calibration.widened(UNSTATED)
+    if not described:
         return calibration, tuple(warnings)
     if calibration.haze and attenuation is None:
         calibration = replace(calibration, attenuation=calibration.attenuation / calibration.haze * sensor.haze)
@@ -369,7 +333,13 @@ def match_strip(
         # Light that is seen to fade from the calibrated level on also moves the mean, which the first error holds.
         growth = max(growth, more) if lines else math.hypot(growth, more)
         reasons, notes = [*reasons, *lines], [*notes, *hidden]
-    warnings += [*reasons, *compare_divergence(calibration, system)]
+    warnings += reasons
+    own, divergence = system.radiometry.divergence, calibration.divergence
+    if own is not None and divergence is not None and abs(own / divergence - 1.0) > SAME_DIVERGENCE:
+        warnings.append(
+            f"calibration: measured with a divergence of {divergence:g} mrad, the survey has {own:g} mrad, which is "
+            f"used: one of the two makes cross sections {100 * abs((own / divergence) ** 2 - 1):.0f} % wrong"
+        )
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows: list[ChannelConstant] = []
     missing: dict[int, str] = {}
@@ -396,7 +366,18 @@ def match_strip(
     rows = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows]
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
-    air = compare_air(calibration, reader, sensor, attenuation, warnings)
+    air = 0.0
+    if attenuation is not None and sensor.distance and not later:
+        # A strip of the calibration's day that is given other air than the calibration had.
+        off = 2.0e-4 * math.log(10.0) * sensor.distance * (attenuation - calibration.attenuation)
+        if abs(off) >= LEAST_AIR:
+            air = abs(off)
+            warnings.append(
+                f"calibration: --attenuation {attenuation:g} dB/km contradicts the {calibration.attenuation:.2g} dB/km "
+                "with which the constant was measured on the same day: light changes by "
+                f"{100 * math.expm1(off):+.0f} %, which is in the error; give `wavebatch calibrate` the same "
+                "--attenuation"
+            )
     fitted = replace(
         calibration, right=setting.right, constant=math.nan, channels=tuple(rows), strips=(), notes=tuple(notes)
     )
@@ -508,9 +489,20 @@ def _compare_decomposers(
         return 0.0
     steps = chain.steps[:3] + (Step(STAGES["attribute.energy"]),)
     pair = (Chain(steps), Chain((*steps[:2], Step(other), steps[3])))
-    blocks = list(reader.sample_blocks(scan, _CHAIN_SAMPLE))
-    ratios = [_compare_energies(block, system, pair) for block in blocks]
-    ratio = np.concatenate(ratios) if ratios else np.empty(0)
+    ratios = [np.empty(0)]
+    for block in reader.sample_blocks(scan, _CHAIN_SAMPLE):
+        # Energies of clean single echoes by the strip's chain over those by the calibration's.
+        found = []
+        for one in pair:
+            echoes = one.run(block, system)
+            clean = echoes.alone(len(block)) & ((echoes.flags & np.uint16(UNCLEAN)) == 0)
+            energy = np.full(len(block), np.nan)
+            energy[echoes.waveform[clean]] = echoes.attributes["energy"][clean]
+            found.append(energy)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = found[0] / found[1]
+        ratios.append(ratio[np.isfinite(ratio)])
+    ratio = np.concatenate(ratios)
     off = float(np.median(ratio)) - 1.0 if len(ratio) >= _LEAST_SHARED else 0.0
     if abs(off) > 0.002:
         warnings.append(
@@ -519,20 +511,6 @@ def _compare_decomposers(
             "--profile"
         )
     return abs(off)
-
-
-def _compare_energies(block: WaveformBlock, system: SystemPulse, pair: tuple[Chain, Chain]) -> np.ndarray:
-    """Energies of clean single echoes by the first chain over those by the second."""
-    found = []
-    for chain in pair:
-        echoes = chain.run(block, system)
-        clean = echoes.alone(len(block)) & ((echoes.flags & np.uint16(UNCLEAN)) == 0)
-        energy = np.full(len(block), np.nan)
-        energy[echoes.waveform[clean]] = echoes.attributes["energy"][clean]
-        found.append(energy)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = found[0] / found[1]
-    return ratio[np.isfinite(ratio)]
 
 
 def _take_strip_constants(

@@ -198,18 +198,13 @@ def read_system(table: TomlTable) -> SystemPulse:
 def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
     """A pulse from a table that may hold one extra key."""
     found = read_record(SystemPulse, table, remedy=REMEDY, also=(extra,))
-    _check_components(found.components, f"{table.where}: components")
-    _check_whitening(found.noise.whitening, f"{table.where}: whitening")
-    return found
-
-
-def _check_components(components: tuple[tuple[float, ...], ...], where: str) -> None:
+    components, whitening = found.components, found.noise.whitening
+    where = f"{table.where}: components"
     if len(components) == 1 or len(components) > MOST_COMPONENTS:
         raise ConfigError(f"{where} must be empty or hold 2 to {MOST_COMPONENTS} Gaussians, it holds {len(components)}")
     if components and components[0][0] < 0.01:
         raise ConfigError(f"{where} row 1 is the main Gaussian, its weight must be positive, it is {components[0][0]}")
-
-
-def _check_whitening(whitening: tuple[float, ...], where: str) -> None:
     if whitening and not (len(whitening) == 2 and abs(whitening[1]) < 1 and abs(whitening[0]) < 1 - whitening[1]):
+        where = f"{table.where}: whitening"
         raise ConfigError(f"{where} must be empty or hold two shares a, b of steady noise: |a| < 1 - b and |b| < 1")
+    return found

@@ -91,13 +91,12 @@ def known_systems() -> tuple[KnownSystem, ...]:
 
 @cache
 def _load_all() -> tuple[KnownSystem, ...]:
-    return tuple(_load(path) for path in sorted(Path(__file__).parent.glob("*.toml")))
-
-
-def _load(path: Path) -> KnownSystem:
-    table = parse_toml(read_text(path, "system file"), str(path))
-    spacing = table.table("figures").number("spacing_ns", 1e-3, 1e3)
-    return KnownSystem(path.stem, table.get("sensor", str), spacing, read_system(table.table("system")))
+    found = []
+    for path in sorted(Path(__file__).parent.glob("*.toml")):
+        table = parse_toml(read_text(path, "system file"), str(path))
+        spacing = table.table("figures").number("spacing_ns", 1e-3, 1e3)
+        found.append(KnownSystem(path.stem, table.get("sensor", str), spacing, read_system(table.table("system"))))
+    return tuple(found)
 
 
 def list_known(block: WaveformBlock, system: SystemPulse) -> dict[str, SystemPulse]:

@@ -80,7 +80,13 @@ def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, 
         too narrow or too wide for the strip's samples.
     """
     if survey is not None and force:
-        _refuse_unseen(reader, scan, survey)
+        used = [digitizer for index, digitizer in reader.facts.digitizers.items() if index in scan.by_descriptor]
+        sigma = survey.system.sigma_ref
+        if used and not any(NARROWEST * one.spacing <= sigma <= WIDEST * one.n_samples * one.spacing for one in used):
+            raise InputError(
+                f"{reader.facts.path}: its waveforms ({used[0].n_samples} samples {used[0].spacing:g} ns apart) cannot "
+                f"show the pulse of --system, {sigma:.3g} ns (Gaussian sigma); leave --system out to survey the strip"
+            )
     reason, sure = ("", False) if survey is None else find_contradiction(reader, scan, survey)
     if sure and not force:
         raise InputError(
@@ -88,18 +94,6 @@ def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, 
             "survey the strip, or use it all the same with --force"
         )
     return reason
-
-
-def _refuse_unseen(reader: StripReader, scan: StripScan, survey: Survey) -> None:
-    """Raise InputError where the waveforms of no digitizer can show the saved pulse."""
-    used = [digitizer for index, digitizer in reader.facts.digitizers.items() if index in scan.by_descriptor]
-    sigma = survey.system.sigma_ref
-    if not used or any(NARROWEST * one.spacing <= sigma <= WIDEST * one.n_samples * one.spacing for one in used):
-        return
-    raise InputError(
-        f"{reader.facts.path}: its waveforms ({used[0].n_samples} samples {used[0].spacing:g} ns apart) "
-        f"cannot show the pulse of --system, {sigma:.3g} ns (Gaussian sigma); leave --system out to survey the strip"
-    )
 
 
 def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> tuple[str, bool]:
