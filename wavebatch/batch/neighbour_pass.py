@@ -15,7 +15,7 @@ import functools
 import itertools
 import pickle
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.output_rows import Assembled, UnitEchoes, spread
-from wavebatch.batch.unit import Prepared, SolvedBlocks, UnitResult, finish_rows, solve_unit, unpack
+from wavebatch.batch.output_rows import spread
+from wavebatch.batch.unit import Prepared, UnitResult, finish_rows, solve_unit, unpack
 from wavebatch.core.echoes import COLUMNS, EchoTable
 from wavebatch.core.errors import StageError
 from wavebatch.core.frozen import frozen
@@ -42,7 +42,7 @@ from wavebatch.kernels.geometry.normals import (
     sort_into_tiles,
     thin_out,
 )
-from wavebatch.stages.chain import Chain, Step
+from wavebatch.stages.chain import Step
 
 TILE_POINTS = 150_000
 """Points of a tile without its buffer, roughly."""
@@ -129,7 +129,8 @@ class SecondPass:
         if self._entries is not None:
             return RunReport()
         start = Seconds.now()
-        reach = _reach(self._step)
+        # Width of a tile's buffer [m]: cells that the radius touches must be complete.
+        reach = self._step.effective()["radius"] * (1.0 + 2.0 / FINENESS)
         sample = np.concatenate(self._sample)
         self._sample = []
         sample = sample[np.isfinite(sample).all(axis=1)]
@@ -208,7 +209,15 @@ def begin_unit(blob: bytes, number: int, block_size: int | None) -> tuple[tuple[
     chain = prepared.job.chain
     kept = [(index, chain.keep_needed(block)) for index, block in solved] if chain.after_second else []
     state = np.frombuffer(pickle.dumps((made._replace(columns=needed), kept), PROTOCOL), np.uint8)
-    return (_list_entries(echoes, made), state), RunReport(timing=timing)
+    entries = np.zeros(len(made.rows), ENTRY)
+    for axis, name in enumerate("XYZ"):
+        entries["xyz"][:, axis] = made.rows[name]
+    x, y, z = echoes.direction.T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        length = np.sqrt(x * x + y * y + z * z)
+        ray = (echoes.direction / length[:, None]).astype(np.float32)[echoes.table.waveform]
+    entries["ray"] = np.append(ray, np.full((1, 3), np.nan, np.float32), axis=0)[made.echo]
+    return (entries, state), RunReport(timing=timing)
 
 
 def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> UnitResult:
@@ -241,45 +250,26 @@ def end_unit(blob: bytes, state: np.ndarray, found: np.ndarray) -> UnitResult:
         # A ray that is off turns the angle by as much: no plane of points shows it.
         values[f"{first}_err"] = np.hypot(values[f"{first}_err"], np.float32(prepared.sensor.turned))
     values[f"{first}{SUFFIX}"] = _REASONS[by_echo["gap"]]
-    values |= _solve_again(prepared.job.chain, solved, values, timing)
+    if solved:
+        # Stages that need the columns of the second pass; these (k,) are by packet, as `gather_echoes` sorts.
+        chain = prepared.job.chain
+        order = np.argsort(np.concatenate([index[block.echoes.waveform] for index, block in solved]), kind="stable")
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        tables, at = [], 0
+        for _, block in solved:
+            rows = place[at : at + len(block.echoes)]
+            echoes = block.echoes.with_attributes(**{name: column[rows] for name, column in values.items()})
+            tables.append((chain.solve_again(block._replace(echoes=echoes), timing), 0))
+            at += len(rows)
+        more = EchoTable.concatenate(tables).take(order).attributes
+        makes = [name for step in chain.after_second for name in step.stage.makes]
+        values |= {name: more[name] for one in makes for name in (one, f"{one}{SUFFIX}") if name in more}
     columns = {name: spread(name, column, made.echo) for name, column in values.items() if name in COLUMNS}
     prepared.layout.fill(made.rows, columns)
     reasons = count_reasons({name: codes[made.counted] for name, codes in values.items()})
     report = replace(made.report, no_data={**made.report.no_data, **reasons})
     return finish_rows(prepared, made.rows, {**made.columns, **columns}, report, timing)
-
-
-def _solve_again(
-    chain: Chain, solved: SolvedBlocks, values: Mapping[str, np.ndarray], timing: dict[str, Seconds]
-) -> dict[str, np.ndarray]:
-    """The columns of stages that need those of the second pass; values (k,) are by packet, as `gather_echoes` sorts."""
-    if not solved:
-        return {}
-    order = np.argsort(np.concatenate([index[block.echoes.waveform] for index, block in solved]), kind="stable")
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    tables, at = [], 0
-    for _, block in solved:
-        rows = place[at : at + len(block.echoes)]
-        echoes = block.echoes.with_attributes(**{name: column[rows] for name, column in values.items()})
-        tables.append((chain.solve_again(block._replace(echoes=echoes), timing), 0))
-        at += len(rows)
-    found = EchoTable.concatenate(tables).take(order).attributes
-    made = [name for step in chain.after_second for name in step.stage.makes]
-    return {name: found[name] for one in made for name in (one, f"{one}{SUFFIX}") if name in found}
-
-
-def _list_entries(echoes: UnitEchoes, made: Assembled) -> np.ndarray:
-    """Entries (m,) of the rows of a unit, without numbers."""
-    entries = np.zeros(len(made.rows), ENTRY)
-    for axis, name in enumerate("XYZ"):
-        entries["xyz"][:, axis] = made.rows[name]
-    x, y, z = echoes.direction.T
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        length = np.sqrt(x * x + y * y + z * z)
-        ray = (echoes.direction / length[:, None]).astype(np.float32)[echoes.table.waveform]
-    entries["ray"] = np.append(ray, np.full((1, 3), np.nan, np.float32), axis=0)[made.echo]
-    return entries
 
 
 def process_tile(blob: bytes, number: int, part: int) -> Found:
@@ -304,7 +294,14 @@ def process_tile(blob: bytes, number: int, part: int) -> Found:
     stage = task.step.stage
     if stage.second_pass is None:
         raise StageError(f"{stage.name} has no second pass; please report it as a bug")
-    entries = _read_part(task, number, part)
+    low, high, at = part * task.part_points, (part + 1) * task.part_points, 0
+    pieces = [np.empty(0, ENTRY)]
+    for piece in task.entries.pieces(number):
+        pieces.append(piece[max(low - at, 0) : max(high - at, 0)])
+        at += len(piece)
+        if at >= high:
+            break
+    entries = np.concatenate(pieces)
     place = task.place(entries["xyz"])
     own = np.flatnonzero(is_inside(task.tiles, number, place))
     around = _gather(blob, number)
@@ -330,23 +327,6 @@ def _gather(blob: bytes, number: int) -> Surroundings:
             kept = kept[thin_out(task.place(kept["xyz"]), kept["row"], radius)]
             held = []
     return Surroundings(task.place(kept["xyz"]))
-
-
-def _read_part(task: TileTask, number: int, part: int) -> np.ndarray:
-    """Entries of a part of a tile, in the order of their rows."""
-    low, high, at = part * task.part_points, (part + 1) * task.part_points, 0
-    found = [np.empty(0, ENTRY)]
-    for piece in task.entries.pieces(number):
-        found.append(piece[max(low - at, 0) : max(high - at, 0)])
-        at += len(piece)
-        if at >= high:
-            break
-    return np.concatenate(found)
-
-
-def _reach(step: Step) -> float:
-    """Width of a tile's buffer [m]: cells that the radius touches must be complete."""
-    return step.effective()["radius"] * (1.0 + 2.0 / FINENESS)
 
 
 def _found_dtype(step: Step) -> np.dtype:

@@ -246,14 +246,10 @@ class RunOptions:
         for name, value in self.given().items():
             if name in ELSEWHERE:
                 continue
-            option = typed("profile" if name == "chain" and _is_name(value) else name)
+            shipped = isinstance(value, str) and Path(value).name == value and not Path(value).suffix
+            option = typed("profile" if name == "chain" and shipped else name)
             parts.append(option if value is True else f"{option} {shlex.quote(_text(name, value))}")
         return " ".join(parts)
-
-
-def _is_name(value: Any) -> bool:
-    """Whether a chain is given by the name of a shipped one."""
-    return isinstance(value, str) and Path(value).name == value and not Path(value).suffix
 
 
 def _text(name: str, value: Any) -> str:

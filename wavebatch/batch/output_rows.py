@@ -78,20 +78,6 @@ class _Members:
         return rows
 
 
-@frozen(eq=False)
-class _Rows:
-    """The sources of each output row, in output order."""
-
-    echo: np.ndarray
-    """Row of the echo table, -1 for points that are passed through, i8 (m,)."""
-    source: np.ndarray
-    """Row of the members whose record it copies, i8 (m,)."""
-    owner: np.ndarray
-    """Point of the unit that owns the packet, or the point itself: the row is of its pulse, i8 (m,)."""
-    reason: np.ndarray
-    """Why it is passed through, EchoFlag, u2 (m,)."""
-
-
 class Assembled(NamedTuple):
     """The rows of a unit."""
 
@@ -185,7 +171,15 @@ def assemble_echoes(
     -----
     A return that no echo of its packet matches is passed through with a flag, so that no return of the vendor is lost.
     """
-    members = _join_points(unit)
+    if np.any((unit.packet_of_point >= 0) != (unit.point_flags == 0)):
+        raise _bug(unit, "a point has neither a packet nor a reason for that")
+    own, index = np.asarray(unit.points), np.arange(unit.start, unit.start + len(unit.points), dtype=np.int64)
+    source, packet = own, unit.packet_of_point
+    if len(unit.context):
+        source = np.concatenate([own, np.asarray(unit.context)])
+        index = np.concatenate([index, unit.context_index])
+        packet = np.concatenate([packet, unit.packet_of_context])
+    members = _Members(len(own), source, index, packet.astype(np.int64))
     owned = np.append(unit.packets.owned, False)
     if not owned[echoes.table.waveform].all():
         raise _bug(unit, "an echo lies in a packet of another unit")
@@ -193,33 +187,47 @@ def assemble_echoes(
     table = echoes.table.with_flags(EchoFlag.ADDED, point < 0)
     found = np.zeros(len(members.index), bool)
     found[members.find(point[point >= 0])] = True
-    rows = _place_rows(unit, members, table, echoes.nearest, found, owned)
-
-    records = take_whole_records(members.source, rows.source)
-    xyz = np.stack([np.append(table.attributes[name], np.nan)[rows.echo] for name in "xyz"], axis=1)
-    packet = np.where(rows.echo >= 0, np.append(table.waveform, -1)[rows.echo], members.packet[rows.source])
+    missing = np.flatnonzero(unit.point_flags)
+    silent = np.flatnonzero(owned[members.packet] & ~found)
+    passed = np.concatenate([missing, silent])
+    no_echo = np.full(len(silent), EchoFlag.NO_ECHO, np.uint16)
+    owner = np.append(unit.packets.owner - unit.start, -1)
+    owner = owner[np.concatenate([table.waveform, members.packet[passed]])]
+    source = np.concatenate([members.find(echoes.nearest), passed])
+    owner = np.where(owner < 0, source, owner)
+    # Points that share a packet are sorted by their return locations; NaN comes first.
+    located = widen_integers(members.source["return_point_wave_location"][passed]) / PS_PER_NS
+    order: Any = find_order(owner, np.concatenate([table.time, np.nan_to_num(located, nan=-np.inf)]))
+    order = slice(None) if order is None else order
+    # Rows in the order of the output: their echo or -1, their point, the point that owns their packet, and their flags.
+    echo = np.concatenate([np.arange(len(table)), np.full(len(passed), -1)])[order]
+    source, owner = source[order], owner[order]
+    reason = np.concatenate([np.zeros(len(table), np.uint16), unit.point_flags[missing], no_echo])[order]
+    records = take_whole_records(members.source, source)
+    xyz = np.stack([np.append(table.attributes[name], np.nan)[echo] for name in "xyz"], axis=1)
+    packet = np.where(echo >= 0, np.append(table.waveform, -1)[echo], members.packet[source])
     direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0).take(packet, axis=0)
     absent = np.isnan(xyz)
     # For all rows at once: to take those that are passed through takes longer than to locate the others too.
     places = np.where(absent, locate(records, layout.source.header), xyz) if absent.any() else xyz
-    flags = np.append(table.flags, np.uint16(0))[rows.echo] | rows.reason
-    pulse = find_pulses(unit.points["gps_time"])[rows.owner]
+    flags = np.append(table.flags, np.uint16(0))[echo] | reason
+    pulse = find_pulses(unit.points["gps_time"])[owner]
     number, total = _number_rows(pulse, places, direction, records, (flags & np.uint16(dropped)) == 0)
     flags |= np.where(number > layout.max_return, np.uint16(EchoFlag.RETURN_LIMIT), np.uint16(0))
 
-    columns = {**_columns(table, rows.echo, layout, needed), "echo_flags": flags}
+    columns = {**_columns(table, echo, layout, needed), "echo_flags": flags}
     output = layout.rows(
         records,
         xyz=xyz,
         return_number=number,
         number_of_returns=total,
         columns=columns,
-        matched=(rows.echo < 0) | np.append(point >= 0, False)[rows.echo],
-        time=np.append(table.time, np.nan)[rows.echo],
+        matched=(echo < 0) | np.append(point >= 0, False)[echo],
+        time=np.append(table.time, np.nan)[echo],
     )
     counted = np.ones(len(table), bool)
-    report = _count(unit, table, counted, members.packet, found, owned[members.packet], rows.reason)
-    return Assembled(output, rows.echo, columns, counted, report)
+    report = _count(unit, table, counted, members.packet, found, owned[members.packet], reason)
+    return Assembled(output, echo, columns, counted, report)
 
 
 def assemble_returns(
@@ -274,40 +282,6 @@ def _bug(unit: Unit, what: str) -> StageError:
     return StageError(f"points {unit.start} to {last}: {what}; please report it as a bug")
 
 
-def _join_points(unit: Unit) -> _Members:
-    if np.any((unit.packet_of_point >= 0) != (unit.point_flags == 0)):
-        raise _bug(unit, "a point has neither a packet nor a reason for that")
-    own, index = np.asarray(unit.points), np.arange(unit.start, unit.start + len(unit.points), dtype=np.int64)
-    source, packet = own, unit.packet_of_point
-    if len(unit.context):
-        source = np.concatenate([own, np.asarray(unit.context)])
-        index = np.concatenate([index, unit.context_index])
-        packet = np.concatenate([packet, unit.packet_of_context])
-    return _Members(len(own), source, index, packet.astype(np.int64))
-
-
-def _place_rows(
-    unit: Unit, members: _Members, table: EchoTable, point: np.ndarray, found: np.ndarray, owned: np.ndarray
-) -> _Rows:
-    """Echoes, points without a packet, and points that no echo matches, in the order of the output."""
-    missing = np.flatnonzero(unit.point_flags)
-    silent = np.flatnonzero(owned[members.packet] & ~found)
-    passed = np.concatenate([missing, silent])
-    no_echo = np.full(len(silent), EchoFlag.NO_ECHO, np.uint16)
-    owner = np.append(unit.packets.owner - unit.start, -1)
-    owner = owner[np.concatenate([table.waveform, members.packet[passed]])]
-    source = np.concatenate([members.find(point), passed])
-    owner = np.where(owner < 0, source, owner)
-    order: Any = find_order(owner, np.concatenate([table.time, _locations(members.source, passed)]))
-    order = slice(None) if order is None else order
-    return _Rows(
-        echo=np.concatenate([np.arange(len(table)), np.full(len(passed), -1)])[order],
-        source=source[order],
-        owner=owner[order],
-        reason=np.concatenate([np.zeros(len(table), np.uint16), unit.point_flags[missing], no_echo])[order],
-    )
-
-
 def _number_rows(
     pulse: np.ndarray, xyz: np.ndarray, direction: np.ndarray, records: np.ndarray, counted: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -318,11 +292,6 @@ def _number_rows(
     number[rows] = np.where(known, found, number[rows])
     total[rows] = np.where(known, count, total[rows])
     return number, total
-
-
-def _locations(records: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return locations of the records at `rows` [ns], which order points that share a packet; NaN comes first."""
-    return np.nan_to_num(widen_integers(records["return_point_wave_location"][rows]) / PS_PER_NS, nan=-np.inf)
 
 
 def _columns(

@@ -329,7 +329,14 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
             continue
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:
-            lines.append(_explain(prepared, report, column, counts))
+            total = sum(counts.values())
+            first = max(NoData, key=lambda reason: (counts.get(reason.name, 0), -reason))
+            meaning, remedy = REASONS[first]
+            share = f"{counts[first.name]} of them: " if counts[first.name] < total else ""
+            if column == _ANGLE and first in (NoData.UNCERTAIN, NoData.SHORT_PULSE, NoData.TOO_STEEP):
+                outlook = _look_out(prepared, report)
+                meaning = f"{meaning}: {outlook.reason}" if outlook is not None else meaning
+            lines.append(f"{column}: none of {total} echoes has one; {share}{meaning}; {remedy}")
         elif total and column == _ANGLE:
             outlook = _look_out(prepared, report)
             if outlook is not None and not outlook.possible:
@@ -518,17 +525,6 @@ def explain_absence(prepared: Prepared) -> dict[str, str]:
             reason = next((REASONS[need][0] for need in needs if lacks[need]), None)
             reasons[column] = reason or f"the chain has no stage attribute.{column}"
     return reasons
-
-
-def _explain(prepared: Prepared, report: RunReport, column: str, counts: Mapping[str, int]) -> str:
-    total = sum(counts.values())
-    first = max(NoData, key=lambda reason: (counts.get(reason.name, 0), -reason))
-    meaning, remedy = REASONS[first]
-    share = f"{counts[first.name]} of them: " if counts[first.name] < total else ""
-    if column == _ANGLE and first in (NoData.UNCERTAIN, NoData.SHORT_PULSE, NoData.TOO_STEEP):
-        outlook = _look_out(prepared, report)
-        meaning = f"{meaning}: {outlook.reason}" if outlook is not None else meaning
-    return f"{column}: none of {total} echoes has one; {share}{meaning}; {remedy}"
 
 
 def _look_out(prepared: Prepared, report: RunReport) -> AngleOutlook | None:

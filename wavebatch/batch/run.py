@@ -283,26 +283,24 @@ class _Batch:
         try:
             yield
         except WorkerDied:
-            self._try_again(strip)
+            # It is tried once more, alone, because several strips may need too much memory.
+            strip.drop()
+            if strip.alone:
+                lost = InputError(
+                    f"{strip.job.path}: a worker process died while it worked on this strip (killed, or out of "
+                    "memory), also when it was tried again alone; run again with --resume and fewer --jobs or less "
+                    "--memory"
+                )
+                self._end(strip, Outcome(strip.job, "failed", error=lost))
+            else:
+                self._active.remove(strip)
+                self._again.append(strip.job)
         except BrokenExecutor as error:
             self._give_up(error)
         except Exception as error:
             interrupts.check()  # it may come from an interrupt that compiled code has turned into an error
             strip.drop()
             self._end(strip, Outcome(strip.job, "failed", error=error))
-
-    def _try_again(self, strip: StripTask) -> None:
-        """A process died at this strip: it is tried once more, alone, because several may need too much memory."""
-        strip.drop()
-        if not strip.alone:
-            self._active.remove(strip)
-            self._again.append(strip.job)
-            return
-        error = InputError(
-            f"{strip.job.path}: a worker process died while it worked on this strip (killed, or out of memory), also "
-            "when it was tried again alone; run again with --resume and fewer --jobs or less --memory"
-        )
-        self._end(strip, Outcome(strip.job, "failed", error=error))
 
     def _give_up(self, reason: BrokenExecutor) -> None:
         """No worker is left: all strips that are not written fail, for one reason that is reported once."""

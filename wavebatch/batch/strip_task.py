@@ -184,7 +184,17 @@ class StripTask:
         self.prepared = prepared
         self._scanned = []
         self._report += prepared.report
-        self._open(prepared)
+        options = self._options
+        self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
+        command = self.job.options.command(self.job.path.name)
+        provenance = {**self._described, "command": command, **report_file.describe_chain(prepared)}
+        provenance |= report_file.describe_strip_result(prepared, self._described)
+        cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
+        self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
+        if prepared.second_step is not None:
+            from wavebatch.batch.neighbour_pass import SecondPass  # 20 ms that other runs do not need
+
+            self._second = SecondPass(prepared.second_step, prepared.layout.source.header.scales, cloud)
 
     def _take_unit(self, unit: UnitResult) -> None:
         self.written += 1
@@ -224,19 +234,6 @@ class StripTask:
         _given(self._writer).append(chunk)
         self._packing.end_chunk()
         self._report += RunReport(timing={"write": took + (Seconds.now() - start)})
-
-    def _open(self, prepared: Prepared) -> None:
-        options = self._options
-        self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
-        command = self.job.options.command(self.job.path.name)
-        provenance = {**self._described, "command": command, **report_file.describe_chain(prepared)}
-        provenance |= report_file.describe_strip_result(prepared, self._described)
-        cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
-        self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
-        if prepared.second_step is not None:
-            from wavebatch.batch.neighbour_pass import SecondPass  # 20 ms that other runs do not need
-
-            self._second = SecondPass(prepared.second_step, prepared.layout.source.header.scales, cloud)
 
     def finish(self) -> RunReport:
         """Publish the cloud, then its report, which means that the cloud is complete; both or none.

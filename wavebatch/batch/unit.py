@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import pickle
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from wavebatch.core.errors import InputError, StripWarning
 from wavebatch.core.frozen import frozen
 from wavebatch.core.process import Seconds
 from wavebatch.core.units import ASSUMED_DIVERGENCE, INSET
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.cloud.point_filter import REASONS, PlannedFilter
 from wavebatch.files.cloud.writer import OutputLayout
 from wavebatch.files.disk.raw_bytes import naming, undoing
@@ -348,7 +348,12 @@ def solve_unit(
         unit = reader.read_unit(number, prepared.scan)
         timing["read points"] = Seconds.now() - start
         blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)
-        solved = list(_run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
+        system, solved = prepared.system, []
+        for block, index in _timed(blocks, timing, "read packets"):
+            placed = prepared.sensor.fill(block)
+            if prepared.pulse_energy is not None:
+                placed = prepared.pulse_energy.fill(placed, unit)
+            solved.append((index, prepared.job.chain.solve(placed, system, timing).without_samples()))
     start = Seconds.now()
     solved = _mark_edges(prepared, solved)
     echoes = gather_echoes(unit, ((block.block, index, block.echoes) for index, block in solved))
@@ -400,17 +405,6 @@ def _block_size(unit: Unit, wanted: int | None) -> int:
     longest = int(unit.packets.n_samples.max(initial=1))
     most = max(min(BLOCK_SAMPLES // longest, 65536), 1)
     return most if wanted is None else min(most, max(wanted * USUAL_SAMPLES // longest, 1), wanted)
-
-
-def _run_blocks(
-    prepared: Prepared, unit: Unit, blocks: Iterable[tuple[WaveformBlock, np.ndarray]], timing: dict[str, Seconds]
-) -> Iterator[tuple[np.ndarray, Solved]]:
-    system = prepared.system
-    for block, index in blocks:
-        placed = prepared.sensor.fill(block)
-        if prepared.pulse_energy is not None:
-            placed = prepared.pulse_energy.fill(placed, unit)
-        yield index, prepared.job.chain.solve(placed, system, timing).without_samples()
 
 
 def _timed(items: Iterator, timing: dict[str, Seconds], name: str) -> Iterator:

@@ -187,7 +187,15 @@ class _Parser:
 
     def _read_comparison(self) -> tuple:
         if (self._kind, self._value) == ("name", "flag") and self._text[self._at :].lstrip().startswith("("):
-            return self._read_flag()
+            # `flag(NAME)` is `echo_flags has NAME`.
+            self.places.setdefault("echo_flags", self._place)
+            self._advance()
+            self._advance()
+            found = ("has", "echo_flags", self._read_bits())
+            if (self._kind, self._value) != ("sign", ")"):
+                self._fail("a closing parenthesis is missing before")
+            self._advance()
+            return found
         tree: tuple | None = None
         left = self._read_operand()
         if (self._kind, self._value) == ("name", "has") and isinstance(left, str):
@@ -202,17 +210,6 @@ class _Parser:
             part = (sign, left, right)
             tree, left = part if tree is None else ("and", tree, part), right
         return tree or ()
-
-    def _read_flag(self) -> tuple:
-        """`flag(NAME)`, which is `echo_flags has NAME`."""
-        self.places.setdefault("echo_flags", self._place)
-        self._advance()
-        self._advance()
-        tree = ("has", "echo_flags", self._read_bits())
-        if (self._kind, self._value) != ("sign", ")"):
-            self._fail("a closing parenthesis is missing before")
-        self._advance()
-        return tree
 
     def _read_bits(self) -> float:
         """The bit of a flag by its name."""

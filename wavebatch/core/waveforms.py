@@ -322,7 +322,13 @@ class WaveformBlock:
         names = ("samples", "point", "gps_time", "origin", "direction")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
         arrays["samples"].flags.writeable = False
-        return replace(blocks[0], **arrays, returns=_join_returns(blocks), sensor=None, scanner=None)
+        returns, tables = None, [block.returns for block in blocks if block.returns is not None]
+        if len(tables) == len(blocks):
+            starts = np.cumsum([0, *(len(block) for block in blocks[:-1])])
+            waveform = [table.waveform + start for table, start in zip(tables, starts, strict=True)]
+            others = [np.concatenate([getattr(table, name) for table in tables]) for name in ("time", "point", "xyz")]
+            returns = ReturnTable(np.concatenate(waveform).astype(np.int32), *others)
+        return replace(blocks[0], **arrays, returns=returns, sensor=None, scanner=None)
 
     def rows(self, rows: np.ndarray | slice) -> WaveformBlock:
         """The block restricted to the waveforms at `rows` (indices, mask or slice), with the returns of these."""
@@ -352,16 +358,6 @@ class WaveformBlock:
     def without_samples(self) -> WaveformBlock:
         """The block with waveforms of no samples: their place, time and sensor are left."""
         return replace(self, samples=np.empty((len(self), 0), self.samples.dtype), missing=None)
-
-
-def _join_returns(blocks: Sequence[WaveformBlock]) -> ReturnTable | None:
-    tables = [block.returns for block in blocks if block.returns is not None]
-    if len(tables) < len(blocks):
-        return None
-    starts = np.cumsum([0, *(len(block) for block in blocks[:-1])])
-    waveform = [table.waveform + start for table, start in zip(tables, starts, strict=True)]
-    others = [np.concatenate([getattr(table, name) for table in tables]) for name in ("time", "point", "xyz")]
-    return ReturnTable(np.concatenate(waveform).astype(np.int32), *others)
 
 
 @frozen(eq=False)

@@ -174,7 +174,20 @@ class _Signature(Mapping[str, Parameter]):
 
     @cached_property
     def _parameters(self) -> dict[str, Parameter]:
-        return _read_parameters(*self._source)
+        name, kind, function, shares = self._source
+        given = inspect.signature(function).parameters.values()
+        data = tuple(p.name for p in given if p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD))
+        if data != KINDS[kind][0]:
+            raise StageError(f"stage {name} takes {data}, a {kind} stage takes {KINDS[kind][0]}")
+        if typing.get_type_hints(function).get("return") is not KINDS[kind][1]:
+            raise StageError(f"stage {name} must be annotated to return {KINDS[kind][1].__name__}")
+        defaults = {p.name: p.default for p in given if p.kind is p.KEYWORD_ONLY}
+        parameters = _declare(name, function, defaults)
+        if shares is not None:
+            values = dataclasses.asdict(shares)
+            for one in type(shares).__mro__[:-1]:
+                parameters |= _declare(name, one, {key: values[key] for key in one.__annotations__})
+        return parameters
 
     def __getitem__(self, name: str) -> Parameter:
         return self._parameters[name]
@@ -187,22 +200,6 @@ class _Signature(Mapping[str, Parameter]):
 
     def __reduce__(self) -> tuple[type[dict], tuple[dict[str, Parameter]]]:
         return dict, (self._parameters,)
-
-
-def _read_parameters(name: str, kind: str, function: Callable, shares: Any) -> dict[str, Parameter]:
-    given = inspect.signature(function).parameters.values()
-    data = tuple(p.name for p in given if p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD))
-    if data != KINDS[kind][0]:
-        raise StageError(f"stage {name} takes {data}, a {kind} stage takes {KINDS[kind][0]}")
-    if typing.get_type_hints(function).get("return") is not KINDS[kind][1]:
-        raise StageError(f"stage {name} must be annotated to return {KINDS[kind][1].__name__}")
-    defaults = {p.name: p.default for p in given if p.kind is p.KEYWORD_ONLY}
-    parameters = _declare(name, function, defaults)
-    if shares is not None:
-        values = dataclasses.asdict(shares)
-        for one in type(shares).__mro__[:-1]:
-            parameters |= _declare(name, one, {key: values[key] for key in one.__annotations__})
-    return parameters
 
 
 def _declare(name: str, source: Callable | type, defaults: Mapping[str, Any]) -> dict[str, Parameter]:

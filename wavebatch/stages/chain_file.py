@@ -199,18 +199,17 @@ def _read_step(table: TomlTable) -> Step:
     name = table.get("stage", str)
     stage, where = find_stage(name, table.where), f"{table.where} ({name})"
     TomlTable(table.values, where).check_keys(["stage", *stage.parameters])
-    keys = (key for key in table.values if key != "stage")
-    return Step(stage, {key: _read_value(stage, key, table.values[key], f"{where}: {key}") for key in keys})
-
-
-def _read_value(stage: Stage, key: str, value: Any, where: str) -> Any:
-    parameter = stage.parameters[key]
-    value = check_type(value, parameter.types, where)
-    if parameter.choices is not None and value not in parameter.choices:
-        choices = ", ".join(map(format_toml_value, parameter.choices))
-        if parameter.range is None or isinstance(value, str):
-            number = "" if parameter.range is None else " or a number"
-            raise ConfigError(f"{where} must be one of {choices}{number}, it is {format_toml_value(value)}")
-    if parameter.range is not None and not isinstance(value, str):
-        check_range(value, *parameter.range, where)
-    return value
+    values = {}
+    for key in table.values:
+        if key == "stage":
+            continue
+        parameter, place = stage.parameters[key], f"{where}: {key}"
+        value = values[key] = check_type(table.values[key], parameter.types, place)
+        if parameter.choices is not None and value not in parameter.choices:
+            choices = ", ".join(map(format_toml_value, parameter.choices))
+            if parameter.range is None or isinstance(value, str):
+                number = "" if parameter.range is None else " or a number"
+                raise ConfigError(f"{place} must be one of {choices}{number}, it is {format_toml_value(value)}")
+        if parameter.range is not None and not isinstance(value, str):
+            check_range(value, *parameter.range, place)
+    return Step(stage, values)

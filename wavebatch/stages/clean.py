@@ -84,7 +84,14 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
         signal -= offsets[np.arange(len(signal)) % len(offsets)][:, None]
     missing = None if block.missing is None else block.missing.T
     if defects.slope_spread > 0:
-        signal -= _slopes(signal, system, block.spacing, missing)
+        # Own slopes, drawn towards none by their errors.
+        reach = int(np.ceil(GUARD * system.sigma_ref / block.spacing))
+        recovery = int(np.ceil(system.noise.recovery / block.spacing))  # a tail there would look like a slope
+        slope, error = fit_slopes(signal, system.noise.quiet, reach, missing=missing, recovery=recovery)
+        spread = system.defects.slope_spread * block.spacing
+        slope = np.where(np.isfinite(error), slope * spread**2 / (spread**2 + np.minimum(error, 1e6) ** 2), 0.0)
+        x = np.arange(len(signal), dtype=np.float32) - np.float32(0.5 * (len(signal) - 1))
+        signal -= x[:, None] * slope.astype(np.float32)
     if defects.spikes > 0:
         level = np.median(signal, axis=0) if defects.slope_spread > 0 else np.float32(system.noise.baseline)
         fill_spikes(signal, find_spikes(signal - level, system.noise.quiet, system.sigma_ref / block.spacing))
@@ -127,17 +134,6 @@ def find_seams(blocks: Iterable[WaveformBlock]) -> dict[int, int]:
     return {length: at for length, at in found.items() if at}
 
 
-def _slopes(signal: np.ndarray, system: SystemPulse, spacing: float, missing: np.ndarray | None) -> np.ndarray:
-    """The sloping part of each baseline (s, n), 0 in its middle: own slopes, drawn towards none by their errors."""
-    reach = int(np.ceil(GUARD * system.sigma_ref / spacing))
-    recovery = _recovery(system, spacing)
-    slope, error = fit_slopes(signal, system.noise.quiet, reach, missing=missing, recovery=recovery)
-    spread = system.defects.slope_spread * spacing
-    slope = np.where(np.isfinite(error), slope * spread**2 / (spread**2 + np.minimum(error, 1e6) ** 2), 0.0)
-    x = np.arange(len(signal), dtype=np.float32) - np.float32(0.5 * (len(signal) - 1))
-    return x[:, None] * slope.astype(np.float32)
-
-
 def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     """Return the system with the defects of its waveforms.
 
@@ -161,7 +157,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     reach = int(np.ceil(3 * width))
     # Slopes come from runs of samples much longer than the noise is correlated.
     colour = float(np.sqrt(max(1.0 + 2.0 * sum(system.noise.correlation), 1.0)))
-    recovery = _recovery(system, block.spacing)
+    recovery = int(np.ceil(system.noise.recovery / block.spacing))  # a tail there would look like a slope
     spread, defects = _slope_spread(signal, std, colour, reach, missing, recovery), Defects()
     if spread:
         # Everything else is measured about level baselines.
@@ -191,11 +187,6 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
 RARER = 0.1
 """Share of the steep slopes that must be of the rarer sign: tails, and weak echoes after the last clear one, slope one
 way."""
-
-
-def _recovery(system: SystemPulse, spacing: float) -> int:
-    """Samples after strong signal in which a tail would look like a slope."""
-    return int(np.ceil(system.noise.recovery / spacing))
 
 
 def _slope_spread(

@@ -147,19 +147,14 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, R
         number = np.array(len(end))
         std = np.sqrt(sum_samples(deviation * deviation) / max(len(end) - 1, 1))
     else:
-        baseline, std, number = _tail_of_recorded(block, samples)
+        recorded = ~block.gaps
+        behind = np.cumsum(recorded[:, ::-1], axis=1)[:, ::-1]
+        end = np.where(recorded & (behind <= samples), block.samples, np.float32(np.nan)).T.astype(np.float32)
+        number = np.isfinite(end).sum(axis=0)
+        end[:, number == 0] = block.samples[number == 0].T
+        baseline = known_median(end, 0)
+        deviation = np.nan_to_num(end - baseline)
+        std = np.sqrt(sum_samples(deviation * deviation) / np.maximum(number - 1, 1))
     std = np.maximum(std, max(system.noise.std, QUANTISATION_STD)).astype(np.float32)
     error = MEDIAN_ERROR * std / np.sqrt(np.maximum(number, 1))
     return Noise(baseline.astype(np.float32), std, baseline_err=error.astype(np.float32))
-
-
-def _tail_of_recorded(block: WaveformBlock, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Median, standard deviation and number (n,) of the last recorded samples of each waveform."""
-    recorded = ~block.gaps
-    behind = np.cumsum(recorded[:, ::-1], axis=1)[:, ::-1]
-    end = np.where(recorded & (behind <= samples), block.samples, np.float32(np.nan)).T.astype(np.float32)
-    number = np.isfinite(end).sum(axis=0)
-    end[:, number == 0] = block.samples[number == 0].T
-    baseline = known_median(end, 0)
-    deviation = np.nan_to_num(end - baseline)
-    return baseline, np.sqrt(sum_samples(deviation * deviation) / np.maximum(number - 1, 1)), number

@@ -343,17 +343,15 @@ def _factors_at(
     whole = main.copy()
     whole[1] += _find_delay(shape, limits.ref, np.full(1, width))[1] * main[2]
     if shape.components:
-        peak, by_peak = _change_with_width(pulse_measures(shape, limits), np.array(width))
+        # The peak of a pulse of amplitude 1, and its slope by the width.
+        measures = pulse_measures(shape, limits)
+        slopes = np.gradient(measures.peak, measures.width)
+        peak, by_peak = (np.interp(np.array(width), measures.width, values) for values in (measures.peak, slopes))
         whole[0] += by_peak / peak * width * main[2]
     given = np.einsum("is,is->i", whole, whole)
     weights = np.einsum("if,sf->is", whole, bare)
     variance = coloured_variance(weights, correlation)
     return np.stack([np.sqrt(np.maximum(variance / given, LEAST_FACTOR)), weights.sum(axis=1) / np.sqrt(given)])
-
-
-def _change_with_width(table: PulseMeasures, width: np.ndarray) -> list[np.ndarray]:
-    """Peak of a pulse of amplitude 1, and its slope by the width, each of the shape of width."""
-    return [np.interp(width, table.width, values) for values in (table.peak, np.gradient(table.peak, table.width))]
 
 
 def describe_fitted(

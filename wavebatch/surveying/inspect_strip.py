@@ -70,7 +70,13 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
     """
     path = Path(path)
     if path.suffix.lower() == ".toml":
-        return _check_chain(path)
+        from wavebatch.stages.chain_file import load_chain_file  # stages and survey: half of the start of `info`
+
+        try:
+            chain = load_chain_file(path)
+        except (ConfigError, InputError) as error:
+            return Findings(str(path), (_without_name(path, error),), ())
+        return Findings(str(path), (), (), f"{len(chain.steps)} stages")
     try:
         with (
             StripReader(path, direction=direction, headerless=headerless) as reader,
@@ -79,16 +85,6 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
             return _check_strip(path, reader, scan)
     except (OSError, ConfigError, MemoryError) as error:  # the other files are still checked
         return Findings(str(path), (_without_name(path, error),), ())
-
-
-def _check_chain(path: Path) -> Findings:
-    from wavebatch.stages.chain_file import load_chain_file  # stages and survey: half of the start of `info`
-
-    try:
-        chain = load_chain_file(path)
-    except (ConfigError, InputError) as error:
-        return Findings(str(path), (_without_name(path, error),), ())
-    return Findings(str(path), (), (), f"{len(chain.steps)} stages")
 
 
 def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:

@@ -349,13 +349,21 @@ def _decide(
     saturated, system_like = figures.saturated_share or 0.0, figures.system_width_share or 0.0
     learned = len(system.components)
     inverted = "the signal goes down from its baseline: counts are mirrored when they are read"
+    pulse = "no pulse was looked for"
+    if candidates:
+        chosen = next(one for one in candidates if one.chosen)
+        others = [one for one in candidates if not one.chosen]
+        pulse = f"{chosen.name}: {chosen.nats:.1f} nats describe a waveform"
+        pulse += "".join(f", {one.nats:.1f} with {one.name}" for one in others[:2])
+        if any(one.longer_by < -SURE for one in others):
+            pulse += "; a shorter one saves too little per echo, or needs more echoes"
     skew = "no pulse was learned"
     if figures.misfit_skewed is not None:
         misfit = f"it misses the stacked echoes by {figures.misfit_skewed:.4f} of the amplitude"
         skew = f"with kappa {figures.kappa:z.3f} {misfit}"
     return (
         *((Decision(Part.INVERTED, True, inverted),) if figures.inverted else ()),
-        Decision(Part.PULSE, learned > 1, _explain_pulse(candidates)),
+        Decision(Part.PULSE, learned > 1, pulse),
         Decision(Part.SKEW, system.kappa != 0, skew),
         Decision(Part.GROWTH, share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
         Decision(Part.PRIOR, share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (limit 40 %)"),
@@ -395,15 +403,3 @@ def _decide_defects(defects: Defects) -> Iterator[Decision]:
         yield Decision("spikes taken off", True, f"{defects.spikes:.3g} spikes of one sample per waveform")
     if defects.transient:
         yield Decision("start left out", True, f"the first {defects.transient:g} ns of the waveforms jump")
-
-
-def _explain_pulse(candidates: tuple[Tried, ...]) -> str:
-    """Why the pulse is the one that it is."""
-    if not candidates:
-        return "no pulse was looked for"
-    chosen = next(one for one in candidates if one.chosen)
-    others = [one for one in candidates if not one.chosen]
-    text = f"{chosen.name}: {chosen.nats:.1f} nats describe a waveform"
-    text += "".join(f", {one.nats:.1f} with {one.name}" for one in others[:2])
-    shorter = any(one.longer_by < -SURE for one in others)
-    return text + ("; a shorter one saves too little per echo, or needs more echoes" if shorter else "")

@@ -79,7 +79,12 @@ class Cluster:
         with contextlib.ExitStack() as stack:
             stack.enter_context(silent())
             self._client = stack.enter_context(connected(self.address))
-            self._workers = self._find_workers()
+            try:
+                self._client.wait_for_workers(1, timeout=_WORKERS)
+            except Exception as error:
+                problem = "has no workers; start some: dask worker ADDRESS"
+                raise ConfigError(f"--scheduler {self.address}: {problem}") from error
+            self._workers = dict(self._client.nthreads())
             self._check_versions()
             with reporting(self._folder):
                 self._folder.mkdir(parents=True, exist_ok=True)
@@ -153,13 +158,6 @@ class Cluster:
 
     def restart(self) -> None:
         """Do nothing: calls of a worker that died go to the others."""
-
-    def _find_workers(self) -> dict[str, int]:
-        try:
-            self._client.wait_for_workers(1, timeout=_WORKERS)
-        except Exception as error:
-            raise ConfigError(f"--scheduler {self.address}: has no workers; start some: dask worker ADDRESS") from error
-        return dict(self._client.nthreads())
 
     def _check_versions(self) -> None:
         """Raise ConfigError where the scheduler or a worker is not of the kind of this process."""
@@ -286,12 +284,18 @@ _LOUD = ("distributed", "distributed.client", "distributed.core", "distributed.u
 def connected(address: str) -> Iterator[Any]:
     """A client of the cluster; ConfigError where it cannot be reached."""
     from distributed import Client
+    from distributed.security import Security
 
     try:
         _knock(address)
-        _check_keys(address)
+        # A client that fails prints more when it ends; one that waits too long goes on in its thread.
+        if address.startswith("tls://") and Security().get_connection_args("client").get("ssl_context") is None:
+            what = "no certificate and key here (distributed.comm.tls in its configuration)"
+            raise ValueError(f"dask has {what}; set them")
         options = {"timeout": _CONNECT, "set_as_default": False, "name": "wavebatch"}
-        client = _call_in_time(_CONNECT + 0.5, lambda: Client(address, **options))
+        future: Future = Future()
+        threading.Thread(target=settle_future, args=(future, lambda: Client(address, **options)), daemon=True).start()
+        client = future.result(timeout=_CONNECT + 0.5)
     except Exception as error:
         raise ConfigError(
             f"--scheduler {address}: cannot be reached: {shorten_error(error)}; "
@@ -313,21 +317,6 @@ def _knock(address: str) -> None:
     if not host or not port.isdigit():
         raise ValueError("it has no host and port")
     socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT).close()
-
-
-def _check_keys(address: str) -> None:
-    """Raise ValueError where TLS is wanted and dask has no keys; a client that fails prints more when it ends."""
-    from distributed.security import Security
-
-    if address.startswith("tls://") and Security().get_connection_args("client").get("ssl_context") is None:
-        raise ValueError("dask has no certificate and key here (distributed.comm.tls in its configuration); set them")
-
-
-def _call_in_time(seconds: float, function: Callable) -> Any:
-    """The result of `function()`; TimeoutError where it takes longer, while its thread goes on."""
-    future: Future = Future()
-    threading.Thread(target=settle_future, args=(future, function), daemon=True).start()
-    return future.result(timeout=seconds)
 
 
 @contextlib.contextmanager

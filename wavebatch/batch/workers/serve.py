@@ -29,7 +29,13 @@ _SET_DEATH_SIGNAL = 1
 
 def serve_calls(pipe: Connection) -> None:
     """Make calls until the parent process closes the pipe."""
-    _wake_when_parent_dies()  # before all else: until then nothing wakes this process if it is stopped
+    # Before all else: until then nothing wakes this process if it is stopped. Linux continues it when its parent dies,
+    # and `_end_with` ends it. A signal that kills would come too early: when the thread ends that has started it.
+    if sys.platform == "linux":
+        import ctypes
+
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGCONT)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     keep_freed_memory()
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
@@ -38,18 +44,6 @@ def serve_calls(pipe: Connection) -> None:
     with contextlib.suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(_answer(pipe.recv_bytes()))
-
-
-def _wake_when_parent_dies() -> None:
-    """Let Linux continue this process, if it is stopped, when its parent dies: `_end_with` then ends it.
-
-    A signal that kills would come too early: when the thread ends that has started this process.
-    """
-    if sys.platform == "linux":
-        import ctypes
-
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGCONT)
 
 
 def _answer(pickled: bytes) -> bytes:

@@ -128,7 +128,11 @@ def probe_arithmetic() -> str:
     digest = hashlib.sha256()
     for parameters, samples in _SIZES:
         for kind in (np.float64, np.float32):
-            rows: np.ndarray = _make_rows(parameters, samples).astype(kind)
+            # Numbers of many digits that every machine makes alike: whole numbers, then one division.
+            place = np.arange(parameters * samples, dtype=np.uint64)
+            mixed = (place * np.uint64(2654435761) + np.uint64(12345)) % np.uint64(1_000_003)
+            digits = (mixed.astype(np.float64) / 500_001.5 - 1.0).reshape(parameters, samples)
+            rows: np.ndarray = digits.astype(kind)
             gram = rows @ rows.T
             matrix = gram.astype(np.float64) + np.eye(parameters)
             results = [
@@ -147,13 +151,6 @@ def probe_arithmetic() -> str:
             for result in results:
                 digest.update(np.ascontiguousarray(result).tobytes())
     return digest.hexdigest()[:16]
-
-
-def _make_rows(parameters: int, samples: int) -> np.ndarray:
-    """Numbers of many digits (parameters, samples) that every machine makes alike: whole numbers, then one division."""
-    place = np.arange(parameters * samples, dtype=np.uint64)
-    mixed = (place * np.uint64(2654435761) + np.uint64(12345)) % np.uint64(1_000_003)
-    return (mixed.astype(np.float64) / 500_001.5 - 1.0).reshape(parameters, samples)
 
 
 def _find_name() -> str:

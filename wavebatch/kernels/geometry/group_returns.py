@@ -321,18 +321,13 @@ def fit_rays(xyz: np.ndarray, starts: np.ndarray, angle: np.ndarray, source: np.
         sure = (length[rows] >= _SURE) & (down > 0.3 * length[rows])
         if np.count_nonzero(sure) >= _ENOUGH:
             slopes = span[rows[sure], :2] / down[sure, None]
-            rays[rows, :2] = _fit_slopes(tangent[rows[sure]], slopes, tangent[rows])
+            terms = np.stack([np.ones(len(slopes)), tangent[rows[sure]]], axis=1)
+            use = np.ones(len(slopes), bool)
+            for _ in range(3):  # outliers are clipped twice
+                factors = np.linalg.lstsq(terms[use], slopes[use], rcond=None)[0]
+                off = np.linalg.norm(slopes - terms @ factors, axis=1)
+                use = off <= _CLIP * max(MAD_TO_STD * float(np.median(off)), 1e-6)
+            rays[rows, :2] = factors[0] + tangent[rows, None] * factors[1]
     own = length >= OWN
     rays[own] = span[own]
     return rays / np.linalg.norm(rays, axis=1)[:, None]
-
-
-def _fit_slopes(tangent: np.ndarray, slopes: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Linear fit of slopes (m, 2) by tangent (m,), outliers clipped twice, evaluated at `wanted`."""
-    use = np.ones(len(tangent), bool)
-    for _ in range(3):
-        terms = np.stack([np.ones(len(tangent)), tangent], axis=1)
-        factors = np.linalg.lstsq(terms[use], slopes[use], rcond=None)[0]
-        off = np.linalg.norm(slopes - terms @ factors, axis=1)
-        use = off <= _CLIP * max(MAD_TO_STD * float(np.median(off)), 1e-6)
-    return factors[0] + wanted[:, None] * factors[1]

@@ -303,8 +303,13 @@ def measure_normals(
     """
     angle, error = np.full((2, len(points)), np.nan, np.float32)
     gap = np.full(len(points), Gap.NO_RAY, np.uint8)
-    unit = _normalise(ray)
-    able = _by_place(points, np.isfinite(unit).all(axis=1) & np.isfinite(points).all(axis=1), 8 * radius)
+    x, y, z = np.ascontiguousarray(ray.T, np.float64)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        length = np.sqrt(x * x + y * y + z * z)
+        unit = np.stack([x / length, y / length, z / length], axis=1)  # NaN where the length is 0
+    able = np.flatnonzero(np.isfinite(unit).all(axis=1) & np.isfinite(points).all(axis=1))
+    # Cell by cell: points that are searched together should lie together.
+    able = able[np.lexsort(tuple(np.floor(points[able, axis] / (8 * radius)) for axis in (2, 1, 0)))]
     at, size = 0, 512
     while at < len(able):
         rows = able[at : at + size]
@@ -314,20 +319,6 @@ def measure_normals(
         angle[rows], error[rows] = np.degrees(angles), np.degrees(errors)
         size = int(np.clip(pairs * len(rows) // max(len(point), 1), 64, _LARGEST_CHUNK))
     return (angle, error), gap
-
-
-def _by_place(points: np.ndarray, wanted: np.ndarray, side: float) -> np.ndarray:
-    """The wanted points cell by cell: points that are searched together should lie together."""
-    rows = np.flatnonzero(wanted)
-    return rows[np.lexsort(tuple(np.floor(points[rows, axis] / side) for axis in (2, 1, 0)))]
-
-
-def _normalise(ray: np.ndarray) -> np.ndarray:
-    """Unit vectors, NaN where the length is 0."""
-    x, y, z = np.ascontiguousarray(ray.T, np.float64)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        length = np.sqrt(x * x + y * y + z * z)
-        return np.stack([x / length, y / length, z / length], axis=1)
 
 
 def _judge(
@@ -342,11 +333,17 @@ def _judge(
     surface &= planes.offset() <= planes.limit
     folded = np.zeros(n)
     rows = np.flatnonzero(surface)
-    folded[rows] = _find_folds(offset, point, planes, unit, rows)
+    # How far angles may be off because the neighbours are two planes [rad].
+    apart, of, some = _take(offset, point, planes, rows)
+    folded[rows] = misfit_of_angles(compare_halves(apart, of, some), some, unit[rows])
     surface &= ~((error <= max_error) & (np.hypot(error, folded) > max_error))
     rows = np.flatnonzero(surface)
     untried = np.zeros(n, bool)
-    untried[rows] = _find_two_lines(offset, point, planes, rows)
+    # A plane through two scan lines only, which nothing could contradict.
+    apart, of, some = _take(offset, point, planes, rows)
+    away, u, v = (np.einsum("ki,ki->k", apart - some.centre[of], some.axes[of, :, axis]) for axis in range(3))
+    near = np.abs(away) <= some.limit[of]
+    untried[rows] = in_two_lines(u[near], v[near], of[near], len(rows))
     error = np.hypot(error, folded)
     gap = np.where(error <= max_error, Gap.KNOWN, Gap.UNCERTAIN)
     gap = np.where(angle > STEEPEST, Gap.TOO_STEEP, gap)
@@ -354,22 +351,6 @@ def _judge(
     gap = np.where((count < min_points) | untried, Gap.FEW_NEIGHBOURS, gap).astype(np.uint8)
     known = gap == Gap.KNOWN
     return np.where(known, angle, np.nan), np.where(known, error, np.nan), gap
-
-
-def _find_folds(
-    offset: np.ndarray, point: np.ndarray, planes: Planes, unit: np.ndarray, rows: np.ndarray
-) -> np.ndarray:
-    """How far the angles of points `rows` may be off because their neighbours are two planes [rad]."""
-    offset, point, some = _take(offset, point, planes, rows)
-    return misfit_of_angles(compare_halves(offset, point, some), some, unit[rows])
-
-
-def _find_two_lines(offset: np.ndarray, point: np.ndarray, planes: Planes, rows: np.ndarray) -> np.ndarray:
-    """Which of the points `rows` have a plane through two scan lines only, which nothing could contradict."""
-    offset, point, some = _take(offset, point, planes, rows)
-    away, u, v = (np.einsum("ki,ki->k", offset - some.centre[point], some.axes[point, :, axis]) for axis in range(3))
-    near = np.abs(away) <= some.limit[point]
-    return in_two_lines(u[near], v[near], point[near], len(rows))
 
 
 def _take(

@@ -119,7 +119,9 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
         off += (x[2][rows] - centre[at, 2]) * axes[at, 2, 0]
         off = np.abs(off)
         tight = (number < _TIGHT_ROUNDS) & (spreads[active, 0] > SMOOTH * spreads[active, 1])
-        factor = np.where(tight, TIGHT, OUTLYING * MAD_TO_STD * _spread_lost(count[active]))
+        # The median distance from a plane fitted to few points is too small (Rousseeuw and Leroy 1987).
+        few = 1.0 + 5.0 / np.maximum(count[active] - 3, 1)
+        factor = np.where(tight, TIGHT, OUTLYING * MAD_TO_STD * few)
         limit[active] = factor * np.maximum(_medians(off, local, count[active]), LEAST_SPREAD)
         near = off <= limit[at]
         changed = np.bincount(local, near != kept[rows], minlength=len(active)) > 0
@@ -199,11 +201,6 @@ def _solve(moments: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarra
         covariance[:, a, b] = covariance[:, b, a] = total / number - centre[:, a] * centre[:, b]
     spreads, axes = np.linalg.eigh(covariance)
     return centre, spreads, axes
-
-
-def _spread_lost(count: np.ndarray) -> np.ndarray:
-    """By how much the median distance from a plane fitted to few points is too small (Rousseeuw and Leroy 1987)."""
-    return 1.0 + 5.0 / np.maximum(count - 3, 1)
 
 
 def _rows_of(sets: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -343,7 +340,26 @@ def compare_halves(offset: np.ndarray, point: np.ndarray, planes: Planes) -> Hal
     for number, values in enumerate((u, v, r, u * u, u * v, v * v, u * r, v * r), 1):
         sums[:, number] = np.bincount(cell, values, minlength=len(sums))
     squares = np.bincount(point[near], r * r, minlength=n)
-    return _choose_cut(sums.reshape(n, _SECTORS, 9), squares)
+    sectors = sums.reshape(n, _SECTORS, 9)
+    ring = np.concatenate([sectors, sectors[:, : CUTS - 1]], axis=1)
+    window = np.stack([ring[:, start : start + CUTS].sum(axis=1) for start in range(_SECTORS)], axis=1)
+    explained, tilts = _fit(window)
+    both = explained[:, :CUTS] + explained[:, CUTS:]
+    whole, _ = _fit(window[:, 0] + window[:, CUTS])
+    count = sectors[:, :, 0].sum(axis=1)
+    rows = np.arange(n)
+    best = np.argmax(both, axis=1)
+    known = np.isfinite(both[rows, best]) & np.isfinite(whole) & (count > 6)
+    both, whole = np.where(known, both[rows, best], 0.0), np.where(known, whole, 0.0)
+    left = np.maximum(squares - both, 0.0) + count * LEAST_SPREAD**2
+    freedom = np.maximum(count - 6.0, 1.0)
+    ratio = np.maximum(both - whole, 0.0) / 3.0 * freedom / np.maximum(left, LEAST_SPREAD**2)
+    import scipy.special  # here, because most runs need none of it
+
+    chance = scipy.special.fdtrc(3.0, freedom, ratio)
+    chance = np.where(known, np.minimum(CUTS * chance, 1.0), 1.0)
+    pair = np.stack([tilts[rows, best], tilts[rows, best + CUTS]], axis=1)
+    return Halves(chance, np.where(known[:, None, None], pair, 0.0))
 
 
 def misfit_of_angles(halves: Halves, planes: Planes, ray: np.ndarray) -> np.ndarray:
@@ -379,29 +395,6 @@ def _angle_of(cosine: np.ndarray) -> np.ndarray:
 
 def _project(offset: np.ndarray, axis: np.ndarray, point: np.ndarray) -> np.ndarray:
     return offset[:, 0] * axis[point, 0] + offset[:, 1] * axis[point, 1] + offset[:, 2] * axis[point, 2]
-
-
-def _choose_cut(sums: np.ndarray, squares: np.ndarray) -> Halves:
-    """The best cut from sums over sectors (n, 12, 9) and the sums of squared distances (n,)."""
-    ring = np.concatenate([sums, sums[:, : CUTS - 1]], axis=1)
-    window = np.stack([ring[:, start : start + CUTS].sum(axis=1) for start in range(_SECTORS)], axis=1)
-    explained, tilts = _fit(window)
-    both = explained[:, :CUTS] + explained[:, CUTS:]
-    whole, _ = _fit(window[:, 0] + window[:, CUTS])
-    count = sums[:, :, 0].sum(axis=1)
-    rows = np.arange(len(sums))
-    best = np.argmax(both, axis=1)
-    known = np.isfinite(both[rows, best]) & np.isfinite(whole) & (count > 6)
-    both, whole = np.where(known, both[rows, best], 0.0), np.where(known, whole, 0.0)
-    left = np.maximum(squares - both, 0.0) + count * LEAST_SPREAD**2
-    freedom = np.maximum(count - 6.0, 1.0)
-    ratio = np.maximum(both - whole, 0.0) / 3.0 * freedom / np.maximum(left, LEAST_SPREAD**2)
-    import scipy.special  # here, because most runs need none of it
-
-    chance = scipy.special.fdtrc(3.0, freedom, ratio)
-    chance = np.where(known, np.minimum(CUTS * chance, 1.0), 1.0)
-    pair = np.stack([tilts[rows, best], tilts[rows, best + CUTS]], axis=1)
-    return Halves(chance, np.where(known[:, None, None], pair, 0.0))
 
 
 def _fit(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

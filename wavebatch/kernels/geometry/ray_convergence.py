@@ -137,13 +137,9 @@ def range_error(fit: SensorFit, time: np.ndarray, direction: np.ndarray) -> np.n
     tau = (np.asarray(time, np.float64) - fit.centre) / fit.half
     along = (np.vander(tau, order + 1, increasing=True)[:, :, None] * direction[:, None, :]).reshape(len(tau), -1)
     variance = np.einsum("ni,ij,nj->n", along, fit.covariance, along)
-    return np.sqrt(np.maximum(variance, 0.0) + _unknown_motion(fit) ** 2)
-
-
-def _unknown_motion(fit: SensorFit) -> float:
-    """How far a sensor may be off a path of the fit's order within its window [m], as weak directions enlarge it."""
+    # How far a sensor may be off a path of the fit's order within its window [m], as weak directions enlarge it.
     stray = (SPEED * fit.half / 3**0.5, ACCELERATION * fit.half**2 / 6, 0.0)[len(fit.coefficients) - 1]
-    return float(stray * np.sqrt(fit.condition))
+    return np.sqrt(np.maximum(variance, 0.0) + float(stray * np.sqrt(fit.condition)) ** 2)
 
 
 def fit_sensor(
@@ -175,14 +171,28 @@ def fit_sensor(
     weight = np.ones(len(used)) if weight is None else np.asarray(weight, np.float64)[used]
     time = np.asarray(time, np.float64)[used]
     if len(used) < LEAST_PULSES:
-        return _nothing(order, len(used))
+        # A fit that is not sound.
+        size = 3 * (order + 1)
+        empty = np.full((order + 1, 3), np.nan), np.full((size, size), np.nan)
+        return SensorFit(0.0, 1.0, *empty, np.inf, np.nan, 0.0, np.nan, len(used))
     centre = 0.5 * float(time.min() + time.max())
     half = max(0.5 * float(time.max() - time.min()), 1e-9)
     origin = np.median(point[used], axis=0)
     ground = point[used] - origin
     powers = np.vander((time - centre) / half, order + 1, increasing=True)
     with np.errstate(all="ignore"):
-        start = _solve_lines(powers, ground, unit, weight)
+        across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+        w = weight
+        start = np.zeros((powers.shape[1], 3))
+        for _ in range(_ROUNDS):
+            right = np.einsum("nij,nj->ni", across, ground) * w[:, None]
+            normal, right = _normal(powers, across * np.sqrt(w)[:, None, None], right)
+            start = _solve(normal, right).reshape(start.shape)
+            ahead = ground - powers @ start
+            distance = np.sqrt(np.einsum("ni,ni->n", ahead, ahead))
+            off = np.einsum("nij,nj->ni", across, ahead)
+            error = np.sqrt(np.einsum("ni,ni->n", off, off) * weight) / distance
+            w = _keep(error, weight / distance**2)
         ahead = ground - powers @ start
         unit = np.where((np.einsum("ni,ni->n", unit, ahead) < 0)[:, None], -unit, unit)
         found, normal, residual, left = _solve_angles(powers, ground, unit, weight, start)
@@ -278,13 +288,6 @@ def _see_turn(
     return normal / variance, right / variance, normal / kept * (distance / SCANNER) ** 2
 
 
-def _nothing(order: int, pulses: int) -> SensorFit:
-    """A fit that is not sound."""
-    size = 3 * (order + 1)
-    empty = np.full((order + 1, 3), np.nan), np.full((size, size), np.nan)
-    return SensorFit(0.0, 1.0, *empty, np.inf, np.nan, 0.0, np.nan, pulses)
-
-
 def _condition(normal: np.ndarray) -> float:
     values = np.linalg.eigvalsh(normal) if np.isfinite(normal).all() else np.zeros(1)
     return float(values[-1] / values[0]) if values[0] > 0 else np.inf
@@ -316,23 +319,6 @@ def _keep(error: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Weights, 0 for what lies beyond four robust standard deviations."""
     limit = CLIP * max(float(np.median(error)), 1e-12)
     return np.where(error <= limit, weight, 0.0)
-
-
-def _solve_lines(powers: np.ndarray, ground: np.ndarray, unit: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Coefficients that minimise the distances of the position from the lines, weighted by 1/R^2, without outliers."""
-    across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
-    w = weight
-    found = np.zeros((powers.shape[1], 3))
-    for _ in range(_ROUNDS):
-        right = np.einsum("nij,nj->ni", across, ground) * w[:, None]
-        normal, right = _normal(powers, across * np.sqrt(w)[:, None, None], right)
-        found = _solve(normal, right).reshape(found.shape)
-        ahead = ground - powers @ found
-        distance = np.sqrt(np.einsum("ni,ni->n", ahead, ahead))
-        off = np.einsum("nij,nj->ni", across, ahead)
-        error = np.sqrt(np.einsum("ni,ni->n", off, off) * weight) / distance
-        w = _keep(error, weight / distance**2)
-    return found
 
 
 def _solve_angles(

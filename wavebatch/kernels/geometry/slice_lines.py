@@ -63,25 +63,22 @@ def _find_turns(angle: np.ndarray) -> np.ndarray:
         return np.empty(0, np.int64)
     rising = angle[LAG:] > angle[:-LAG]
     changes = np.flatnonzero(rising[1:] != rising[:-1]) + 1
-    edges = _drop_short(np.concatenate([[0], changes, [len(rising)]]))[1:-1]
+    # Runs shorter than LAG are joined with their two neighbours, the shortest first.
+    bounds = np.concatenate([[0], changes, [len(rising)]])
+    while len(bounds) > 2:
+        lengths = np.diff(bounds)
+        shortest = int(np.argmin(lengths))
+        if lengths[shortest] >= LAG:
+            break
+        gone = [number for number in (shortest, shortest + 1) if 0 < number < len(bounds) - 1]
+        bounds = np.delete(bounds, gone)
+    edges = bounds[1:-1]
     turns = []
     for edge in edges.tolist():
         low, high = max(edge - LAG, 0), min(edge + 2 * LAG, len(angle))
         part = angle[low:high]
         turns.append(low + int(np.argmax(part) if rising[edge - 1] else np.argmin(part)))
     return np.array(turns, np.int64)
-
-
-def _drop_short(edges: np.ndarray) -> np.ndarray:
-    """Edges without those of runs shorter than LAG: the shortest run is joined with its two neighbours first."""
-    while len(edges) > 2:
-        lengths = np.diff(edges)
-        shortest = int(np.argmin(lengths))
-        if lengths[shortest] >= LAG:
-            break
-        gone = [number for number in (shortest, shortest + 1) if 0 < number < len(edges) - 1]
-        edges = np.delete(edges, gone)
-    return edges
 
 
 LEAST_POINTS, LEAST_BEYOND = 8, 2
@@ -132,18 +129,6 @@ def find_bend(place: np.ndarray, off: np.ndarray) -> float | None:
     x, y = x - centre, y - y.mean()
     square = float(x @ x)
     y = y - x * (x @ y / square)
-    gains, changes = _try_bends(x, y, square)
-    at = LEAST_BEYOND + int(np.argmax(gains[LEAST_BEYOND : n - LEAST_BEYOND]))
-    whole, gain = float(y @ y), float(gains[at])
-    left = max(whole - gain, 1e-12 * n)
-    chance = scipy.special.fdtrc(2.0, n - 4.0, gain / 2.0 * (n - 4.0) / left)
-    bent = chance < LARGEST_CHANCE and gain >= LEAST_SHARE * whole
-    bent &= abs(np.arctan(changes[at])) >= LEAST_BEND and gain > _gain(x * x, x, y, square)
-    return middle + half * float(x[at] + centre) if bent else None
-
-
-def _try_bends(x: np.ndarray, y: np.ndarray, square: float) -> tuple[np.ndarray, np.ndarray]:
-    """What a bend at each x takes off the sum of squares of y, and its change of slope; y has no slope and no mean."""
     number, sum_x, sum_xx, sum_y, sum_xy = (
         np.cumsum(values[::-1])[::-1] for values in (np.ones(len(x)), x, x * x, y, x * y)
     )
@@ -152,14 +137,17 @@ def _try_bends(x: np.ndarray, y: np.ndarray, square: float) -> tuple[np.ndarray,
     size = sum_xx - 2 * x * sum_x + x * x * number - total**2 / len(x) - along**2 / square
     size = np.maximum(size, 1e-12)
     with_y = sum_xy - x * sum_y
-    return with_y**2 / size, with_y / size
-
-
-def _gain(curve: np.ndarray, x: np.ndarray, y: np.ndarray, square: float) -> float:
-    """What a curve takes off the sum of squares of y, which has no slope and no mean."""
-    curve = curve - curve.mean()
+    gains, changes = with_y**2 / size, with_y / size
+    at = LEAST_BEYOND + int(np.argmax(gains[LEAST_BEYOND : n - LEAST_BEYOND]))
+    whole, gain = float(y @ y), float(gains[at])
+    left = max(whole - gain, 1e-12 * n)
+    chance = scipy.special.fdtrc(2.0, n - 4.0, gain / 2.0 * (n - 4.0) / left)
+    bent = chance < LARGEST_CHANCE and gain >= LEAST_SHARE * whole
+    curve = x * x - (x * x).mean()
     curve = curve - x * (x @ curve / square)
-    return float((curve @ y) ** 2 / max(curve @ curve, 1e-12))
+    smooth = float((curve @ y) ** 2 / max(curve @ curve, 1e-12))  # what a parabola takes off the sum of squares
+    bent &= abs(np.arctan(changes[at])) >= LEAST_BEND and gain > smooth
+    return middle + half * float(x[at] + centre) if bent else None
 
 
 THETA_STEP = 0.5
@@ -337,7 +325,9 @@ class _Image:
             # Whole pulses: pixels of half a pulse would turn the line.
             rows = rows[~np.isin(self.pulse[rows], other)]
             inside = np.intersect1d(run.rows, rows, assume_unique=True)
-            start = _normal_form(*_fit(self.points[inside], self.weight[inside]))
+            middle, along = _fit(self.points[inside], self.weight[inside])
+            normal = _across(along)
+            start = float(np.arctan2(normal[1], normal[0])), float(middle @ normal)
 
     def _other_side(self, run: _Run) -> np.ndarray | None:
         """Pulses on the weaker side of a run's bend; None where it has no bend."""
@@ -371,30 +361,21 @@ class _Image:
             middle, along = _fit(self.points[inside], self.weight[inside])
             shift = float((old - middle) @ along)
             ends = (ends[0] + shift, ends[1] + shift)
-        spread = _measure_spread(self.points[tried] - middle, self.weight[tried], along)
+        # The median of its four quarters, so that one bright spot does not decide.
+        apart, weight = self.points[tried] - middle, self.weight[tried]
+        place, off = apart @ along, apart @ _across(along)
+        low, high = place.min(), place.max()
+        part = np.minimum(4 * (place - low) / max(high - low, 1e-12), 3).astype(np.int64)
+        sums = np.bincount(part, weight, 4)
+        spread = float(np.sqrt(np.median(np.bincount(part, weight * off**2, 4)[sums > 0] / sums[sums > 0])))
         if ends[1] - ends[0] < self.shortest or spread > CROWD * self.band / BAND:
             return None, np.union1d(first, tried)
         return _Run(middle, along, ends, tried), tried
 
 
-def _normal_form(middle: np.ndarray, along: np.ndarray) -> tuple[float, float]:
-    """Angle [rad] and rho of a line."""
-    normal = _across(along)
-    return float(np.arctan2(normal[1], normal[0])), float(middle @ normal)
-
-
 def _across(along: np.ndarray) -> np.ndarray:
     """A direction turned left by 90 degrees."""
     return np.array([-along[1], along[0]])
-
-
-def _measure_spread(apart: np.ndarray, weight: np.ndarray, along: np.ndarray) -> float:
-    """Spread of pixels about their line: the median of its four quarters, so that one bright spot does not decide."""
-    place, off = apart @ along, apart @ _across(along)
-    low, high = place.min(), place.max()
-    part = np.minimum(4 * (place - low) / max(high - low, 1e-12), 3).astype(np.int64)
-    sums = np.bincount(part, weight, 4)
-    return float(np.sqrt(np.median(np.bincount(part, weight * off**2, 4)[sums > 0] / sums[sums > 0])))
 
 
 def _fit(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

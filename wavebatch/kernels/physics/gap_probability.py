@@ -96,7 +96,13 @@ def estimate_canopy_ratio(canopy: np.ndarray, ground: np.ndarray) -> CanopyRatio
             return None
         others.append(other)
     error = float(np.sqrt((PARTS - 1) * np.var(others)))
-    scatter, unlike = _measure_scatter(canopy, ground, np.exp(found))
+    # Robust scatter of the light of pulses, and what pulses beyond it add.
+    ratio = np.exp(found)
+    light = np.log(canopy + ratio * ground)
+    off = np.abs(light - np.median(light))
+    scatter = MAD_TO_STD * float(np.median(off))
+    beyond = (off > _CLIP * scatter) & (off < _MOST_UNLIKE)
+    unlike = float(np.sqrt(np.mean(np.where(beyond, off, 0.0) ** 2)))
     error = float(np.sqrt(error**2 + MODEL_ERROR**2 + scatter**4 + unlike**2))
     return CanopyRatio(float(np.exp(found)), float(np.exp(found) * error)) if error < LARGEST_ERROR else None
 
@@ -121,15 +127,6 @@ def _find_ratio(canopy: np.ndarray, ground: np.ndarray, logs: np.ndarray) -> flo
 
 def _share(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> np.ndarray:
     return ratio * ground / (canopy + ratio * ground)
-
-
-def _measure_scatter(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> tuple[float, float]:
-    """Robust relative standard deviation of the light of pulses, and what pulses beyond it add."""
-    light = np.log(canopy + ratio * ground)
-    off = np.abs(light - np.median(light))
-    scatter = MAD_TO_STD * float(np.median(off))
-    beyond = (off > _CLIP * scatter) & (off < _MOST_UNLIKE)
-    return scatter, float(np.sqrt(np.mean(np.where(beyond, off, 0.0) ** 2)))
 
 
 def _slope(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> float:

@@ -217,21 +217,18 @@ def _fit_widths(spread: np.ndarray, tau: float, spacing: float) -> np.ndarray:
         first, last = time[np.flatnonzero(curve > 1e-6)[[0, -1]]]
         for phase in _PHASES:
             at = np.arange(first - 3.0 * half + phase * spacing, last + spacing, spacing)
-            widths[k] += _fit_gaussian(at, np.interp(at, time, curve), peak, half / FWHM_PER_SIGMA) / len(_PHASES)
+            # Gauss-Newton from a close start.
+            value = np.interp(at, time, curve)
+            amplitude, place, width = 1.0, peak, half / FWHM_PER_SIGMA
+            for _ in range(12):
+                z = (at - place) / width
+                unit = np.exp(-0.5 * z * z)
+                slope = amplitude / width * unit * z
+                jacobian = np.stack([unit, slope, slope * z], axis=1)
+                step = np.linalg.lstsq(jacobian, value - amplitude * unit, rcond=None)[0]
+                amplitude, place, width = amplitude + step[0], place + step[1], max(width + step[2], 0.3 * width)
+            widths[k] += width / len(_PHASES)
     return widths
-
-
-def _fit_gaussian(time: np.ndarray, value: np.ndarray, centre: float, sigma: float) -> float:
-    """Width of the least-squares Gaussian, by Gauss-Newton from a close start."""
-    amplitude = 1.0
-    for _ in range(12):
-        z = (time - centre) / sigma
-        unit = np.exp(-0.5 * z * z)
-        slope = amplitude / sigma * unit * z
-        jacobian = np.stack([unit, slope, slope * z], axis=1)
-        step = np.linalg.lstsq(jacobian, value - amplitude * unit, rcond=None)[0]
-        amplitude, centre, sigma = amplitude + step[0], centre + step[1], max(sigma + step[2], 0.3 * sigma)
-    return sigma
 
 
 RADIUS = np.array([

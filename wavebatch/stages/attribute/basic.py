@@ -49,21 +49,13 @@ def echo_width(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: 
     2.354820 sigma of a Gaussian, 2 sinh(1.17741 kappa) / kappa sigma of a skewed pulse. Of a learned pulse it is the
     width of the main lobe.
     """
-    factor = _width_factor(_skew_of(system, echoes))
-    return echoes.with_attributes(echo_width=echoes.sigma * factor, echo_width_err=echoes.sigma_err * factor)
-
-
-def _skew_of(system: SystemPulse, echoes: EchoTable) -> np.ndarray:
-    """Skew of the pulses that were fitted: one per echo where each has its own, else that of the system."""
-    return np.asarray(echoes.attributes.get("skew", system.kappa), np.float64)
-
-
-def _width_factor(kappa: np.ndarray) -> np.ndarray:
-    """Full width at half maximum per sigma of a skewed pulse (docs/algorithms.md 0); 2.354820 without skew."""
+    # docs/algorithms.md 0
+    kappa = np.asarray(echoes.attributes.get("skew", system.kappa), np.float64)
     half = FWHM_PER_SIGMA / 2
     small = np.abs(kappa) < 1e-6
     safe = np.where(small, 1.0, kappa)
-    return np.where(small, FWHM_PER_SIGMA, 2 * np.sinh(half * safe) / safe).astype(np.float32)
+    factor = np.where(small, FWHM_PER_SIGMA, 2 * np.sinh(half * safe) / safe).astype(np.float32)
+    return echoes.with_attributes(echo_width=echoes.sigma * factor, echo_width_err=echoes.sigma_err * factor)
 
 
 @stage("attribute", makes=("skew", "skew_err"), check=_need_free_skew)
@@ -322,7 +314,11 @@ def incidence_angle(
     distance = sensor_distance(block, echoes)
     angle, error = incidence.angles_of_variance(variance, variance_err, distance, 1e-3 * beam if beam else np.nan)
     steep = np.isnan(angle) & np.isfinite(variance) & np.isfinite(variance_err) & np.isfinite(distance)
-    facing_err = _facing_error(system, echoes, reference_error)
+    # Of a surface that faces the sensor: the relative error of a width goes with 1/(amplitude sqrt(sigma)), whose noise
+    # has nothing to do with that of the width (docs/algorithms.md 2.1), so that this selects no echoes by their width.
+    square = system.sigma_ref**2
+    relative = np.hypot(echoes.sigma_err / echoes.sigma, system.widths.scatter / system.sigma_ref)
+    facing_err = np.hypot(2.0 * square * np.hypot(relative, reference_error), system.widths.error or 0.0)
     flat_error = incidence.angle_of_spread(np.sqrt(facing_err), distance, 1e-3 * beam if beam else np.nan)
     with np.errstate(invalid="ignore"):
         weak = ~(flat_error <= np.radians(max_error))
@@ -386,17 +382,6 @@ def added_variance(
         variance = width * width - reference * reference - system.widths.variance
     fit_err = 2.0 * np.hypot(width * error, reference * reference * reference_error)
     return variance, np.hypot(fit_err, system.widths.error or 0.0)
-
-
-def _facing_error(system: SystemPulse, echoes: EchoTable, reference_error: float) -> np.ndarray:
-    """Error that the added variance [ns2] of each echo would have on a surface that faces the sensor.
-
-    The relative error of a width goes with 1/(amplitude sqrt(sigma)), whose noise has nothing to do with that of the
-    width (docs/algorithms.md 2.1): what is decided by it selects no echoes by their width.
-    """
-    square = system.sigma_ref**2
-    relative = np.hypot(echoes.sigma_err / echoes.sigma, system.widths.scatter / system.sigma_ref)
-    return np.hypot(2.0 * square * np.hypot(relative, reference_error), system.widths.error or 0.0)
 
 
 def _model_width(

@@ -183,8 +183,16 @@ def _start_closed_form(
     peak = np.clip(np.rint(echoes.time / block.spacing), 0, s - 1).astype(np.int64)
     reach = min(int(np.ceil(2.5 * ref)), s)
     step = max(CLOSED_VALUES // (2 * reach + 1), 2)
-    parts = [slice(begin, begin + step) for begin in range(0, len(waveform), step)] or [slice(0)]
-    found = [fit_closed_form(_cut_peaks(block, noise, waveform[part], peak[part], reach), fraction) for part in parts]
+    found = []
+    for begin in range(0, max(len(waveform), 1), step):
+        # Signal above the baseline around peaks; 0 where no sample was recorded.
+        row, at = waveform[begin : begin + step, None], peak[begin : begin + step, None] + np.arange(-reach, reach + 1)
+        inside = (at >= 0) & (at < s)
+        at = np.clip(at, 0, s - 1)
+        y = block.samples[row, at] - (noise.baseline[row] if noise.of_sample is None else noise.of_sample[row, at])
+        if block.missing is not None:
+            inside &= ~block.missing[row, at]
+        found.append(fit_closed_form(np.where(inside, y, 0.0), fraction))
     amplitude, shift, width, holds = (np.concatenate(fields) for fields in zip(*found, strict=True))
     holds &= (width > widths[0] * ref) & (width < widths[1] * ref)
     return replace(
@@ -193,18 +201,6 @@ def _start_closed_form(
         time=np.where(holds, (peak + shift) * block.spacing, echoes.time),
         sigma=np.where(holds, width * block.spacing, echoes.sigma).astype(np.float32),
     )
-
-
-def _cut_peaks(block: WaveformBlock, noise: Noise, waveform: np.ndarray, peak: np.ndarray, reach: int) -> np.ndarray:
-    """Signal above the baseline around peaks (m, 2 reach + 1); 0 where no sample was recorded."""
-    s = block.samples.shape[1]
-    at = peak[:, None] + np.arange(-reach, reach + 1)
-    inside = (at >= 0) & (at < s)
-    row, at = waveform[:, None], np.clip(at, 0, s - 1)
-    y = block.samples[row, at] - (noise.baseline[row] if noise.of_sample is None else noise.of_sample[row, at])
-    if block.missing is not None:
-        inside &= ~block.missing[row, at]
-    return np.where(inside, y, 0.0)
 
 
 def loop_model(system: SystemPulse, model: str) -> str:
@@ -274,7 +270,11 @@ def residual_loop(
     fitted = loop_model(system, model)
     shape = pulse_shape(_fit_loop(system, {"model": fitted}), block.spacing)
     options = {"max_iterations": max_iterations, "tolerance": 0.1, **limits}
-    limit = _residual_limit(block, noise, t_diff, t_unit)
+    limit = t_diff * noise.std  # never below the noise
+    if t_unit == "count":
+        limit = np.maximum(t_diff, noise.std)
+    elif t_unit == "amplitude":
+        limit = np.maximum(t_diff * np.max(block.samples - noise.level, axis=1, initial=0), noise.std)
     rows = np.arange(len(block))
     before = np.full(len(block), -1)
     varies = find_varying(block.samples)
@@ -287,11 +287,11 @@ def residual_loop(
         grows = (height > limit) & (number < max_echoes) & (number > before) & varies
         at, goes_on = np.flatnonzero(grows), grows[found.waveform]
         final, kept = found.take(np.flatnonzero(~goes_on)), found.take(np.flatnonzero(goes_on))
-        parts.append(_renumber(final, rows[final.waveform]))
+        parts.append(replace(final, waveform=rows[final.waveform].astype(np.int32)))
         new = residual[at].argmax(axis=1) * block.spacing
         added = EchoTable.build(at, new, height[at], np.full(len(at), system.sigma_ref))
         echoes = join_tables(replace(kept, attributes={}), added)
-        echoes = _renumber(echoes, np.searchsorted(at, echoes.waveform))
+        echoes = replace(echoes, waveform=np.searchsorted(at, echoes.waveform).astype(np.int32))
         rows, before, varies, limit = rows[at], number[at], varies[at], limit[at]
         block, noise = block.rows(at), noise.rows(at)
     return join_tables(*parts)
@@ -304,20 +304,6 @@ _LOOP_FITS: dict[str, Callable[..., EchoTable]] = {
     "learned": reference,
 }
 """The decomposer that fits each model of a residual loop; none of them adds an echo."""
-
-
-def _residual_limit(block: WaveformBlock, noise: Noise, t_diff: float, unit: str) -> np.ndarray:
-    """Largest residual of each waveform that adds no echo [count]; never below the noise."""
-    if unit == "noise":
-        return t_diff * noise.std
-    if unit == "count":
-        return np.maximum(t_diff, noise.std)
-    top = np.max(block.samples - noise.level, axis=1, initial=0)
-    return np.maximum(t_diff * top, noise.std)
-
-
-def _renumber(table: EchoTable, waveform: np.ndarray) -> EchoTable:
-    return replace(table, waveform=waveform.astype(np.int32))
 
 
 def _residual(
@@ -396,27 +382,23 @@ def asdf_only(
         width_err = np.hypot(width_err, (measured.sigma - sigma) / spacing)
         table = replace(table, amplitude=np.maximum(echoes.amplitude, 0), sigma=sigma)
     residual = _residual(block, noise, system, GAUSSIAN, table)
-    table = replace(
-        table,
-        amplitude_err=amplitude_err.astype(np.float32),
-        sigma_err=(spacing * width_err).astype(np.float32),
-        residual=_misfit(residual, waveform, sample, 3 * system.sigma_ref / spacing) / std,
-    )
-    close = (np.diff(waveform) == 0) & (np.diff(table.time) < 4 * system.sigma_ref)
-    overlapped = np.append(close, False) | np.append(False, close) if len(table) else np.zeros(0, bool)
-    return flag_echoes(block, noise, system, table.with_flags(EchoFlag.OVERLAPPED, overlapped))
-
-
-def _misfit(residual: np.ndarray, waveform: np.ndarray, sample: np.ndarray, reach: float) -> np.ndarray:
-    """Root mean square of residuals (n, s) within `reach` of samples, float32 (m,)."""
+    # The root mean square of the residuals around each echo.
     total, number = np.zeros(len(sample)), np.zeros(len(sample))
-    most = min(int(np.ceil(reach)), residual.shape[1])
+    most = min(int(np.ceil(3 * system.sigma_ref / spacing)), residual.shape[1])
     for lag in range(-most, most + 1):
         at = sample + lag
         inside = (at >= 0) & (at < residual.shape[1])
         total += np.where(inside, residual[waveform, np.clip(at, 0, residual.shape[1] - 1)], 0.0) ** 2
         number += inside
-    return np.sqrt(total / np.maximum(number, 1)).astype(np.float32)
+    table = replace(
+        table,
+        amplitude_err=amplitude_err.astype(np.float32),
+        sigma_err=(spacing * width_err).astype(np.float32),
+        residual=np.sqrt(total / np.maximum(number, 1)).astype(np.float32) / std,
+    )
+    close = (np.diff(waveform) == 0) & (np.diff(table.time) < 4 * system.sigma_ref)
+    overlapped = np.append(close, False) | np.append(False, close) if len(table) else np.zeros(0, bool)
+    return flag_echoes(block, noise, system, table.with_flags(EchoFlag.OVERLAPPED, overlapped))
 
 
 @stage("decompose", fits=fit_gaussian, check=need_asdf)
@@ -443,18 +425,13 @@ def asdf_mixed(
     """
     quick = asdf_only(block, noise, system, echoes, describe=describe)
     maxima = maximum(block, noise, system)
-    differ = _disagree(len(block), maxima, quick, tolerance * system.sigma_ref)
+    # Waveforms with other numbers of echoes, or one at another time.
+    differ = maxima.count(len(block)) != quick.count(len(block))
+    a, b = (table.take(np.flatnonzero(~differ[table.waveform])) for table in (maxima, quick))
+    differ[a.waveform[np.abs(a.time - b.time) > tolerance * system.sigma_ref]] = True
     rows = np.flatnonzero(differ)
     chosen = maxima.take(np.flatnonzero(differ[maxima.waveform]))
     chosen = replace(chosen, waveform=np.searchsorted(rows, chosen.waveform).astype(np.int32))
     fitted = gaussian(block.rows(rows), noise.rows(rows), system, chosen)
     agreed = quick.take(np.flatnonzero(~differ[quick.waveform]))
     return join_tables(agreed, replace(fitted, waveform=rows[fitted.waveform].astype(np.int32)))
-
-
-def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> np.ndarray:
-    """Find waveforms in which two tables have different numbers of echoes, or one at a different time."""
-    differ = first.count(n) != second.count(n)
-    a, b = (table.take(np.flatnonzero(~differ[table.waveform])) for table in (first, second))
-    differ[a.waveform[np.abs(a.time - b.time) > tolerance]] = True
-    return differ

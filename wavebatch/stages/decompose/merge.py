@@ -70,7 +70,29 @@ def merge_unresolved(table: EchoTable) -> EchoTable:
         first = find_pairs(table, OVERLAP, UNRESOLVED)
         if not len(first):
             return table
-        table = _merge(table, first)
+        a, b = table.take(first), table.take(first + 1)
+        area_a, area_b = (part.amplitude.astype(np.float64) * part.sigma for part in (a, b))
+        total = np.maximum(area_a + area_b, 1e-12)
+        share = area_a / total
+        time = share * a.time + (1 - share) * b.time
+        variance = share * (a.sigma**2 + (a.time - time) ** 2) + (1 - share) * (b.sigma**2 + (b.time - time) ** 2)
+        sigma = np.sqrt(variance)
+        relative = np.minimum(a.amplitude_err / a.amplitude, b.amplitude_err / b.amplitude)
+        merged = {
+            "time": time,
+            "amplitude": total / sigma,
+            "sigma": sigma,
+            "time_err": np.minimum(a.time_err, b.time_err),
+            "amplitude_err": relative * total / sigma,
+            "sigma_err": np.minimum(a.sigma_err, b.sigma_err),
+            "relative_energy_err": np.minimum(a.relative_energy_err, b.relative_energy_err),
+            "flags": a.flags | b.flags | np.uint16(EchoFlag.MERGED),
+        }
+        keep = np.ones(len(table), bool)
+        keep[first + 1] = False
+        table = table.take(np.flatnonzero(keep))
+        for name, values in merged.items():  # between its neighbours: the order stays
+            getattr(table, name)[first - np.arange(len(first))] = values
 
 
 def cover_hidden(table: EchoTable, system: SystemPulse, n: int) -> EchoTable:
@@ -119,33 +141,6 @@ def excess_variance(table: EchoTable, system: SystemPulse) -> np.ndarray:
     """
     sigma, error = table.sigma.astype(np.float64), np.nan_to_num(table.sigma_err.astype(np.float64))
     return (sigma * sigma - 2.0 * sigma * error) / system.sigma_ref**2 - 1.0
-
-
-def _merge(table: EchoTable, first: np.ndarray) -> EchoTable:
-    a, b = table.take(first), table.take(first + 1)
-    area_a, area_b = (part.amplitude.astype(np.float64) * part.sigma for part in (a, b))
-    total = np.maximum(area_a + area_b, 1e-12)
-    share = area_a / total
-    time = share * a.time + (1 - share) * b.time
-    variance = share * (a.sigma**2 + (a.time - time) ** 2) + (1 - share) * (b.sigma**2 + (b.time - time) ** 2)
-    sigma = np.sqrt(variance)
-    relative = np.minimum(a.amplitude_err / a.amplitude, b.amplitude_err / b.amplitude)
-    merged = {
-        "time": time,
-        "amplitude": total / sigma,
-        "sigma": sigma,
-        "time_err": np.minimum(a.time_err, b.time_err),
-        "amplitude_err": relative * total / sigma,
-        "sigma_err": np.minimum(a.sigma_err, b.sigma_err),
-        "relative_energy_err": np.minimum(a.relative_energy_err, b.relative_energy_err),
-        "flags": a.flags | b.flags | np.uint16(EchoFlag.MERGED),
-    }
-    keep = np.ones(len(table), bool)
-    keep[first + 1] = False
-    rest = table.take(np.flatnonzero(keep))
-    for name, values in merged.items():  # between its neighbours: the order stays
-        getattr(rest, name)[first - np.arange(len(first))] = values
-    return rest
 
 
 def join_tables(*tables: EchoTable) -> EchoTable:

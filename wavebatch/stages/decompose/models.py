@@ -18,7 +18,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import log
-from wavebatch.kernels.fit.decompose import Settings, Solution, choose, decompose_clusters
+from wavebatch.kernels.fit.decompose import Settings, choose, decompose_clusters
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.kernels.fit.render import render_echoes, render_skewed, skewed_pulse
 from wavebatch.stages.chain import Range, Step, stage
@@ -38,7 +38,15 @@ def _fit_reference(system: SystemPulse, parameters: Mapping[str, Any]) -> System
 def _shape_reference(system: SystemPulse, spacing: float, parameters: Mapping[str, Any]) -> PulseShape:
     """The pulse that `reference` fits."""
     if parameters["model"] == "stretched":
-        return _tabulate_system(system, pulse_shape(system, spacing), spacing)
+        shape = pulse_shape(system, spacing)
+        ref = shape_limits(system, spacing).ref
+        ends = [-6 * ref, 6 * ref]
+        for _, delay, extra in shape.components:
+            wide = 5 * np.sqrt(ref * ref + extra)
+            ends = [min(ends[0], delay - wide), max(ends[1], delay + wide)]
+        x = np.arange(ends[0], ends[1], ref / 16)
+        value = evaluate_pulse(shape, x[:, None].copy(), np.zeros(1), np.full(1, ref))[0][:, 0]
+        return PulseShape(table=tabulate_pulse(x, value))
     if parameters["model"] == "given":
         taps, _ = reference_pulse(system, spacing, "given", pulse=parameters["pulse"])
         return PulseShape(table=tabulate_pulse(np.arange(len(taps), dtype=np.float64), taps))
@@ -77,18 +85,6 @@ def reference(
     return solve.fit_candidates(block, noise, system, echoes, settings, significance=fit.significance)
 
 
-def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> PulseShape:
-    """Tabulate the survey's pulse."""
-    ref = shape_limits(system, spacing).ref
-    ends = [-6 * ref, 6 * ref]
-    for _, delay, extra in shape.components:
-        wide = 5 * np.sqrt(ref * ref + extra)
-        ends = [min(ends[0], delay - wide), max(ends[1], delay + wide)]
-    x = np.arange(ends[0], ends[1], ref / 16)
-    value = evaluate_pulse(shape, x[:, None].copy(), np.zeros(1), np.full(1, ref))[0][:, 0]
-    return PulseShape(table=tabulate_pulse(x, value))
-
-
 @stage("decompose", fits=solve.fit_gaussian, shares=solve.FIT)
 def generalized_gaussian(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, **options: Any
@@ -110,7 +106,11 @@ def generalized_gaussian(
         factor = half_width_factor(power)
         widths = {name: getattr(plain, name) / factor for name in ("width_ref", "width_low", "width_high")}
         settings = plain._replace(shape=PulseShape(power=power), **widths)
-        solutions.append(_as_half_width(decompose_clusters(samples, candidates, clusters, settings), factor))
+        solution = decompose_clusters(samples, candidates, clusters, settings)
+        scale = np.array([1.0, 1.0, factor, 1.0])
+        solutions.append(solution._replace(
+            parameters=solution.parameters * scale, errors=solution.errors * scale, shared=solution.shared * factor
+        ))
     chosen = np.argmin([solution.cost for solution in solutions], axis=0)
     best = choose(solutions, chosen)
     columns = {"power": np.array(POWERS, np.float32)[chosen[best.cluster]]}
@@ -131,14 +131,6 @@ def half_width_factor(power: float) -> float:
         1 for a Gaussian.
     """
     return float(2 * (2 * log(2)) ** (1 / power) / FWHM_PER_SIGMA)
-
-
-def _as_half_width(solution: Solution, factor: float) -> Solution:
-    """Multiply the widths of a solution by the factor."""
-    scale = np.array([1.0, 1.0, factor, 1.0])
-    return solution._replace(
-        parameters=solution.parameters * scale, errors=solution.errors * scale, shared=solution.shared * factor
-    )
 
 
 UNKNOWN_SPREAD = 0.15

@@ -335,7 +335,10 @@ def _leave_out_unknown(
         if not len(rows):
             break
         noise[rows] = larger[rows]
-        solution = _replace_clusters(solution, rows, _fit_again(samples, clusters, solution, again, rows, noise[rows]))
+        order = np.arange(len(solution.number))
+        order[rows] = len(order) + np.arange(len(rows))
+        fitted = _fit_again(samples, clusters, solution, again, rows, noise[rows])
+        solution = Solution(*map(np.concatenate, zip(solution, fitted, strict=True))).take(order)
         table = describe(clusters, solution)
     both = EchoTable.concatenate((rest, _leave_out_explained(table, solution)))
     return both.take(np.argsort(both.waveform, kind="stable"))
@@ -380,13 +383,6 @@ def _fit_again(
     return new._replace(
         misfit=new.misfit * factor, cost=new.cost * factor**2, errors=new.errors / each, shared=new.shared / each**2
     )
-
-
-def _replace_clusters(solution: Solution, rows: np.ndarray, new: Solution) -> Solution:
-    """The solution with other fits of the clusters `rows`."""
-    order = np.arange(len(solution.number))
-    order[rows] = len(order) + np.arange(len(rows))
-    return Solution(*map(np.concatenate, zip(solution, new, strict=True))).take(order)
 
 
 ROUNDS = 3

@@ -561,7 +561,13 @@ def zero_crossing(
     smoothed = smooth_121(found.signal)
     ref = system.sigma_ref / block.spacing
     if derivative == "first":
-        waveform, time = _falls_through_zero(found.values)
+        # From positive to zero or below.
+        n = found.values.shape[1]
+        falling = found.values[:-1] > 0
+        falling &= found.values[1:] <= 0
+        before_it, waveform = np.divmod(np.flatnonzero(falling), n) if n else (np.empty(0, np.int64),) * 2
+        before, after = found.values[before_it, waveform], found.values[before_it + 1, waveform]
+        time = before_it + before / (before - after)
         width = np.full(len(time), ref)
     else:
         # The middle of each stretch of positive curvature that exceeds the noise.
@@ -574,13 +580,3 @@ def zero_crossing(
     amplitude = smoothed[sample, waveform]
     high = amplitude > (level * SMOOTH_GAIN) * noise.std[waveform]
     return candidate_table(block, system, waveform[high], time[high], amplitude[high], width[high])
-
-
-def _falls_through_zero(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Waveform and time (m,) of the places where slope (s, n) goes from positive to zero or below."""
-    n = slope.shape[1]
-    falling = slope[:-1] > 0
-    falling &= slope[1:] <= 0
-    sample, waveform = np.divmod(np.flatnonzero(falling), n) if n else (np.empty(0, np.int64),) * 2
-    before, after = slope[sample, waveform], slope[sample + 1, waveform]
-    return waveform, sample + before / (before - after)

@@ -269,7 +269,13 @@ def adjust_constants(
     """
     n = len(anchors.value)
     columns = np.empty((len(ties.cell), 0)) if columns is None else columns
-    reached = _reach(ties, np.flatnonzero(np.isfinite(anchors.value)), n)
+    # Sources that are tied, over any number of others, to one with a target.
+    shared = csr_array((np.ones(len(ties.cell)), (ties.cell, ties.source)), (int(ties.cell.max(initial=-1)) + 1, n))
+    common = (shared.T @ shared).tocsr()
+    common.data = (common.data >= LEAST_TIES).astype(float)
+    common.eliminate_zeros()
+    _, group = connected_components(common, directed=False)
+    reached = np.isin(group, group[np.flatnonzero(np.isfinite(anchors.value))])
     use = reached[ties.source]
     cell, source, value, error = ties.cell[use], ties.source[use], ties.value[use], ties.error[use]
     one = csr_array((np.ones(len(cell)), (np.arange(len(cell)), source)), (len(cell), n))
@@ -298,36 +304,20 @@ def adjust_constants(
         row[:] = replace(equations, anchors=moved).solve(part)
     residual = np.full(len(ties.cell), np.nan)
     residual[use] = rest
+    # Brightness of a row beyond its error; a cell's mean takes a part of it away.
+    count, excess = np.bincount(cell)[cell], 0.0
+    several = count > 1
+    if several.any():
+        free = np.sqrt(count[several] / (count[several] - 1))
+        scatter = MAD_TO_STD * float(np.median(np.abs(rest[several]) * free))
+        excess = float(np.sqrt(max(scatter**2 - float(np.median(error)) ** 2, 0.0)))
     number = np.bincount(source, minlength=n)
     errors = np.std(again[:, :n], axis=0, ddof=1) if trials else np.full(n, np.nan)
     if trials and columns.shape[1] and len(cell):
         # Of sources with ties: of the constants and the terms over these.
         square = np.var(equations.design @ np.nan_to_num(again).T, axis=1, ddof=1)
         errors = np.where(number > 0, np.sqrt(np.bincount(source, square, n) / np.maximum(number, 1)), errors)
-    return Adjustment(
-        found[:n], errors, again[:, :n], number, residual, _excess(rest, cell, error), found[n:], again[:, n:]
-    )
-
-
-def _excess(rest: np.ndarray, cell: np.ndarray, error: np.ndarray) -> float:
-    """Robust standard deviation of the brightness of a row beyond its error; a cell's mean takes a part of it away."""
-    count = np.bincount(cell)[cell]
-    shared = count > 1
-    if not shared.any():
-        return 0.0
-    free = np.sqrt(count[shared] / (count[shared] - 1))
-    scatter = MAD_TO_STD * float(np.median(np.abs(rest[shared]) * free))
-    return float(np.sqrt(max(scatter**2 - float(np.median(error)) ** 2, 0.0)))
-
-
-def _reach(ties: Ties, known: np.ndarray, n: int) -> np.ndarray:
-    """Sources that are tied, over any number of others, to one with a target; bool (n,)."""
-    shared = csr_array((np.ones(len(ties.cell)), (ties.cell, ties.source)), (int(ties.cell.max(initial=-1)) + 1, n))
-    common = (shared.T @ shared).tocsr()
-    common.data = (common.data >= LEAST_TIES).astype(float)
-    common.eliminate_zeros()
-    _, group = connected_components(common, directed=False)
-    return np.isin(group, group[known])
+    return Adjustment(found[:n], errors, again[:, :n], number, residual, excess, found[n:], again[:, n:])
 
 
 @frozen(eq=False)

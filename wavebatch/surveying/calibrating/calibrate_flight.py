@@ -450,7 +450,16 @@ def calibrate_flight(
         if not (np.isfinite(value) or _is_covered(source.row, calibration.channels))
     ]
     notes = [*calibration.notes, *find_doubts(lost, calibration.strips, pairs)]
-    calibration, more = _widen(calibration, adjusted, find_trend(ties, anchors, seen, adjusted))
+    # What the overlaps leave unexplained is in the errors; where it is more than these, it is said.
+    trend, more = find_trend(ties, anchors, seen, adjusted), []
+    spread = adjusted.scatter if trend is None else max(adjusted.scatter, trend.spread)
+    if spread >= LEAST_SPREAD:
+        stated = max(row.relative_error for row in calibration.strips)
+        if spread > stated:
+            reason = _UNEXPLAINED if trend is None else trend.doubt
+            growth = f"the error of the constants grows from {100 * stated:.1f} by {100 * spread:.1f} %"
+            more.append(f"{reason}; {growth}")
+        calibration = calibration.widened(spread)
     if open_error is not None and open_error > LEAST_SPREAD:
         calibration = calibration.widened(open_error)
         more.append(
@@ -470,18 +479,6 @@ def _is_covered(row: ChannelConstant, channels: Sequence[ChannelConstant]) -> bo
         == (row.scanner, row.bits, row.spacing_ns, row.gain)
     ]
     return bool(alike) and all(other.samples != row.samples for other in alike)
-
-
-def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) -> tuple[Calibration, list[str]]:
-    """The calibration with what the overlaps leave unexplained in its errors, and the sentence about it where it is
-    more than these."""
-    spread = adjusted.scatter if trend is None else max(adjusted.scatter, trend.spread)
-    if spread < LEAST_SPREAD:
-        return calibration, []
-    stated = max(row.relative_error for row in calibration.strips)
-    reason = _UNEXPLAINED if trend is None else trend.doubt
-    note = f"{reason}; the error of the constants grows from {100 * stated:.1f} by {100 * spread:.1f} %"
-    return calibration.widened(spread), [note] if spread > stated else []
 
 
 def _reflectance_error(found: Sequence[Calibration], options: CalibrationOptions) -> float:

@@ -257,17 +257,13 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
     if incidence is not None and not 0 <= incidence < 85:
         raise ConfigError(f"{where}: incidence must lie in 0 to 85 degrees, it is {incidence:g}")
     name = str(fields.get("name", where.rsplit(": ", 1)[-1]))
-    return Target(name, reflectance, corners, incidence, _find_hot_spot(fields, reflectance, where))
-
-
-def _find_hot_spot(fields: Mapping[str, Any], reflectance: float, where: str) -> float:
     geometry = str(fields.get("geometry", GEOMETRIES[0])).strip().lower()
     if geometry not in GEOMETRIES or (geometry == "directional") != ("angle" in fields):
         kinds = " or ".join(GEOMETRIES)
         raise ConfigError(f"{where}: geometry must be {kinds}, and only directional has an angle [deg] to the light")
     try:
-        angle = float(fields.get("angle", 90.0))
+        to_light = float(fields.get("angle", 90.0))
     except ValueError as error:
         raise ConfigError(f"{where}: not numbers: {error}") from error
-    aside = geometry == "hemispherical" or (geometry == "directional" and not abs(angle) <= NARROW)
-    return HOT_SPOT * min(reflectance / BRIGHT, 1.0) if aside else 0.0
+    aside = geometry == "hemispherical" or (geometry == "directional" and not abs(to_light) <= NARROW)
+    return Target(name, reflectance, corners, incidence, HOT_SPOT * min(reflectance / BRIGHT, 1.0) if aside else 0.0)

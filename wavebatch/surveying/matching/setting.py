@@ -279,7 +279,12 @@ def measure_setting(
     places = {channel: _list_places(*rows[[2, 3, 1, 0]]) for channel, rows in known.items()}
     fading = [NO_CHANGE, *(_find_fading(rows[0], rows[1], rows[2:4], chance=chance) for rows in known.values())]
     fades = max(fading, key=lambda one: one.error)
-    return Setting(rate, brightest, scenes, places, _find_right(every), fades, zone)
+    right = (0.0, 0.0)  # by the mean motion of the sensor; 0 where it does not move
+    if every.size:
+        time, *place = every[[0, 6, 7]] - every[[0, 6, 7]].mean(axis=1, keepdims=True)
+        ahead = np.nan_to_num(np.stack(place) @ time)
+        right = tuple((np.array([ahead[1], -ahead[0]]) / max(float(np.hypot(*ahead)), 1e-30)).tolist())
+    return Setting(rate, brightest, scenes, places, right, fades, zone)
 
 
 def _read_rows(
@@ -321,15 +326,6 @@ def doubt_zone(reader: StripReader, scan: StripScan, sensor: SensorSource) -> tu
         line = str(error).removeprefix(f"{reader.facts.path}: ")
         return (f"{line}; a valley or a ridge along the flight looks alike",)
     return ()
-
-
-def _find_right(rows: np.ndarray) -> tuple[float, float]:
-    """Unit vector to the right of the mean motion of the sensor; 0 where it does not move."""
-    if not rows.size:
-        return 0.0, 0.0
-    time, *place = rows[[0, 6, 7]] - rows[[0, 6, 7]].mean(axis=1, keepdims=True)
-    ahead = np.nan_to_num(np.stack(place) @ time)
-    return tuple((np.array([ahead[1], -ahead[0]]) / max(float(np.hypot(*ahead)), 1e-30)).tolist())
 
 
 def _find_zone(reader: StripReader, rows: np.ndarray, size: float) -> Zone:

@@ -144,27 +144,22 @@ def take_energies(
         growth = math.hypot(growth, apart * 0.5**0.5)
     lacks = 0.0
     if calibration is not None:
-        energy = energy and _refer(reader, energy, calibration)
+        known = calibration.energy_mean
+        if energy is not None and known is not None:
+            ratio = energy.mean / known
+            if max(ratio, 1 / ratio) > OTHER_UNIT:
+                raise InputError(
+                    f"{reader.facts.path}: the mean energy of its pulses is {energy.mean:.4g} ({energy.source}), that "
+                    f"of the calibration {known:.4g} {calibration.energy_unit} ({calibration.energy_source}): another "
+                    "unit? Then give the calibration's mean in this unit as energy_mean in CAL.toml, or leave "
+                    "energies out with --energy none"
+                )
+            energy = replace(energy, reference=known)
         lacks, note = _compare(energy, calibration)
         notes += [note] if note else []
     if energy is None:
         return StripEnergies(None, lacks, growth, tuple(notes))
     return StripEnergies(replace(energy, missed=lacks), 0.0, growth, tuple(notes))
-
-
-def _refer(reader: StripReader, energy: PulseEnergy, calibration: Calibration) -> PulseEnergy:
-    """The energies relative to the mean of the calibration's; InputError for another unit."""
-    known = calibration.energy_mean
-    if known is None:
-        return energy
-    ratio = energy.mean / known
-    if max(ratio, 1 / ratio) > OTHER_UNIT:
-        raise InputError(
-            f"{reader.facts.path}: the mean energy of its pulses is {energy.mean:.4g} ({energy.source}), that of the "
-            f"calibration {known:.4g} {calibration.energy_unit} ({calibration.energy_source}): another unit? Then give "
-            "the calibration's mean in this unit as energy_mean in CAL.toml, or leave energies out with --energy none"
-        )
-    return replace(energy, reference=known)
 
 
 def _compare(energy: PulseEnergy | None, calibration: Calibration) -> tuple[float, str]:
