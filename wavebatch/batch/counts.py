@@ -178,7 +178,13 @@ class RunReport:
 
     def to_json(self) -> dict[str, Any]:
         """Return counts and quality as plain values, without timing."""
-        histograms = {"amplitude_dn": self.amplitude, "echo_width_ns": self.echo_width}
+        histograms: dict[str, Any] = {}
+        for name, counts in (("amplitude_dn", self.amplitude), ("echo_width_ns", self.echo_width)):
+            bins, filled = _BINS[name], np.flatnonzero(counts)
+            first, last = (int(filled[0]), int(filled[-1])) if len(filled) else (0, -1)
+            numbers = {"first_bin": first, "counts": [int(n) for n in counts[first : last + 1]]}
+            histograms[name] = {f"p{round(100 * share):02d}": bins.quantile(counts, share) for share in QUANTILES}
+            histograms[name]["histogram"] = {**numbers, "low": bins.low, "log_step": bins.step}
         return {
             "counts": {
                 **{name: self.count(name) for name in COUNTS},
@@ -196,7 +202,7 @@ class RunReport:
                 "echoes_per_waveform": [int(n) for n in self.echoes_per_waveform],
                 "reflectance_above_one": self.above_one,
                 "last_echoes_left_out": self.last_left_out,
-                **{name: _histogram_json(_BINS[name], counts) for name, counts in histograms.items()},
+                **histograms,
             },
         }
 
@@ -204,7 +210,12 @@ class RunReport:
     def from_json(cls, document: Mapping[str, Any]) -> RunReport:
         """Read a report that `to_json` wrote; raises KeyError, TypeError or ValueError for any other document."""
         counts, quality = document["counts"], document["quality"]
-        amplitude, echo_width = (_read_histogram(_BINS[name], quality[name]) for name in _BINS)
+        histograms = {}
+        for name, bins in _BINS.items():
+            filled = quality[name]["histogram"]["counts"]
+            first = quality[name]["histogram"]["first_bin"]
+            histograms[name] = np.zeros(bins.number, np.int64)
+            histograms[name][first : first + len(filled)] = filled
         return cls(
             counts={name: int(counts[name]) for name in COUNTS},
             passed_through={name: int(n) for name, n in counts["passed_through"].items()},
@@ -218,8 +229,8 @@ class RunReport:
             above_one=int(quality.get("reflectance_above_one", 0)),
             last_left_out=int(quality.get("last_echoes_left_out", 0)),
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
-            amplitude=amplitude,
-            echo_width=echo_width,
+            amplitude=histograms["amplitude_dn"],
+            echo_width=histograms["echo_width_ns"],
         )
 
 
@@ -272,18 +283,3 @@ def _add(a: Any, b: Any) -> Any:
     if isinstance(a, Mapping):
         return {name: _add(a[name], b[name]) if name in a and name in b else {**a, **b}[name] for name in {**a, **b}}
     return tuple(sorted({*a, *b})) if isinstance(a, tuple) else a + b
-
-
-def _histogram_json(bins: LogBins, counts: np.ndarray) -> dict[str, Any]:
-    filled = np.flatnonzero(counts)
-    first, last = (int(filled[0]), int(filled[-1])) if len(filled) else (0, -1)
-    quantiles = {f"p{round(100 * share):02d}": bins.quantile(counts, share) for share in QUANTILES}
-    histogram = {"first_bin": first, "counts": [int(n) for n in counts[first : last + 1]]}
-    return {**quantiles, "histogram": {**histogram, "low": bins.low, "log_step": bins.step}}
-
-
-def _read_histogram(bins: LogBins, document: Mapping[str, Any]) -> np.ndarray:
-    first, filled = document["histogram"]["first_bin"], document["histogram"]["counts"]
-    counts = np.zeros(bins.number, np.int64)
-    counts[first : first + len(filled)] = filled
-    return counts

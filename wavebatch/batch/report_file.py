@@ -82,7 +82,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
         "input": {"file": job.path.name, **fingerprint},
         "options": {name: getattr(job.options, name) for name in WRITING} | {"columns": list(job.columns)},
         "request": {
-            "chain": job.request.describe(job.chain) or effective(job.chain),
+            "chain": job.request.describe() or effective(job.chain),
             "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
             "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
@@ -427,7 +427,7 @@ def _doubt_fits(prepared: Prepared, report: RunReport) -> Iterator[str]:
     for flag in (EchoFlag.NOT_CONVERGED, EchoFlag.AT_BOUND):
         number = report.flags.get(str(flag.name), 0)
         if written >= LEAST_JUDGED and number > MOST_FAILED * written:
-            auto = prepared.job.request.describe(prepared.job.chain) is not None
+            auto = prepared.job.request.describe() is not None
             remedy = "draw some with `wavebatch plot waveform --flags`" if auto else "use --profile auto"
             yield (
                 f"{number} of {written} echoes ({100 * number / written:.0f} %) are {flag.name}, far more than usual: "

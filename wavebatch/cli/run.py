@@ -371,7 +371,7 @@ def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> in
             messages.print_text(messages.printable(line))
     for line in () if as_json else click.get_current_context().meta.get("wavebatch.settings", ()):
         messages.print_text(f"# setting: {line}")
-    by = jobs[0].request.describe(jobs[0].chain)
+    by = jobs[0].request.describe()
     messages.answer({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, mode="plan")
     if not as_json:
         words = "" if by is None else f"\n# the chain is chosen per strip ({by}); the largest possible one:"

@@ -168,8 +168,8 @@ class Request:
     force: bool = False
     """Use the saved survey also where the strip contradicts it."""
 
-    def describe(self, chain: Chain) -> str | None:
-        """Return what chooses the chain, for reports; None where the user gave `chain` itself."""
+    def describe(self) -> str | None:
+        """Return what chooses the chain, for reports; None where the user gave the chain itself."""
         if self.tolerance is not None:
             return f"tolerance {self.tolerance:g} m"
         return "auto" if self.auto else None
@@ -311,7 +311,7 @@ def try_chain(reader: StripReader, scan: StripScan, choice: ChainChoice, request
     Only strips whose pulse is no plain Gaussian are tried: a trial takes as long as some 4,000 waveforms of the run.
     """
     system = choice.survey.system
-    if request.describe(choice.chain) is not None or (len(system.components) < 2 and not system.kappa):
+    if request.describe() is not None or (len(system.components) < 2 and not system.kappa):
         return choice
     from wavebatch.surveying.predict_error import WAVEFORMS, leave_out_false, predict_errors
 
@@ -328,7 +328,7 @@ def try_chain(reader: StripReader, scan: StripScan, choice: ChainChoice, request
 def describe_choice(choice: ChainChoice, request: Request) -> dict[str, Any]:
     """Return how the chain was chosen, for reports: decisions with reasons, or predicted errors."""
     report: dict[str, Any] = {
-        "by": request.describe(choice.chain) or "user",
+        "by": request.describe() or "user",
         "chain": choice.chain.name,
         "decisions": [asdict(decision) for decision in choice.decisions],
     }

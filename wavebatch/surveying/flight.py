@@ -258,7 +258,9 @@ def _hold(
     kind = _compare_kinds(sample.blocks, kinds)
     look = look_at(sample.blocks, system, None if system.digitizers else seen)
     # Counts of other bits or another gain say nothing; times do.
-    pulse = "" if look is None or whole is None else (compare_echoes if kind else compare_looks)(look, whole, system)
+    pulse = ""
+    if look is not None and whole is not None:
+        pulse = compare_echoes(look, whole) if kind else compare_looks(look, whole, system)
     reason = "; ".join(filter(None, (pulse, kind)))
     return Held(sample.path, sample.fingerprint, sample.waveforms, None if kind else look, reason, sample.facts)
 

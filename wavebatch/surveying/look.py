@@ -229,10 +229,10 @@ def compare_looks(own: Look, whole: Look, system: SystemPulse, wider: float = WI
     """
     level = compare_levels(own.level, [whole.level], system.noise.std, OTHER_NOISE)
     level = level.strip().replace("the others", "the flight")
-    return "; ".join(filter(None, (compare_echoes(own, whole, system, wider), level)))
+    return "; ".join(filter(None, (compare_echoes(own, whole, wider), level)))
 
 
-def compare_echoes(own: Look, whole: Look, system: SystemPulse, wider: float = WIDER) -> str:
+def compare_echoes(own: Look, whole: Look, wider: float = WIDER) -> str:
     """Why the echoes of a strip are not of the flight's sensor; empty where they may be."""
     if own.width and whole.width:
         ratio = own.width / whole.width

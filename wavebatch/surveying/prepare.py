@@ -117,7 +117,7 @@ def prepare(
         forced = check_saved(reader, scan, request.system.survey, force=request.force)
     used = replace(request, system=None) if stranger else request
     choice = make_choice(reader, scan, chain, used)
-    if extend is not None and used.describe(chain) is not None:
+    if extend is not None and used.describe() is not None:
         choice = replace(choice, chain=extend(choice.chain))
     source = UNKNOWN
     if positions is not Positions.IF_NEEDED or needs_sensor(choice.chain):

@@ -53,14 +53,10 @@ def _answer(pickled: bytes) -> bytes:
         return pickle.dumps((function(*arguments), None), pickle.HIGHEST_PROTOCOL)
     except Exception as error:
         error.add_note(traceback.format_exc())
-        return _pickle_error(error)
-
-
-def _pickle_error(error: Exception) -> bytes:
-    try:
-        return pickle.dumps((None, error))
-    except Exception:
-        return pickle.dumps((None, RuntimeError(repr(error))))
+        try:
+            return pickle.dumps((None, error))
+        except Exception:
+            return pickle.dumps((None, RuntimeError(repr(error))))
 
 
 def _end_with(parent: Any) -> None:

@@ -149,7 +149,11 @@ class PipedProcess:
 
     def _ask(self, call: bytes) -> tuple[Any, BaseException | None]:
         self._pipe.send_bytes(call)
-        return _unpack(self._pipe.recv_bytes())
+        answer = self._pipe.recv_bytes()
+        try:
+            return pickle.loads(answer)
+        except Exception as error:
+            return None, error
 
     def look(self) -> None:
         """Give the call of a dead process up, where another process still holds its end of the pipe open."""
@@ -161,13 +165,6 @@ class PipedProcess:
             if call is not None:
                 end_future(call.future, error=WorkerDied())
         self._seen_dead = True
-
-
-def _unpack(answer: bytes) -> tuple[Any, BaseException | None]:
-    try:
-        return pickle.loads(answer)
-    except Exception as error:
-        return None, error
 
 
 @contextlib.contextmanager

@@ -116,9 +116,8 @@ def measure_ties(rows: np.ndarray, size: float, slope: float | None = None, righ
         Only cells that at least two sources saw, that are flat and that no ray struck too steeply.
     """
     index = np.floor(rows["xyz"][:, :2] / size).astype(np.int64)
-    _, first, cell = np.unique(index, axis=0, return_index=True, return_inverse=True)
-    cell = cell.ravel()
-    rows, cell, pair = _keep_shared(rows, cell)
+    _, cell = np.unique(index, axis=0, return_inverse=True)
+    rows, cell, pair = _keep_shared(rows, cell.ravel())
     if not len(rows):
         empty = np.empty(0)
         return Ties(

@@ -379,14 +379,16 @@ def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None
     return off, abs(off / (1.0 + off))
 
 
-def combine_targets(results: Sequence[TargetResult], light_err: np.ndarray, channel: int = 0) -> ChannelConstant | None:
+def combine_targets(
+    results: Sequence[TargetResult], used: Sequence[np.ndarray], channel: int = 0
+) -> ChannelConstant | None:
     """Combine the constants of several targets; None where none of them has one.
 
     Parameters
     ----------
     results : sequence of TargetResult
-    light_err : float64 (n,)
-        Relative errors of the fits of all their echoes.
+    used : sequence of arrays of ECHO
+        Their echoes.
     channel : int
         Number of the channel.
 
@@ -403,7 +405,8 @@ def combine_targets(results: Sequence[TargetResult], light_err: np.ndarray, chan
     stated = float(np.sqrt(sum((result.relative_error or 0.0) ** 2 for result in good))) / len(good)
     between = float(np.std(constants, ddof=1) / constant / np.sqrt(len(good))) if len(good) > 1 else 0.0
     spread = float(np.median([result.spread for result in good]))
-    fits = float(np.median(light_err)) if len(light_err) else 0.0
+    rows = np.concatenate(used)
+    fits = float(np.median(rows["light_err"] / rows["light"])) if len(rows) else 0.0
     return ChannelConstant(
         digitizer=channel // SCANNERS,
         scanner=channel % SCANNERS,
@@ -464,7 +467,7 @@ def build_calibration(
     if options.column:
         measured = [measure_column(options.column, found[0], options.reflectance_error, source.air)]
     results = [result for result, _, _ in measured]
-    whole = combine_targets(results, _fit_errors([used for _, used, _ in measured]))
+    whole = combine_targets(results, [rows for _, rows, _ in measured])
     if whole is None:
         miss = describe_miss([target.corners for target in targets], source.reader.facts.header) if targets else ""
         reasons = miss or "; ".join(f"{result.name}: {result.refused}" for result in results)
@@ -531,11 +534,6 @@ def build_calibration(
     )
 
 
-def _fit_errors(parts: Sequence[np.ndarray]) -> np.ndarray:
-    rows = np.concatenate(parts)
-    return rows["light_err"] / rows["light"]
-
-
 def measure_ranging(sensor: SensorSource, distance: np.ndarray, attenuation: float) -> float:
     """Return the relative error of the constant from that of the sensor's position, which all echoes share."""
     middle = np.array([np.median(distance)])
@@ -553,7 +551,7 @@ def _measure_channels(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndar
             if mine.sum() >= LEAST_ECHOES:
                 results.append(summarise(result, constant[mine]))
                 parts.append(rows[mine])
-        combined = combine_targets(results, _fit_errors(parts), channel) if results else None
+        combined = combine_targets(results, parts, channel) if results else None
         if combined is not None:
             found.append(combined)
     return found
