@@ -4,6 +4,7 @@ import naive
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.special import fdtrc
 
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.kernels.geometry import normals
@@ -14,6 +15,7 @@ from wavebatch.kernels.geometry.planes import (
     SMOOTH,
     SURE,
     TIGHT,
+    chance_of_ratio,
     compare_halves,
     fit_planes,
     is_flat,
@@ -133,13 +135,27 @@ def test_one_normal(rng):
     assert np.degrees(np.arccos(abs(normal[2]))) == pytest.approx(20, abs=0.3)
 
 
-def test_neighbours_are_those_of_a_loop(rng):
-    around, points = rng.uniform(0, 5, (400, 3)).round(1), rng.uniform(0, 5, (70, 3)).round(1)
-    point, offset = normals.Surroundings(around).find(points, 1.0)
-    expected = []
+def test_chance_of_two_planes_is_that_of_f():
+    freedom, ratio = np.repeat(np.arange(1.0, 120), 50), np.tile(np.r_[0, np.geomspace(1e-4, 1e3, 49)], 119)
+    np.testing.assert_allclose(chance_of_ratio(ratio, freedom), fdtrc(3, freedom, ratio), rtol=0, atol=1e-13)
+
+
+def _neighbours_by_loop(around, points, radius):
+    found = []
     for number, place in enumerate(points):
-        expected += [(number, *step) for step in around - place if (step * step).sum() <= 1.0]
-    np.testing.assert_array_equal(np.column_stack([point, offset]), np.array(expected))
+        found += [(number, *step) for step in around - place if (step * step).sum() <= radius * radius]
+    return np.array(found)
+
+
+def test_neighbours_are_those_of_a_loop(rng):
+    """Also for another radius afterwards, and where some points are too far away for cells of their own."""
+    around, points = rng.uniform(0, 5, (400, 3)).round(1), rng.uniform(0, 5, (70, 3)).round(1)
+    far = [[0, 0, 9e9], [0, 0, 9e9], [-9e9, 0, 0], [3e6, 2, 2]]
+    around, points = np.concatenate([around, far]), np.concatenate([points, far])
+    found = normals.Surroundings(around)
+    for radius in (1.0, 0.3):
+        point, offset = found.find(points, radius)
+        np.testing.assert_array_equal(np.column_stack([point, offset]), _neighbours_by_loop(around, points, radius))
 
 
 def gable(rng, degrees, noise, density, half=6.0, length=40.0):

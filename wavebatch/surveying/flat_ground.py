@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from wavebatch.core.waveforms import LevelWidths, SystemPulse, WaveformBlock
 from wavebatch.files.las.header import locate
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.fit.closed_form import bound_time
-from wavebatch.kernels.geometry.normals import Surroundings, grow_tree, measure_normals, thin_out
+from wavebatch.kernels.geometry.normals import Surroundings, measure_normals, thin_out
 from wavebatch.kernels.geometry.planes import in_two_lines
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
 from wavebatch.stages.attribute.basic import added_variance
@@ -37,10 +37,6 @@ from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, find_
 from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.survey_result import Decision, Part, Survey
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
@@ -176,20 +172,34 @@ def _choose_radius(xyz: np.ndarray) -> float:
     number = LEAST_NEIGHBOURS * 3 // 2
     if len(xyz) <= number:
         return RADII[0]
-    some = xyz[:: max(len(xyz) // 500, 1)]
-    tree = grow_tree(xyz)
-    distance = tree.query(some, k=number)[0][:, -1]
-    radius = float(np.clip(np.ceil(10.0 * np.quantile(distance, 0.9)) / 10.0, *RADII))
-    while radius < RADII[1] and _share_in_two_lines(xyz, tree, some, radius) > 0.1:
+    some, around = xyz[:: max(len(xyz) // 500, 1)], Surroundings(xyz)
+    reach = RADII[0]
+    needed = _find_distance(around, some, number, reach)
+    while needed > reach and reach < RADII[1]:
+        reach = min(2 * reach, RADII[1])
+        needed = _find_distance(around, some, number, reach)
+    radius = float(np.clip(np.ceil(10.0 * needed) / 10.0, *RADII))
+    while radius < RADII[1] and _share_in_two_lines(around, some, radius) > 0.1:
         radius = min(round(radius + WIDER, 1), RADII[1])
     return radius
 
 
-def _share_in_two_lines(xyz: np.ndarray, tree: cKDTree, some: np.ndarray, radius: float) -> float:
+def _find_distance(around: Surroundings, some: np.ndarray, number: int, reach: float) -> float:
+    """Distance within which nine tenths of some points have so many points, with themselves; far beyond `reach` where
+    that is not enough."""
+    point, offset = around.find(some, reach)
+    square = (offset * offset).sum(axis=1)
+    square = square[np.lexsort((square, point))]
+    last = np.searchsorted(point, np.arange(len(some))) + number - 1
+    near = np.bincount(point, minlength=len(some)) >= number
+    distance = np.full(len(some), 1e9)
+    distance[near] = np.sqrt(square[last[near]])
+    return float(np.quantile(distance, 0.9))
+
+
+def _share_in_two_lines(around: Surroundings, some: np.ndarray, radius: float) -> float:
     """Share of the points whose neighbours lie on two scan lines, seen from above: they have no angle."""
-    near = tree.query_ball_point(some, radius)
-    group = np.repeat(np.arange(len(some)), [len(rows) for rows in near])
-    offset = xyz[np.concatenate(near).astype(np.int64)] - some[group]
+    group, offset = around.find(some, radius)
     return float(np.mean(in_two_lines(offset[:, 0], offset[:, 1], group, len(some))))
 
 

@@ -1,4 +1,4 @@
-/* Points of one pulse and of one waveform: which they are, return numbers, the nearest return.
+/* Points of one pulse and of one waveform: which they are, return numbers, the nearest return. Points around a place.
 
    Pairs of echoes and returns of one waveform: mutual nearest neighbours, then again among the rest, until none is left.
 
@@ -148,4 +148,20 @@ EXPORT int64_t share_offsets(int64_t m, const int64_t *waveform, const double *t
         if (others > 0 && scatter > others) out->doubt[waveform[i]] = sqrt(scatter / (others * total));
     }
     return 0;
+}
+
+/* Pairs (point, neighbour) whose squared distance is at most `square`, as point * m + neighbour; their number. Neighbours
+   (m, 3) are sorted by cells; each of n points looks from `first` to before `last` in nine rows of cells. */
+EXPORT int64_t find_around(int64_t n, const double *points, const int64_t *first, const int64_t *last, const double *neighbours,
+                           const int64_t *order, int64_t m, double square, int64_t *pairs) {
+    int64_t found = 0;
+    for (int64_t row = 0; row < 9 * n; row++) {
+        const double *at = points + 3 * (row / 9);
+        for (int64_t j = first[row]; j < last[row]; j++) {
+            const double x = neighbours[3 * j] - at[0], y = neighbours[3 * j + 1] - at[1], z = neighbours[3 * j + 2] - at[2];
+            pairs[found] = row / 9 * m + order[j];
+            found += x * x + y * y + z * z <= square; /* no branch: about every third is near */
+        }
+    }
+    return found;
 }

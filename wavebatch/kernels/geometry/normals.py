@@ -9,11 +9,13 @@ box by box: every point lies in exactly one tile, and a buffer adds the points a
 
 from __future__ import annotations
 
+import ctypes
 from enum import IntEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.kernels import library
 from wavebatch.kernels.geometry.planes import (
     Planes,
     compare_halves,
@@ -24,9 +26,6 @@ from wavebatch.kernels.geometry.planes import (
     misfit_of_angles,
 )
 from wavebatch.kernels.physics.incidence import STEEPEST
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 
 class Tiles(NamedTuple):
@@ -167,6 +166,9 @@ SPACED = 2000
 SAME_RAY = 0.1
 """Distance over the reach of a footprint below which two echoes are of one pulse."""
 
+_CELLS = 2**20
+"""Cells of Surroundings on either side of its first point, along each axis: their number has 63 bits."""
+
 _LARGEST_CHUNK = 4096
 """Points that are handled at a time at most."""
 
@@ -220,19 +222,17 @@ def thin_out(xyz: np.ndarray, row: np.ndarray, radius: float) -> np.ndarray:
     return kept
 
 
-def grow_tree(points: np.ndarray, **settings: bool) -> cKDTree:
-    """Return a tree of points (m, d), with settings of SciPy's class; here, because most runs need none."""
-    from scipy.spatial import cKDTree
-
-    return cKDTree(points, **settings)
-
-
 class Surroundings:
     """Points (m, 3) [m], finite, that may be neighbours of others. Sums run in the order of these points."""
 
     def __init__(self, xyz: np.ndarray) -> None:
         self._xyz = np.ascontiguousarray(xyz, np.float64)
-        self._tree = grow_tree(self._xyz, balanced_tree=False, compact_nodes=False)
+        self._side = 0.0
+
+    def _number_cells(self, points: np.ndarray) -> np.ndarray:
+        """Cells of points, counted along x, then y, then z; what is far away is in the outermost ones."""
+        cell = np.clip(np.floor((points - self._xyz[0]) / self._side), 2 - _CELLS, _CELLS - 2).astype(np.int64)
+        return (cell[:, 2] * 2 * _CELLS + cell[:, 1]) * 2 * _CELLS + cell[:, 0]
 
     def find(self, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Pairs (point, neighbour) that are at most `radius` apart.
@@ -253,15 +253,22 @@ class Surroundings:
         """
         if not len(points) or not len(self._xyz):
             return np.empty(0, np.int64), np.empty((0, 3))
-        # Rounded distances differ from tree to tree; the exact test below is the same in every tree.
-        tree = grow_tree(points)
-        near = tree.sparse_distance_matrix(self._tree, radius * (1 + 1e-6), output_type="ndarray")
-        key = np.sort(near["i"] * np.int64(len(self._xyz)) + near["j"])
-        point, neighbour = np.divmod(key, len(self._xyz))
-        offset = self._xyz[neighbour] - points[point]
-        x, y, z = offset.T
-        within = x * x + y * y + z * z <= radius * radius
-        return point[within], offset[within]
+        points, side = np.ascontiguousarray(points, np.float64), radius * (1 + 1e-6)
+        if self._side != side:
+            self._side = side
+            cell = self._number_cells(self._xyz)
+            self._order = np.argsort(cell, kind="stable")
+            self._cell, self._sorted = cell[self._order], self._xyz[self._order]
+        # Neighbours are at most one cell away; cells along x follow each other.
+        away = np.array([-1, 0, 1])
+        row = self._number_cells(points)[:, None] + ((away[:, None] * 2 * _CELLS + away) * 2 * _CELLS).ravel()
+        first, last = np.searchsorted(self._cell, row - 1), np.searchsorted(self._cell, row + 1, side="right")
+        key = np.empty(int((last - first).sum()), np.int64)
+        n, m = ctypes.c_int64(len(points)), ctypes.c_int64(len(self._xyz))
+        square = ctypes.c_double(radius * radius)
+        found = library.call("find_around", n, points, first, last, self._sorted, self._order, m, square, key)
+        point, neighbour = np.divmod(np.sort(key[:found]), len(self._xyz))
+        return point, self._xyz[neighbour] - points[point]
 
 
 def measure_normals(
@@ -395,7 +402,9 @@ def find_edges(
         return edge
     with np.errstate(invalid="ignore", divide="ignore"):
         level = points[:, :2] - (points[:, 2:] - np.median(points[able, 2])) * (ray[:, :2] / ray[:, 2:])
-    tree = grow_tree(level[able])
+    from scipy.spatial import cKDTree  # here, because most runs need none of it
+
+    tree = cKDTree(level[able])
     few = level[able[:: max(len(able) // SPACED, 1)]]
     spacing = float(np.median(tree.query(few, k=[min(RING, len(able))])[0]))
     # The footprint reaches over the edge, and so does that of the pulses behind it that still see this surface.

@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 LAG = 16
 """Pulses over which the direction of the mirror is judged: turns closer together than that are noise."""
@@ -141,7 +140,7 @@ def find_bend(place: np.ndarray, off: np.ndarray) -> float | None:
     at = LEAST_BEYOND + int(np.argmax(gains[LEAST_BEYOND : n - LEAST_BEYOND]))
     whole, gain = float(y @ y), float(gains[at])
     left = max(whole - gain, 1e-12 * n)
-    chance = scipy.special.fdtrc(2.0, n - 4.0, gain / 2.0 * (n - 4.0) / left)
+    chance = (1.0 + gain / left) ** (-0.5 * (n - 4.0))  # of F with 2 and n - 4 degrees of freedom
     bent = chance < LARGEST_CHANCE and gain >= LEAST_SHARE * whole
     curve = x * x - (x * x).mean()
     curve = curve - x * (x @ curve / square)
