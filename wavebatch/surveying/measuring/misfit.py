@@ -13,6 +13,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp, log
+from wavebatch.kernels.fit.learn_pulse import ONSET
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.decompose.solve import PROVEN
@@ -234,9 +235,12 @@ class Left:
         taps = gaussian_taps(ref)
         energy = filter_energy(taps)
         residual = subtract_echoes(part, system, fitted)[fitted.waveform]
+        self.lag = (np.arange(residual.shape[1]) - (fitted.time / part.spacing)[:, None]) / ref
+        # What broad parts of the model have there is not taken off an echo before it, in a cluster of its own.
+        whole = subtract_echoes(part, system, fitted.take(np.empty(0, np.int64)))[fitted.waveform]
+        residual = np.where(self.lag < -ONSET, whole, residual)
         share = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
         self.share = share / fitted.amplitude[:, None]
-        self.lag = (np.arange(residual.shape[1]) - (fitted.time / part.spacing)[:, None]) / ref
         self.lag[~np.isfinite(residual)] = np.nan
         self.noise = float(system.noise.std / np.median(fitted.amplitude) / np.sqrt(energy))
 
