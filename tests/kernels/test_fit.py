@@ -113,6 +113,19 @@ def test_clipped_samples_only_bound_the_signal_from_below(rng):
     assert (fit(y, start, **TIGHT).parameters[:, 0] < 300).all()
 
 
+@pytest.mark.parametrize("whitening", [None, np.diag([1.0, 1.0, 1.0])])
+def test_samples_at_the_floor_only_bound_the_signal_from_above(rng, whitening):
+    shape = PulseShape(components=((-0.15, 6.0, 2.0),))
+    truth = draw(rng, 12, 1)
+    truth[:, 0] = 150
+    y, start = np.maximum(record(rng, truth, shape), -5), near(rng, truth)
+    found = fit(y, start, shape=shape, floor=-5.0, whitening=whitening, **TIGHT)
+    assert np.abs((found.parameters[:, :3] - truth) / found.errors[:, :3]).max() < 4.5
+    samples = LENGTH - np.count_nonzero(y <= -5, axis=1)
+    assert found.cost.sum() == pytest.approx(samples.sum(), rel=0.2)
+    assert (fit(y, start, shape=shape, **TIGHT).cost > 3 * LENGTH).all()
+
+
 def test_noise_that_grows_with_the_signal_weighs_samples(rng):
     truth = draw(rng, 8, 1)
     y, start = record(rng, truth), near(rng, truth)

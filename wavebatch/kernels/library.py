@@ -55,8 +55,8 @@ class CSettings(ctypes.Structure):
         ("pulse", Pulse),
         *_fields(
             ctypes.c_double,
-            "width_ref width_low width_high clip noise_gain tolerance acceptance misfit prior_spread gate_residual "
-            "gate_hermite known skew_mean skew_spread",
+            "width_ref width_low width_high clip floor noise_gain tolerance acceptance misfit prior_spread "
+            "gate_residual gate_hermite known skew_mean skew_spread",
         ),
         *_fields(ctypes.c_int64, "max_iterations max_echoes grow undamped whitened"),
         ("whitening", ctypes.c_double * 9),

@@ -23,7 +23,7 @@ from wavebatch.kernels.signal.defects import (
 )
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, transpose_samples
-from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.stages.pulse_tables import clip_level, floor_level
 
 GUARD = 3.0
 """Samples this close to a signal do not show the slope of the baseline [widths of the system pulse]."""
@@ -95,7 +95,7 @@ def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
     if defects.spikes > 0:
         level = np.median(signal, axis=0) if defects.slope_spread > 0 else np.float32(system.noise.baseline)
         fill_spikes(signal, find_spikes(signal - level, system.noise.quiet, system.sigma_ref / block.spacing))
-    clipped = raw >= clip_level(block, system)
+    clipped = (raw >= clip_level(block, system)) | (raw <= floor_level(system))
     np.copyto(signal, raw, where=clipped)
     samples = np.ascontiguousarray(signal.T)
     samples.flags.writeable = False

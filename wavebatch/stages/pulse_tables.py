@@ -76,6 +76,28 @@ def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
     return float(block.digitizer.max_count) if system.saturation is None else system.saturation
 
 
+FAR_FROM_FLOOR = 3.0
+"""Noises that a baseline lies above count 0 where samples of that count are an undershoot that was cut off: noise makes
+one sample of 740 so low."""
+
+
+def floor_level(system: SystemPulse) -> float:
+    """Return the count up to which samples are cut off: 0, as a digitizer records no less; -inf where noise is so low.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+
+    Returns
+    -------
+    float
+        Level [count].
+    """
+    noise = system.noise
+    return 0.0 if noise.baseline > FAR_FROM_FLOOR * np.hypot(noise.quiet, noise.baseline_spread) else -np.inf
+
+
 def noise_filter(system: SystemPulse) -> np.ndarray | None:
     """Return the filter that makes the strip's noise white, with `noise.std`.
 

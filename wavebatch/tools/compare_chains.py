@@ -24,7 +24,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Solved, Step
 from wavebatch.stages.chain_file import list_profiles
 from wavebatch.stages.decompose.models import rebuild_waveforms
-from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.stages.pulse_tables import clip_level, floor_level
 from wavebatch.surveying.choose_chain import Request, widest_chain
 from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
@@ -55,7 +55,7 @@ def find_residual(
     model = rebuild_waveforms(block, system, decomposer, echoes)
     if model is None:
         return None
-    used = block.samples < clip_level(block, system)
+    used = (block.samples < clip_level(block, system)) & (block.samples > floor_level(system))
     if block.missing is not None:
         used &= ~block.missing
     model = np.where(used, model.astype(np.float64), 0.0)

@@ -52,7 +52,7 @@ INLINE void evaluate_rows(int64_t k, int64_t per, const Settings *s, Work *work,
     }
     for (int64_t v = 0; v < n && (w->any_clipped || w->is_weighted); v++) {
         lanes weight = w->is_weighted ? w->weight[v] : ALL(1);
-        if (w->any_clipped) weight = pick((w->clipped[v] > 0.f) & (residual[v] <= 0.f), ALL(0), weight);
+        if (w->any_clipped) weight = pick((w->clipped[v] != 0.f) & (residual[v] * w->clipped[v] <= 0.f), ALL(0), weight);
         for (int64_t i = 0; i <= per * k; i++) work->rows[i * n + v] *= weight;
     }
     for (int64_t i = 0; i <= per * k && w->is_whitened; i++) whiten(w, work->rows + i * n);

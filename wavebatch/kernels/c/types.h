@@ -19,7 +19,7 @@ typedef struct { /* model of the system pulse, docs/algorithms.md 0 and R1 */
 typedef struct {
     Pulse pulse;
     double width_ref, width_low, width_high;   /* of a new echo, and of any */
-    double clip;                               /* count from which samples are clipped, or infinity */
+    double clip, floor;                        /* counts from which, and up to which, samples are cut off, or infinity */
     double noise_gain;                         /* noise variance per count of signal, H12 */
     double tolerance;                          /* a fit has converged when its next step promises less */
     double acceptance, misfit;                 /* fall of chi2 that one more echo needs, 2.3 and R3 */

@@ -44,7 +44,7 @@ static void set_filter(const Settings *s, Window *w) {
     float *filter = (float *)w->filter;
     int64_t before = 0;
     for (int64_t i = 0; i < room; i++) {
-        int is_clipped = w->any_clipped && clipped[i] > 0, is_there = i < w->n && x[i] >= 0;
+        int is_clipped = w->any_clipped && clipped[i] != 0, is_there = i < w->n && x[i] >= 0;
         if (is_clipped) before = 0;
         for (int64_t j = 0; j < 3; j++) filter[j * room + i] = is_there ? s->whitening[before][j] : 0;
         before = !is_there || is_clipped ? 0 : before < 2 ? before + 1 : 2;
@@ -79,13 +79,13 @@ static void filter_back(const Window *w, const lanes *row, lanes *out) {
 static void cut_window(const Block *block, const Settings *s, int64_t waveform, int64_t low, int64_t high, Window *w) {
     float *y = (float *)w->y, *x = (float *)w->x, *clipped = (float *)w->clipped;
     const int64_t first = waveform * block->length + low, n = high - low;
-    const float top = s->clip;
+    const float top = s->clip, floor = s->floor;
     w->begin = low; w->n = w->used = n; w->vectors = VECTORS(n); w->std = block->std[waveform];
     w->any_clipped = 0; w->is_weighted = s->noise_gain > 0;
     read_counts(block, first, n, y);
     for (int64_t i = 0; i < n; i++) x[i] = i;
-    for (int64_t i = 0; i < n; i++) w->any_clipped |= y[i] >= top;
-    for (int64_t i = 0; i < n && w->any_clipped; i++) clipped[i] = y[i] >= top;
+    for (int64_t i = 0; i < n; i++) w->any_clipped |= (y[i] >= top) | (y[i] <= floor);
+    for (int64_t i = 0; i < n && w->any_clipped; i++) clipped[i] = (y[i] >= top) - (y[i] <= floor);
     take_level(block, waveform, first, n, y);
     for (int64_t i = 0; i < n && block->missing; i++)
         if (block->missing[first + i]) { y[i] = 0; x[i] = OUTSIDE; clipped[i] = 0; w->used--; }

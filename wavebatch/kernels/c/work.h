@@ -4,7 +4,7 @@ typedef struct { /* samples of one cluster, padded to whole vectors */
     int64_t begin, n, vectors, used;           /* used: recorded samples */
     double std;
     lanes *y, *x;                              /* signal; position, OUTSIDE where there is no sample */
-    lanes *clipped, *weight;                   /* 1 where clipped; noise without signal over noise */
+    lanes *clipped, *weight;                   /* 1 where clipped, -1 at the floor; noise without signal over noise */
     lanes *filter;                             /* where noise is whitened: coefficients of samples i, i - 1, i - 2; (3, vectors) */
     int any_clipped, is_weighted, is_whitened;
 } Window;

@@ -105,6 +105,8 @@ class Settings(NamedTuple):
     """Model of the pulse."""
     clip: float | None = None
     """Raw count from which samples are clipped; None where none is."""
+    floor: float | None = None
+    """Raw count up to which samples are cut off below; None where none is."""
     noise_gain: float = 0.0
     """Noise variance per count of signal (docs/algorithms.md H12) [count]."""
     tolerance: float = 1e-2
@@ -276,7 +278,11 @@ def _as_structure(settings: Settings) -> library.CSettings:
     if not 0 < settings.width_ref < np.inf:
         raise ValueError("the width of the pulse must be above 0")
     pulse = as_pulse(settings.shape)
-    values = settings._asdict() | {"pulse": pulse, "clip": np.inf if settings.clip is None else settings.clip}
+    values = settings._asdict() | {
+        "pulse": pulse,
+        "clip": np.inf if settings.clip is None else settings.clip,
+        "floor": -np.inf if settings.floor is None else settings.floor,
+    }
     del values["shape"]
     table = np.zeros((3, 3)) if settings.whitening is None else np.asarray(settings.whitening, np.float64)
     if table.shape != (3, 3) or not np.isfinite(table).all():

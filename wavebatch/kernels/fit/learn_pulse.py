@@ -75,12 +75,14 @@ def stack_pulse(
     after: float,
     std: float = 0.0,
     first: np.ndarray | int = 0,
+    cut: np.ndarray | None = None,
 ) -> Stack:
     """Median of signal (m, s) over amplitude, by lag from `before` samples before each centre to `after` behind it.
 
     first: sample at which each row of the signal begins, int or int (m,).
     std: error of a sample that counts have without any noise; where they are rounded more coarsely than they scatter,
     the values of a bin may all be equal without being exact.
+    cut: samples that were cut off below, bool (m, s). The median does not see by how much, unless most are cut off.
     """
     step = float(np.clip(IN_BIN / max(len(amplitude), 1), STEP, 1.0))
     least = max(std / float(np.median(amplitude)), 1e-6) if len(amplitude) else 1e-6
@@ -88,6 +90,10 @@ def stack_pulse(
     used = (lag >= -before) & (lag <= after) & np.isfinite(signal)
     values = ((signal + _dither(time, signal.shape[1], std)) / amplitude[:, None])[used]
     bins = np.floor((lag[used] + before) / step).astype(np.int64)
+    if cut is not None:
+        lost = cut[used]
+        lost &= (2 * np.bincount(bins, lost) > np.bincount(bins))[bins]
+        values, bins = values[~lost], bins[~lost]
     middle, spread = group_medians(values, bins)
     number = np.bincount(bins)
     kept = np.flatnonzero(number >= LEAST_BIN)

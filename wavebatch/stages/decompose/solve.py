@@ -38,6 +38,7 @@ from wavebatch.stages.pulse_tables import (
     ShapeLimits,
     clip_level,
     error_factors,
+    floor_level,
     matched_gaussian,
     model_parameters,
     noise_filter,
@@ -247,9 +248,10 @@ def make_settings(
     """
     pulse = system if shape.components else replace(system, components=())
     limits = shape_limits(pulse, block.spacing, fit.least_width, fit.most_width)
+    floor = floor_level(system) if shape.components else None  # no other pulse goes below its level
     return Settings(
-        *limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise.gain, tolerance=fit.tolerance,
-        max_iterations=fit.max_iterations, whitening=noise_filter(system), **options,
+        *limits, shape=shape, clip=clip_level(block, system), floor=floor, noise_gain=system.noise.gain,
+        tolerance=fit.tolerance, max_iterations=fit.max_iterations, whitening=noise_filter(system), **options,
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, fi
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import floor_level, pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, MIN_SNR, SMALL, find_edge, fit_lone
 from wavebatch.surveying.systems.figures import Figures
 
@@ -121,7 +121,8 @@ def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figu
         signal[block.missing[main.waveform]] = np.nan
     width = system.sigma_ref / block.spacing
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
-    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD)
+    cut = block.samples[main.waveform] <= floor_level(system)
+    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, cut=cut)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = REACHED * system.noise.std / strongest
     small = len(block) < SMALL

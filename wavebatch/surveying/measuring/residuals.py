@@ -24,7 +24,7 @@ from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import matched_filter
 from wavebatch.stages.flags import use_noise_errors
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import clip_level, floor_level, model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.noise_and_width import DITHERED, ENOUGH_TO_LEARN, FEW, UNDITHERED
 
 WEAK = 60.0
@@ -95,12 +95,13 @@ def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable
     -------
     float32 (n, s)
         Samples above the baseline less the echoes [count]; NaN where a sample was not recorded, 0 where it is clipped
-        and the echoes are higher: it shows no more than that they are.
+        and the echoes are higher, or cut off below and they are lower: it shows no more than that they are.
     """
     noise = pooled_noise(block, system)
     residual = block.samples - noise.level
     residual -= render_own(block, system, echoes, echoes.waveform, len(block))
     residual[(block.samples >= clip_level(block, system)) & (residual < 0)] = 0.0
+    residual[(block.samples <= floor_level(system)) & (residual > 0)] = 0.0
     if block.missing is not None:
         residual[block.missing] = np.nan
     return residual
