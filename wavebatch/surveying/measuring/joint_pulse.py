@@ -35,9 +35,9 @@ deviation: a fifth of what the second difference of a Gaussian pulse is there.""
 EARLY, LATE = 0.02, 0.15
 """The same far before and after the core, over its value: before a pulse there is hardly anything."""
 
-STEP, FINEST, TAIL_STEP = 0.07, 0.2, 5.0
-"""Steps of the lag at which the core is drawn, [widths] and at least [samples]: no pulse bends faster; and those in the
-tail over them."""
+STEP, TAIL_STEP = 0.07, 5.0
+"""Steps of the lag at which the core is drawn [widths], also where they are a tenth of a sample: echoes lie anywhere
+between samples, and coarser steps do not see what the Gaussians miss. And those in the tail over them."""
 
 LEAST_CHANGE = 0.003
 """Least misfit that is expected of the strongest echoes, so that a few do not decide alone."""
@@ -94,7 +94,7 @@ def learn_jointly(
     missed = [float(np.mean(_miss(fit, stack) ** 2)) for fit in fits]
     best = next(fit for fit, rest in zip(fits, missed, strict=True) if rest <= ALIKE**2 * min(missed))
     core = np.abs(stack.lag - best.datum) < CORE * width
-    misfit = misfit_of(_miss(best, stack)[core], _find_step(system.sigma_ref / spacing), width)
+    misfit = misfit_of(_miss(best, stack)[core], STEP * system.sigma_ref / spacing, width)
     system = replace(system, kappa=0.0, components=(), ringing=0.0, misfit=misfit)
     if len(best.components) == 1:
         return replace(system, sigma_ref=float(best.components[0, 2]) * spacing)
@@ -129,8 +129,10 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     reference *= find_own_width(explained, reference)
     delay, sigma = _place_gaussians(width, s)
     noise = sample_noise(system)
+    # Samples that were cut off leave nothing, whatever the pulse is there: they teach nothing.
+    sums = explained.sums._replace(used=explained.sums.used & (explained.sums.left != 0))
     matrix, right = gather_pulse(
-        explained.sums, noise, max(change, LEAST_CHANGE), delay, sigma, reference, MOST_ECHOES
+        sums, noise, max(change, LEAST_CHANGE), delay, sigma, reference, MOST_ECHOES
     )
     # Coloured noise: so many samples say as much as one of white noise.
     share = (system.noise.std / max(system.noise.quiet, 1e-6)) ** 2
@@ -140,18 +142,13 @@ def stack_jointly(system: SystemPulse, explained: Explained, change: float, spac
     matrix += 1e-9 * np.trace(matrix) / len(delay) * np.eye(len(matrix))
     inverse = solve(matrix, np.eye(len(matrix)))
     weight = np.einsum("ij,j->i", inverse, right)
-    step, end = _find_step(width), min(AFTER * width, 0.8 * s)
+    step, end = STEP * width, min(AFTER * width, 0.8 * s)
     lag = np.r_[np.arange(-6 * width, 8 * width, step), np.arange(8 * width, end, TAIL_STEP * step)]
     rows = exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2) / sigma
     value = np.einsum("lk,k->l", rows, weight[:-1])
     error = np.sqrt(np.maximum(np.einsum("lk,kj,lj->l", rows, inverse[:-1, :-1], rows), 0.0))
     top = max(float(value.max()), 1e-30)
     return Stack(lag, value / top, np.maximum(error / top, LEAST_ERROR))
-
-
-def _find_step(width: float) -> float:
-    """The step of the lag at which the core of a pulse of this width is drawn [samples]."""
-    return max(FINEST, STEP * width)
 
 
 def _place_gaussians(width: float, s: int) -> tuple[np.ndarray, np.ndarray]:

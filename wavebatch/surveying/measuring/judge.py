@@ -30,7 +30,7 @@ from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.direct import matched_filter
 from wavebatch.stages.flags import misfit_factor, scale_errors
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import clip_level, floor_level, model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.noise_and_width import find_edge
 
 WIDER = 1.0 + 0.02 * 2.0 ** np.arange(-0.5, 9.0)
@@ -81,6 +81,7 @@ def explain(
     if block.missing is not None:
         used &= ~block.missing
     left = np.where(used, block.samples - noise.level - model, np.float32(0))
+    left[(block.samples <= floor_level(system)) & (left > 0)] = 0  # an undershoot that was cut off is as any model says
     return Explained(echoes, Sums(shape, count_echoes(echoes.waveform, n), main, left, model, used))
 
 
@@ -205,6 +206,9 @@ def find_own_width(explained: Explained, ref: float) -> float:
     strongest = np.zeros(len(explained.sums.left), np.float32)
     np.maximum.at(strongest, echoes.waveform, echoes.amplitude)
     known &= echoes.amplitude >= 0.5 * strongest[echoes.waveform]
+    # A width at its limit repeats that, not the pulse's; unless most are there, and the pulse is narrower.
+    free = known & ((echoes.flags & np.uint16(EchoFlag.AT_BOUND)) == 0)
+    known = free if 2 * np.count_nonzero(free) > np.count_nonzero(known) else known
     return find_edge(ratio[known], error[known]) if np.count_nonzero(known) >= LEAST_KNOWN else 1.0
 
 
