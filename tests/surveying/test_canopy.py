@@ -1,4 +1,4 @@
-"""Dense canopies: the survey takes no scene for noise, misfit, tail, slope or pulse."""
+"""Dense canopies and receivers that ring: the survey takes no scene for noise, misfit, tail, slope or pulse."""
 
 import numpy as np
 import pytest
@@ -113,3 +113,19 @@ def test_neighbours_raise_neither_misfit_nor_significance(number, tmp_path):
     """Those too close to be found, and those in the mirror: 6 and 4 % of the clear echoes were lost."""
     result = judge_strip(number, tmp_path)
     assert result["right"] and result["missed"] < 0.03
+
+
+@pytest.mark.quick_cases("2022")
+@pytest.mark.parametrize("number", [2022, 1920])
+def test_an_undershoot_that_was_cut_off_hides_no_echo(number, tmp_path):
+    """Counts end at 0: 14 and 3 % of the echoes were what is left there of a receiver that rings."""
+    result = judge_strip(number, tmp_path)
+    assert result["right"] and result["extra"] < 0.01
+
+
+@pytest.mark.quick_cases("1193")
+@pytest.mark.parametrize("number", [1193, 1892])
+def test_a_part_before_the_pulse_is_no_echo(number, tmp_path):
+    """A tail was measured with the model's broad part taken off there, which no fit takes off."""
+    result = judge_strip(number, tmp_path)
+    assert result["right"] and result["extra"] < 0.02

@@ -1,17 +1,32 @@
 """Scenes that widen all single echoes: the pulse is as wide as the narrowest echoes of waveforms with several."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from writer_tools import data_file
 
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.choose_chain import choose_chain, read_sample
+from wavebatch.surveying.measuring.judge import find_own_width
 from wavebatch.surveying.systems.known_systems import draw_pulse, find_source, known_systems, leave_out
 
 NUMBER, LENGTH, NOISE = 600, 90, 1.2
+
+
+@pytest.mark.parametrize(("at_limit", "expected"), [(30, 1.0), (90, 0.7)])
+def test_widths_at_their_limit_are_no_width_that_echoes_repeat(at_limit, expected):
+    """Unless most are there: then the pulse is narrower than what was tried."""
+    n, bound = 120, np.arange(120) < at_limit
+    width = np.where(bound, 0.7, np.linspace(0.98, 1.02, n))
+    flags = np.where(bound, int(EchoFlag.AT_BOUND), 0)
+    echoes = EchoTable.build(np.arange(n), np.full(n, 9.0), np.ones(n), width, sigma_err=np.full(n, 0.01), flags=flags)
+    sums = SimpleNamespace(left=np.zeros((n, 1)), main=np.stack([np.ones(n), np.full(n, 9.0), width], axis=1))
+    assert find_own_width(SimpleNamespace(echoes=echoes, sums=sums), 1.0) == pytest.approx(expected, rel=0.02)
 
 
 def _lobes(sigma, tail):
