@@ -155,7 +155,8 @@ def draw_settings(rng: np.random.Generator, s: int) -> Settings:
     low, high = (0.5 * width, 6 * width) if usual else (one(1e-9, 1e-3, 1.0), one(1.0, 50.0, 1e9))
     return Settings(
         width, low, high, draw_shape(rng), clip=None if rng.random() < 0.6 else one(-5, 0, 60, 250, 1e9),
-        noise_gain=one(0, 0, 0.05, 1e9), tolerance=one(1e-2, 1e-6, 0, 1e9), max_iterations=int(one(0, 1, 40, 40, 200)),
+        floor=None if rng.random() < 0.6 else one(-1e9, -5, 0, 5, 300), noise_gain=one(0, 0, 0.05, 1e9),
+        tolerance=one(1e-2, 1e-6, 0, 1e9), max_iterations=int(one(0, 1, 40, 40, 200)),
         grow=bool(rng.random() < 0.8), acceptance=one(15, 15, 0, 1e9), misfit=one(0, 0.01, 10),
         max_echoes=int(one(1, 6, 6, 20)), prior_spread=one(0, 0.2, 1e-30, 1e9), gate_residual=one(4.2, 0, 1e9),
         gate_hermite=one(8.5, 0, 1e9), undamped=bool(rng.random() < 0.15), skew_mean=one(0, 0.1, 5),
