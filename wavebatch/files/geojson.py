@@ -145,17 +145,10 @@ def place_rings(file: AreaFile | None, rings: Sequence[np.ndarray], strip: Path,
             f"{file.path}: is {what}, and {strip} has no CRS to project it into; write it in the coordinates of the "
             "strip, without a member crs"
         )
-    code = _code(definition) or definition
+    other = _code(definition)
+    code = other or definition
     if source in (definition, code) or (source in _SAME_DEGREES and code in _SAME_DEGREES):
         return rings
-    return _project(file, rings, source, strip, definition)
-
-
-def _project(
-    file: AreaFile, rings: Sequence[np.ndarray], source: str, strip: Path, definition: str
-) -> list[np.ndarray]:
-    """Rings of the CRS `source` in that of a strip, `definition`."""
-    other = _code(definition)
     stated = f"is in {other}" if other else "does not name its CRS by a code"
     pyproj = need("pyproj", lambda advice: ConfigError(
         f"{file.path}: is in {source[:_LONGEST_NAME]}, and {strip} {stated}; projecting it needs pyproj: {advice}; or "
@@ -260,7 +253,13 @@ def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
     if mode not in GEOJSON_CRS:
         raise ConfigError(f"geojson_crs {mode!r}: must be one of {', '.join(GEOJSON_CRS)}")
     if mode == "keep":
-        return GeoJsonCrs(None if crs is None else _name(crs), None)
+        if crs is None:
+            return GeoJsonCrs(None, None)
+        # The member `crs` of GeoJSON 2008, which GDAL and QGIS read: an EPSG code, or else the WKT.
+        short = re.fullmatch(r"EPSG:(\d+)", crs)
+        code = int(short[1]) if short else find_epsg(crs)
+        name = f"urn:ogc:def:crs:EPSG::{code}" if code else drop_empty_codes(crs)
+        return GeoJsonCrs({"type": "name", "properties": {"name": name}}, None)
     if crs is None:
         raise InputError(
             f"{path}: has no CRS, so its points have no longitude and latitude, which GeoJSON needs; write .csv, or "
@@ -277,14 +276,6 @@ def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: its CRS is not understood ({reason}); write --geojson-crs keep") from error
     return GeoJsonCrs(None, transformer.transform)
-
-
-def _name(crs: str) -> dict[str, Any]:
-    """The member `crs` of GeoJSON 2008, which GDAL and QGIS read: an EPSG code, or else the WKT."""
-    short = re.fullmatch(r"EPSG:(\d+)", crs)
-    code = int(short[1]) if short else find_epsg(crs)
-    name = f"urn:ogc:def:crs:EPSG::{code}" if code else drop_empty_codes(crs)
-    return {"type": "name", "properties": {"name": name}}
 
 
 _WANTED = 'it needs "features", each with "properties", and a "geometry" with "type" and "coordinates"'
@@ -375,15 +366,8 @@ def read_features(text: str, path: Path | str) -> tuple[list[tuple[dict[str, Any
         raise ConfigError(f"{path}: not GeoJSON with a list of polygons: {_WANTED}") from error
     features = [_read_feature(feature, f"{path}: feature {number}") for number, feature in enumerate(listed, 1)]
     rings = [ring for _, rings in features for ring in rings]
-    return features, read_area_file(path, _find_member(document, listed, path), rings)
-
-
-def _find_member(document: dict[str, Any], listed: Sequence[dict[str, Any]], path: Path | str) -> Any:
-    """The value of the member `crs` of a document; None without one.
-
-    GDAL and QGIS write it into the document, PostGIS into each geometry. The innermost one of an area counts; they must
-    be the same for all.
-    """
+    # GDAL and QGIS write the member crs into the document, PostGIS into each geometry. The innermost one of an area
+    # counts; they must be the same for all.
     found: dict[str | None, Any] = {}
     for feature in listed:
         levels = (feature["geometry"].get("crs"), feature.get("crs"), document.get("crs"))
@@ -392,7 +376,7 @@ def _find_member(document: dict[str, Any], listed: Sequence[dict[str, Any]], pat
     if len(found) > 1:
         names = ", ".join("none" if name is None else name[:40] for name in list(found)[:3])
         raise ConfigError(f"{path}: its areas name more than one CRS ({names}); write one file for each")
-    return next(iter(found.values()), document.get("crs"))
+    return features, read_area_file(path, next(iter(found.values()), document.get("crs")), rings)
 
 
 def _read_feature(feature: Any, where: str) -> tuple[dict[str, Any], list[np.ndarray]]:

@@ -6,7 +6,6 @@ the calibration, or of the strip where there is none: see `matching.strip_energi
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -204,26 +203,22 @@ def _read_file(reader: StripReader, request: str) -> PulseEnergy:
     if not Path(request).is_file():
         hint = name_columns(reader, request)
         raise InputError(f"{reader.facts.path}: --energy: no extra byte and no file is called {request!r}; {hint}")
-    time, energy = _parse(read_text(request, "file of pulse energies", 1 << 30).splitlines(), request)
+    lines = read_text(request, "file of pulse energies", 1 << 30).splitlines()
+    rows = [line.replace(",", " ").replace(";", " ").split() for line in lines if line.strip()]
+    header = [word.casefold() for word in rows[0]] if rows else []
+    if not {"time", "energy"} <= set(header):
+        raise InputError(f"{request}: its first line must name the columns time and energy; it is {' '.join(header)!r}")
+    try:
+        columns = [np.array([float(row[header.index(key)]) for row in rows[1:]]) for key in ("time", "energy")]
+    except (IndexError, ValueError) as error:
+        raise InputError(f"{request}: a row has no number for time or energy: {error}") from error
+    time, energy = columns
+    good = np.isfinite(time) & (energy < LARGEST) & (energy > 0)
+    if np.count_nonzero(good) < 2:
+        raise InputError(f"{request}: fewer than two rows have a time and a positive energy")
+    time, energy = time[good], energy[good]
     order = np.argsort(time, kind="stable")
     time, energy = time[order], energy[order]
     step = np.diff(time)
     reach = NEAR * float(np.median(step[step > 0])) if (step > 0).any() else 1e-6
     return PulseEnergy(Path(request).name, time=time, energy=energy, reach=reach)
-
-
-def _parse(lines: Iterable[str], name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Columns time and energy of a text file with a header line; InputError where they are not there."""
-    rows = [line.replace(",", " ").replace(";", " ").split() for line in lines if line.strip()]
-    header = [word.casefold() for word in rows[0]] if rows else []
-    if not {"time", "energy"} <= set(header):
-        raise InputError(f"{name}: its first line must name the columns time and energy; it is {' '.join(header)!r}")
-    try:
-        columns = [np.array([float(row[header.index(key)]) for row in rows[1:]]) for key in ("time", "energy")]
-    except (IndexError, ValueError) as error:
-        raise InputError(f"{name}: a row has no number for time or energy: {error}") from error
-    time, energy = columns
-    good = np.isfinite(time) & (energy < LARGEST) & (energy > 0)
-    if np.count_nonzero(good) < 2:
-        raise InputError(f"{name}: fewer than two rows have a time and a positive energy")
-    return time[good], energy[good]

@@ -138,53 +138,60 @@ def read_pulse_header(path: Path) -> PulseHeader:
             raise InputError(f"{path}: not a PulseWaves file (it does not begin with PulseWavesPulse)")
         if len(front) < _HEADER_SIZE:
             raise damaged(path, f"a header of {len(front)} bytes instead of {_HEADER_SIZE}")
-        return _read(file, path, front)
-
-
-def _read(file: BinaryIO, path: Path, front: bytes) -> PulseHeader:
-    (_, _, major, minor, header_size, start, count, form, attributes, length, compression, _, records, appended,
-     time_scale, time_offset, _, _, *numbers) = _NUMBERS.unpack_from(front, 168)  # fmt: skip
-    size = os.fstat(file.fileno()).st_size
-    if compression or path.suffix.lower() == ".plz":
-        raise refuse_packed_waves(path)
-    if major or form:
-        raise InputError(f"{path}: PulseWaves {major}.{minor}, pulse format {form}; wavebatch reads 0.3, format 0")
-    if not (_HEADER_SIZE <= header_size <= start <= size < MAX_FILE) or start > MAX_FRONT or records > MAX_VLRS:
-        raise damaged(path, f"header of {header_size} bytes and {records} records, pulses at byte {start} of {size}")
-    if not 48 <= length <= MOST_PULSE_BYTES or not 0 <= count <= (size - start) // length:
-        raise damaged(path, f"{count} pulses of {length} bytes do not fit between byte {start} and the end at {size}")
-    scales, offsets = np.array(numbers[:3]), np.array(numbers[3:])
-    sizes, shifts = np.abs(np.append(scales, time_scale)), np.abs(np.append(offsets, time_offset))
-    if not ((sizes >= LEAST_SCALE) & (sizes <= LARGEST_SCALE) & (shifts <= LARGEST_OFFSET)).all():
-        raise damaged(path, "scales or offsets of coordinates or time that no survey has")
-    found, at = [], header_size
-    for number in range(records):
-        file.seek(at)
-        user, record, _, size_of_record, _ = _RECORD.unpack(file.read(_RECORD.size).ljust(_RECORD.size, b"\0"))
-        if size_of_record < 0 or at + _RECORD.size + size_of_record > start:
-            raise damaged(path, f"record {number} of {records} runs into the pulses")
-        found.append((decode_text(user), record, file.read(size_of_record)))
-        at += _RECORD.size + size_of_record
-    found += _list_appended(file, size, start + count * length, appended)
-    descriptors: dict[int, Any] = {}
-    for user, number, payload in found:
-        if user == _SPEC and 200_000 < number <= 200_255:
-            descriptors.setdefault(number - 200_000, _read_descriptor(path, number - 200_000, payload))
-    # The attributes that 0.3 defines are sources of points of 2 and of 4 bytes.
-    pulse, at = list(PULSE), 48
-    for bit, kind in _POINT_SOURCE.items():
-        if attributes & bit and at + int(kind[2]) <= length and "point_source" not in [field[0] for field in pulse]:
-            pulse.append(("point_source", kind))
-            at += int(kind[2])
-    pulse += [("rest", f"V{length - at}")] * (length > at)
-    waves = find_waves(path)
-    return PulseHeader(
-        path, waves, _check_waves(path, waves), decode_text(front[40:104]), decode_text(front[104:168]),
-        struct.unpack_from("<I", front, 20)[0], start, count, np.dtype(pulse), time_scale, time_offset,
-        scales, offsets, descriptors,
-        tuple(Vlr(PROJECTION.encode(), number, payload) for user, number, payload in found
-              if user == _PROJ and number in (34735, 34736, 34737) and len(payload) < 65536),
-    )  # fmt: skip
+        (_, _, major, minor, header_size, start, count, form, attributes, length, compression, _, records, appended,
+         time_scale, time_offset, _, _, *numbers) = _NUMBERS.unpack_from(front, 168)  # fmt: skip
+        size = os.fstat(file.fileno()).st_size
+        if compression or path.suffix.lower() == ".plz":
+            raise refuse_packed_waves(path)
+        if major or form:
+            raise InputError(f"{path}: PulseWaves {major}.{minor}, pulse format {form}; wavebatch reads 0.3, format 0")
+        if not (_HEADER_SIZE <= header_size <= start <= size < MAX_FILE) or start > MAX_FRONT or records > MAX_VLRS:
+            what = f"header of {header_size} bytes and {records} records"
+            raise damaged(path, f"{what}, pulses at byte {start} of {size}")
+        if not 48 <= length <= MOST_PULSE_BYTES or not 0 <= count <= (size - start) // length:
+            where = f"between byte {start} and the end at {size}"
+            raise damaged(path, f"{count} pulses of {length} bytes do not fit {where}")
+        scales, offsets = np.array(numbers[:3]), np.array(numbers[3:])
+        sizes, shifts = np.abs(np.append(scales, time_scale)), np.abs(np.append(offsets, time_offset))
+        if not ((sizes >= LEAST_SCALE) & (sizes <= LARGEST_SCALE) & (shifts <= LARGEST_OFFSET)).all():
+            raise damaged(path, "scales or offsets of coordinates or time that no survey has")
+        found, at = [], header_size
+        for number in range(records):
+            file.seek(at)
+            user, record, _, size_of_record, _ = _RECORD.unpack(file.read(_RECORD.size).ljust(_RECORD.size, b"\0"))
+            if size_of_record < 0 or at + _RECORD.size + size_of_record > start:
+                raise damaged(path, f"record {number} of {records} runs into the pulses")
+            found.append((decode_text(user), record, file.read(size_of_record)))
+            at += _RECORD.size + size_of_record
+        found += _list_appended(file, size, start + count * length, appended)
+        descriptors: dict[int, Any] = {}
+        for user, number, payload in found:
+            if user == _SPEC and 200_000 < number <= 200_255:
+                descriptors.setdefault(number - 200_000, _read_descriptor(path, number - 200_000, payload))
+        # The attributes that 0.3 defines are sources of points of 2 and of 4 bytes.
+        pulse, at = list(PULSE), 48
+        for bit, kind in _POINT_SOURCE.items():
+            if attributes & bit and at + int(kind[2]) <= length and "point_source" not in [field[0] for field in pulse]:
+                pulse.append(("point_source", kind))
+                at += int(kind[2])
+        pulse += [("rest", f"V{length - at}")] * (length > at)
+        waves = find_waves(path)
+        with reporting_reads(waves), open_regular(waves) as other:
+            head = other.read(WAVES_HEADER_SIZE)
+            waves_size = os.fstat(other.fileno()).st_size
+        if len(head) < WAVES_HEADER_SIZE or not head.startswith(WAVES_SIGNATURE):
+            raise damaged(path, f"{waves.name} does not begin with PulseWavesWaves")
+        if struct.unpack_from("<I", head, 16)[0]:
+            raise refuse_packed_waves(path)
+        if waves_size >= MAX_FILE:
+            raise damaged(path, f"{waves.name} has {waves_size} bytes")
+        return PulseHeader(
+            path, waves, waves_size, decode_text(front[40:104]), decode_text(front[104:168]),
+            struct.unpack_from("<I", front, 20)[0], start, count, np.dtype(pulse), time_scale, time_offset,
+            scales, offsets, descriptors,
+            tuple(Vlr(PROJECTION.encode(), number, payload) for user, number, payload in found
+                  if user == _PROJ and number in (34735, 34736, 34737) and len(payload) < 65536),
+        )  # fmt: skip
 
 
 def _list_appended(file: BinaryIO, end: int, least: int, count: int) -> Iterator[tuple[str, int, bytes]]:
@@ -201,19 +208,6 @@ def _list_appended(file: BinaryIO, end: int, least: int, count: int) -> Iterator
         end, left = start, left - 1
 
 
-def _check_waves(path: Path, waves: Path) -> int:
-    with reporting_reads(waves), open_regular(waves) as file:
-        head = file.read(WAVES_HEADER_SIZE)
-        size = os.fstat(file.fileno()).st_size
-    if len(head) < WAVES_HEADER_SIZE or not head.startswith(WAVES_SIGNATURE):
-        raise damaged(path, f"{waves.name} does not begin with PulseWavesWaves")
-    if struct.unpack_from("<I", head, 16)[0]:
-        raise refuse_packed_waves(path)
-    if size >= MAX_FILE:
-        raise damaged(path, f"{waves.name} has {size} bytes")
-    return size
-
-
 def _read_descriptor(path: Path, index: int, payload: bytes) -> Descriptor:
     """The descriptor of a record; raises InputError for one that no waves can be read with."""
     if len(payload) < _COMPOSITION.size:
@@ -226,29 +220,25 @@ def _read_descriptor(path: Path, index: int, payload: bytes) -> Descriptor:
     for number in range(count):
         if at + _SAMPLING.size > len(payload):
             raise damaged(path, f"descriptor {index} ends before sampling {number + 1} of {count}")
-        samplings.append(_read_sampling(path, index, payload, at))
+        (_, _, kind, channel, _, duration_bits, scale, offset, segment_bits, length_bits, segments, samples, bits, _,
+         spacing, compression) = _SAMPLING.unpack_from(payload, at)  # fmt: skip
+        if compression:
+            raise refuse_packed_waves(path)
+        widths = duration_bits in _INTEGERS and segment_bits in _INTEGERS[:3] and length_bits in _INTEGERS[:3]
+        counts = (segment_bits or segments <= MOST_SEGMENTS) and (length_bits or samples <= MAX_SAMPLES)
+        times = abs(scale) < LARGEST_OFFSET and abs(offset) < LARGEST_OFFSET and LEAST_SPACING <= spacing <= MAX_SPACING
+        if not widths or not counts or not times or bits not in _INTEGERS[1:]:
+            raise InputError(
+                f"{path}: descriptor {index} has a sampling of {segments} segments of {samples} samples of {bits} "
+                f"bits, {spacing:g} ns apart, with integers of {duration_bits}, {segment_bits} and {length_bits} bits; "
+                "wavebatch reads samples of 8, 16 or 32 bits: the file is damaged, or write it again with such samples"
+            )
+        samplings.append(Sampling(
+            kind, channel, duration_bits, float(scale), float(offset), segment_bits, length_bits, segments, samples,
+            bits, float(spacing),
+        ))  # fmt: skip
         at += max(struct.unpack_from("<I", payload, at)[0], _SAMPLING.size)
     return Descriptor(extra, float(unit), scanner, tuple(samplings))
-
-
-def _read_sampling(path: Path, index: int, payload: bytes, at: int) -> Sampling:
-    (_, _, kind, channel, _, duration_bits, scale, offset, segment_bits, length_bits, segments, samples, bits, _,
-     spacing, compression) = _SAMPLING.unpack_from(payload, at)  # fmt: skip
-    if compression:
-        raise refuse_packed_waves(path)
-    widths = duration_bits in _INTEGERS and segment_bits in _INTEGERS[:3] and length_bits in _INTEGERS[:3]
-    counts = (segment_bits or segments <= MOST_SEGMENTS) and (length_bits or samples <= MAX_SAMPLES)
-    times = abs(scale) < LARGEST_OFFSET and abs(offset) < LARGEST_OFFSET and LEAST_SPACING <= spacing <= MAX_SPACING
-    if not widths or not counts or not times or bits not in _INTEGERS[1:]:
-        raise InputError(
-            f"{path}: descriptor {index} has a sampling of {segments} segments of {samples} samples of {bits} bits, "
-            f"{spacing:g} ns apart, with integers of {duration_bits}, {segment_bits} and {length_bits} bits; wavebatch "
-            "reads samples of 8, 16 or 32 bits: the file is damaged, or write it again with such samples"
-        )
-    return Sampling(
-        kind, channel, duration_bits, float(scale), float(offset), segment_bits, length_bits, segments, samples, bits,
-        float(spacing),
-    )  # fmt: skip
 
 
 PULSES = 50_000
@@ -327,26 +317,16 @@ class Waves:
             return np.empty((len(places), width), np.uint8)
         low, high = int(places.min()), int(places.max()) + width
         if low < self._start or high > self._start + len(self._bytes):
-            self._hold(low, high)
-        return np.lib.stride_tricks.sliding_window_view(self._bytes, width)[places - self._start]
-
-    def _hold(self, low: int, high: int) -> None:
-        end = self._start + len(self._bytes)
-        if self._start <= low < end:  # walking on: what is there stays
-            high = min(max(high, low + 2 * (high - low)) + _AHEAD, self._size)
-            kept = self._bytes[low - self._start :]
+            end = self._start + len(self._bytes)
+            walks_on = self._start <= low < end  # then what is there stays
+            high = min((max(high, low + 2 * (high - low)) if walks_on else high) + _AHEAD, self._size)
+            kept = self._bytes[low - self._start :] if walks_on else self._bytes[:0]
             more = np.empty(high - low, np.uint8)
             more[: len(kept)] = kept
-            self._read(more[len(kept) :], low + len(kept))
+            with reporting_reads(self._path):
+                read_exactly(self._fd, more[len(kept) :], low + len(kept))
             self._start, self._bytes = low, more
-            return
-        high = min(high + _AHEAD, self._size)
-        self._start, self._bytes = low, np.empty(high - low, np.uint8)
-        self._read(self._bytes, low)
-
-    def _read(self, target: np.ndarray, at: int) -> None:
-        with reporting_reads(self._path):
-            read_exactly(self._fd, target, at)
+        return np.lib.stride_tricks.sliding_window_view(self._bytes, width)[places - self._start]
 
 
 class PulseReader(Closing):
@@ -377,25 +357,19 @@ class PulseReader(Closing):
             with reporting_reads(header.path):
                 at = header.start + first * header.record.itemsize
                 read_exactly(self._pulses.fileno(), pulses.view(np.uint8), at)
-            for begin, end in self._cut(pulses["offset"]):
-                yield self._read(first + begin, pulses[begin:end])
-
-    def _cut(self, offsets: np.ndarray) -> Iterator[tuple[int, int]]:
-        """Runs of pulses whose waves lie near each other, so that no piece of the file is larger than twice a usual."""
-        begin = 0
-        while begin < len(offsets):
-            part = offsets[begin:]
-            span = np.maximum.accumulate(part) - np.minimum.accumulate(part)
-            many = int(np.searchsorted(span, 2 * self._size, side="right"))
-            yield begin, begin + max(many, 1)
-            begin += max(many, 1)
-
-    def _read(self, first: int, pulses: np.ndarray) -> PulsePiece:
-        header = self.header
-        anchor = pulses["anchor"] * header.scales + header.offsets
-        direction = (pulses["target"].astype(np.float64) - pulses["anchor"]) * (header.scales / 1000)
-        waves = Waves(header.waves, self._waves.fileno(), header.waves_size)
-        return PulsePiece(first, pulses, anchor, direction, self._walk(first, pulses, waves), waves)
+            begin = 0
+            while begin < len(pulses):
+                # A piece has pulses whose waves lie near each other: at most twice as many bytes of the file as usual.
+                offsets = pulses["offset"][begin:]
+                span = np.maximum.accumulate(offsets) - np.minimum.accumulate(offsets)
+                many = max(int(np.searchsorted(span, 2 * self._size, side="right")), 1)
+                part = pulses[begin : begin + many]
+                anchor = part["anchor"] * header.scales + header.offsets
+                direction = (part["target"].astype(np.float64) - part["anchor"]) * (header.scales / 1000)
+                waves = Waves(header.waves, self._waves.fileno(), header.waves_size)
+                segments = self._walk(first + begin, part, waves)
+                yield PulsePiece(first + begin, part, anchor, direction, segments, waves)
+                begin += many
 
     def _walk(self, first: int, pulses: np.ndarray, waves: Waves) -> Segments:
         """The segments of pulses, by pulse, sampling and place in the waves."""
@@ -434,25 +408,20 @@ class _Walk:
             self._refuse(count > MOST_SEGMENTS, rows)
             for segment in range(int(count.max(initial=0))):
                 has = np.flatnonzero(count > segment)
-                yield self._step(rows[has], at, has, sampling, descriptor.unit, number)
+                those, place, n = rows[has], at[has], len(has)
+                start, length = np.full(n, sampling.offset), np.full(n, sampling.samples)
+                if sampling.duration_bits:
+                    start = start + sampling.scale * self._integers(those, place, sampling.duration_bits, signed=True)
+                    place = place + sampling.duration_bits // 8
+                if sampling.length_bits:
+                    length = self._integers(those, place, sampling.length_bits, signed=False)
+                    place = place + sampling.length_bits // 8
+                at[has] = place + length * (sampling.bits // 8)  # the next segment begins behind this one
+                self._refuse((at[has] > self._header.waves_size) | (length > MAX_SAMPLES), those)
+                same = np.uint8(sampling.kind), np.uint8(sampling.channel), sampling.bits, sampling.spacing
+                columns = (np.full(n, value) for value in (*same, descriptor.unit))
+                yield those, *columns, start, place, length, np.full(n, number)
                 number += 1
-
-    def _step(
-        self, rows: np.ndarray, at: np.ndarray, has: np.ndarray, sampling: Sampling, unit: float, number: int
-    ) -> tuple:
-        """One segment of the pulses `has`; moves their places in `at` behind it."""
-        place, n = at[has], len(has)
-        start, length = np.full(n, sampling.offset), np.full(n, sampling.samples)
-        if sampling.duration_bits:
-            start = start + sampling.scale * self._integers(rows, place, sampling.duration_bits, signed=True)
-            place = place + sampling.duration_bits // 8
-        if sampling.length_bits:
-            length = self._integers(rows, place, sampling.length_bits, signed=False)
-            place = place + sampling.length_bits // 8
-        at[has] = place + length * (sampling.bits // 8)
-        self._refuse((at[has] > self._header.waves_size) | (length > MAX_SAMPLES), rows)
-        same = (np.full(n, value) for value in (np.uint8(sampling.kind), np.uint8(sampling.channel), sampling.bits))
-        return rows, *same, np.full(n, sampling.spacing), np.full(n, unit), start, place, length, np.full(n, number)
 
     def _integers(self, rows: np.ndarray, at: np.ndarray, bits: int, *, signed: bool) -> np.ndarray:
         self._refuse(at > self._header.waves_size - bits // 8, rows)

@@ -80,7 +80,7 @@ def write_text(path: Path, text: str, *, overwrite: bool) -> None:
     """
     if overwrite and is_stream(path):
         with reporting(path), open_stream(path) as stream:
-            stream.write(_encode(text))
+            stream.write(text.encode(errors="replace"))  # a strip's file name may hold bytes that are not text
         return
     with draft_text(path, text, overwrite=overwrite) as draft:
         draft.publish()
@@ -90,13 +90,9 @@ def draft_text(path: Path, text: str, *, overwrite: bool) -> Draft:
     """Write a text file under a temporary name, to be published; raises InputError if it cannot be written."""
     draft = Draft(path, overwrite=overwrite)
     with undoing(draft.discard), reporting(path):
-        draft.file.write(_encode(text))
+        draft.file.write(text.encode(errors="replace"))
         draft.file.flush()
     return draft
-
-
-def _encode(text: str) -> bytes:
-    return text.encode(errors="replace")  # a strip's file name may hold bytes that are not text
 
 
 SUFFIXES = (".las", ".laz")

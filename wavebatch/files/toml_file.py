@@ -94,14 +94,17 @@ def format_toml_value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(format_toml_value, value)) + "]"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_format_key(key)} = {format_toml_value(item)}" for key, item in _present(value)) + "}"
+        present = ((_format_key(key), item) for key, item in value.items() if item is not None)
+        return "{" + ", ".join(f"{key} = {format_toml_value(item)}" for key, item in present) + "}"
     raise TypeError(f"TOML cannot hold {shorten(value)} of type {type(value).__name__}")
 
 
 def _format_table(table: Mapping[str, Any], prefix: str, comments: Mapping[str, str]) -> Iterator[str]:
     """Lines of one table: plain values first, because TOML counts all keys below a header to that header."""
     nested = []
-    for key, value in _present(table):
+    for key, value in table.items():
+        if value is None:
+            continue
         path = prefix + _format_key(key)
         is_tables = isinstance(value, list | tuple) and value and all(isinstance(item, Mapping) for item in value)
         if isinstance(value, Mapping) or is_tables:
@@ -119,10 +122,6 @@ def _format_table(table: Mapping[str, Any], prefix: str, comments: Mapping[str, 
                 yield f"# {comment}"
             yield f"[[{path}]]" if is_tables else f"[{path}]"
             yield from _format_table(item, f"{path}.", comments)
-
-
-def _present(table: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    return [(key, value) for key, value in table.items() if value is not None]
 
 
 def _format_key(key: str) -> str:
@@ -307,8 +306,16 @@ def list_entries(kind: Any) -> tuple[Entry, ...]:
             continue
         optional = get_origin(hint) in (types.UnionType, typing.Union)
         hint = next(part for part in get_args(hint) if part is not type(None)) if optional else hint
-        # That of the field stands behind that of a shared annotation.
-        shape, parts = _read_shape(hint, keys[-1])
+        inner, parts = get_args(hint), (hint,)
+        if get_origin(hint) is tuple:
+            shape = "records" if dataclasses.is_dataclass(inner[0]) else "rows"
+            parts = get_args(inner[0]) if get_origin(inner[0]) is tuple else inner[:1]
+        elif get_origin(hint) is Mapping:
+            # The Key of the field stands behind that of a shared annotation.
+            shape = "numbered" if "{}" in keys[-1].name else "table" if inner[0] is str else "pairs"
+            parts = inner if shape == "pairs" else inner[1:]
+        else:
+            shape = "record" if dataclasses.is_dataclass(hint) else "value"
         split = [(hint, notes)] if shape == "value" else list(map(_split, parts))
         limits = tuple(next((note for note in more if isinstance(note, Range)), _EVERY) for _, more in split)
         key = keys[-1] if shape == "record" else keys[-1]._replace(name=keys[-1].name or one.name)
@@ -324,18 +331,6 @@ def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
         return hint, ()
     kind, *notes = get_args(hint)
     return kind, tuple(notes)
-
-
-def _read_shape(hint: Any, key: Key) -> tuple[str, tuple[Any, ...]]:
-    """Shape of a field, and the types of its parts."""
-    inner = get_args(hint)
-    if get_origin(hint) is tuple:
-        shape = "records" if dataclasses.is_dataclass(inner[0]) else "rows"
-        return shape, get_args(inner[0]) if get_origin(inner[0]) is tuple else inner[:1]
-    if get_origin(hint) is Mapping:
-        shape = "numbered" if "{}" in key.name else "table" if inner[0] is str else "pairs"
-        return shape, inner if shape == "pairs" else inner[1:]
-    return "record" if dataclasses.is_dataclass(hint) else "value", (hint,)
 
 
 def list_keys(kind: type, prefix: str = "") -> dict[str, Entry]:
@@ -467,7 +462,19 @@ def _read_entry(one: Entry, table: TomlTable, key: str) -> Any:
     if one.shape == "records":
         return tuple(read_record(one.kinds[0], row) for row in table.tables(key))
     if one.shape in ("rows", "pairs"):
-        rows = _read_rows(one, table, key)
+        where, rows, single = f"{table.where}: {key}", table.values[key], len(one.kinds) == 1
+        if isinstance(rows, list) and single:
+            rows = [[value] for value in rows]
+        if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == len(one.kinds) for row in rows):
+            raise ConfigError(f"{where} must be a list of {one.key.form}, it is {shorten(rows)}")
+        if len(rows) > MOST_ROWS:
+            raise ConfigError(f"{where} holds {len(rows)} rows, at most {MOST_ROWS} are read")
+        read = tuple(
+            tuple(kind(check_number(value, *limits, f"{where} row {number}"))
+                  for value, kind, limits in zip(row, one.kinds, one.limits, strict=True))
+            for number, row in enumerate(rows, 1)
+        )  # fmt: skip
+        rows = tuple(row[0] for row in read) if single else read
         return rows if one.shape == "rows" else dict(rows)
     (kind,), ((low, high),) = one.kinds, one.limits
     if one.shape == "table":
@@ -478,19 +485,3 @@ def _read_entry(one: Entry, table: TomlTable, key: str) -> Any:
     if kind is str and isinstance(table.values[key], date | int | float):
         return str(table.values[key])  # a day or a number that a person wrote without quotes
     return table.number(key, low, high) if kind is float else table.get(key, kind)
-
-
-def _read_rows(one: Entry, table: TomlTable, key: str) -> Any:
-    where, rows, single = f"{table.where}: {key}", table.values[key], len(one.kinds) == 1
-    if isinstance(rows, list) and single:
-        rows = [[value] for value in rows]
-    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == len(one.kinds) for row in rows):
-        raise ConfigError(f"{where} must be a list of {one.key.form}, it is {shorten(rows)}")
-    if len(rows) > MOST_ROWS:
-        raise ConfigError(f"{where} holds {len(rows)} rows, at most {MOST_ROWS} are read")
-    read = tuple(
-        tuple(kind(check_number(value, *limits, f"{where} row {number}"))
-              for value, kind, limits in zip(row, one.kinds, one.limits, strict=True))
-        for number, row in enumerate(rows, 1)
-    )  # fmt: skip
-    return tuple(row[0] for row in read) if single else read

@@ -102,7 +102,16 @@ def _read_text(path: Path, size: int) -> dict[str, np.ndarray]:
     if size > MOST_TEXT:
         raise InputError(f"{path}: {size / 1e9:.1f} GB of text are too much; thin it to 20 positions per second")
     lines = path.read_text("utf-8", "replace").splitlines()
-    place, names = _find_header(path, lines)
+    for place in range(min(len(lines), 200)):
+        found = [_meaning(field) for field in _split(lines[place])]
+        if "time" in found and ({"x", "y", "z"} <= set(found) or {"latitude", "longitude", "z"} <= set(found)):
+            break
+    else:
+        raise InputError(
+            f"{path}: no line names the columns of the trajectory; the first line must hold time, x, y, z "
+            "(or time, latitude, longitude, height)"
+        )
+    names = [name if name not in found[:i] else "" for i, name in enumerate(found)]
     body = (_split(line) for line in lines[place + 1 :])
     rows = [row for row in (_numbers(fields, len(names)) for fields in body) if row is not None]
     if not rows:
@@ -125,18 +134,6 @@ def _numbers(fields: list[str], number: int) -> list[float] | None:
         return [float(field) if field else np.nan for field in fields[:number]] if len(fields) >= number else None
     except ValueError:
         return None
-
-
-def _find_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
-    """Number of the header line, and the meaning of each column; empty for columns that are not used."""
-    for place, line in enumerate(lines[:200]):
-        names = [_meaning(field) for field in _split(line)]
-        if "time" in names and ({"x", "y", "z"} <= set(names) or {"latitude", "longitude", "z"} <= set(names)):
-            return place, [name if name not in names[:i] else "" for i, name in enumerate(names)]
-    raise InputError(
-        f"{path}: no line names the columns of the trajectory; the first line must hold time, x, y, z "
-        "(or time, latitude, longitude, height)"
-    )
 
 
 def _meaning(field: str) -> str:

@@ -128,7 +128,8 @@ class CloudReader(Closing):
         """The record of each extra dimension that is one number, by its field."""
         self._point_length = checked.dtype.itemsize
         written = find_written(checked.header, self.extra)
-        self.written = {column: name for column, name in written.items() if _may_hold(self.extra[name], column)}
+        self.written = {column: name for column, name in written.items()
+                        if column != "echo_flags" or self.extra[name].dtype.kind == "u"}  # fmt: skip
         """The file's name of each wavebatch column, by its provenance; empty without one. Columns that another
         program has stored as several numbers, or flags as signed ones, are none."""
         self._sources = self._find_ours((*las.field_names(dtype), "echo_flags"))
@@ -195,10 +196,6 @@ class CloudReader(Closing):
         found = {name: self.written[name] for name in columns if name in self.written}
         return {name: one for name, one in found.items() if decibel or not self.extra[one].description.endswith("[dB]")}
 
-    def read_extra(self, raw: np.ndarray, field: str) -> np.ndarray:
-        """Return the physical values (n,) of an extra dimension of raw records, with NaN for no data."""
-        return self.extra[field].read(raw[field])
-
     def list_columns(self) -> list[str]:
         """Return the names of all columns of the file."""
         standard = [name for name in las.list_dimensions(self.point_format) if name not in ("X", "Y", "Z")]
@@ -222,7 +219,7 @@ class CloudReader(Closing):
         standard = name_standard(self.point_format)
         wanted, column = column, resolve(column, written, {name: name for name in self.extra} | standard, ours)
         if column in self.extra:
-            return self._describe_extra(column), lambda raw: self.read_extra(raw, column)
+            return self._describe_extra(column), lambda raw: self.extra[column].read(raw[column])
         if column in known:
             fields = las.STANDARD_DTYPES[self.point_format]
             step = 0.0 if column in las.field_names(fields) and fields[column].kind == "f" else 1.0
@@ -268,7 +265,8 @@ class CloudReader(Closing):
     def _read_named(self, raw: np.ndarray, name: str) -> np.ndarray | float | None:
         """Values of a field of `dtype`; None where the file has none and they are 0."""
         if name in COLUMNS:
-            return self.read_extra(raw, self._sources[name]) if name in self._sources else np.nan
+            field = self._sources.get(name)
+            return np.nan if field is None else self.extra[field].read(raw[field])
         if name == "ray" and self.has_packets:
             ray = np.stack([widen_integers(raw[axis]) for axis in ("x_t", "y_t", "z_t")], axis=1)
             ray[~np.isfinite(ray).all(axis=1)] = 0.0  # damaged: as if there were none
@@ -331,14 +329,11 @@ def find_columns(extra: Mapping[str, las.ExtraRecord], columns: Iterable[str]) -
     for column, name, scale in names:
         for field in (f"wb_{name.replace(' ', '_')}", f"wb {name}", name):
             record = extra.get(field) if column in wanted else None
-            if record is not None and (record.scaling is None) == (scale is None) and _may_hold(record, column):
+            if record is None or (record.scaling is None) != (scale is None):
+                continue
+            if column != "echo_flags" or record.dtype.kind == "u":
                 found.setdefault(column, field)
     return found
-
-
-def _may_hold(record: las.ExtraRecord, column: str) -> bool:
-    """Whether numbers of a dimension may be a column: flags are unsigned integers."""
-    return column != "echo_flags" or record.dtype.kind == "u"
 
 
 def check_alike(readers: Iterable[tuple[Path, ColumnFacts]]) -> ColumnFacts:

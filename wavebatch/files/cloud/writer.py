@@ -64,9 +64,19 @@ def choose_version(path: Path, header: las.LasHeader, wanted: str, point_format:
     if wanted not in LAS_VERSIONS:
         raise ConfigError(f"las_version {wanted!r}: must be one of {', '.join(LAS_VERSIONS)}")
     target = las.choose_format(path, header, point_format, keep)
-    if wanted == "1.3":
-        return _as_1_3(path, header, target)
     evlrs, _ = las.find_evlrs(path, header)
+    if wanted == "1.3":  # if it can hold all that the strip has
+        if target >= 6:
+            needed = header.point_format >= 6
+            what = "leave --las-version out" if needed else "leave one of the two out"
+            reason = f", and the strip's points of format {header.point_format} fit into no other" if needed else ""
+            raise ConfigError(f"{path}: --las-version 1.3 has no point format {target}{reason}; {what}")
+        if any(evlr.record_id != las.WAVEFORM_RECORD_ID for evlr in evlrs):
+            raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")
+        if _tell_crs(header.vlrs) == (True, False):
+            raise InputError(f"{path}: its CRS is given as WKT, which LAS 1.3 does not have; leave --las-version out")
+        repaired, notes = _repair(path, header)
+        return Version((1, 3), target, repaired, notes)
     records: list[Any] = [*header.vlrs, *evlrs]
     only_keys = _tell_crs(records) == (False, True)
     repaired, notes = _repair(path, header, evlrs)
@@ -111,22 +121,6 @@ def _tell_crs(records: Sequence[Any]) -> tuple[bool, bool]:
     """Whether records, extended or not, have the CRS as WKT, and as GeoTIFF keys."""
     has = (las.has_record(records, las.PROJECTION, number) for number in (las.WKT_ID, las.GEOTIFF_ID))
     return next(has), next(has)
-
-
-def _as_1_3(path: Path, header: las.LasHeader, target: int) -> Version:
-    """LAS 1.3, if it can hold all that the strip has."""
-    if target >= 6:
-        needed = header.point_format >= 6
-        what = "leave --las-version out" if needed else "leave one of the two out"
-        reason = f", and the strip's points of format {header.point_format} fit into no other" if needed else ""
-        raise ConfigError(f"{path}: --las-version 1.3 has no point format {target}{reason}; {what}")
-    evlrs, _ = las.find_evlrs(path, header)
-    if any(evlr.record_id != las.WAVEFORM_RECORD_ID for evlr in evlrs):
-        raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")
-    if _tell_crs(header.vlrs) == (True, False):
-        raise InputError(f"{path}: its CRS is given as WKT, which LAS 1.3 does not have; leave --las-version out")
-    repaired, notes = _repair(path, header)
-    return Version((1, 3), target, repaired, notes)
 
 
 @frozen
@@ -234,13 +228,37 @@ class OutputLayout(Version):
         rows = np.zeros(len(source), self.dtype)
         las.copy_standard(np.ascontiguousarray(source), rows, self.source.header.point_format, self.point_format)
         if xyz is not None and len(rows):
-            self._set_coordinates(rows, np.asarray(xyz, np.float64))
+            xyz = np.asarray(xyz, np.float64)
+            header, absent = self.source.header, np.isnan(xyz)
+            new = ~(absent[:, 0] & absent[:, 1] & absent[:, 2])
+            for axis, (name, scale, offset) in enumerate(zip("XYZ", header.scales, header.offsets, strict=True)):
+                with np.errstate(all="ignore"):
+                    counts = np.rint((xyz[:, axis] - offset) / np.float64(scale))
+                bad = new & ~(np.abs(counts) <= 2**31 - 1)
+                if bad.any():
+                    row = int(np.argmax(bad))
+                    raise InputError(
+                        f"{self.source.path}: {name.lower()} = {xyz[row, axis]:.3f} of output row {row} does not fit "
+                        f"32-bit integers at scale {scale:g} and offset {offset:g}; rescale the strip (las2las "
+                        "-rescale ... -reoffset ...) and run again"
+                    )
+                rows[name] = np.where(new, counts, rows[name])
         bits = 4 if self.point_format >= 6 else 3
         for shift, values in ((0, return_number), (bits, number_of_returns)):
             if values is not None:
                 cut = np.minimum(values, self.max_return).astype(np.uint8) << np.uint8(shift)
                 rows["bit_fields"] = (rows["bit_fields"] & np.uint8(255 ^ (self.max_return << shift))) | cut
-        self._carry(rows, source, matched)
+        if self.carried:
+            names = self.extra_fields[: len(self.carried)]
+            formats = [carried.record.dtype for carried in self.carried]
+            places, size = [carried.source for carried in self.carried], source.dtype.itemsize
+            fields: Any = {"names": list(names), "formats": formats, "offsets": places, "itemsize": size}
+            values = np.ascontiguousarray(source).view(np.dtype(fields))
+            for carried, name in zip(self.carried, names, strict=True):
+                rows[name] = values[name]
+                empty = carried.record.no_data
+                if not (self.whole or matched is None or empty is None):
+                    rows[name][~np.asarray(matched)] = empty if len(empty) > 1 else empty[0]
         if self.packets is not None and self.packets.shift:
             has_packet = rows["wavepacket_index"] > 0
             rows["wavepacket_offset"][has_packet] += np.uint64(self.packets.shift)
@@ -262,36 +280,6 @@ class OutputLayout(Version):
     @property
     def _columns(self) -> list[tuple[str, WrittenColumn]]:
         return list(zip(self.extra_fields[len(self.carried) :], self.written, strict=True))
-
-    def _set_coordinates(self, rows: np.ndarray, xyz: np.ndarray) -> None:
-        header, absent = self.source.header, np.isnan(xyz)
-        new = ~(absent[:, 0] & absent[:, 1] & absent[:, 2])
-        for axis, (name, scale, offset) in enumerate(zip("XYZ", header.scales, header.offsets, strict=True)):
-            with np.errstate(all="ignore"):
-                counts = np.rint((xyz[:, axis] - offset) / np.float64(scale))
-            bad = new & ~(np.abs(counts) <= 2**31 - 1)
-            if bad.any():
-                row = int(np.argmax(bad))
-                raise InputError(
-                    f"{self.source.path}: {name.lower()} = {xyz[row, axis]:.3f} of output row {row} does not fit "
-                    f"32-bit integers at scale {scale:g} and offset {offset:g}; rescale the strip (las2las "
-                    "-rescale ... -reoffset ...) and run again"
-                )
-            rows[name] = np.where(new, counts, rows[name])
-
-    def _carry(self, rows: np.ndarray, source: np.ndarray, matched: np.ndarray | None) -> None:
-        if not self.carried:
-            return
-        names = self.extra_fields[: len(self.carried)]
-        formats = [carried.record.dtype for carried in self.carried]
-        places = [carried.source for carried in self.carried]
-        fields: Any = {"names": list(names), "formats": formats, "offsets": places, "itemsize": source.dtype.itemsize}
-        values = np.ascontiguousarray(source).view(np.dtype(fields))
-        for carried, name in zip(self.carried, names, strict=True):
-            rows[name] = values[name]
-            empty = carried.record.no_data
-            if not (self.whole or matched is None or empty is None):
-                rows[name][~np.asarray(matched)] = empty if len(empty) > 1 else empty[0]
 
 
 def plan_output(
@@ -391,7 +379,34 @@ class CloudWriter(PointFile):
         packets = layout.packets
         self._inputs = [layout.source.path, *([packets.file] if packets else [])]
         self._evlrs, self.dropped = _choose_evlrs(layout.source.path, layout.source.header)
-        header = _build_header(layout, provenance, self._evlrs)
+        source = layout.source.header
+        vlrs = [vlr for vlr in source.vlrs if _is_carried(vlr, layout)]
+        earlier = sum(vlr.user == USER_ID for vlr in vlrs)
+        if layout.wkt is not None:
+            vlrs = [vlr for vlr in vlrs if not las.has_record([vlr], las.PROJECTION, las.WKT_ID)]
+            vlrs.append(las.build_wkt(layout.wkt))
+        vlrs.append(_encode_provenance(layout, provenance, earlier + 1))
+        encoding = source.global_encoding & ~(las.WAVES_INTERNAL | las.WAVES_EXTERNAL)
+        if layout.packets is not None:
+            encoding |= las.WAVES_INTERNAL if layout.packets.internal else las.WAVES_EXTERNAL
+        has_wkt, has_keys = _tell_crs([*vlrs, *self._evlrs])[0], _tell_crs(vlrs)[1]
+        if layout.version < (1, 4):
+            encoding &= ~las.WKT_BIT  # a reserved bit there
+        elif not has_keys and (has_wkt or layout.point_format >= 6) or has_wkt and layout.point_format >= 6:
+            encoding |= las.WKT_BIT
+        # `PointFile` sets what follows from the points: their number, length, bounds, times and compression.
+        header = replace(
+            source,
+            version=layout.version,
+            point_format=layout.point_format,
+            vlrs=vlrs,
+            global_encoding=encoding,
+            system_identifier=b"MODIFICATION",
+            generating_software=las.SOFTWARE,
+            waveform_start=0,
+            evlr_start=0,
+            evlr_count=0,
+        )
         for place, vlr in enumerate(header.vlrs):  # laspy opens no file with ids that are no UTF-8
             clean = replace(vlr, user_id=_as_text(vlr.user_id), description=_as_text(vlr.description))
             if clean != vlr:
@@ -451,37 +466,6 @@ def _choose_evlrs(path: Path, header: las.LasHeader) -> tuple[list[las.Evlr], di
     return kept, dropped
 
 
-def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: list[las.Evlr]) -> las.LasHeader:
-    source = layout.source.header
-    vlrs = [vlr for vlr in source.vlrs if _is_carried(vlr, layout)]
-    earlier = sum(vlr.user == USER_ID for vlr in vlrs)
-    if layout.wkt is not None:
-        vlrs = [vlr for vlr in vlrs if not las.has_record([vlr], las.PROJECTION, las.WKT_ID)]
-        vlrs.append(las.build_wkt(layout.wkt))
-    vlrs.append(_encode_provenance(layout, provenance, earlier + 1))
-    encoding = source.global_encoding & ~(las.WAVES_INTERNAL | las.WAVES_EXTERNAL)
-    if layout.packets is not None:
-        encoding |= las.WAVES_INTERNAL if layout.packets.internal else las.WAVES_EXTERNAL
-    has_wkt, has_keys = _tell_crs([*vlrs, *evlrs])[0], _tell_crs(vlrs)[1]
-    if layout.version < (1, 4):
-        encoding &= ~las.WKT_BIT  # a reserved bit there
-    elif not has_keys and (has_wkt or layout.point_format >= 6) or has_wkt and layout.point_format >= 6:
-        encoding |= las.WKT_BIT
-    # `PointFile` sets what follows from the points: their number, length, bounds, times and compression.
-    return replace(
-        source,
-        version=layout.version,
-        point_format=layout.point_format,
-        vlrs=vlrs,
-        global_encoding=encoding,
-        system_identifier=b"MODIFICATION",
-        generating_software=las.SOFTWARE,
-        waveform_start=0,
-        evlr_start=0,
-        evlr_count=0,
-    )
-
-
 def _as_text(field: bytes) -> bytes:
     """The field, with question marks for bytes before its first NUL that are not UTF-8."""
     text, end, rest = field.partition(b"\0")
@@ -515,7 +499,16 @@ def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], numb
     whole = {"wavebatch": __version__, "input_header": made_by, "columns": columns, **provenance}
     payload = _encode_json(whole)
     if len(payload) > MOST_PAYLOAD:
-        payload = _encode_json(_shorten(json.loads(payload)))
+        table = json.loads(payload)
+        parts = sorted(_list_parts(table, ""), key=lambda part: (-part[0], part[1]))
+        left_out: dict[str, str] = {}
+        table["left_out"] = {"why": "a VLR is too small; the report of the strip has them", "sha256": left_out}
+        for _, name, holder, key in parts:
+            if len(_encode_json(table)) <= MOST_PAYLOAD:
+                break
+            left_out[name] = hashlib.sha256(_encode_json(holder[key])).hexdigest()
+            holder[key] = None
+        payload = _encode_json(table)
     if len(payload) > MOST_PAYLOAD:
         raise ConfigError(f"{path}: the provenance takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}")
     return las.Vlr(USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
@@ -524,19 +517,6 @@ def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], numb
 def _encode_json(value: Any) -> bytes:
     text = json.dumps(value, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=_plain)
     return text.encode(errors="backslashreplace")
-
-
-def _shorten(whole: dict[str, Any]) -> dict[str, Any]:
-    """The provenance, with the largest tables and lists replaced by their checksums until it fits into a VLR."""
-    parts = sorted(_list_parts(whole, ""), key=lambda part: (-part[0], part[1]))
-    left_out: dict[str, str] = {}
-    whole["left_out"] = {"why": "a VLR is too small; the report of the strip has them", "sha256": left_out}
-    for _, name, holder, key in parts:
-        if len(_encode_json(whole)) <= MOST_PAYLOAD:
-            break
-        left_out[name] = hashlib.sha256(_encode_json(holder[key])).hexdigest()
-        holder[key] = None
-    return whole
 
 
 def _list_parts(table: dict[str, Any], prefix: str) -> Iterator[tuple[int, str, dict[str, Any], str]]:

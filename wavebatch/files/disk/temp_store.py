@@ -166,7 +166,7 @@ class Spool(Closing):
         self._held += entries.nbytes + 8 * len(bucket)
         self.count += len(entries)
         if self._held >= self._most:
-            self._flush()
+            self._write(*self._take_pending())
 
     def seal(self) -> Spool:
         """End the writing, as the first reading does; may be called twice."""
@@ -174,7 +174,7 @@ class Spool(Closing):
             return self
         self._sealed = True
         if self._segments:
-            self._flush()
+            self._write(*self._take_pending())
         else:
             starts, parts = self._take_pending()
             self._memory = starts, np.concatenate(parts) if parts else np.empty(0, self.dtype)
@@ -236,9 +236,6 @@ class Spool(Closing):
             order = np.argsort(bucket, kind="stable")
             bucket, parts = bucket[order], [take_whole_records(np.concatenate(parts), order)]
         return np.searchsorted(bucket, np.arange(self.buckets + 1)).astype(np.int64), parts
-
-    def _flush(self) -> None:
-        self._write(*self._take_pending())
 
     def _write(self, starts: np.ndarray, parts: list[np.ndarray]) -> None:
         with reporting_scratch():

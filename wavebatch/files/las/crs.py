@@ -491,7 +491,13 @@ def read_crs(path: Path, header: las.LasHeader) -> tuple[str | None, tuple[CrsUn
 
     Where none gives a kind or a unit, coordinates that are geocentric by their size are one more entry.
     """
-    records = _read_records(path, header)
+    # VLRs of the header come before EVLRs after the points.
+    records = {vlr.record_id: vlr.payload for vlr in header.vlrs if las.is_projection(vlr)}
+    evlrs, _ = las.find_evlrs(path, header)
+    for evlr in evlrs:
+        new = las.is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in records
+        if new and evlr.length <= LONGEST_WKT:
+            records[evlr.record_id] = las.read_evlr(path, evlr)
     units, text = [], None
     if las.WKT_ID in records:
         text = records[las.WKT_ID].split(b"\0")[0].decode("utf-8", "replace") or None
@@ -518,17 +524,6 @@ def read_crs_definition(path: Path, header: las.LasHeader, *, heights: bool = Fa
         return repair_wkt(text)
     code = find_code(header.vlrs)
     return f"EPSG:{code}" if code else None
-
-
-def _read_records(path: Path, header: las.LasHeader) -> dict[int, bytes]:
-    """Payloads of the CRS records by number; VLRs of the header come before EVLRs after the points."""
-    found = {vlr.record_id: vlr.payload for vlr in header.vlrs if las.is_projection(vlr)}
-    evlrs, _ = las.find_evlrs(path, header)
-    for evlr in evlrs:
-        new = las.is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in found
-        if new and evlr.length <= LONGEST_WKT:
-            found[evlr.record_id] = las.read_evlr(path, evlr)
-    return found
 
 
 _PROJECTED = ("PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")

@@ -19,7 +19,7 @@ import struct
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -238,7 +238,55 @@ def read_header(path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
     itself.
     """
     with reporting_reads(path, remedy="; check name and permissions"), open_regular(path) as file:
-        return read_header_of(file, path, least)
+        file.seek(0)
+        front = file.read(_FRONT.size)
+        if len(front) < _FRONT.size or front[:4] != b"LASF":
+            raise InputError(f"{path}: not a LAS or LAZ file (it does not begin with LASF){_guess(path, front)}")
+        (_, source_id, encoding, project, major, minor, system, software, day, year, size, offset, n_vlrs,
+         point_format, length, count, *rest) = _FRONT.unpack(front)  # fmt: skip
+        standard = HEADER_SIZES.get((major, minor))
+        if standard is None or (major, minor) < least:
+            what = "has no waveforms" if standard else "is not known"
+            versions = f"{least[0]}.{least[1]} to 1.5"
+            raise InputError(f"{path}: LAS version {major}.{minor} {what}; wavebatch needs versions {versions} here")
+        file_size = os.fstat(file.fileno()).st_size
+        if file_size >= MAX_FILE:
+            raise InputError(f"{path}: a file of {file_size} bytes is too large for wavebatch; cut it into tiles")
+        if not standard <= size <= offset <= file_size:
+            raise damaged(path, f"header of {size} bytes, but points at byte {offset} of {file_size}")
+        if offset > MAX_FRONT or n_vlrs > MAX_VLRS:
+            raise damaged(path, f"header with {n_vlrs} VLRs in {offset} bytes (at most {MAX_VLRS} in {MAX_FRONT})")
+        by_return, numbers = rest[:5], rest[5:]
+        header = LasHeader(
+            (major, minor), point_format & 0x3F, length, tuple(numbers[0:3]), tuple(numbers[3:6]),
+            compressed=bool(point_format & 0xC0), offset_to_points=offset, file_source_id=source_id,
+            global_encoding=encoding, project_id=project, system_identifier=system, generating_software=software,
+            creation=(day, year), point_count=count, counts=(count, 0), file_size=file_size,
+            by_return=(*by_return, *(0,) * 10),
+            maxs=tuple(numbers[6::2]), mins=tuple(numbers[7::2]),
+        )  # fmt: skip
+        tail = file.read(standard - _FRONT.size)
+        if header.version >= (1, 3):
+            (header.waveform_start,) = struct.unpack_from("<Q", tail)
+        if header.version >= (1, 4):
+            header.evlr_start, header.evlr_count, count, *by_return = struct.unpack_from("<QIQ15Q", tail, 8)
+            header.counts = header.point_count, count
+            if count:
+                header.point_count, header.by_return = count, tuple(by_return)
+        if header.version >= (1, 5):
+            largest, smallest, header.gps_offset = struct.unpack_from("<ddH", tail, 148)
+            header.gps_range = (largest, smallest)
+        header.user_bytes = file.read(size - standard)
+        records, at = file.read(offset - size), 0
+        for number in range(n_vlrs):
+            head = records[at : at + _VLR.size].ljust(_VLR.size, b"\0")
+            reserved, user_id, record_id, length, description = _VLR.unpack(head)
+            at += _VLR.size + length
+            if at > len(records):
+                raise damaged(path, f"VLR {number} of {n_vlrs} runs into the points")
+            header.vlrs.append(Vlr(user_id, record_id, records[at - length : at], description, reserved))
+        header.padding = records[at:]
+        return header
 
 
 def _guess(path: Path, front: bytes) -> str:
@@ -256,59 +304,6 @@ def _guess(path: Path, front: bytes) -> str:
     if text and b"\0" not in front:
         return f"; if it is a list of files, write @{path}" if front else "; it is empty"
     return ""
-
-
-def read_header_of(file: BinaryIO, path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
-    """Return header and VLRs of an open LAS or LAZ file; `path` is its name in messages."""
-    file.seek(0)
-    front = file.read(_FRONT.size)
-    if len(front) < _FRONT.size or front[:4] != b"LASF":
-        raise InputError(f"{path}: not a LAS or LAZ file (it does not begin with LASF){_guess(path, front)}")
-    (_, source_id, encoding, project, major, minor, system, software, day, year, size, offset, n_vlrs,
-     point_format, length, count, *rest) = _FRONT.unpack(front)  # fmt: skip
-    standard = HEADER_SIZES.get((major, minor))
-    if standard is None or (major, minor) < least:
-        what = "has no waveforms" if standard else "is not known"
-        versions = f"{least[0]}.{least[1]} to 1.5"
-        raise InputError(f"{path}: LAS version {major}.{minor} {what}; wavebatch needs versions {versions} here")
-    file_size = os.fstat(file.fileno()).st_size
-    if file_size >= MAX_FILE:
-        raise InputError(f"{path}: a file of {file_size} bytes is too large for wavebatch; cut it into tiles")
-    if not standard <= size <= offset <= file_size:
-        raise damaged(path, f"header of {size} bytes, but points at byte {offset} of {file_size}")
-    if offset > MAX_FRONT or n_vlrs > MAX_VLRS:
-        raise damaged(path, f"header with {n_vlrs} VLRs in {offset} bytes (at most {MAX_VLRS} in {MAX_FRONT})")
-    by_return, numbers = rest[:5], rest[5:]
-    header = LasHeader(
-        (major, minor), point_format & 0x3F, length, tuple(numbers[0:3]), tuple(numbers[3:6]),
-        compressed=bool(point_format & 0xC0), offset_to_points=offset, file_source_id=source_id,
-        global_encoding=encoding, project_id=project, system_identifier=system, generating_software=software,
-        creation=(day, year), point_count=count, counts=(count, 0), file_size=file_size,
-        by_return=(*by_return, *(0,) * 10),
-        maxs=tuple(numbers[6::2]), mins=tuple(numbers[7::2]),
-    )  # fmt: skip
-    tail = file.read(standard - _FRONT.size)
-    if header.version >= (1, 3):
-        (header.waveform_start,) = struct.unpack_from("<Q", tail)
-    if header.version >= (1, 4):
-        header.evlr_start, header.evlr_count, count, *by_return = struct.unpack_from("<QIQ15Q", tail, 8)
-        header.counts = header.point_count, count
-        if count:
-            header.point_count, header.by_return = count, tuple(by_return)
-    if header.version >= (1, 5):
-        largest, smallest, header.gps_offset = struct.unpack_from("<ddH", tail, 148)
-        header.gps_range = (largest, smallest)
-    header.user_bytes = file.read(size - standard)
-    records, at = file.read(offset - size), 0
-    for number in range(n_vlrs):
-        head = records[at : at + _VLR.size].ljust(_VLR.size, b"\0")
-        reserved, user_id, record_id, length, description = _VLR.unpack(head)
-        at += _VLR.size + length
-        if at > len(records):
-            raise damaged(path, f"VLR {number} of {n_vlrs} runs into the points")
-        header.vlrs.append(Vlr(user_id, record_id, records[at - length : at], description, reserved))
-    header.padding = records[at:]
-    return header
 
 
 def find_evlrs(path: Path, header: LasHeader, most: int = MAX_EVLRS) -> tuple[list[Evlr], int]:
@@ -524,16 +519,13 @@ class ExtraRecord:
         kind, length = _TYPES[(self.code - 1) % 10], (self.code - 1) // 10 + 1
         return np.dtype(f"<{kind}") if length == 1 else np.dtype((f"<{kind}", (length,)))
 
-    @property
-    def _container(self) -> np.dtype:
-        """Type of the 8-byte numbers that hold the no-data, least and largest value."""
-        return np.dtype(f"<{self.dtype.base.kind}8")
-
     def _numbers(self, at: int, option: int) -> np.ndarray | None:
         if self.code == 0 or not self.data[3] & option:
             return None
         dtype = self.dtype
-        numbers = np.frombuffer(self.data, self._container, max(1, dtype.itemsize // dtype.base.itemsize), at)
+        # 8-byte numbers hold the no-data, least and largest value.
+        stored, length = np.dtype(f"<{dtype.base.kind}8"), max(1, dtype.itemsize // dtype.base.itemsize)
+        numbers = np.frombuffer(self.data, stored, length, at)
         with np.errstate(over="ignore", invalid="ignore"):
             return numbers.astype(dtype.base)
 
@@ -571,7 +563,7 @@ class ExtraRecord:
         data[at : at + 24] = bytes(24)
         data[3] &= ~option
         if numbers is not None:
-            packed = np.asarray(numbers).astype(self._container).tobytes()
+            packed = np.asarray(numbers).astype(np.dtype(f"<{self.dtype.base.kind}8")).tobytes()
             data[at : at + len(packed)] = packed
             data[3] |= option
         return ExtraRecord(bytes(data))
@@ -651,18 +643,13 @@ def _free_name(name: str, taken: Container[str], most: int | None = None) -> str
     while not found or found in taken:
         number += 1
         end = f" {number}"
-        found = (name if most is None else _cut(name, most - len(end))) + end
+        found = (name if most is None else name.encode()[: most - len(end)].decode(errors="ignore")) + end
     return found
-
-
-def _cut(text: str, most: int) -> str:
-    """As much of the text as so many bytes of UTF-8 hold."""
-    return text.encode()[:most].decode(errors="ignore")
 
 
 def _as_field(text: str) -> bytes:
     """The text as a record holds it."""
-    return _cut(text, TEXT_BYTES).encode().ljust(TEXT_BYTES, b"\0")
+    return text.encode()[:TEXT_BYTES].decode(errors="ignore").encode().ljust(TEXT_BYTES, b"\0")
 
 
 def build_dtype(point_format: int, records: Sequence[ExtraRecord]) -> np.dtype:

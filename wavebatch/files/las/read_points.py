@@ -62,9 +62,19 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     Raises InputError if it is not a LAS or LAZ file with waveforms, or contradicts itself.
     """
     header = las.read_header(path, (1, 3) if waveforms else (1, 0))
-    if waveforms:
-        _check_waveforms(path, header)
     number = header.point_format
+    if waveforms:
+        if any(vlr.user == "lascompatible" for vlr in header.vlrs):
+            restore = f"laszip -i {path.name} -o {path.stem}_restored.las"
+            raise InputError(f"{path}: written in LAStools' LAS 1.4 compatibility mode; restore it first: {restore}")
+        if number not in WAVEFORM_FORMATS:
+            raise InputError(f"{path}: point format {number} has no waveforms; wavebatch needs format 4, 5, 9 or 10")
+        both = las.WAVES_INTERNAL | las.WAVES_EXTERNAL
+        if header.global_encoding & both == both:
+            raise InputError(
+                f"{path}: the header claims packets both in the file and in a .wdp (global encoding bits 1 and 2); "
+                "clear the wrong bit in byte 6 of the file"
+            )
     if number not in las.STANDARD_DTYPES:
         raise damaged(path, f"point format {number} is not known")
     if number >= 6 and header.version < (1, 4):
@@ -89,21 +99,6 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
         used = "64-bit" if count else "legacy"
         warnings = (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
     return CheckedHeader(path, header.file_size, header, dtype, records, points_end, warnings)
-
-
-def _check_waveforms(path: Path, header: las.LasHeader) -> None:
-    number = header.point_format
-    if any(vlr.user == "lascompatible" for vlr in header.vlrs):
-        restore = f"laszip -i {path.name} -o {path.stem}_restored.las"
-        raise InputError(f"{path}: written in LAStools' LAS 1.4 compatibility mode; restore it first: {restore}")
-    if number not in WAVEFORM_FORMATS:
-        raise InputError(f"{path}: point format {number} has no waveforms; wavebatch needs format 4, 5, 9 or 10")
-    both = las.WAVES_INTERNAL | las.WAVES_EXTERNAL
-    if header.global_encoding & both == both:
-        raise InputError(
-            f"{path}: the header claims packets both in the file and in a .wdp (global encoding bits 1 and 2); clear "
-            "the wrong bit in byte 6 of the file"
-        )
 
 
 def _find_points_end(path: Path, header: las.LasHeader) -> int:
@@ -153,23 +148,6 @@ _BYTES = {0, 14}
 
 NEWEST = 3
 """Highest version of an item that lazrs decodes; the compression of LAS 1.5 has version 4."""
-
-
-def open_laz(checked: CheckedHeader) -> LazPoints:
-    """Return a reader of the points.
-
-    Raises InputError if the records of the compression are damaged, or are those of LAS 1.5.
-    """
-    coding = _read_coding(checked.path, checked.header)
-    total = checked.header.point_count
-    if total > checked.size * MAX_POINTS_PER_BYTE:  # a scan of points that cannot be there would never end
-        raise damaged(checked.path, f"the header claims {total} points in {checked.size} bytes")
-    if coding.newest > NEWEST:
-        raise InputError(
-            f"{checked.path}: has the compression of LAS 1.5, which wavebatch does not read; "
-            "decompress it first: laszip -i IN.laz -o OUT.las"
-        )
-    return LazPoints(checked, coding)
 
 
 class _Coding(NamedTuple):
@@ -326,7 +304,18 @@ def open_points(checked: CheckedHeader) -> PointSource:
     Raises InputError if the records of the compression are damaged, or are those of LAS 1.5.
     """
     with reading(checked.path):
-        return open_laz(checked) if checked.header.compressed else _PlainPoints(checked)
+        if not checked.header.compressed:
+            return _PlainPoints(checked)
+        coding = _read_coding(checked.path, checked.header)
+        total = checked.header.point_count
+        if total > checked.size * MAX_POINTS_PER_BYTE:  # a scan of points that cannot be there would never end
+            raise damaged(checked.path, f"the header claims {total} points in {checked.size} bytes")
+        if coding.newest > NEWEST:
+            raise InputError(
+                f"{checked.path}: has the compression of LAS 1.5, which wavebatch does not read; "
+                "decompress it first: laszip -i IN.laz -o OUT.las"
+            )
+        return LazPoints(checked, coding)
 
 
 class _PlainPoints:

@@ -431,24 +431,22 @@ class Judge:
             reason[full], n_samples[full], short[full] = Reason.OVERFULL, 0, False
         if self._rules.packs.any():
             rows = np.flatnonzero(self._rules.packs[fields["index"]] & (reason == Reason.USABLE))
-            index, offset, size = (fields[name][rows] for name in ("index", "offset", "size"))
-            broken = rows[~self._decode(index, offset, size.astype(np.int64))]
+            index, offset = fields["index"][rows], fields["offset"][rows]
+            size = fields["size"][rows].astype(np.int64)
+            # Whether compressed packets are whole, only decoding them shows.
+            good = np.zeros(len(index), bool)
+            packets = PacketFile(self._facts.packets, self._facts.compressed)
+            try:
+                for kind in distinct(index).tolist():
+                    same = np.flatnonzero(index == kind)
+                    length, bits = int(self._rules.samples[kind]), 8 * int(self._rules.width[kind])
+                    for part in np.array_split(same, -(-len(same) * length * bits // 8 // BLOCK_BYTES)):
+                        good[part] = packets.decode(offset[part], size[part], length, bits)[1]
+            finally:
+                packets.close()
+            broken = rows[~good]
             reason[broken], n_samples[broken], short[broken] = Reason.DAMAGED, 0, False
         return Judged(reason, n_samples, keys, short, packed)
-
-    def _decode(self, index: np.ndarray, offset: np.ndarray, size: np.ndarray) -> np.ndarray:
-        """Whether compressed packets are whole, bool (n,): only decoding them shows it."""
-        good = np.zeros(len(index), bool)
-        packets = PacketFile(self._facts.packets, self._facts.compressed)
-        try:
-            for kind in distinct(index).tolist():
-                same = np.flatnonzero(index == kind)
-                n_samples, bits = int(self._rules.samples[kind]), 8 * int(self._rules.width[kind])
-                for rows in np.array_split(same, -(-len(same) * n_samples * bits // 8 // BLOCK_BYTES)):
-                    good[rows] = packets.decode(offset[rows], size[rows], n_samples, bits)[1]
-        finally:
-            packets.close()
-        return good
 
 
 def packed_bytes(n_samples: int, bits: int) -> int:
@@ -643,28 +641,7 @@ def find_forms(
         Without descriptors whose counts are read as they are.
     """
     kinds = _sort_by_kind(sample)
-    little = _find_orders(digitizers, packets, kinds)
-    votes: dict[int, _Votes] = {}
-    for (index, length, packed), offsets in kinds.items():
-        stored = digitizers[index]
-        form = SampleForm(little=little[index][0] if packed else False)
-        samples = read_packet_samples(packets, offsets, length, stored, packed, form)
-        tops = (stored.max_count, form.digitizer(stored, packed).max_count)
-        votes.setdefault(index, _Votes()).add(samples, tops)
-    forms = {}
-    for index in votes:
-        inverted, why = _decide_direction(digitizers, votes, index)
-        order, notes = little.get(index, (False, ""))
-        lines = tuple(f"descriptor {index}: {line}" for line in (notes, why) if line)
-        if inverted or lines:
-            forms[index] = SampleForm(order, inverted, lines)
-    return forms
-
-
-def _find_orders(
-    digitizers: Mapping[int, Digitizer], packets: PacketFile, kinds: Mapping[tuple[int, int, bool], np.ndarray]
-) -> dict[int, tuple[bool, str]]:
-    """Order of packed bits by descriptor, with the reason: in the right one, neighbouring samples differ less."""
+    # Order of packed bits: in the right one, neighbouring samples differ less.
     steps: dict[int, np.ndarray] = {}
     for (index, length, packed), offsets in kinds.items():
         if packed:
@@ -673,15 +650,29 @@ def _find_orders(
             both = [unpack_samples(rows, length, bits, order).astype(np.int64) for order in (False, True)]
             here = np.array([np.abs(np.diff(values, axis=1)).sum() for values in both], np.float64)
             steps[index] = steps.get(index, np.zeros(2)) + here / max(length - 1, 1) / len(rows)
-    found = {}
+    orders = {}
     for index, (big, small) in steps.items():
         little = bool(small < big)
         first, second = ("lowest", "highest") if little else ("highest", "lowest")
-        found[index] = little, (
+        orders[index] = little, (
             f"samples of {digitizers[index].bits} bits are packed, {first} bit first: neighbouring samples differ by "
             f"{min(big, small):.1f} DN, with the {second} bit first by {max(big, small):.1f} DN"
         )
-    return found
+    votes: dict[int, _Votes] = {}
+    for (index, length, packed), offsets in kinds.items():
+        stored = digitizers[index]
+        form = SampleForm(little=orders[index][0] if packed else False)
+        samples = read_packet_samples(packets, offsets, length, stored, packed, form)
+        tops = (stored.max_count, form.digitizer(stored, packed).max_count)
+        votes.setdefault(index, _Votes()).add(samples, tops)
+    forms = {}
+    for index in votes:
+        inverted, why = _decide_direction(digitizers, votes, index)
+        order, notes = orders.get(index, (False, ""))
+        lines = tuple(f"descriptor {index}: {line}" for line in (notes, why) if line)
+        if inverted or lines:
+            forms[index] = SampleForm(order, inverted, lines)
+    return forms
 
 
 def _decide_direction(digitizers: Mapping[int, Digitizer], votes: Mapping[int, _Votes], index: int) -> tuple[bool, str]:

@@ -291,7 +291,30 @@ class PacketFile:
         """Return the first `width` bytes of packets that were checked before, u1 (n, width)."""
         starts = (offsets + np.uint64(self._place.base % 2**64)).astype(np.int64)
         with reporting_reads(self._place.file or Path(), "packets ", "; check the disk"):
-            return self._gather(starts, width)
+            if not len(starts):
+                return np.empty((0, width), np.uint8)
+            first, last = int(starts.min()), int(starts.max())
+            if last - first == (len(starts) - 1) * width and (len(starts) == 1 or np.all(np.diff(starts) == width)):
+                rows = np.empty((len(starts), width), np.uint8)
+                self._fill(rows.reshape(-1), first)
+                return rows
+            span = last - first + width
+            if span <= max(_SPARSE * len(starts) * width, self._span):
+                buffer = self._take_buffer(span)
+                self._fill(buffer, first)
+                return np.lib.stride_tricks.sliding_window_view(buffer, width)[starts - first]
+            order = np.argsort(starts, kind="stable")
+            ordered = starts[order]
+            found = _find_runs(ordered, width, self._gap)
+            runs = [(a, z, int(ordered[a]), int(ordered[z - 1]) + width) for a, z in found]
+            buffer = self._take_buffer(sum(end - begin for _, _, begin, end in runs))
+            place = np.empty(len(starts), np.int64)
+            at = 0
+            for a, z, begin, end in runs:
+                self._fill(buffer[at : at + end - begin], begin)
+                place[order[a:z]] = ordered[a:z] - begin + at
+                at += end - begin
+            return np.lib.stride_tricks.sliding_window_view(buffer, width)[place]
 
     def decode(
         self, offsets: np.ndarray, sizes: np.ndarray, n_samples: int, bits: int
@@ -316,35 +339,6 @@ class PacketFile:
                 samples[rows], good[rows] = decode_packets(buffer, here, ends[a:z] - first, n_samples, bits // 8)
         return samples, good
 
-    def _gather(self, starts: np.ndarray, width: int) -> np.ndarray:
-        n = len(starts)
-        if n == 0:
-            return np.empty((0, width), np.uint8)
-        first, last = int(starts.min()), int(starts.max())
-        if last - first == (n - 1) * width and (n == 1 or np.all(np.diff(starts) == width)):
-            rows = np.empty((n, width), np.uint8)
-            self._fill(rows.reshape(-1), first)
-            return rows
-        span = last - first + width
-        if span <= max(_SPARSE * n * width, self._span):
-            buffer = self._take_buffer(span)
-            self._fill(buffer, first)
-            return _pick(buffer, starts - first, width)
-        return self._gather_sparse(starts, width)
-
-    def _gather_sparse(self, starts: np.ndarray, width: int) -> np.ndarray:
-        order = np.argsort(starts, kind="stable")
-        ordered = starts[order]
-        runs = [(a, z, int(ordered[a]), int(ordered[z - 1]) + width) for a, z in _find_runs(ordered, width, self._gap)]
-        buffer = self._take_buffer(sum(end - begin for _, _, begin, end in runs))
-        place = np.empty(len(starts), np.int64)
-        at = 0
-        for a, z, begin, end in runs:
-            self._fill(buffer[at : at + end - begin], begin)
-            place[order[a:z]] = ordered[a:z] - begin + at
-            at += end - begin
-        return _pick(buffer, place, width)
-
     def _fill(self, target: np.ndarray, at: int) -> None:
         if self._file is None:
             raise InputError("the strip has no packets")
@@ -363,11 +357,6 @@ def _find_runs(ordered: np.ndarray, width: int, gap: int, most: int = 2**62) -> 
     cuts = np.flatnonzero(cut) + 1
     edges = [0, *cuts.tolist(), len(ordered)]
     return zip(edges[:-1], edges[1:], strict=True)
-
-
-def _pick(buffer: np.ndarray, place: np.ndarray, width: int) -> np.ndarray:
-    """Rows (n, width) that begin at `place` in the buffer."""
-    return np.lib.stride_tricks.sliding_window_view(buffer, width)[place]
 
 
 def block_rows(size: int, n_samples: int, bits: int) -> int:

@@ -143,7 +143,7 @@ class StripReader(Closing):
         tolerant: put reasons against processing into `problems` instead of raising InputError. force: do not refuse
         packets of another strip. parts: of all units, in order, where other processes have passed over the points.
         """
-        scan = self._start_scan().run(parts)
+        scan = Scanner(self.facts, self._points, self._packets, self._unit_points, self._sizes).run(parts)
         if not scan.problems and (stranger := self._find_stranger(scan)):
             remedy = "get the one of this strip, or use it all the same with `wavebatch run --force`"
             scan = replace(scan, stranger=stranger, problems=() if force else (f"{stranger}; {remedy}",))
@@ -154,10 +154,8 @@ class StripReader(Closing):
 
     def scan_units(self, first: int, last: int) -> ScanPart:
         """Return what `scan` needs to know of the units [first, last), which are among those of `cut_scan`."""
-        return self._start_scan().scan_units(first, last).seal()
-
-    def _start_scan(self) -> Scanner:
-        return Scanner(self.facts, self._points, self._packets, self._unit_points, self._sizes)
+        scan = Scanner(self.facts, self._points, self._packets, self._unit_points, self._sizes)
+        return scan.scan_units(first, last).seal()
 
     def cut_scan(self, parts: int) -> list[tuple[int, int]]:
         """Return at most so many runs of units that may be scanned one by one, by any processes."""
@@ -369,7 +367,10 @@ class _Geometry:
         """Return the block of packets `rows`; the first return of each packet is its owner."""
         counts = self._counts[rows]
         place = scanner.expand(self._starts[rows], counts)
-        records = self._take(self._entry[place])
+        if self._all is None:
+            unit = self._unit
+            self._all = join_records(unit.points, unit.context) if len(unit.context) else unit.points
+        records = take_whole_records(self._all, self._entry[place])
         xyz = locate(records, self._facts.header)
         location = widen_integers(records["return_point_wave_location"])
         owner = np.cumsum(counts) - counts
@@ -390,14 +391,6 @@ class _Geometry:
             scanner=read_scanner(lead),
             missing=missing,
         )
-
-    def _take(self, entries: np.ndarray) -> np.ndarray:
-        unit = self._unit
-        if not len(unit.context):
-            return take_whole_records(unit.points, entries)
-        if self._all is None:
-            self._all = join_records(unit.points, unit.context)
-        return take_whole_records(self._all, entries)
 
 
 def read_scanner(records: np.ndarray) -> np.ndarray | None:
@@ -471,8 +464,17 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[RaySample, RaySam
     def take(start: int, stop: int) -> float:
         points = reader.read_points(start, stop, scan)
         xyz, time = locate(points, reader.facts.header), widen_integers(points["gps_time"])
-        away = _read_vectors(points, scan)
-        pairs.append(_pair_returns(xyz, time, away))
+        with np.errstate(all="ignore"):
+            away = -packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
+            ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
+            good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
+        away = np.where(good[:, None], away, np.nan)
+        place = np.flatnonzero(time[1:] == time[:-1])
+        apart = xyz[place + 1] - xyz[place]
+        square = (apart * apart).sum(axis=1)
+        far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
+        middle = 0.5 * (xyz[place[far]] + xyz[place[far] + 1])
+        pairs.append(RaySample(time[place[far]], middle, apart[far], square[far], away[place[far]]))
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
         rows = rows[np.isfinite(time[rows]) & np.isfinite(xyz[rows]).all(axis=1) & np.isfinite(away[rows, 0])]
         kept.append(RaySample(time[rows], xyz[rows], away[rows], np.ones(len(rows)), away[rows]))
@@ -523,25 +525,6 @@ def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
     borders = scan.borders
     chosen = even_places(len(borders) - 1, MOST_SLICES)
     return [(int(borders[i]), int(borders[i + 1])) for i in chosen.tolist() if borders[i + 1] > borders[i]]
-
-
-def _read_vectors(points: np.ndarray, scan: StripScan) -> np.ndarray:
-    """Vectors away from the sensor, f8 (n, 3); NaN where they are no directions."""
-    with np.errstate(all="ignore"):
-        away = -packet_check.read_toward(points, scan.vectors.direction, scan.vectors.form)
-        ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
-        good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
-    return np.where(good[:, None], away, np.nan)
-
-
-def _pair_returns(xyz: np.ndarray, time: np.ndarray, away: np.ndarray) -> RaySample:
-    """Rays from neighbouring returns of one pulse; returns far apart get a large weight."""
-    place = np.flatnonzero(time[1:] == time[:-1])
-    apart = xyz[place + 1] - xyz[place]
-    square = (apart * apart).sum(axis=1)
-    far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
-    middle = 0.5 * (xyz[place[far]] + xyz[place[far] + 1])
-    return RaySample(time[place[far]], middle, apart[far], square[far], away[place[far]])
 
 
 def _join(parts: list[RaySample]) -> RaySample:

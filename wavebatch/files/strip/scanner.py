@@ -145,29 +145,24 @@ class NearSharing:
         current = own[last]
         if current.any():
             self.reach = max(self.reach, int((index[last] - index[first])[current].max()))
-        self._mark(keys, index, own, first[current & own[first]])
+        place, where = self.bin(keys[own]), index[own]
+        self._last[place] = where
+        bins = place[::-1]
+        unseen = self._first[bins] < 0
+        self._first[bins[unseen]] = where[::-1][unseen]
+        new = self.bin(keys[first[current & own[first]]])
+        if len(new):
+            low, high = int(new.min()), int(new.max())
+            if high - low < 8 * len(new):  # as nearly always: packets follow the points, and counting takes a tenth
+                self._new[low : high + 1] += np.bincount(new - low).astype(np.int32)
+            else:
+                np.add.at(self._new, new, 1)
         self.overfull.append(keys[first[groups.counts > MAX_RETURNS]])
         target, member = cross_units(groups, unit)
         here = unit[-1] if len(unit) else -1
         fresh = own[member] | (target == here)
         self._context.append(target[fresh], records(member[fresh]))
         return groups
-
-    def _mark(self, keys: np.ndarray, index: np.ndarray, own: np.ndarray, new: np.ndarray) -> None:
-        place = self.bin(keys[own])
-        where = index[own]
-        self._last[place] = where
-        fresh = place[::-1]
-        unseen = self._first[fresh] < 0
-        self._first[fresh[unseen]] = where[::-1][unseen]
-        fresh = self.bin(keys[new])
-        if not len(fresh):
-            return
-        low, high = int(fresh.min()), int(fresh.max())
-        if high - low < 8 * len(fresh):  # as nearly always: packets follow the points, and counting takes a tenth
-            self._new[low : high + 1] += np.bincount(fresh - low).astype(np.int32)
-        else:
-            np.add.at(self._new, fresh, 1)
 
     def bin(self, keys: np.ndarray) -> np.ndarray:
         """Return the bin of each key (n,)."""
@@ -194,10 +189,6 @@ class NearSharing:
     def suspects(self) -> np.ndarray:
         """Return for each bin whether its points lie too far apart for the window."""
         return (self._last - self._first) >= self._window
-
-    def count_packets(self, suspects: np.ndarray) -> int:
-        """Return the number of different packets in all other bins."""
-        return int(self._new[~suspects].sum())
 
 
 def find_far(
@@ -452,7 +443,7 @@ class Scanner:
         near = found.near
         with undoing(found.close):
             suspects = near.suspects()
-            packets, reach = near.count_packets(suspects), near.reach
+            packets, reach = int(near._new[~suspects].sum()), near.reach
             full = [np.empty(0, np.uint64), *near.overfull]
             if suspects.any():
                 more, far_reach, far_overfull = self._go_far(suspects)
@@ -469,7 +460,39 @@ class Scanner:
                     tally.first[check.Reason.OVERFULL] = start + int(np.argmax(here))
                 tally.reasons[check.Reason.OVERFULL] += many
                 tally.reasons[check.Reason.USABLE] -= many
-        return self._finish(packets - len(overfull), reach, overfull, MAX_RETURNS if suspects.any() else MOST_OVERLAP)
+        facts, points, tally = self._facts, self._facts.header.point_count, found.tally
+        usable, missing = int(tally.reasons[check.Reason.USABLE]), int(tally.reasons[check.Reason.NO_WAVEFORM])
+        decision = check.decide_direction(found.votes, facts.direction_option, metres_per_unit(facts.units)[0])
+        reasons = tally.describe()
+        problems = list(decision.problems)
+        if not usable and missing < points:
+            problems.insert(0, describe_hopeless(facts, reasons))
+        low, high = facts.packets.offsets
+        most = MAX_RETURNS if suspects.any() else MOST_OVERLAP
+        if found.claimed > most * max(high - low, 0):
+            problems.append(
+                f"packets overlap: they claim {found.claimed:,} bytes of {high - low:,}; the strip is damaged, or its "
+                "packets belong to another one: get both again"
+            )
+        return StripScan(
+            points=points,
+            with_waveform=usable,
+            without_waveform=missing,
+            broken=points - usable - missing,
+            packets=packets - len(overfull),
+            short=tally.short,
+            reasons=reasons,
+            by_descriptor={i: int(tally.by_descriptor[i]) for i in np.flatnonzero(tally.by_descriptor).tolist()},
+            reach=reach,
+            vectors=decision,
+            borders=np.array(found.borders or [0]),
+            overfull=overfull,
+            context=found.context,
+            decoded=found.decoded,
+            warnings=(*describe_oddities(reasons, tally.short), *decision.warnings),
+            problems=tuple(problems),
+            forms=check.find_forms(facts.digitizers, self._packets, found.sample),
+        )
 
     def _cut_units(self, first: int, last: int) -> Iterator[tuple[int, np.ndarray]]:
         """Yields first index and points of each unit, and collects the borders."""
@@ -503,12 +526,6 @@ class Scanner:
             return self._source.read(start, stop)
         return here if len(here) == stop - start else np.concatenate([here, self._source.read(start + len(here), stop)])
 
-    def _keep(self, unit: int, points: np.ndarray) -> None:
-        """Keep the points of a compressed strip: to decode them again takes twenty times as long as to read them."""
-        size = (unit + 1) * self._unit_points * points.itemsize
-        if self._keeps and size <= self._sizes.kept_bytes:
-            self._try_keeping(lambda: self._found.decoded.append(np.full(len(points), unit), points))
-
     def _try_keeping(self, write: Callable[[], object]) -> None:
         """Do without the kept points where there is no room for them."""
         try:
@@ -519,7 +536,10 @@ class Scanner:
 
     def _add_unit(self, start: int, points: np.ndarray) -> None:
         unit = self._first + len(self._found.borders) - 1
-        self._keep(unit, points)
+        # Of a compressed strip, because to decode points again takes twenty times as long as to read them.
+        size = (unit + 1) * self._unit_points * points.itemsize
+        if self._keeps and size <= self._sizes.kept_bytes:
+            self._try_keeping(lambda: self._found.decoded.append(np.full(len(points), unit), points))
         judged = self._judge.judge(points, self._form)
         self._found.tally.add(points, start, judged)
         rows = np.flatnonzero(judged.usable)
@@ -593,42 +613,6 @@ class Scanner:
             rows = rows[np.argsort(index[rows], kind="stable")]
             near = _Near(judged.keys[rows], np.arange(len(rows)), rows, take_whole_records(points, rows), 0)
             self._vote(group_keys(near.keys), near, np.ones(len(rows), bool))
-
-    def _finish(self, packets: int, reach: int, overfull: np.ndarray, most: int) -> StripScan:
-        """most: how many times packets may claim the bytes that are there."""
-        found, facts, points = self._found, self._facts, self._facts.header.point_count
-        tally = found.tally
-        usable, missing = int(tally.reasons[check.Reason.USABLE]), int(tally.reasons[check.Reason.NO_WAVEFORM])
-        decision = check.decide_direction(found.votes, facts.direction_option, metres_per_unit(facts.units)[0])
-        reasons = tally.describe()
-        problems = list(decision.problems)
-        if not usable and missing < points:
-            problems.insert(0, describe_hopeless(facts, reasons))
-        low, high = facts.packets.offsets
-        if found.claimed > most * max(high - low, 0):
-            problems.append(
-                f"packets overlap: they claim {found.claimed:,} bytes of {high - low:,}; the strip is damaged, or its "
-                "packets belong to another one: get both again"
-            )
-        return StripScan(
-            points=points,
-            with_waveform=usable,
-            without_waveform=missing,
-            broken=points - usable - missing,
-            packets=packets,
-            short=tally.short,
-            reasons=reasons,
-            by_descriptor={i: int(tally.by_descriptor[i]) for i in np.flatnonzero(tally.by_descriptor).tolist()},
-            reach=reach,
-            vectors=decision,
-            borders=np.array(found.borders or [0]),
-            overfull=overfull,
-            context=found.context,
-            decoded=found.decoded,
-            warnings=(*describe_oddities(reasons, tally.short), *decision.warnings),
-            problems=tuple(problems),
-            forms=check.find_forms(facts.digitizers, self._packets, found.sample),
-        )
 
 
 @frozen(eq=False)
