@@ -27,7 +27,7 @@ from wavebatch.files.geojson import load_polygons
 from wavebatch.files.text_file import write_text
 from wavebatch.files.toml_file import describe_record
 from wavebatch.tools import return_stats as returns
-from wavebatch.tools.raster import ForestOptions, GridOptions, GridResult, write_grid
+from wavebatch.tools.raster import ForestOptions, GridOptions, write_grid
 from wavebatch.tools.sheets.sheet import Fact, Note, Part, Sheet, Table, format_csv, list_facts
 
 EXIT_UNREADABLE = 1
@@ -81,7 +81,11 @@ def stats(clouds: tuple[Path, ...], output: Path | None, **options: Any) -> None
     if output is not None and failed:
         talk(f"error: {output}: not written, because {count(len(failed), 'cloud')} of {len(files)} cannot be read")
     elif output is not None:
-        write_text(output, _format_table(each, total), overwrite=options["overwrite"])
+        every = [*each, total] if len(each) > 1 else each
+        parts = [(one.cloud, part) for one in every for part in (one, *one.areas)]
+        most = [max((max(getattr(part, name), default=0) for _, part in parts), default=0) for name in _COUNTED]
+        rows = [_table_row(cloud, part, *most) for cloud, part in parts]
+        write_text(output, format_csv(list(rows[0]), (row.values() for row in rows)), overwrite=options["overwrite"])
     shown = [*each, total] if len(files) > 1 else each
     document = {"files": [_plain(one) for one in each], "total": _plain(total)}
     sheets = [_sheet(one) for one in shown]
@@ -122,15 +126,6 @@ def _sheet(found: returns.ReturnStats) -> Sheet:
     return Sheet(found.cloud, [*parts, Table(head, rows, forms, shown=SHOWN)])
 
 
-def _format_table(each: Sequence[returns.ReturnStats], total: returns.ReturnStats) -> str:
-    """CSV: one row per cloud and per area of it; for several clouds also the total."""
-    every = [*each, total] if len(each) > 1 else each
-    parts = [(one.cloud, part) for one in every for part in (one, *one.areas)]
-    most = [max((max(getattr(part, name), default=0) for _, part in parts), default=0) for name in _COUNTED]
-    rows = [_table_row(cloud, part, *most) for cloud, part in parts]
-    return format_csv(list(rows[0]), (row.values() for row in rows))
-
-
 def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_count: int) -> dict[str, Any]:
     """Values of a cloud or an area by column; most_...: largest return number and number of returns of the table."""
     is_area = isinstance(part, returns.AreaStats)
@@ -140,7 +135,14 @@ def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_coun
     found |= {f"return_{k}": part.by_number.get(k, 0.0) for k in range(1, 1 + most_number)}
     found |= {f"pulses_with_{k}": part.by_count.get(k, 0.0) for k in range(1, 1 + most_count)}
     ends = ["", *(f"_{pair.replace('-', '_').rstrip('_')}" for pair in returns.RANKS)]
-    for end, one in zip(ends, [part if is_area else part.separations["all"], *_rank_pairs(part)], strict=True):
+    # A cloud has more classes above the third than RANKS, which are joined here.
+    unknown = returns.Separation(0, math.nan, math.nan)
+    apart = {pair: part.separations.get(pair, unknown) for pair in returns.RANKS[:-1]}
+    rest = [one for name, one in part.separations.items() if name not in (*apart, "all") and one.pairs]
+    pairs, least = sum(one.pairs for one in rest), min((one.least for one in rest), default=math.nan)
+    others = returns.describe_pairs(pairs, sum(one.pairs * one.mean for one in rest), least)
+    every = part if is_area else part.separations["all"]
+    for end, one in zip(ends, [every, *apart.values(), others], strict=True):
         found |= {f"pairs{end}": one.pairs, f"mean_m{end}": one.mean, f"least_m{end}": one.least}
     found |= describe_record(part)
     # Distances are collected per cloud only: a histogram per area would need too much memory.
@@ -149,17 +151,6 @@ def _table_row(cloud: str, part: returns.PulseStats, most_number: int, most_coun
         zone = zones.get(name, returns.DeadZone(0, math.nan, math.nan))
         found |= {f"dead_zone_m{end}": zone.size, f"dead_zone_err_m{end}": zone.error}
     return found
-
-
-def _rank_pairs(part: returns.PulseStats) -> list[returns.Separation]:
-    """Distances per class of RANKS; a cloud has more classes above the third, which are joined here."""
-    found = {}
-    for pair in returns.RANKS[:-1]:
-        found[pair] = part.separations.get(pair, returns.Separation(0, math.nan, math.nan))
-    rest = [one for name, one in part.separations.items() if name not in (*found, "all") and one.pairs]
-    pairs = sum(one.pairs for one in rest)
-    least = min((one.least for one in rest), default=math.nan)
-    return [*found.values(), returns.describe_pairs(pairs, sum(one.pairs * one.mean for one in rest), least)]
 
 
 def _plain(found: returns.ReturnStats) -> dict[str, Any]:
@@ -224,42 +215,31 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     if found.filled < cells / 1000 and cells > FEW_CELLS:
         share = f"{100 * found.filled / cells:.1g} % of the cells have a value"
         talk(f"warning: {output}: only {share}: if clouds lie far apart, make a raster of each")
-    tell(f"{output}: {_summarise(found, columns)}")
-    statistic = None if forest else options["statistic"]
-    answer({"output": str(output), "clouds": [str(path) for path in paths], "statistic": statistic,
-            **_describe(found, columns)})  # fmt: skip
-
-
-def _summarise(found: GridResult, columns: Sequence[str]) -> str:
-    layout = found.layout
-    used = found.points - found.left_out - found.outside
+    extent = f"{layout.columns} x {layout.rows} cells of {layout.size:g} {layout.unit}"
     if found.reasons:
         known, few, dark = found.reasons
-        return (
-            f"{count(found.points, 'voxel')}, {found.outside} outside; {layout.columns} x {layout.rows} cells of "
-            f"{layout.size:g} {layout.unit}: {known} with metrics, {few} with fewer than 10 rays, "
-            f"{dark} without light on the ground"
+        text = (
+            f"{count(found.points, 'voxel')}, {found.outside} outside; {extent}: {known} with metrics, {few} with "
+            f"fewer than 10 rays, {dark} without light on the ground"
         )
-    parts = [f"{name or 'points'} {values} values, {used - values} without data"
-             for name, values in zip(columns or ("",), found.values, strict=True)]  # fmt: skip
-    return (
-        f"{count(found.points, 'point')}, {found.left_out} left out, {found.outside} outside; "
-        f"{'; '.join(parts)}; {layout.columns} x {layout.rows} cells of {layout.size:g} {layout.unit}, {found.filled} "
-        "with a value"
-    )
-
-
-def _describe(found: GridResult, columns: Sequence[str]) -> dict[str, Any]:
-    """The raster and the counts as plain values."""
-    layout = found.layout
+    else:
+        used = found.points - found.left_out - found.outside
+        parts = [f"{name or 'points'} {values} values, {used - values} without data"
+                 for name, values in zip(columns or ("",), found.values, strict=True)]  # fmt: skip
+        text = (
+            f"{count(found.points, 'point')}, {found.left_out} left out, {found.outside} outside; {'; '.join(parts)}; "
+            f"{extent}, {found.filled} with a value"
+        )
+    tell(f"{output}: {text}")
+    statistic = None if forest else options["statistic"]
     used = sum(found.reasons) or found.points - found.left_out - found.outside
-    if found.reasons:
-        columns = [""] * len(found.bands)
+    names = [""] * len(found.bands) if found.reasons else columns or ("",)
     bands = [{"column": name or None, "description": band.description, "unit": band.unit, "values": values,
               "no_data": used - values}
-             for name, band, values in zip(columns or ("",), found.bands, found.values, strict=True)]  # fmt: skip
+             for name, band, values in zip(names, found.bands, found.values, strict=True)]  # fmt: skip
     east, south = layout.west + layout.columns * layout.size, layout.north - layout.rows * layout.size
-    cells = {"columns": layout.columns, "rows": layout.rows, "size": layout.size, "filled": found.filled}
-    return {"points": found.points, "left_out": found.left_out, "outside": found.outside, "bands": bands, **cells,
+    answer({"output": str(output), "clouds": [str(path) for path in paths], "statistic": statistic,
+            "points": found.points, "left_out": found.left_out, "outside": found.outside, "bands": bands,
+            "columns": layout.columns, "rows": layout.rows, "size": layout.size, "filled": found.filled,
             "bounds": [layout.west, south, east, layout.north], "unit": layout.unit, "crs": layout.crs,
-            "no_data_value": layout.no_data}  # fmt: skip
+            "no_data_value": layout.no_data})  # fmt: skip

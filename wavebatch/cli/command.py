@@ -96,8 +96,12 @@ def read_settings(command: click.Command, title: str, context: click.Context, ar
         context.default_map = {name: value for values in found.values() for name, value in values.items()}
 
 
-def drop_rivals(context: click.Context) -> None:
-    """Put settings aside that exclude an option that counts more: of the command line, or of a variable."""
+def settle_options(context: click.Context) -> None:
+    """Put settings aside that exclude an option that counts more: of the command line, or of a variable.
+
+    Then print the settings in force in one line, keep them for --dry-run, and name variables without use. With --quiet
+    those of a file are printed still: who types the command may not know of the file.
+    """
     options = _list_options(context.command)
     for rivals in EXCLUSIVE:
         given = {name: _ORDER.index(source) for name in rivals
@@ -107,15 +111,8 @@ def drop_rivals(context: click.Context) -> None:
             default = options[name].get_default(context)
             context.params[name] = default if isinstance(default, bool | int | str) else None
             context.set_parameter_source(name, ParameterSource.DEFAULT)
-
-
-def tell_settings(context: click.Context) -> None:
-    """Print the settings in force in one line, keep them for --dry-run, and name variables without use.
-
-    With --quiet those of a file are printed still: who types the command may not know of the file.
-    """
     lines, shown = [], []
-    for name, option in _list_options(context.command).items():
+    for name, option in options.items():
         source = context.get_parameter_source(name)
         if source is ParameterSource.DEFAULT_MAP:
             place, value = next((str(path), values[name]) for path, values in context.meta[READ].items()
@@ -137,12 +134,14 @@ def tell_settings(context: click.Context) -> None:
 def _find_strangers(context: click.Context) -> Iterator[str]:
     """What is wrong with variables of our name that no command reads."""
     given = [name for name in os.environ if name.startswith(PREFIX)]
-    if set(given) <= _list_variables(context.command):  # nearly always: the other commands need not be imported
+    read = {name for option in _list_options(context.command).values() for name in option.envvar or ()}
+    if read.issuperset(given):  # nearly always: the other commands need not be imported
         return
     import difflib
 
     commands = dict(_load_all(context.find_root()))
-    known = {name.removeprefix(PREFIX) for one in commands.values() for name in _list_variables(one)}
+    every = [option for one in commands.values() for option in _list_options(one).values()]
+    known = {name.removeprefix(PREFIX) for option in every for name in option.envvar or ()}
     prefixes = tuple(f"{name.upper().replace(' ', '_')}_" for name in commands)
     for name in sorted(name.removeprefix(PREFIX) for name in given):
         near = difflib.get_close_matches(name, known, 1, SIMILAR)
@@ -167,10 +166,6 @@ def _load_all(root: click.Context) -> Iterator[tuple[str, click.Command]]:
 
 def _list_options(command: click.Command) -> dict[str, click.Option]:
     return {one.name: one for one in command.params if isinstance(one, click.Option)}
-
-
-def _list_variables(command: click.Command) -> set[str]:
-    return {name for option in _list_options(command).values() for name in option.envvar or ()}
 
 
 def _option_name(option: click.Option) -> str:
@@ -378,8 +373,7 @@ class ProgramCommand(click.Command):
                 if isinstance(number, float) and not math.isfinite(number) and option.name not in MAYBE_NAN:
                     raise click.BadParameter(f"{number} is not a finite number.", ctx, option)
         if is_real:
-            drop_rivals(ctx)
-            tell_settings(ctx)
+            settle_options(ctx)
         return rest
 
     def _rename(self, word: str) -> str:
@@ -498,7 +492,10 @@ def _pages(command: click.Command, ctx: click.Context, title: str = "") -> Itera
         lines.append(".SH COMMANDS")
         for one, its in inner.items():
             lines += [".TP", f"\\fB{roff(f'wavebatch-{one}(1)')}\\fR", roff(_first_line(its.help))]
-    lines += _options(command, ctx)
+    for heading, records in group_options(command, ctx):
+        lines.append(f".SH {heading.upper()}")
+        for names, text in records:
+            lines += [".TP", f"\\fB{roff(names)}\\fR", roff(" ".join(text.split()))]
     if examples := getattr(command, "examples", ()):
         lines.append(".SH EXAMPLES")
         for line, purpose in examples:
@@ -508,13 +505,6 @@ def _pages(command: click.Command, ctx: click.Context, title: str = "") -> Itera
     yield name, "\n".join(lines) + "\n"
     for one, its in inner.items():
         yield from _pages(its, click.Context(its, info_name=one, parent=ctx), f"{title} {one}".strip())
-
-
-def _options(command: click.Command, ctx: click.Context) -> Iterator[str]:
-    for heading, records in group_options(command, ctx):
-        yield f".SH {heading.upper()}"
-        for names, text in records:
-            yield from (".TP", f"\\fB{roff(names)}\\fR", roff(" ".join(text.split())))
 
 
 def _describe(text: str) -> Iterator[str]:

@@ -96,7 +96,23 @@ def compare(a: Path, b: Path | None, strip: Path | None, output: Path | None, **
             f"warning: A and B have {common} in common; are they results of one strip, in one CRS? "
             "Positions of two formats may differ: try a larger --within"
         )
-    broken = _check_thresholds(between, options)
+    time = between.differences.get("time")
+    figures = {
+        "min_completeness": between.completeness,
+        "min_correctness": between.correctness,
+        "min_exact": between.exact_count,
+        "max_median": abs(time.median) if time else math.nan,
+        "max_rmse": time.rms if time else math.nan,
+        "max_nmad": time.nmad if time else math.nan,
+    }
+    broken = []  # a line per threshold that is not met; NaN meets none
+    for name, figure in figures.items():
+        limit = options[name]
+        if limit is None:
+            continue
+        fine = figure >= limit if name.startswith("min") else figure <= limit
+        if not fine:
+            broken.append(f"threshold --{name.replace('_', '-')} {limit:g} is not met: {between.a} has {figure:.6g}")
     names = " with ".join(Path(side).name for side in (between.a, between.b) if side)
     warnings = (Note(words, "warning") for words in broken)
     shared.write_html(options["html_file"], names, [*warnings, *parts, Fact("wavebatch", __version__)])
@@ -140,28 +156,6 @@ def _match(a: Path, b: Path | None, strip: Path, options: dict) -> Matchup:
     return match_sides(strip, *sides, **more)
 
 
-def _check_thresholds(result: Comparison, options: dict) -> list[str]:
-    """A line per threshold that is not met; NaN meets none."""
-    time = result.differences.get("time")
-    figures = {
-        "min_completeness": result.completeness,
-        "min_correctness": result.correctness,
-        "min_exact": result.exact_count,
-        "max_median": abs(time.median) if time else math.nan,
-        "max_rmse": time.rms if time else math.nan,
-        "max_nmad": time.nmad if time else math.nan,
-    }
-    lines = []
-    for name, figure in figures.items():
-        limit = options[name]
-        if limit is None:
-            continue
-        fine = figure >= limit if name.startswith("min") else figure <= limit
-        if not fine:
-            lines.append(f"threshold --{name.replace('_', '-')} {limit:g} is not met: {result.a} has {figure:.6g}")
-    return lines
-
-
 _UNITS = {"time": "time ns", "echo_time": "echo_time ns", "amplitude": "amplitude DN", "echo_width": "width ns"}
 _SPREAD = ("number", "median", "mean", "rms", "nmad")
 """What the tables show of a difference."""
@@ -184,7 +178,10 @@ def _list_parts(one: Comparison) -> Iterator[Part]:
         yield Fact("pulses", one.pulses)
     numbers = sorted({*one.counts_a, *one.counts_b}) if one.pulses else ()
     rows = [(str(n), one.counts_a.get(n, 0), one.counts_b.get(n, 0)) for n in numbers]
-    yield Sheet("Echoes per pulse", [Table(("echoes per pulse", "A", "B"), rows), Later(lambda: [_sums(one)])])
+    sides = (("echoes of A", one.echoes_a, one.extra, "extra"), ("echoes of B", one.echoes_b, one.missed, "missed"))
+    sums = sum_table((title, whole, f"{one.matched:,} identical + {rest:,} {name}", one.matched + rest == whole)
+                     for title, whole, rest, name in sides)  # fmt: skip
+    yield Sheet("Echoes per pulse", [Table(("echoes per pulse", "A", "B"), rows), Later(lambda: [sums])])
     # Differences of the echoes of both sides, also by class and by number of echoes where there are several.
     spread = lambda of: tuple(getattr(of, name) for name in _SPREAD)  # noqa: E731
     rows = [(_UNITS[name], *spread(of)) for name, of in one.differences.items()]
@@ -219,12 +216,6 @@ def _draw(one: Comparison) -> Iterator[Picture]:
     for side, counts in (("A", one.counts_a), ("B", one.counts_b)) if one.pulses else ():
         shown = {str(number): counts.get(number, 0) for number in range(min(max(counts, default=0), 16) + 1)}
         yield from draw_counts(shown, title=f"Echoes per pulse, {side}", label="echoes")
-
-
-def _sums(one: Comparison) -> Table:
-    sides = (("echoes of A", one.echoes_a, one.extra, "extra"), ("echoes of B", one.echoes_b, one.missed, "missed"))
-    return sum_table((title, whole, f"{one.matched:,} identical + {rest:,} {name}", one.matched + rest == whole)
-                     for title, whole, rest, name in sides)  # fmt: skip
 
 
 def _list_match(result: Matchup) -> Iterator[Sheet]:

@@ -59,9 +59,22 @@ def info(strips: tuple[str, ...], direction: str, headerless: bool, **options: A
     def show(path: Path) -> dict[str, Any]:
         facts = describe_file(path, direction=direction, headerless=headerless)
         if options["verbose"] and facts.get("packets", {}).get("count") and not facts["problems"]:
-            facts["pulse"] = _describe_pulse(path, direction, headerless)
+            from wavebatch.core.units import FWHM_PER_SIGMA
+            from wavebatch.surveying.systems.known_systems import find_likeness
+            from wavebatch.tools.api import open_strip, survey
+
+            with open_strip(path, direction=direction, headerless=headerless) as strip:
+                found = survey(strip)
+            like = find_likeness(found.system, found.figures.spacing_ns)
+            facts["pulse"] = {
+                "full_width_ns": FWHM_PER_SIGMA * found.system.sigma_ref,
+                "noise_dn": found.system.noise.std,
+                "sensor": like and like.known.sensor,
+                "difference": like and like.difference,
+                "sentence": like.describe() if like else "this strip's pulse looks like that of no known sensor",
+            }
         if not options["as_json"]:
-            sheet = _sheet(facts)
+            sheet = Sheet(facts["file"], list(_list_parts(facts)))
             print_sheet(sheet if path == paths[0] else Sheet("info", [sheet]))  # an empty line between two
         if facts["problems"] and not facts.get("points_with_waveform"):  # points are shown, packets cannot be
             nonlocal lost
@@ -72,24 +85,6 @@ def info(strips: tuple[str, ...], direction: str, headerless: bool, **options: A
     results, failed = shared.for_each(paths, show, debug=options["debug"])
     answer(results[0] if len(paths) == 1 else results)
     sys.exit(EXIT_UNREADABLE if failed or lost else 0)
-
-
-def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, Any]:
-    """The pulse of a strip by its survey, and the known sensor that it looks like."""
-    from wavebatch.core.units import FWHM_PER_SIGMA
-    from wavebatch.surveying.systems.known_systems import find_likeness
-    from wavebatch.tools.api import open_strip, survey
-
-    with open_strip(path, direction=direction, headerless=headerless) as strip:
-        found = survey(strip)
-    like = find_likeness(found.system, found.figures.spacing_ns)
-    return {
-        "full_width_ns": FWHM_PER_SIGMA * found.system.sigma_ref,
-        "noise_dn": found.system.noise.std,
-        "sensor": like and like.known.sensor,
-        "difference": like and like.difference,
-        "sentence": like.describe() if like else "this strip's pulse looks like that of no known sensor",
-    }
 
 
 @click.command()
@@ -130,11 +125,8 @@ def check(files: tuple[Path, ...], direction: str, headerless: bool, **options: 
     sys.exit(0 if clean else EXIT_PROBLEMS)
 
 
-def _sheet(facts: dict[str, Any]) -> Sheet:
-    return Sheet(facts["file"], [*_list_header(facts), *_list_points(facts), *_list_packets(facts), *_list_rest(facts)])
-
-
-def _list_header(facts: dict[str, Any]) -> Iterator[Part]:
+def _list_parts(facts: dict[str, Any]) -> Iterator[Part]:
+    """Header, points, packets and records of a file."""
     kind = "LAZ" if facts["compressed"] else "LAS"
     yield Fact("file", f"{facts['file']} ({facts['bytes']} bytes)")
     yield Fact("format", f"{kind} {facts['las_version']}, point format {facts['point_format']}")
@@ -151,10 +143,7 @@ def _list_header(facts: dict[str, Any]) -> Iterator[Part]:
     crs = " ".join((facts["crs"] or "none").split())
     yield Fact("CRS", crs if len(crs) <= _LONG else crs[: _LONG - 3] + "...")
     yield Fact("coordinates", facts["coordinates"])
-
-
-def _list_points(facts: dict[str, Any]) -> Iterator[Part]:
-    """Number, flags, extent, times, returns and classes of the points."""
+    # Number, flags, extent, times, returns and classes of the points
     yield Fact("points", facts["points"])
     if "counts" in facts:
         counts = facts["counts"]
@@ -181,40 +170,34 @@ def _list_points(facts: dict[str, Any]) -> Iterator[Part]:
     if facts.get("scan_angle_deg"):
         yield Fact("scan angle", "{:g} to {:g} degrees".format(*facts["scan_angle_deg"]))
         yield Fact("intensity", "{:g} to {:g}".format(*facts["intensity"]))
-
-
-def _list_packets(facts: dict[str, Any]) -> Iterator[Part]:
-    if "packets" not in facts:
-        return
-    packets, samples, vectors = facts["packets"], facts["samples"], facts["vectors"]
-    share, ratio = facts["share_with_waveform"], vectors["length_over_half_c"]
-    yield Fact("with waveform", f"{facts['points_with_waveform']}" + ("" if share is None else f" ({share:.1%})"))
-    yield Fact("without", f"{facts['points_without_waveform']}, broken {facts['points_broken']}")
-    yield Fact("packets", f"{packets['count']} in {packets['file'] or 'no file'} ({packets['bytes']} bytes)")
-    for one in packets["descriptors"]:
-        words = f"{one['samples']} samples of {one['bits']} bits, {one['spacing_ns']:g} ns apart"
-        yield Fact(f"descriptor {one['index']}", f"{words}; {count(one['points'], 'point')}")
-    if packets["descriptors_unused"]:
-        yield Fact("descriptors", f"{packets['descriptors_unused']} more, which no point uses")
-    if samples["waveforms_read"]:
-        lengths = ", ".join(map(str, samples["lengths"][:8])) + (" ..." if len(samples["lengths"]) > 8 else "")
-        read, limited = (count(samples[name], "waveform") for name in ("waveforms_read", "waveforms_at_limit"))
-        values = f"{samples['least']} to {samples['largest']}"
-        yield Fact("samples", f"{values} in {read} of {lengths} samples; {limited} at the limit")
-        if samples["waveforms_with_gaps"]:
-            gaps = count(samples["waveforms_with_gaps"], "waveform")
-            yield Fact("gaps", f"{gaps} with fill between recordings, which is no sample")
-    yield Fact("vectors", f"{vectors['direction']} the sensor: {vectors['evidence']}")
-    if ratio is not None:
-        yield Fact("vector length", f"{ratio:.4f} of c/2" + (" (once divided)" if vectors["form"] == "range" else ""))
-    if "pulse" in facts:
-        pulse = facts["pulse"]
-        width = f"{pulse['full_width_ns']:.3g} ns at half maximum, noise {pulse['noise_dn']:.3g} DN"
-        yield Fact("pulse", f"{width}; {pulse['sentence']}")
-
-
-def _list_rest(facts: dict[str, Any]) -> Iterator[Part]:
-    """Extra bytes and records; descriptors of packets have a line already."""
+    if "packets" in facts:
+        packets, samples, vectors = facts["packets"], facts["samples"], facts["vectors"]
+        share, ratio = facts["share_with_waveform"], vectors["length_over_half_c"]
+        yield Fact("with waveform", f"{facts['points_with_waveform']}" + ("" if share is None else f" ({share:.1%})"))
+        yield Fact("without", f"{facts['points_without_waveform']}, broken {facts['points_broken']}")
+        yield Fact("packets", f"{packets['count']} in {packets['file'] or 'no file'} ({packets['bytes']} bytes)")
+        for one in packets["descriptors"]:
+            words = f"{one['samples']} samples of {one['bits']} bits, {one['spacing_ns']:g} ns apart"
+            yield Fact(f"descriptor {one['index']}", f"{words}; {count(one['points'], 'point')}")
+        if packets["descriptors_unused"]:
+            yield Fact("descriptors", f"{packets['descriptors_unused']} more, which no point uses")
+        if samples["waveforms_read"]:
+            lengths = ", ".join(map(str, samples["lengths"][:8])) + (" ..." if len(samples["lengths"]) > 8 else "")
+            read, limited = (count(samples[name], "waveform") for name in ("waveforms_read", "waveforms_at_limit"))
+            values = f"{samples['least']} to {samples['largest']}"
+            yield Fact("samples", f"{values} in {read} of {lengths} samples; {limited} at the limit")
+            if samples["waveforms_with_gaps"]:
+                gaps = count(samples["waveforms_with_gaps"], "waveform")
+                yield Fact("gaps", f"{gaps} with fill between recordings, which is no sample")
+        yield Fact("vectors", f"{vectors['direction']} the sensor: {vectors['evidence']}")
+        if ratio is not None:
+            divided = " (once divided)" if vectors["form"] == "range" else ""
+            yield Fact("vector length", f"{ratio:.4f} of c/2{divided}")
+        if "pulse" in facts:
+            pulse = facts["pulse"]
+            width = f"{pulse['full_width_ns']:.3g} ns at half maximum, noise {pulse['noise_dn']:.3g} DN"
+            yield Fact("pulse", f"{width}; {pulse['sentence']}")
+    # Extra bytes and records; descriptors of packets have a line already
     for one in facts["extra_bytes"]:
         scale = "" if one["scale"] is None else f", scale {one['scale']:g}"
         empty = "" if one["no_data"] is None else f", no-data {' '.join(one['no_data'])}"

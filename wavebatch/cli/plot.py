@@ -348,55 +348,22 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
       # a sheet of 100 random waveforms
       wavebatch plot waveform strip.las -o sheet.png --random 100 --sheet
     """  # fmt: skip
+    from wavebatch.batch.options import RunOptions
     from wavebatch.core.condition import read_flags
     from wavebatch.files.cloud.point_filter import PointFilter
-    from wavebatch.tools.plots.waveform import Wanted, format_echoes
+    from wavebatch.files.strip.reader import StripReader
+    from wavebatch.surveying.prepare import Positions, prepare
+    from wavebatch.tools.api import find_request
+    from wavebatch.tools.plots.waveform import Wanted, add_ranges, find_places, format_echoes, name_chain, read_views
 
     tabular = output.suffix.lower() == ".csv"
-    for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
-        if options[name]:
+    for key, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
+        if options[key]:
             raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
     (check_target if tabular else check_picture)(output, overwrite=options["overwrite"])
     chosen = PointFilter(flags=read_flags(options["flags"]), where=options["where"])
     wanted = shared.from_options(Wanted, options, points=options["point_numbers"], chosen=chosen)
-    views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
-    if tabular:
-        write_text(output, format_echoes(views), overwrite=options["overwrite"])
-    else:
-        _draw_waveforms(views, output, strip.name, chain, options)
-    echoes = sum(len(view.echoes) for view in views)
-    tell(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
-    answer({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
-
-
-def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, options: dict[str, Any]) -> None:
-    """Draws the waveforms as small multiples or as a contact sheet."""
-    from wavebatch.tools.plots.draw_waveform import draw_waveform_panels, draw_waveform_sheet
-
-    shown, more = options["shown"], {"strip": strip, "chain": chain, "overwrite": options["overwrite"]}
-    if shown == "all":
-        last = max(float(view.time[-1] + 0.5 * view.spacing) for view in views)
-        shown = (min(-0.5 * view.spacing for view in views), last)
-    if shown and all(view.time[-1] < shown[0] or shown[1] < 0 for view in views):
-        end = max(view.time[-1] for view in views)
-        raise ConfigError(f"--times {shown[0]:g}:{shown[1]:g}: no sample lies there; the waveforms end at {end:g} ns")
-    if options["sheet"]:
-        draw_waveform_sheet(views, output, times=shown, **more)
-    else:
-        draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
-
-
-def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) -> tuple[list[Any], str]:
-    """The waveforms that are wanted, and the chain that they were run through, in words.
-
-    ranges: compute the distances of the echoes from the sensor, too, if its position is known.
-    """
-    from wavebatch.batch.options import RunOptions
-    from wavebatch.files.strip.reader import StripReader
-    from wavebatch.surveying.prepare import Positions, prepare
-    from wavebatch.tools.api import find_request
-    from wavebatch.tools.plots.waveform import add_ranges, find_places, name_chain, read_views
-
+    # The waveforms, and the chain that they are run through.
     chain, request = find_request(shared.from_options(RunOptions, options))
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
     with opened as reader, reader.scan(force=options["force"]) as scan:
@@ -404,11 +371,31 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
         system = choice.survey.system
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))
         run, fill = choice.chain, None
-        if ranges:
+        if tabular or options["table"]:  # the distances of the echoes from the sensor, too, if its position is known
             run, fill, error = add_ranges(choice.chain, reader, scan)
             system = system.with_radiometry(sensor_error=error)
         views = read_views(reader, scan, places, run, system, options["show"], fill)
-        return views, name_chain(choice.chain)
+    name = name_chain(choice.chain)
+    if tabular:
+        write_text(output, format_echoes(views), overwrite=options["overwrite"])
+    else:
+        from wavebatch.tools.plots.draw_waveform import draw_waveform_panels, draw_waveform_sheet
+
+        shown, more = options["shown"], {"strip": strip.name, "chain": name, "overwrite": options["overwrite"]}
+        if shown == "all":
+            last = max(float(view.time[-1] + 0.5 * view.spacing) for view in views)
+            shown = (min(-0.5 * view.spacing for view in views), last)
+        if shown and all(view.time[-1] < shown[0] or shown[1] < 0 for view in views):
+            end = max(view.time[-1] for view in views)
+            span = f"{shown[0]:g}:{shown[1]:g}"
+            raise ConfigError(f"--times {span}: no sample lies there; the waveforms end at {end:g} ns")
+        if options["sheet"]:
+            draw_waveform_sheet(views, output, times=shown, **more)
+        else:
+            draw_waveform_panels(views, output, times=shown, table=options["table"], **more)
+    echoes = sum(len(view.echoes) for view in views)
+    tell(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
+    answer({"output": str(output), "chain": name, "waveforms": len(views), "echoes": echoes})
 
 
 for command in (histogram, map_, section, profile, cube):

@@ -66,11 +66,15 @@ class Progress(Closing):
         kind, strip = event["event"], event["strip"]
         if self._bar is not None:
             share = event["done"] / event["of"] if kind == "unit" else float(kind != "start")
-            self._advance(strip, share)
+            done = round(self._sizes.get(strip, 0) * share)
+            self._bar.set_description(Path(strip).name, refresh=False)
+            self._bar.update(max(done - self._shown.get(strip, 0), 0))
+            self._shown[strip] = done
         if error is not None and not event["again"]:
             if self._debug:
                 self._say("".join(traceback.format_exception(error)).rstrip())
-            self._say(f"error: {_place(messages.printable(strip), messages.one_line(error))}")
+            name, line = messages.printable(strip), messages.one_line(error)
+            self._say(f"error: {line}" if name in line else f"error: {name}: {line}")
         elif kind == "incomplete" and "decisions" not in event:
             cut = count(event["counts"]["points_cut"], "point")
             words = f"the packets of {cut} are missing; get its waveform data again, whole"
@@ -94,12 +98,6 @@ class Progress(Closing):
         elif kind == "flight" and self._level > 0:
             self._say(messages.printable(f"{strip}: survey of {count(event['strips'], 'strip')} together"))
 
-    def _advance(self, strip: str, share: float) -> None:
-        done = round(self._sizes.get(strip, 0) * share)
-        self._bar.set_description(Path(strip).name, refresh=False)
-        self._bar.update(max(done - self._shown.get(strip, 0), 0))
-        self._shown[strip] = done
-
     def _tell(self, line: str) -> None:
         """A message that --quiet leaves to the log."""
         if self._level >= 0:
@@ -121,11 +119,6 @@ def _size(path: Path) -> int:
         return os.path.getsize(path)
     except (OSError, ValueError):
         return 0
-
-
-def _place(strip: str, line: str) -> str:
-    """The line with the strip's name first, unless it contains the name already."""
-    return line if strip in line else f"{strip}: {line}"
 
 
 def _sensor_lines(sensor: dict[str, Any]) -> Iterator[str]:

@@ -67,29 +67,26 @@ def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **opti
     def work(path: Path) -> ImportSummary:
         with counting("pulses", options["quiet"]) as bar:
             summary = import_file(path, targets[path], chosen, bar.update)
-        _say(summary)
+        place = summary.output
+        if summary.skipped:
+            tell(f"{place}: is up to date, skipped")
+            return summary
+        parts = (summary.points, "point"), (summary.packets, "packet"), (summary.pulses, "pulse")
+        points, packets, pulses = (count(*part) for part in parts)
+        tell(f"{place}: {points} and {packets} of {pulses}")
+        sent = summary.outgoing
+        if sent is not None:
+            spread, error = 100 * sent["energy_scatter"], 100 * sent["energy_error"]
+            width = f" {sent['fwhm_ns']:.3f} ns wide at half maximum," if math.isfinite(sent["fwhm_ns"]) else ":"
+            tell(f"{place}: outgoing pulses{width} energies vary by {spread:.2f} %, known to {error:.2f} %")
+        for note in summary.notes:
+            tell(f"{place}: {note}")
         return summary
 
     # A single file that fails is one line too, with the exit code of a batch.
     results, failed = shared.for_each(paths, work, debug=options["debug"], alone=True)
     answer({"files": [asdict(one) for one in results], "failed": failed})
     sys.exit(0 if not failed else EXIT_SOME if results else EXIT_NONE)
-
-
-def _say(summary: ImportSummary) -> None:
-    if summary.skipped:
-        tell(f"{summary.output}: is up to date, skipped")
-        return
-    parts = (summary.points, "point"), (summary.packets, "packet"), (summary.pulses, "pulse")
-    points, packets, pulses = (count(*part) for part in parts)
-    tell(f"{summary.output}: {points} and {packets} of {pulses}")
-    sent = summary.outgoing
-    if sent is not None:
-        spread, error = 100 * sent["energy_scatter"], 100 * sent["energy_error"]
-        width = f" {sent['fwhm_ns']:.3f} ns wide at half maximum," if math.isfinite(sent["fwhm_ns"]) else ":"
-        tell(f"{summary.output}: outgoing pulses{width} energies vary by {spread:.2f} %, known to {error:.2f} %")
-    for note in summary.notes:
-        tell(f"{summary.output}: {note}")
 
 
 @click.command()

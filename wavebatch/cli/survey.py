@@ -63,7 +63,9 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
       wavebatch survey strip.las -o system.toml --chain chain.toml
     """  # fmt: skip
     from wavebatch.surveying.choose_chain import chain_text
-    from wavebatch.surveying.system_file import format_survey
+    from wavebatch.surveying.system_file import SYSTEM_SCHEMA, format_survey
+    from wavebatch.surveying.systems.figures import describe_figures, describe_system
+    from wavebatch.surveying.systems.known_systems import doubt_survey, find_likeness, find_source
     from wavebatch.tools.sheets.survey import check_angles, list_doubts, survey_page, survey_sheet
 
     angles, html_file, overwrite = options["angles"], options["html_file"], options["overwrite"]
@@ -79,12 +81,31 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
             raise ConfigError(f"--angles {angles}: {words}")
         check_angles(angles, overwrite=overwrite)
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
+    survey = saved.survey
     if output is not None:
         write_text(output, format_survey(saved), overwrite=overwrite)
     if chain_file is not None:
-        write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
-    document = _document(saved, facts)
-    sheet = survey_sheet(saved.survey, document)
+        write_text(chain_file, chain_text(survey), overwrite=overwrite)
+    doubts = doubt_survey(survey.system, survey.figures, survey.waveforms)
+    like = find_likeness(survey.system, survey.figures.spacing_ns or 0.0)
+    document = {
+        "schema": SYSTEM_SCHEMA,
+        "version": saved.version,
+        **facts,
+        "warnings": [*facts.get("warnings", ()), *map(asdict, doubts)],
+        "fingerprint": dict(saved.fingerprint),
+        "waveforms": survey.waveforms,
+        "system": describe_system(survey.system),
+        "figures": describe_figures(survey.figures),
+        "decisions": [{"part": one.part, "needed": bool(one.needed), "reason": one.reason} for one in survey.decisions],
+        "candidates": [one._asdict() for one in survey.candidates],
+        "chain": chain_text(survey),
+        "looks_like": like and {
+            "sensor": like.known.sensor, "name": like.known.name, "difference": like.difference,
+            "taken": find_source(survey.system) is not None, "sentence": like.describe(),
+        },
+    }  # fmt: skip
+    sheet = survey_sheet(survey, document)
     answer(document, Sheet("survey", [*sheet.parts, *list_doubts(document)]))
     for target in filter(None, (output, chain_file, angles)):
         tell(f"{target}: written")
@@ -92,7 +113,7 @@ def survey(strips: tuple[str, ...], output: Path | None, chain_file: Path | None
     failed = {*facts.get("failed", ()), *facts.get("misfits", ())}
     used = [path for path in paths if str(path) not in failed]
     of = used[0].name if len(used) == 1 else f"{len(used)} strips"
-    shared.write_html(html_file, of, survey_page(saved.survey, document, used, **reading))
+    shared.write_html(html_file, of, survey_page(survey, document, used, **reading))
     if facts.get("misfits") or facts.get("failed"):
         sys.exit(EXIT_PROBLEMS)
 
@@ -154,31 +175,3 @@ def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[Sa
         "misfits": [str(strip.path) for strip in strips if not strip.fits],
         "failed": list(map(str, failed)),
     }
-
-
-def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
-    from wavebatch.surveying.choose_chain import chain_text
-    from wavebatch.surveying.system_file import SYSTEM_SCHEMA
-    from wavebatch.surveying.systems.figures import describe_figures, describe_system
-    from wavebatch.surveying.systems.known_systems import doubt_survey, find_likeness, find_source
-
-    survey = saved.survey
-    doubts = doubt_survey(survey.system, survey.figures, survey.waveforms)
-    like = find_likeness(survey.system, survey.figures.spacing_ns or 0.0)
-    return {
-        "schema": SYSTEM_SCHEMA,
-        "version": saved.version,
-        **facts,
-        "warnings": [*facts.get("warnings", ()), *map(asdict, doubts)],
-        "fingerprint": dict(saved.fingerprint),
-        "waveforms": survey.waveforms,
-        "system": describe_system(survey.system),
-        "figures": describe_figures(survey.figures),
-        "decisions": [{"part": one.part, "needed": bool(one.needed), "reason": one.reason} for one in survey.decisions],
-        "candidates": [one._asdict() for one in survey.candidates],
-        "chain": chain_text(survey),
-        "looks_like": like and {
-            "sensor": like.known.sensor, "name": like.known.name, "difference": like.difference,
-            "taken": find_source(survey.system) is not None, "sentence": like.describe(),
-        },
-    }  # fmt: skip

@@ -145,7 +145,10 @@ def place_rings(file: AreaFile | None, rings: Sequence[np.ndarray], strip: Path,
             f"{file.path}: is {what}, and {strip} has no CRS to project it into; write it in the coordinates of the "
             "strip, without a member crs"
         )
-    other = _code(definition)
+    # `EPSG:n` of a definition that names a projected CRS by its code.
+    number = find_epsg(definition)
+    other = f"EPSG:{number}" if number and parse_wkt(definition) != CrsUnits() else ""
+    other = definition if definition.startswith("EPSG:") else other
     code = other or definition
     if source in (definition, code) or (source in _SAME_DEGREES and code in _SAME_DEGREES):
         return rings
@@ -193,14 +196,6 @@ def _overlaps(extent: tuple[float, float, float, float], header: LasHeader) -> b
     (west, south, _), (east, north, _) = header.mins, header.maxs
     left, low, right, high = extent
     return left <= east and right >= west and low <= north and high >= south
-
-
-def _code(definition: str) -> str | None:
-    """`EPSG:n` of a definition that names a projected CRS by its code."""
-    if definition.startswith("EPSG:"):
-        return definition
-    code = find_epsg(definition)
-    return f"EPSG:{code}" if code and parse_wkt(definition) != CrsUnits() else None
 
 
 def _densify(ring: np.ndarray, step: float) -> np.ndarray:

@@ -159,7 +159,31 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None)
     found = find_column(reader, request or COLUMN)
     if found is None and request is None:
         return None
-    found = found or _read_file(reader, request or "")
+    if found is None:  # a text file
+        name = request or ""
+        if not Path(name).is_file():
+            hint = name_columns(reader, name)
+            raise InputError(f"{path}: --energy: no extra byte and no file is called {name!r}; {hint}")
+        lines = read_text(name, "file of pulse energies", 1 << 30).splitlines()
+        rows = [line.replace(",", " ").replace(";", " ").split() for line in lines if line.strip()]
+        header = [word.casefold() for word in rows[0]] if rows else []
+        if not {"time", "energy"} <= set(header):
+            words = "its first line must name the columns time and energy"
+            raise InputError(f"{name}: {words}; it is {' '.join(header)!r}")
+        try:
+            columns = [np.array([float(row[header.index(key)]) for row in rows[1:]]) for key in ("time", "energy")]
+        except (IndexError, ValueError) as error:
+            raise InputError(f"{name}: a row has no number for time or energy: {error}") from error
+        time, energy = columns
+        good = np.isfinite(time) & (energy < LARGEST) & (energy > 0)
+        if np.count_nonzero(good) < 2:
+            raise InputError(f"{name}: fewer than two rows have a time and a positive energy")
+        time, energy = time[good], energy[good]
+        order = np.argsort(time, kind="stable")
+        time, energy = time[order], energy[order]
+        step = np.diff(time)
+        reach = NEAR * float(np.median(step[step > 0])) if (step > 0).any() else 1e-6
+        found = PulseEnergy(Path(name).name, time=time, energy=energy, reach=reach)
     chosen = even_places(reader.unit_count(), SAMPLED_UNITS)
     values = np.empty(0)
     for number in chosen:
@@ -197,28 +221,3 @@ def name_columns(reader: StripReader, request: str) -> str:
     """Return the extra byte that is called nearly so, or what there is, for a message."""
     names = [record.name for record in reader.facts.records]
     return nearest(request, names) if names else "the strip has no extra bytes"
-
-
-def _read_file(reader: StripReader, request: str) -> PulseEnergy:
-    if not Path(request).is_file():
-        hint = name_columns(reader, request)
-        raise InputError(f"{reader.facts.path}: --energy: no extra byte and no file is called {request!r}; {hint}")
-    lines = read_text(request, "file of pulse energies", 1 << 30).splitlines()
-    rows = [line.replace(",", " ").replace(";", " ").split() for line in lines if line.strip()]
-    header = [word.casefold() for word in rows[0]] if rows else []
-    if not {"time", "energy"} <= set(header):
-        raise InputError(f"{request}: its first line must name the columns time and energy; it is {' '.join(header)!r}")
-    try:
-        columns = [np.array([float(row[header.index(key)]) for row in rows[1:]]) for key in ("time", "energy")]
-    except (IndexError, ValueError) as error:
-        raise InputError(f"{request}: a row has no number for time or energy: {error}") from error
-    time, energy = columns
-    good = np.isfinite(time) & (energy < LARGEST) & (energy > 0)
-    if np.count_nonzero(good) < 2:
-        raise InputError(f"{request}: fewer than two rows have a time and a positive energy")
-    time, energy = time[good], energy[good]
-    order = np.argsort(time, kind="stable")
-    time, energy = time[order], energy[order]
-    step = np.diff(time)
-    reach = NEAR * float(np.median(step[step > 0])) if (step > 0).any() else 1e-6
-    return PulseEnergy(Path(request).name, time=time, energy=energy, reach=reach)

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -112,16 +112,6 @@ class PulseHeader:
     """GeoTIFF keys as LAS has them."""
 
 
-def find_waves(path: Path) -> Path:
-    """Return the .wvs beside a .pls; raises InputError where it is missing or compressed."""
-    for suffix in (".wvs", ".WVS"):
-        if path.with_suffix(suffix).is_file():
-            return path.with_suffix(suffix)
-    if any(path.with_suffix(suffix).is_file() for suffix in (".wvz", ".WVZ")):
-        raise refuse_packed_waves(path)
-    raise InputError(f"{path}: its waves are missing: put {path.with_suffix('.wvs').name} next to it")
-
-
 def refuse_packed_waves(path: Path) -> InputError:
     """Return the error for compressed PulseWaves, with the command that decompresses them."""
     return InputError(
@@ -163,7 +153,17 @@ def read_pulse_header(path: Path) -> PulseHeader:
                 raise damaged(path, f"record {number} of {records} runs into the pulses")
             found.append((decode_text(user), record, file.read(size_of_record)))
             at += _RECORD.size + size_of_record
-        found += _list_appended(file, size, start + count * length, appended)
+        # Records behind the pulses: each ends with its head, so they are read from the end of the file.
+        end, left = size, MAX_VLRS if appended < 0 else min(appended, MAX_VLRS)
+        while left and end - _RECORD.size >= start + count * length:
+            file.seek(end - _RECORD.size)
+            user, record, _, size_of_record, _ = _RECORD.unpack(file.read(_RECORD.size))
+            at = end - _RECORD.size - size_of_record
+            if record == _END or not 0 <= size_of_record <= MAX_FRONT or at < start + count * length:
+                break
+            file.seek(at)
+            found.append((decode_text(user), record, file.read(size_of_record)))
+            end, left = at, left - 1
         descriptors: dict[int, Any] = {}
         for user, number, payload in found:
             if user == _SPEC and 200_000 < number <= 200_255:
@@ -175,7 +175,12 @@ def read_pulse_header(path: Path) -> PulseHeader:
                 pulse.append(("point_source", kind))
                 at += int(kind[2])
         pulse += [("rest", f"V{length - at}")] * (length > at)
-        waves = find_waves(path)
+        beside = [path.with_suffix(suffix) for suffix in (".wvs", ".WVS")]
+        waves = next(filter(Path.is_file, beside), None)
+        if waves is None and any(path.with_suffix(suffix).is_file() for suffix in (".wvz", ".WVZ")):
+            raise refuse_packed_waves(path)
+        if waves is None:
+            raise InputError(f"{path}: its waves are missing: put {beside[0].name} next to it")
         with reporting_reads(waves), open_regular(waves) as other:
             head = other.read(WAVES_HEADER_SIZE)
             waves_size = os.fstat(other.fileno()).st_size
@@ -192,20 +197,6 @@ def read_pulse_header(path: Path) -> PulseHeader:
             tuple(Vlr(PROJECTION.encode(), number, payload) for user, number, payload in found
                   if user == _PROJ and number in (34735, 34736, 34737) and len(payload) < 65536),
         )  # fmt: skip
-
-
-def _list_appended(file: BinaryIO, end: int, least: int, count: int) -> Iterator[tuple[str, int, bytes]]:
-    """Records behind the pulses: each ends with its head, so they are read from the end of the file."""
-    left = MAX_VLRS if count < 0 else min(count, MAX_VLRS)
-    while left and end - _RECORD.size >= least:
-        file.seek(end - _RECORD.size)
-        user, record, _, length, _ = _RECORD.unpack(file.read(_RECORD.size))
-        start = end - _RECORD.size - length
-        if record == _END or not 0 <= length <= MAX_FRONT or start < least:
-            return
-        file.seek(start)
-        yield decode_text(user), record, file.read(length)
-        end, left = start, left - 1
 
 
 def _read_descriptor(path: Path, index: int, payload: bytes) -> Descriptor:

@@ -71,7 +71,24 @@ def read_trajectory(
         raise InputError(f"{path}: trajectory is neither text nor SBET (records of {SBET_RECORD.itemsize} bytes)")
     else:
         columns = _read_text(path, size)
-    xyz = _project(path, columns, crs)
+    if "x" in columns:
+        xyz = np.stack([columns["x"], columns["y"], columns["z"]], axis=1)
+    elif crs is None:
+        raise InputError(f"{path}: the trajectory is in degrees, but the strip has no CRS; give a trajectory in metres")
+    else:
+        pyproj = need("pyproj", lambda advice: InputError(
+            f"{path}: the trajectory is in degrees, which needs pyproj: {advice}; or give x, y, z in the strip's CRS"
+        ))  # fmt: skip
+        try:
+            target = pyproj.CRS.from_user_input(crs)
+            if target.is_geographic:
+                words = "the strip's coordinates are degrees; wavebatch needs metres: project the strip"
+                raise InputError(f"{path}: {words}")
+            transformer = pyproj.Transformer.from_crs("EPSG:4979", target, always_xy=True)
+            placed = transformer.transform(columns["longitude"], columns["latitude"], columns["z"])
+        except pyproj.exceptions.ProjError as error:
+            raise InputError(f"{path}: the CRS of the strip is not understood ({error}); give x, y, z") from error
+        xyz = np.stack([np.asarray(values, np.float64) for values in placed], axis=1)
     if lever_arm is not None:
         missing = [name for name in _ATTITUDE if name not in columns]
         if missing:
@@ -143,23 +160,3 @@ def _meaning(field: str) -> str:
     bare = re.sub(r"[\[(].*?[\])]", "", field.strip().strip('"').lower())
     bare = re.sub(r"[^a-z]", "", re.sub(r"_(m|s|deg)$", "", bare))
     return next((name for name, known in COLUMN_NAMES.items() if bare in known), "")
-
-
-def _project(path: Path, columns: dict[str, np.ndarray], crs: str | None) -> np.ndarray:
-    """Coordinates (n, 3) in the CRS of the strip."""
-    if "x" in columns:
-        return np.stack([columns["x"], columns["y"], columns["z"]], axis=1)
-    if crs is None:
-        raise InputError(f"{path}: the trajectory is in degrees, but the strip has no CRS; give a trajectory in metres")
-    pyproj = need("pyproj", lambda advice: InputError(
-        f"{path}: the trajectory is in degrees, which needs pyproj: {advice}; or give x, y, z in the strip's CRS"
-    ))  # fmt: skip
-    try:
-        target = pyproj.CRS.from_user_input(crs)
-        if target.is_geographic:
-            raise InputError(f"{path}: the strip's coordinates are degrees; wavebatch needs metres: project the strip")
-        transformer = pyproj.Transformer.from_crs("EPSG:4979", target, always_xy=True)
-        placed = transformer.transform(columns["longitude"], columns["latitude"], columns["z"])
-    except pyproj.exceptions.ProjError as error:
-        raise InputError(f"{path}: the CRS of the strip is not understood ({error}); give x, y, z") from error
-    return np.stack([np.asarray(values, np.float64) for values in placed], axis=1)

@@ -352,7 +352,25 @@ def plan_run(
     asked = options.chain or options.profile
     shipped = asked is None or isinstance(asked, str) and asked in (AUTO, *list_profiles())
     found = template.extend(template.chain) if shipped else template.chain
-    _check_use(found, template)
+    sensor = template.sensor
+    if sensor.trajectory is not None:
+        # Once, not for each strip after its survey.
+        try:
+            with reporting_reads(sensor.trajectory, "trajectory "), open_regular(sensor.trajectory):
+                pass
+        except InputError as error:
+            raise ConfigError(str(error)) from error
+    given = {
+        "--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": template.calibration,
+        "--attenuation": template.attenuation, "--energy": None if template.energy == NONE else template.energy,
+    }  # fmt: skip
+    option = next((name for name, value in given.items() if value is not None), None)
+    if option is not None and not needs_sensor(found):
+        stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized",
+                  "--energy": "amplitude_normalized"}  # fmt: skip
+        name = stages.get(option, "range")
+        remedy = f"give --columns +{name}, or add stage attribute.{name} to a chain file"
+        raise ConfigError(f"{option}: chain {found.name} computes nothing from it; {remedy}")
     paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips),
                         recursive=options.recursive, note=note)  # fmt: skip
     processes, block = plan_memory(options.jobs or os.cpu_count() or 1, options.memory)
@@ -398,24 +416,3 @@ def read_sensor(options: RunOptions) -> SensorRequest:
     if arm is not None and not sum(map(abs, arm)) < 1000:
         raise ConfigError(f"--lever-arm: {','.join(map(str, arm))} is too long; a lever arm has a few metres")
     return SensorRequest(None if file is None else Path(file), options.crs, arm, options.flight_height)
-
-
-def _check_use(chain: Chain, job: StripJob) -> None:
-    """Raise ConfigError for files that the chain would ignore, and for a trajectory that cannot be read."""
-    sensor = job.sensor
-    if sensor.trajectory is not None:
-        # Once, not for each strip after its survey.
-        try:
-            with reporting_reads(sensor.trajectory, "trajectory "), open_regular(sensor.trajectory):
-                pass
-        except InputError as error:
-            raise ConfigError(str(error)) from error
-    given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": job.calibration,
-             "--attenuation": job.attenuation, "--energy": None if job.energy == NONE else job.energy}  # fmt: skip
-    option = next((name for name, value in given.items() if value is not None), None)
-    if option is not None and not needs_sensor(chain):
-        stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized",
-                  "--energy": "amplitude_normalized"}  # fmt: skip
-        name = stages.get(option, "range")
-        remedy = f"give --columns +{name}, or add stage attribute.{name} to a chain file"
-        raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; {remedy}")

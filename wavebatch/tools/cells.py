@@ -89,7 +89,14 @@ class Clouds:
         for path in self.paths:
             with self._open(path) as reader:
                 found.append([(path, facts) for facts in reader.facts])
-        self.every = tuple(self._with_unit(check_alike(column)) for column in zip(*found, strict=True))
+        every = []
+        for column in zip(*found, strict=True):
+            facts = check_alike(column)
+            if facts.is_standard and facts.name in ("x", "y", "z"):  # a coordinate has the unit of the CRS
+                words = describe_crs(self.paths[0])
+                facts = replace(facts, unit=words.upright_unit if facts.name == "z" else words.unit)
+            every.append(facts)
+        self.every = tuple(every)
         """Facts of the columns."""
         self.facts = self.every[0]
 
@@ -99,13 +106,6 @@ class Clouds:
         with undoing(reader.close):
             reader.select(self.chosen)
         return reader
-
-    def _with_unit(self, facts: ColumnFacts) -> ColumnFacts:
-        """Facts with the unit of the CRS for a coordinate."""
-        if not (facts.is_standard and facts.name in ("x", "y", "z")):
-            return facts
-        words = describe_crs(self.paths[0])
-        return replace(facts, unit=words.upright_unit if facts.name == "z" else words.unit)
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
         """Pieces of all clouds: number of the cloud, selected points with a value, and counts of the piece."""
@@ -321,21 +321,33 @@ def compute_tiles(
     result: gets the counts before the first tile comes. bounds: only points within them count. held: points in memory
     at a time.
     """
-    number = int(np.clip(-(-points // (held // 2)), 1, MOST_BUCKETS))
+    number, across = int(np.clip(-(-points // (held // 2)), 1, MOST_BUCKETS)), -(-grid.columns // TILE)
     entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (len(clouds.every),))]))
     try:
-        _fill(clouds, bounds, grid, entries, result)
+        # Every point with a value goes into the bucket of its tile.
+        counted = np.zeros(len(clouds.every), np.int64)
+        for _, rows, left_out in clouds.read_all():
+            inside = is_in_bounds(rows, bounds)
+            result.points += len(rows) + left_out
+            result.left_out += left_out
+            row, column, in_grid = grid.place(rows["x"], rows["y"])
+            inside &= in_grid
+            result.outside += int(len(rows) - inside.sum())
+            rows, column, row = rows[inside], column[inside], grid.rows - 1 - row[inside]
+            counted += np.isfinite(rows["values"]).sum(axis=0)
+            found = np.empty(len(rows), entries.dtype)
+            found["tile"] = row // TILE * across + column // TILE
+            found["cell"] = row % TILE * TILE + column % TILE
+            found["values"] = rows["values"]
+            entries.append((found["tile"] % np.uint64(entries.buckets)).astype(np.int64), found)
+        result.values = tuple(counted.tolist())
         entries.seal()
         compute = partial(_compute, statistic=statistic, area=grid.size**2)
         for bucket in range(number):
             for tile, values in _compute_bucket(entries, bucket, compute, held):
-                yield *divmod(tile, _across(grid)), values
+                yield *divmod(tile, across), values
     finally:
         entries.close()
-
-
-def _across(grid: Grid) -> int:
-    return -(-grid.columns // TILE)
 
 
 def is_in_bounds(rows: np.ndarray, bounds: Box | None) -> np.ndarray:
@@ -345,26 +357,6 @@ def is_in_bounds(rows: np.ndarray, bounds: Box | None) -> np.ndarray:
         west, south, east, north = bounds
         inside &= (rows["x"] >= west) & (rows["x"] < east) & (rows["y"] >= south) & (rows["y"] < north)
     return inside
-
-
-def _fill(clouds: Clouds, bounds: Box | None, grid: Grid, entries: Spool, result: Placed) -> None:
-    """Put every point with a value into the bucket of its tile."""
-    counted = np.zeros(len(clouds.every), np.int64)
-    for _, rows, left_out in clouds.read_all():
-        inside = is_in_bounds(rows, bounds)
-        result.points += len(rows) + left_out
-        result.left_out += left_out
-        row, column, in_grid = grid.place(rows["x"], rows["y"])
-        inside &= in_grid
-        result.outside += int(len(rows) - inside.sum())
-        rows, column, row = rows[inside], column[inside], grid.rows - 1 - row[inside]
-        counted += np.isfinite(rows["values"]).sum(axis=0)
-        found = np.empty(len(rows), entries.dtype)
-        found["tile"] = row // TILE * _across(grid) + column // TILE
-        found["cell"] = row % TILE * TILE + column % TILE
-        found["values"] = rows["values"]
-        entries.append((found["tile"] % np.uint64(entries.buckets)).astype(np.int64), found)
-    result.values = tuple(counted.tolist())
 
 
 def _compute_bucket(
@@ -513,12 +505,8 @@ def survey_places(clouds: Clouds, bounds: Box | None = None, option: str = "--bb
         return places
 
     total, sample, box = sample_points(clouds, pick)
-    _refuse_far(clouds.paths, [one.read().get("place", np.empty((0, 2))) for one in each], option)
-    return total, sample, bounds or tuple(box.ravel().tolist())
-
-
-def _refuse_far(paths: Sequence[Path], places: Sequence[np.ndarray], option: str) -> None:
-    """Raises ConfigError for clouds so far apart that a picture would show them as dots."""
+    # Clouds so far apart that a picture would show them as dots.
+    places = [one.read().get("place", np.empty((0, 2))) for one in each]
     known = [number for number, place in enumerate(places) if len(place)]
     # Percentiles, so that a single damaged point moves no cloud.
     boxes = {number: np.percentile(places[number], (1, 99), axis=0) for number in known}
@@ -533,10 +521,11 @@ def _refuse_far(paths: Sequence[Path], places: Sequence[np.ndarray], option: str
     if away:
         middle = [boxes[number].mean(axis=0) for number in (known[0], away[0])]
         raise ConfigError(
-            f"{paths[away[0]]}: lies {float(np.hypot(*(middle[1] - middle[0]))):.6g} from {paths[known[0]]}, and the "
-            f"largest cloud is {reach / FAR:.4g} long: a picture of both would show neither; draw them one by one, or "
-            f"give {option}"
+            f"{clouds.paths[away[0]]}: lies {float(np.hypot(*(middle[1] - middle[0]))):.6g} from "
+            f"{clouds.paths[known[0]]}, and the largest cloud is {reach / FAR:.4g} long: a picture of both would show "
+            f"neither; draw them one by one, or give {option}"
         )
+    return total, sample, bounds or tuple(box.ravel().tolist())
 
 
 def check_crs(paths: Sequence[Path]) -> CrsWords:

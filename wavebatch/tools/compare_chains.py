@@ -6,7 +6,6 @@ positions of echoes are tied to the vendor's returns and would hide differences 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict, field
 from pathlib import Path
 
@@ -224,29 +223,26 @@ def match_sides(
                     task.add(1 - side, rows)
                 between = task.finish(a.name, b.name)
         else:
-            between = match_chains(blocks, runs, (a.name, b.name if b else str(strip)), tolerance_ns)
+            # Waveform by waveform: two chains, or one and the vendor's returns.
+            pairs = pairing.Pairing(tolerance_ns)
+            for block in blocks:
+                found = {key: run.find(block) for key, run in runs.items()}
+                number = {key: one.echoes.count(len(block)) for key, one in found.items()}
+                for key, run in runs.items():
+                    other = number.get("b" if key == "a" else "a", np.zeros(len(block), np.int64))
+                    run.add(block, found[key], other > 0)
+                sides = [found["a"].rows(block), found["a"].vendor_rows(block)]
+                if "b" in found:
+                    sides = [one.rows_along(block) for one in found.values()]
+                # All waveforms of the block, so that those without an echo count too.
+                keys = np.zeros(len(block), pairing.PACKET_DTYPE)
+                keys["gps_time"] = np.arange(len(block))
+                pairs.pair_by_time(*sides, keys)
+            between = pairs.finish(a.name, b.name if b else str(strip), "waveform")
     some = next(iter(runs.values())).vendor
     vendor = {key: run.vendor.finish(chains[key].name, str(strip), "waveform") for key, run in runs.items()}
     fit = {key: runs[key].fit.result() if key in runs else {} for key in ("a", "b")[: 1 if b is None else 2]}
     return Matchup(str(strip), some.pulses, some.echoes[1], between, vendor, fit)
-
-
-def match_chains(
-    blocks: Iterator[WaveformBlock], runs: dict[str, ChainRun], names: tuple[str, str], tolerance_ns: float
-) -> pairing.Comparison:
-    """Compares chains a and b, or a and the vendor's returns, waveform by waveform; each of `runs` collects sums."""
-    between = pairing.Pairing(tolerance_ns)
-    for block in blocks:
-        found = {key: run.find(block) for key, run in runs.items()}
-        number = {key: one.echoes.count(len(block)) for key, one in found.items()}
-        for key, run in runs.items():
-            other = number.get("b" if key == "a" else "a", np.zeros(len(block), np.int64))
-            run.add(block, found[key], other > 0)
-        sides = [found["a"].rows(block), found["a"].vendor_rows(block)]
-        if "b" in found:
-            sides = [one.rows_along(block) for one in found.values()]
-        between.pair_by_time(*sides, _keys(block))
-    return between.finish(*names, "waveform")
 
 
 class _Found(Solved):
@@ -318,14 +314,10 @@ class ChainRun:
         number = found.echoes.count(len(block))
         misfit, floor = measure_fit(found.block, found.noise, found.system, self.chain.steps[2], found.echoes)
         self.fit.add(misfit, floor, number, both & (number > 0))
-        self.vendor.pair_by_time(found.rows(block), found.vendor_rows(block), _keys(block))
-
-
-def _keys(block: WaveformBlock) -> np.ndarray:
-    """All waveforms of the block, so that those without an echo count too."""
-    keys = np.zeros(len(block), pairing.PACKET_DTYPE)
-    keys["gps_time"] = np.arange(len(block))
-    return keys
+        # All waveforms of the block, so that those without an echo count too.
+        keys = np.zeros(len(block), pairing.PACKET_DTYPE)
+        keys["gps_time"] = np.arange(len(block))
+        self.vendor.pair_by_time(found.rows(block), found.vendor_rows(block), keys)
 
 
 def _rank(waveform: np.ndarray, time: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ from wavebatch.files.disk.raw_bytes import take_fingerprint
 from wavebatch.files.las.header import EXTRA_BYTES_RECORD_ID, STANDARD_TIME, Vlr, decode_text, has_record, is_projection
 from wavebatch.files.strip.packet_check import VECTORS, read_toward
 from wavebatch.files.strip.packets import FullwaveWriter
-from wavebatch.files.strip.reader import StripReader, StripScan, Unit
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.inspect_strip import audit_header
 
 SUFFIXES = (".las", ".laz", ".npz")
@@ -133,8 +133,21 @@ def _write_strip(
     reader: StripReader, scan: StripScan, target: Path, account: str, overwrite: bool, progress: Callable[[int], Any]
 ) -> int:
     """The strip with plain packets, one descriptor per kind and length, and vectors toward the sensor."""
-    digitizers, done = _list_digitizers(reader, scan), 0
-    facts, header = reader.facts, reader.facts.header
+    found: dict[tuple[int, int, bool], Digitizer] = {}
+    for unit in reader.read_units(scan):
+        table = unit.packets
+        kinds = np.stack([table.digitizer, table.n_samples, table.packed], axis=1) if len(table) else np.empty((0, 3))
+        for index, length, packed in np.unique(kinds, axis=0).astype(int).tolist():
+            stored = reader.facts.digitizers[index]
+            form = unit.forms.get(index)
+            here = replace(stored, bits=8 * stored.width) if form is None else form.digitizer(stored, bool(packed))
+            found[here.index, length, here.inverted] = replace(here, bits=8 * here.width, n_samples=length)
+    names = sorted(found)
+    facts, header, done = reader.facts, reader.facts.header, 0
+    if len(names) <= MOST_DESCRIPTORS:
+        digitizers = {name: replace(found[name], index=number) for number, name in enumerate(names, 1)}
+    else:  # the strip's own descriptors
+        digitizers = {name: replace(found[name], n_samples=facts.digitizers[name[0]].n_samples) for name in names}
     dropped = [("LASF_Spec", number) for number in (*range(100, 355), EXTRA_BYTES_RECORD_ID)]
     records = [vlr for vlr in header.vlrs if not any(has_record([vlr], *one) for one in dropped)]
     records.append(Vlr(USER_ID, 1, account.encode(), b"what was exported and repaired"))
@@ -150,48 +163,22 @@ def _write_strip(
             # Packets that points of several units share are written in each of them.
             rows = np.unique(unit.packet_of_point[unit.packet_of_point >= 0])
             for samples, stored, chosen in reader.read_counts(unit, rows, _BLOCK):
-                digitizer = digitizers[_name(stored, samples.shape[1])]
+                digitizer = digitizers[stored.index, samples.shape[1], stored.inverted]
                 offset[chosen] = writer.write_packets(samples, digitizer.index)
                 size[chosen], index[chosen] = samples.shape[1] * digitizer.width, digitizer.index
                 done += len(chosen)
                 progress(len(chosen))
-            writer.write_points(_build_points(unit, writer.dtype, index, offset, size))
+            points = np.ascontiguousarray(unit.points).view(writer.dtype).copy()
+            has = np.flatnonzero(unit.packet_of_point >= 0)
+            row = unit.packet_of_point[has]
+            toward = read_toward(points[has], unit.vectors.direction, unit.vectors.form)
+            location = points["return_point_wave_location"][has]
+            for name in _WAVES:
+                points[name] = 0
+            points["wavepacket_index"][has], points["wavepacket_offset"][has] = index[row], offset[row]
+            points["wavepacket_size"][has], points["return_point_wave_location"][has] = size[row], location
+            for axis, name in enumerate(VECTORS):
+                points[name][has] = toward[:, axis]
+            writer.write_points(points)
         writer.commit()
     return done
-
-
-def _name(stored: Digitizer, length: int) -> tuple[int, int, bool]:
-    return stored.index, length, stored.inverted
-
-
-def _list_digitizers(reader: StripReader, scan: StripScan) -> dict[tuple[int, int, bool], Digitizer]:
-    """A descriptor for each kind and length of packets; those of too many lengths keep their own length."""
-    found: dict[tuple[int, int, bool], Digitizer] = {}
-    for unit in reader.read_units(scan):
-        table = unit.packets
-        kinds = np.stack([table.digitizer, table.n_samples, table.packed], axis=1) if len(table) else np.empty((0, 3))
-        for index, length, packed in np.unique(kinds, axis=0).astype(int).tolist():
-            stored = reader.facts.digitizers[index]
-            form = unit.forms.get(index)
-            here = replace(stored, bits=8 * stored.width) if form is None else form.digitizer(stored, bool(packed))
-            found[_name(here, length)] = replace(here, bits=8 * here.width, n_samples=length)
-    names = sorted(found)
-    if len(names) <= MOST_DESCRIPTORS:
-        return {name: replace(found[name], index=number) for number, name in enumerate(names, 1)}
-    return {name: replace(found[name], n_samples=reader.facts.digitizers[name[0]].n_samples) for name in names}
-
-
-def _build_points(unit: Unit, dtype: np.dtype, index: np.ndarray, offset: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Points of a unit with the places of their new packets; those without a usable packet get none."""
-    points = np.ascontiguousarray(unit.points).view(dtype).copy()
-    has = np.flatnonzero(unit.packet_of_point >= 0)
-    row = unit.packet_of_point[has]
-    toward = read_toward(points[has], unit.vectors.direction, unit.vectors.form)
-    location = points["return_point_wave_location"][has]
-    for name in _WAVES:
-        points[name] = 0
-    points["wavepacket_index"][has], points["wavepacket_offset"][has] = index[row], offset[row]
-    points["wavepacket_size"][has], points["return_point_wave_location"][has] = size[row], location
-    for axis, name in enumerate(VECTORS):
-        points[name][has] = toward[:, axis]
-    return points

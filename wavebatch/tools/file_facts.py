@@ -7,7 +7,6 @@ are read once, in bounded memory, because headers are often wrong.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from wavebatch.files.cloud.cloud_reader import CloudReader
 from wavebatch.files.cloud.column_names import read_provenance
 from wavebatch.files.las import header as las
 from wavebatch.files.las.crs import name_units, read_crs
-from wavebatch.files.las.read_points import CheckedHeader, read_checked_header
+from wavebatch.files.las.read_points import read_checked_header
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.inspect_strip import describe_samples
 
@@ -39,9 +38,50 @@ def describe_file(path: Path, *, direction: str = "auto", headerless: bool = Fal
     facts: dict[str, Any] = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
     if header.point_format in las.WITHOUT_WAVES and header.version >= (1, 3):
         facts |= _describe_waveforms(path, direction, headerless)
-    facts |= _describe_header(path, checked)
+    evlrs, _ = las.find_evlrs(path, header, 1000)
+    day, year = header.creation
+    crs, units = read_crs(path, header)
+    facts |= {
+        "las_version": "{}.{}".format(*header.version),
+        "point_format": header.point_format,
+        "compressed": header.compressed,
+        "crs": crs,
+        "coordinates": name_units(units),
+        "scales": list(header.scales),
+        "offsets": list(header.offsets),
+        "system_identifier": las.decode_text(header.system_identifier),
+        "generating_software": las.decode_text(header.generating_software),
+        "created": f"day {day} of {year}" if day or year else None,
+        "file_source_id": header.file_source_id,
+        "points": header.point_count,
+        "header_bounds": {"least": list(header.mins), "largest": list(header.maxs)},
+        "records": [
+            *({"user": one.user, "id": one.record_id, "bytes": len(one.payload), "extended": False,
+               "description": las.decode_text(one.description)} for one in header.vlrs),
+            *({"user": one.user, "id": one.record_id, "bytes": one.length, "extended": True, "description": ""}
+              for one in evlrs),
+        ],
+        "extra_dimensions": [record.name for record in checked.records],
+        "extra_bytes": [
+            {"name": record.name,
+             "type": record.dtype.base.name + (f"[{record.dtype.shape[0]}]" if record.dtype.shape else ""),
+             "description": record.description, "scale": None if record.scaling is None else record.scaling[0],
+             "no_data": None if record.no_data is None else [str(value) for value in record.no_data.tolist()]}
+            for record in checked.records
+        ],
+    }  # fmt: skip
     runs = read_provenance(header)
-    facts["provenance"] = [_describe_provenance(run) for run in runs]
+    facts["provenance"] = [
+        {
+            "version": run.get("wavebatch"),
+            "command": str(run.get("command") or "wavebatch run"),
+            "input": _table(run.get("input")).get("file"),
+            "chain": run.get("chain"),
+            "chosen_by": _table(run.get("choice")).get("by"),
+            "columns": {name: text for name, text in _table(run.get("columns")).items() if isinstance(text, str)},
+        }
+        for run in runs
+    ]
     try:
         facts |= _describe_points(path, header, bool(runs))
     except InputError as error:
@@ -99,57 +139,6 @@ def _describe_waveforms(path: Path, direction: str, headerless: bool) -> dict[st
             }
     except InputError as error:
         return {"problems": [" ".join(str(error).split()).removeprefix(f"{path}: ")]}
-
-
-def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
-    header = checked.header
-    evlrs, _ = las.find_evlrs(path, header, 1000)
-    day, year = header.creation
-    crs, units = read_crs(path, header)
-    return {
-        "las_version": "{}.{}".format(*header.version),
-        "point_format": header.point_format,
-        "compressed": header.compressed,
-        "crs": crs,
-        "coordinates": name_units(units),
-        "scales": list(header.scales),
-        "offsets": list(header.offsets),
-        "system_identifier": las.decode_text(header.system_identifier),
-        "generating_software": las.decode_text(header.generating_software),
-        "created": f"day {day} of {year}" if day or year else None,
-        "file_source_id": header.file_source_id,
-        "points": header.point_count,
-        "header_bounds": {"least": list(header.mins), "largest": list(header.maxs)},
-        "records": [
-            *({"user": one.user, "id": one.record_id, "bytes": len(one.payload), "extended": False,
-               "description": las.decode_text(one.description)} for one in header.vlrs),
-            *({"user": one.user, "id": one.record_id, "bytes": one.length, "extended": True, "description": ""}
-              for one in evlrs),
-        ],
-        "extra_dimensions": [record.name for record in checked.records],
-        "extra_bytes": [
-            {"name": record.name,
-             "type": record.dtype.base.name + (f"[{record.dtype.shape[0]}]" if record.dtype.shape else ""),
-             "description": record.description, "scale": None if record.scaling is None else record.scaling[0],
-             "no_data": None if record.no_data is None else [str(value) for value in record.no_data.tolist()]}
-            for record in checked.records
-        ],
-    }  # fmt: skip
-
-
-def _describe_provenance(run: Mapping[str, Any]) -> dict[str, Any]:
-    """What made a cloud: version, command, chain, input; what it does not hold is None.
-
-    The provenance may come from any program, so nothing in it is certain.
-    """
-    return {
-        "version": run.get("wavebatch"),
-        "command": str(run.get("command") or "wavebatch run"),
-        "input": _table(run.get("input")).get("file"),
-        "chain": run.get("chain"),
-        "chosen_by": _table(run.get("choice")).get("by"),
-        "columns": {name: text for name, text in _table(run.get("columns")).items() if isinstance(text, str)},
-    }
 
 
 def _table(value: Any) -> dict[str, Any]:

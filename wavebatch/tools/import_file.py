@@ -154,7 +154,18 @@ def import_file(
             records=(*frame.records, record), overwrite=overwrite, week=plan.week, system=header.system,
             source=header.source & 0xFFFF,
         ) as writer:  # fmt: skip
-            system = _draft_system(writer, path, plan, source, overwrite)
+            if sent is not None and sent.shape is not None:
+                channel, bits, spacing, _ = decode(sent.kind)
+                saved = save_outgoing(
+                    sent.shape, sent.reference, spacing, bits, path.name, source,
+                    same_receiver=channel == plan.primary, energy_scatter=sent.scatter, energy_error=sent.error,
+                    width_scatter=sent.width_scatter,
+                )  # fmt: skip
+                draft = Draft(writer.target.with_suffix(SYSTEM_SUFFIX), overwrite=overwrite)
+                writer.drafts.insert(0, draft)
+                with reporting(draft.target):
+                    draft.file.write(format_survey(saved).encode())
+                counts.system_file = str(draft.target)
             for piece in reader.pieces():
                 points = build_points(
                     frame.place(piece), plan, writer, header, counts, detect=options.returns == "detect"
@@ -162,46 +173,6 @@ def import_file(
                 writer.write_points(points)
                 progress(len(piece.pulses))
             writer.commit()
-    counts.system_file = None if system is None else str(system)
-    counts.notes = (*frame.notes, *_note(header, plan, counts))
-    return counts
-
-
-def _find_state(target: Path, account: dict[str, Any]) -> str:
-    """`same`: the strip of this import is there; `mine`: that of another import, or none; `other`: another file."""
-    if not target.exists():
-        return "mine"
-    try:
-        records = [vlr for vlr in read_header(target).vlrs if vlr.user_id.rstrip(b"\0") == USER_ID]
-        found = json.loads(records[0].payload) if records else None
-    except (InputError, ValueError):
-        return "other"
-    if found is None:
-        return "other"
-    return "same" if found == account else "mine"
-
-
-def _draft_system(
-    writer: FullwaveWriter, path: Path, plan: Plan, source: dict[str, Any], overwrite: bool
-) -> Path | None:
-    """Puts the system file beside the strip, where the outgoing pulses have a shape; returns its name."""
-    sent = plan.outgoing
-    if sent is None or sent.shape is None:
-        return None
-    channel, bits, spacing, _ = decode(sent.kind)
-    saved = save_outgoing(
-        sent.shape, sent.reference, spacing, bits, path.name, source,
-        same_receiver=channel == plan.primary, energy_scatter=sent.scatter, energy_error=sent.error,
-        width_scatter=sent.width_scatter,
-    )  # fmt: skip
-    draft = Draft(writer.target.with_suffix(SYSTEM_SUFFIX), overwrite=overwrite)
-    writer.drafts.insert(0, draft)
-    with reporting(draft.target):
-        draft.file.write(format_survey(saved).encode())
-    return draft.target
-
-
-def _note(header: PulseHeader, plan: Plan, counts: ImportSummary) -> list[str]:
     notes = []
     if plan.one_time:
         notes.append("all pulses have the same time; they get times 0.1 ms apart")
@@ -218,7 +189,22 @@ def _note(header: PulseHeader, plan: Plan, counts: ImportSummary) -> list[str]:
     kinds = {s.kind for one in header.descriptors.values() for s in one.samplings}
     if plan.outgoing is None and kinds - {RETURNING}:
         notes.append("its recordings of outgoing pulses show no pulse")
-    return notes
+    counts.notes = (*frame.notes, *notes)
+    return counts
+
+
+def _find_state(target: Path, account: dict[str, Any]) -> str:
+    """`same`: the strip of this import is there; `mine`: that of another import, or none; `other`: another file."""
+    if not target.exists():
+        return "mine"
+    try:
+        records = [vlr for vlr in read_header(target).vlrs if vlr.user_id.rstrip(b"\0") == USER_ID]
+        found = json.loads(records[0].payload) if records else None
+    except (InputError, ValueError):
+        return "other"
+    if found is None:
+        return "other"
+    return "same" if found == account else "mine"
 
 
 # The first pass: what segments and outgoing pulses there are
@@ -318,15 +304,7 @@ def make_plan(reader: PulseReader) -> Plan:
     noise = max(float(np.median(np.concatenate(steps))) * MAD_TO_STD / np.sqrt(2), QUANTISATION_STD)
     latest = max(abs(time * header.time_scale + header.time_offset) for time in (first, last))
     week = latest <= 2 * WEEK  # flights over the end of a week count on
-    return Plan(
-        primary, overlap.top, ratios, unknown, noise, _list_digitizers(codes, ratios), _learn_outgoing(outgoing),
-        header.count >= ONE_TIME and first == last, week, header.time_offset - (0.0 if week else ADJUSTED),
-        intensity == 0,
-    )  # fmt: skip
-
-
-def _list_digitizers(codes: Counter[int], ratios: dict[int, float]) -> dict[int, Digitizer]:
-    """A descriptor per kind of segment; where they are too many, one for several lengths."""
+    # A descriptor per kind of segment; where they are too many, one for several lengths.
     step = 1
     while True:
         # The last 18 bits are the length, which is rounded up.
@@ -341,7 +319,11 @@ def _list_digitizers(codes: Counter[int], ratios: dict[int, float]) -> dict[int,
         # Counts of a less sensitive channel are written on the scale of the sensitive one.
         bits = 16 if channel in ratios and bits == 8 else 32 if channel in ratios else bits
         digitizers[code] = Digitizer(index[wide], bits, length, spacing)
-    return digitizers
+    return Plan(
+        primary, overlap.top, ratios, unknown, noise, digitizers, _learn_outgoing(outgoing),
+        header.count >= ONE_TIME and first == last, week, header.time_offset - (0.0 if week else ADJUSTED),
+        intensity == 0,
+    )  # fmt: skip
 
 
 def _learn_outgoing(samples: dict[int, list[tuple[np.ndarray, np.ndarray]]]) -> Outgoing | None:
@@ -391,7 +373,19 @@ def build_points(
 ) -> np.ndarray:
     """Write the packets of a piece and return its points, sorted by pulse and time."""
     segments = piece.segments
-    rows = choose_segments(piece, plan, counts)
+    # Segments that become packets, by pulse and time: of two channels that recorded the same, one.
+    returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
+    first, second = find_partners(segments, plan.primary, returning)
+    drop = np.zeros(len(segments), bool)
+    known = np.isin(segments.channel[second], list(plan.ratios))
+    for a, b in group_rows(segments, first[known], second[known]):
+        over = piece.samples(a).max(axis=1) >= SATURATED * plan.top
+        drop[a[over]], drop[b[~over]] = True, True
+        counts.replaced += int(np.count_nonzero(over))
+        counts.covered += int(np.count_nonzero(~over))
+    rows = returning[~drop[returning]]
+    start = (segments.start * segments.unit)[rows]
+    rows = rows[np.lexsort((start, segments.pulse[rows]))]
     offset, width = np.empty(len(rows), np.uint64), np.empty(len(rows), np.int64)
     owner, sample, height = [], [], []
     for (places,) in group_rows(segments.take(rows), np.arange(len(rows))):
@@ -403,7 +397,17 @@ def build_points(
         samples = np.pad(samples, ((0, 0), (0, digitizer.n_samples - samples.shape[1])))
         offset[places] = writer.write_packets(samples, digitizer.index)
         width[places] = samples.shape[1] * digitizer.width
-        found, at = _place_returns(samples, plan.noise, detect=detect)
+        # Each return is the strongest sample, or a maximum that stands out of the noise. Its time lies between samples:
+        # a run places echoes relative to the returns, so half a sample would be 7 cm.
+        smoothed = smooth_121(transpose_samples(samples))
+        smoothed -= np.partition(smoothed, len(smoothed) // 4, axis=0)[len(smoothed) // 4]
+        found, at = np.arange(len(samples)), np.argmax(samples, axis=1)
+        if detect:
+            high, top = find_peaks(smoothed, np.full(len(samples), np.float32(PEAK * plan.noise)))
+            silent = np.setdiff1d(found, high)
+            found, at = np.concatenate([high, silent]), np.concatenate([top, at[silent]])
+        if len(smoothed) >= 5:
+            at = np.clip(estimate_starts(smoothed, found, at, 1.0)[1], 0, len(smoothed) - 1)
         owner.append(places[found])
         sample.append(at)
         height.append(samples[found, np.round(at).astype(np.int64)])
@@ -426,7 +430,26 @@ def build_points(
         points[name] = np.clip(stored[:, axis], -(2**31), 2**31 - 1)
         points[vector] = -direction[:, axis] / (chosen.unit * PS_PER_NS)
     points["return_point_wave_location"] = sample * chosen.spacing * PS_PER_NS
-    _fill_pulses(points, piece, chosen.pulse, plan, header)
+    # Fields that all returns of a pulse share, and return numbers; points are sorted by pulse and time.
+    records = piece.pulses[chosen.pulse]
+    begin = np.searchsorted(chosen.pulse, chosen.pulse, side="left")
+    count = np.searchsorted(chosen.pulse, chosen.pulse, side="right") - begin
+    number = np.minimum(np.arange(len(chosen.pulse)) - begin + 1, MOST_RETURNS)
+    points["bit_fields"] = number | (np.minimum(count, MOST_RETURNS) << 4)
+    bits = records["bits"].astype(np.int64)
+    scanner = np.zeros(256, np.int64)
+    for index, descriptor in header.descriptors.items():
+        scanner[index] = (descriptor.scanner - 1) & 3 if descriptor.scanner else 0
+    edge, sweep = (bits >> 12) & 1, (bits >> 13) & 1
+    points["classification_flags"] = (scanner[bits & 255] << 4) | (sweep << 6) | (edge << 7)
+    points[FACET] = bits >> 14
+    points["intensity"], points["classification"] = records["intensity"], records["classification"]
+    has_source = "point_source" in records.dtype.names
+    points["point_source_id"] = (records["point_source"] if has_source else np.array(header.source)) & 0xFFFF
+    if plan.one_time:
+        points["gps_time"] = (piece.first + chosen.pulse) * STEP
+    else:
+        points["gps_time"] = records["time"] * header.time_scale + plan.time_offset
     codes = code_segments(chosen, np.arange(len(chosen)))
     kinds, which = np.unique(codes, return_inverse=True)
     points["wavepacket_index"] = np.array([plan.digitizers[int(kind)].index for kind in kinds], np.uint8)[which]
@@ -440,64 +463,6 @@ def build_points(
     counts.packets += len(rows)
     counts.without_returns += len(piece.pulses) - len(np.unique(chosen.pulse))
     return points
-
-
-def choose_segments(piece: PulsePiece, plan: Plan, counts: ImportSummary) -> np.ndarray:
-    """Return the rows of the segments that become packets, sorted by pulse and time."""
-    segments = piece.segments
-    returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
-    first, second = find_partners(segments, plan.primary, returning)
-    drop = np.zeros(len(segments), bool)
-    known = np.isin(segments.channel[second], list(plan.ratios))
-    for a, b in group_rows(segments, first[known], second[known]):
-        over = piece.samples(a).max(axis=1) >= SATURATED * plan.top
-        drop[a[over]], drop[b[~over]] = True, True
-        counts.replaced += int(np.count_nonzero(over))
-        counts.covered += int(np.count_nonzero(~over))
-    rows = returning[~drop[returning]]
-    start = (segments.start * segments.unit)[rows]
-    return rows[np.lexsort((start, segments.pulse[rows]))]
-
-
-def _place_returns(samples: np.ndarray, noise: float, *, detect: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Waveform and time [samples] of each return: the strongest sample, or all maxima that stand out of the noise.
-
-    The time lies between samples: a run places echoes relative to the returns, so half a sample would be 7 cm.
-    """
-    smoothed = smooth_121(transpose_samples(samples))
-    smoothed -= np.partition(smoothed, len(smoothed) // 4, axis=0)[len(smoothed) // 4]
-    waveform, sample = np.arange(len(samples)), np.argmax(samples, axis=1)
-    if detect:
-        found, at = find_peaks(smoothed, np.full(len(samples), np.float32(PEAK * noise)))
-        silent = np.setdiff1d(waveform, found)
-        waveform, sample = np.concatenate([found, silent]), np.concatenate([at, sample[silent]])
-    if len(smoothed) < 5:
-        return waveform, sample
-    _, time, _ = estimate_starts(smoothed, waveform, sample, 1.0)
-    return waveform, np.clip(time, 0, len(smoothed) - 1)
-
-
-def _fill_pulses(points: np.ndarray, piece: PulsePiece, pulse: np.ndarray, plan: Plan, header: PulseHeader) -> None:
-    """Fields that all returns of a pulse share, and return numbers; points are sorted by pulse and time."""
-    records = piece.pulses[pulse]
-    begin = np.searchsorted(pulse, pulse, side="left")
-    count = np.searchsorted(pulse, pulse, side="right") - begin
-    number = np.minimum(np.arange(len(pulse)) - begin + 1, MOST_RETURNS)
-    points["bit_fields"] = number | (np.minimum(count, MOST_RETURNS) << 4)
-    bits = records["bits"].astype(np.int64)
-    scanner = np.zeros(256, np.int64)
-    for index, descriptor in header.descriptors.items():
-        scanner[index] = (descriptor.scanner - 1) & 3 if descriptor.scanner else 0
-    edge, direction = (bits >> 12) & 1, (bits >> 13) & 1
-    points["classification_flags"] = (scanner[bits & 255] << 4) | (direction << 6) | (edge << 7)
-    points[FACET] = bits >> 14
-    points["intensity"], points["classification"] = records["intensity"], records["classification"]
-    has_source = "point_source" in records.dtype.names
-    points["point_source_id"] = (records["point_source"] if has_source else np.array(header.source)) & 0xFFFF
-    if plan.one_time:
-        points["gps_time"] = (piece.first + pulse) * STEP
-    else:
-        points["gps_time"] = records["time"] * header.time_scale + plan.time_offset
 
 
 def _measure_sent(piece: PulsePiece, outgoing: Outgoing, counts: ImportSummary) -> tuple[np.ndarray, np.ndarray]:

@@ -328,8 +328,8 @@ class Pairing:
             completeness=_share(self.matched, b),
             correctness=_share(self.matched, a),
             exact_count=_share(self.exact, self.pulses),
-            counts_a=_list_counts(self.counts[0]),
-            counts_b=_list_counts(self.counts[1]),
+            counts_a={number: int(pulses) for number, pulses in enumerate(self.counts[0]) if pulses},
+            counts_b={number: int(pulses) for number, pulses in enumerate(self.counts[1]) if pulses},
             differences=self.differences.spreads(),
             differences_by={
                 kind: {name_class(number) if kind == "class" else str(number): one for number, one in group.items()}
@@ -356,10 +356,6 @@ class Pairing:
         self.breakdowns[side].add(rows, alone, others)
 
 
-def _list_counts(counts: np.ndarray) -> dict[int, int]:
-    return {number: int(pulses) for number, pulses in enumerate(counts) if pulses}
-
-
 def _share(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
 
@@ -380,32 +376,24 @@ def pair_echoes(
     left, right = list_pairs(pulse_a[calm_a], xyz_a[calm_a, 2], pulse_b[calm_b], xyz_b[calm_b, 2], reach)
     left, right = calm_a[left], calm_b[right]
     if crowd.any():
-        more = _list_crowded(pulse_a, xyz_a, pulse_b, xyz_b, crowd, reach)
-        left, right = (np.concatenate(both) for both in zip((left, right), more, strict=True))
+        # Among points with one GPS time, heights would leave too many pairs to check.
+        rows_a, rows_b = (np.flatnonzero(crowd[pulse]) for pulse in (pulse_a, pulse_b))
+        if len(rows_a) and len(rows_b):
+            trees = scipy.spatial.cKDTree(xyz_a[rows_a]), scipy.spatial.cKDTree(xyz_b[rows_b])
+            if trees[0].count_neighbors(trees[1], reach) > MOST_PAIRS:
+                raise InputError(
+                    f"{len(rows_a)} and {len(rows_b)} points share their GPS times with more than {MOST_PER_PULSE} "
+                    "others and lie too close together to be paired; remove the points without a valid GPS time"
+                )
+            near = trees[0].sparse_distance_matrix(trees[1], reach, output_type="ndarray")
+            near_a, near_b = rows_a[near["i"]], rows_b[near["j"]]
+            same = pulse_a[near_a] == pulse_b[near_b]
+            left, right = np.append(left, near_a[same]), np.append(right, near_b[same])
     distance = np.linalg.norm(xyz_a[left] - xyz_b[right], axis=1)
     near = np.flatnonzero(distance <= reach)
     left, right = left[near], right[near]
     kept = pair_nearest(left, right, distance[near], len(xyz_a), len(xyz_b))
     return left[kept], right[kept]
-
-
-def _list_crowded(
-    pulse_a: np.ndarray, xyz_a: np.ndarray, pulse_b: np.ndarray, xyz_b: np.ndarray, crowd: np.ndarray, reach: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs within reach among points with one GPS time; here heights would leave too many pairs to check."""
-    rows_a, rows_b = (np.flatnonzero(crowd[pulse]) for pulse in (pulse_a, pulse_b))
-    if not len(rows_a) or not len(rows_b):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    trees = scipy.spatial.cKDTree(xyz_a[rows_a]), scipy.spatial.cKDTree(xyz_b[rows_b])
-    if trees[0].count_neighbors(trees[1], reach) > MOST_PAIRS:
-        raise InputError(
-            f"{len(rows_a)} and {len(rows_b)} points share their GPS times with more than {MOST_PER_PULSE} others and "
-            "lie too close together to be paired; remove the points without a valid GPS time"
-        )
-    near = trees[0].sparse_distance_matrix(trees[1], reach, output_type="ndarray")
-    left, right = rows_a[near["i"]], rows_b[near["j"]]
-    same = pulse_a[left] == pulse_b[right]
-    return left[same], right[same]
 
 
 # Differences of pairs

@@ -112,7 +112,21 @@ class Forest:
     """
 
     def __init__(self, paths: Sequence[Path], cell_size: float, options: ForestOptions) -> None:
-        facts = [(path, _read_facts(path)) for path in paths]
+        facts = []
+        for path in paths:
+            # The record that voxelize wrote.
+            found = next((one for one in read_provenance(read_header(path)) if one.get("forest")), None)
+            if found is None:
+                raise ConfigError(
+                    f"{path}: --forest needs voxels: wavebatch voxelize STRIP --size 1 --forest -o voxels.laz"
+                )
+            ratio = found.get("reflectance_ratio")
+            ratio = ratio if isinstance(ratio, dict) else {}
+            numbers = found.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
+            if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
+                raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it "
+                                  "anew with wavebatch voxelize --forest")  # fmt: skip
+            facts.append((path, found))
         self.size = facts[0][1]["size_m"]
         other = next((path for path, one in facts if one["size_m"] != self.size), None)
         if other is not None:
@@ -133,10 +147,6 @@ class Forest:
         self.reasons = np.zeros(3, np.int64)
         """Cells by KNOWN, FEW_RAYS, NO_GROUND."""
 
-    def describe(self) -> dict[str, str]:
-        """What the metrics assume, for the tags of the raster."""
-        return {"LEAF_PROJECTION": f"{self.options.leaf_projection:g}", "VOXEL_SIZE": f"{self.size:g}"}
-
     def list_bands(self, highest: float) -> list[Band]:
         """Names and units of the bands, for voxels up to a height [m]."""
         step = self.options.layer
@@ -156,7 +166,8 @@ class Forest:
         columns, column = np.unique(voxels.column, return_inverse=True)
         owner = np.zeros(len(columns), np.int64)
         owner[column] = voxels.cell
-        light, soil = np.bincount(cell, _caught(values), n), np.bincount(cell, values[:, 3] * _zeroed(values[:, 6]), n)
+        # Light that plants and ground caught, and that the ground caught.
+        light, soil = (np.bincount(cell, values[:, 3] * _zeroed(values[:, part]), n) for part in (5, 6))
         plants = light - soil
         cover = plants / np.where(light > 0, light, 1.0)
         # Columns differ by what grows in them and by the rays that they got: the spread of their sums has both.
@@ -170,10 +181,11 @@ class Forest:
         projection, common = self.options.leaf_projection, cover * self.ratio_error
         area, variance = sums.total(slot[0], n)
         area_err = np.sqrt(variance + common**2) / projection
-        layer = self._place(slot[1])
+        # The layer that a height lies in.
+        layer, place = (np.clip(height / self.options.layer, 0, self.layers - 1).astype(np.int64)
+                        for height in (slot[1], voxels.height))  # fmt: skip
         dense, variance = (one.reshape(n, -1).T for one in sums.total(slot[0] * self.layers + layer, n * self.layers))
-        place = self._place(voxels.height) * n + voxels.cell
-        caught = np.bincount(place, voxels.plants, n * self.layers).reshape(-1, n)
+        caught = np.bincount(place * n + voxels.cell, voxels.plants, n * self.layers).reshape(-1, n)
         below = np.cumsum(caught, axis=0) - caught + soil
         lit = np.where(below > 0, below, 1.0)
         common = self.ratio_error * soil * (1.0 / lit - 1.0 / (lit + caught))
@@ -185,10 +197,6 @@ class Forest:
         result = np.full((len(bands) + 1, number), np.nan)
         result[:, filled] = np.concatenate([np.where(reason == KNOWN, bands, np.nan), reason[None]])
         return result
-
-    def _place(self, height: np.ndarray) -> np.ndarray:
-        """The layer of `layer` metres that a height lies in."""
-        return np.clip(height / self.options.layer, 0, self.layers - 1).astype(np.int64)
 
     def _add_layers(
         self, voxels: _Voxels, columns: np.ndarray, column: np.ndarray, owner: np.ndarray
@@ -239,7 +247,7 @@ def _join(values: np.ndarray, cell: np.ndarray, size: float) -> _Voxels:
     group = np.empty(len(order), np.int64)
     group[order] = np.cumsum(new) - 1
     first, n = order[new], int(new.sum())
-    caught, free = _caught(values), np.where(np.isfinite(values[:, 8]), values[:, 7], 0.0)
+    caught, free = values[:, 3] * _zeroed(values[:, 5]), np.where(np.isfinite(values[:, 8]), values[:, 7], 0.0)
     plants = caught - values[:, 3] * _zeroed(values[:, 6])
     sums = values[:, 4], values[:, 3], caught, plants, free
     path, light, caught, plants, whole = (np.bincount(group, one, n) for one in sums)
@@ -275,26 +283,8 @@ def _find_height(voxels: _Voxels, number: int, part: float) -> np.ndarray:
     return found
 
 
-def _caught(values: np.ndarray) -> np.ndarray:
-    return values[:, 3] * _zeroed(values[:, 5])
-
-
 def _zeroed(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values), values, 0.0)
-
-
-def _read_facts(path: Path) -> dict:
-    """The record that voxelize wrote; ConfigError for none, and for one that it cannot have written."""
-    facts = next((one for one in read_provenance(read_header(path)) if one.get("forest")), None)
-    if facts is None:
-        raise ConfigError(f"{path}: --forest needs voxels: wavebatch voxelize STRIP --size 1 --forest -o voxels.laz")
-    ratio = facts.get("reflectance_ratio")
-    ratio = ratio if isinstance(ratio, dict) else {}
-    numbers = facts.get("size_m"), ratio.get("ratio"), ratio.get("error") or 1.0
-    if not all(isinstance(value, int | float) and 0 < value < np.inf for value in numbers):
-        raise ConfigError(f"{path}: its record of voxels is damaged, at size_m or reflectance_ratio; make it anew with "
-                          "wavebatch voxelize --forest")  # fmt: skip
-    return facts
 
 
 MOST_SIDE, MOST_CELLS = 2_000_000, 100_000_000_000
@@ -366,66 +356,27 @@ def write_grid(
         west, south, east, north = (value / options.size for value in options.bbox)
         borders = math.floor(west), math.floor(south), math.ceil(east), math.ceil(north)
         options = replace(options, bbox=tuple(border * options.size for border in borders))
-    crs, unit, unnamed = _find_crs(paths, options.crs)
+    crs, unit, unnamed = options.crs, "m", []
+    if crs is not None:
+        unit = find_crs_unit(crs, "--crs")
+    else:  # that of all clouds
+        first: tuple[Path, str] | None = None
+        for path in paths:
+            found = read_crs_definition(path, read_checked_header(path, waveforms=False).header)
+            if found is None:
+                unnamed.append(path)
+                continue
+            unit = find_crs_unit(found, str(path))
+            if first is not None and not same_crs(first[1], found, str(path)):
+                raise ConfigError(f"{path}: has another CRS than {first[0]}; make a raster of each, or give --crs")
+            first = first or (path, found)
+        crs, unnamed = (None, []) if first is None else (first[1], unnamed)
     if metrics is not None and unit != "m":
         raise ConfigError(f"{paths[0]}: --forest: voxels are measured in metres, and coordinates are in {unit}; "
                           "project the strip to a CRS in metres first")  # fmt: skip
     clouds = cells.Clouds(paths, options.columns or (None,), options.chosen)
     for one in clouds.every:
         cells.check_statistic(one.name, options.statistic, one, paths[0])
-    box, points, largest = _find_extent(clouds, options)
-    if unit == "degree" and options.size > max(box[2] - box[0], box[3] - box[1]):
-        raise ConfigError(f"{paths[0]}: coordinates are degrees, and cells of {options.size:g} degrees are larger than "
-                          "the clouds; --size 1e-05 gives cells of about 1 m")  # fmt: skip
-    grid = _lay_out(str(paths[0]), box, options)
-    west, _, _, north = grid.extent
-    # float32 where that holds neighbouring values of each column apart.
-    wide = (one.name == "gps_time" or one.step > 0 and top > _EXACT * one.step
-            for one, top in zip(clouds.every, largest, strict=True))  # fmt: skip
-    dtype = "float64" if metrics is None and any(wide) else "float32"
-    layout = RasterLayout(west, north, grid.size, grid.rows, grid.columns, dtype, options.no_data, crs, unit)
-    if metrics is None:
-        statistic = options.statistic
-        units = {"count": "", "density": f"1/{unit}2"}
-        bands = [Band(f"{statistic} of {one.name}", units.get(statistic, one.unit.strip("-"))) for one in clouds.every]
-    else:
-        bands, statistic = metrics.list_bands(largest[COLUMNS.index("height")]), metrics.compute
-    result = GridResult(layout=layout, bands=tuple(bands), unnamed=unnamed)
-    tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}"}
-    tags |= {"STATISTIC": options.statistic} if metrics is None else metrics.describe()
-    with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
-        tiles = cells.compute_tiles(clouds, statistic, grid, points, result, options.bbox, held=held)
-        for row, column, values in tiles:
-            result.filled += int(np.isfinite(values).any(axis=0).sum())
-            writer.write_tile(row, column, values)
-        writer.publish()
-    if metrics is not None:
-        result.reasons = tuple(metrics.reasons.tolist())
-        result.values = (*[result.reasons[KNOWN]] * (len(bands) - 1), result.filled)
-    return result
-
-
-def _find_crs(paths: Sequence[Path], given: str | None) -> tuple[str | None, str, tuple[Path, ...]]:
-    """The CRS of all clouds, its unit, and the clouds that have none; ConfigError where they differ."""
-    if given is not None:
-        return given, find_crs_unit(given, "--crs"), ()
-    first: tuple[Path, str] | None = None
-    unit, unnamed = "m", []
-    for path in paths:
-        checked = read_checked_header(path, waveforms=False)
-        found = read_crs_definition(path, checked.header)
-        if found is None:
-            unnamed.append(path)
-            continue
-        unit = find_crs_unit(found, str(path))
-        if first is not None and not same_crs(first[1], found, str(path)):
-            raise ConfigError(f"{path}: has another CRS than {first[0]}; make a raster of each, or give --crs")
-        first = first or (path, found)
-    return (None, unit, ()) if first is None else (first[1], unit, tuple(unnamed))
-
-
-def _find_extent(clouds: cells.Clouds, options: GridOptions) -> tuple[cells.Box, int, np.ndarray]:
-    """The box of all points, their number, and the largest absolute value of each column."""
     low, high, points = np.full(2, np.inf), np.full(2, -np.inf), 0
     largest = np.zeros(len(clouds.every))
     for _, rows, _ in clouds.read_all():
@@ -440,22 +391,49 @@ def _find_extent(clouds: cells.Clouds, options: GridOptions) -> tuple[cells.Box,
         wanted += ["the chosen flags"] if chosen.flags or chosen.drop_flags else []
         wanted += ["what --where asks for"] if chosen.where is not None else []
         raise InputError(f"{clouds.paths[0]}: no raster: no point has {' and '.join(wanted)}")
-    return options.bbox or (*low.tolist(), *high.tolist()), points, largest
-
-
-def _lay_out(where: str, box: cells.Box, options: GridOptions) -> cells.Grid:
-    """The cells of the raster; ConfigError for too many."""
+    box = options.bbox or (*low.tolist(), *high.tolist())
+    if unit == "degree" and options.size > max(box[2] - box[0], box[3] - box[1]):
+        raise ConfigError(f"{paths[0]}: coordinates are degrees, and cells of {options.size:g} degrees are larger than "
+                          "the clouds; --size 1e-05 gives cells of about 1 m")  # fmt: skip
     west, south, east, north = box
     size = options.size
     columns, rows = (east - west) / size, (north - south) / size
     if max(columns, rows) > MOST_SIDE or columns * rows > MOST_CELLS:
         raise ConfigError(
-            f"{where}: {columns:.3g} x {rows:.3g} cells of {size:g} are too many (at most {MOST_CELLS:.0g}): points "
+            f"{paths[0]}: {columns:.3g} x {rows:.3g} cells of {size:g} are too many (at most {MOST_CELLS:.0g}): points "
             f"lie from {west:.10g}, {south:.10g} to {east:.10g}, {north:.10g}; clouds far apart need a raster each; if "
             "a coordinate is damaged, give --bbox; or give a larger --size"
         )
+    grid = cells.Grid.cover(box, size)
     if options.bbox is not None:  # its cells end at a border, where no other cell begins
         first = round(west / size), round(south / size)
         last = max(round(east / size) - 1, first[0]), max(round(north / size) - 1, first[1])
-        return cells.Grid(size, *first, last[1] - first[1] + 1, last[0] - first[0] + 1)
-    return cells.Grid.cover(box, size)
+        grid = cells.Grid(size, *first, last[1] - first[1] + 1, last[0] - first[0] + 1)
+    west, _, _, north = grid.extent
+    # float32 where that holds neighbouring values of each column apart.
+    wide = (one.name == "gps_time" or one.step > 0 and top > _EXACT * one.step
+            for one, top in zip(clouds.every, largest, strict=True))  # fmt: skip
+    dtype = "float64" if metrics is None and any(wide) else "float32"
+    layout = RasterLayout(west, north, grid.size, grid.rows, grid.columns, dtype, options.no_data, crs, unit)
+    if metrics is None:
+        statistic = options.statistic
+        units = {"count": "", "density": f"1/{unit}2"}
+        bands = [Band(f"{statistic} of {one.name}", units.get(statistic, one.unit.strip("-"))) for one in clouds.every]
+    else:
+        bands, statistic = metrics.list_bands(largest[COLUMNS.index("height")]), metrics.compute
+    result = GridResult(layout=layout, bands=tuple(bands), unnamed=tuple(unnamed))
+    tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}"}
+    if metrics is None:
+        tags["STATISTIC"] = options.statistic
+    else:  # what the metrics assume
+        tags |= {"LEAF_PROJECTION": f"{metrics.options.leaf_projection:g}", "VOXEL_SIZE": f"{metrics.size:g}"}
+    with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
+        tiles = cells.compute_tiles(clouds, statistic, grid, points, result, options.bbox, held=held)
+        for row, column, values in tiles:
+            result.filled += int(np.isfinite(values).any(axis=0).sum())
+            writer.write_tile(row, column, values)
+        writer.publish()
+    if metrics is not None:
+        result.reasons = tuple(metrics.reasons.tolist())
+        result.values = (*[result.reasons[KNOWN]] * (len(bands) - 1), result.filled)
+    return result

@@ -277,23 +277,23 @@ class AreaTally:
     def finish(self) -> list[AreaStats]:
         """The statistics: cells by column and row, polygons in the order of their file, `outside` last."""
         order = np.argsort(np.where(self._areas == _OUTSIDE, np.iinfo(np.int64).max, self._areas), kind="stable")
-        return [self._describe(row) for row in order.tolist()]
-
-    def _describe(self, row: int) -> AreaStats:
-        sums, area = self._sums[row], self.division.describe(int(self._areas[row]))
-        several, parts = int(sums["several"]), (sums["pairs"], sums["apart"], sums["least"])
-        ranks = zip(self._ranks, *parts, strict=True)
-        return AreaStats(
-            **area._asdict(),
-            **asdict(describe_pairs(parts[0].sum(), parts[1].sum(), parts[2].min())),
-            points=int(sums["by_number"].sum()),
-            pulses=int(sums["by_count"].sum()),
-            by_number=_share_counts(sums["by_number"]),
-            by_count=_share_counts(sums["by_count"]),
-            separations={name: describe_pairs(*values) for name, *values in ranks if values[0]},
-            several=several,
-            depth=float(sums["depth"]) / several if several else math.nan,
-        )
+        found = []
+        for row in order.tolist():
+            sums, area = self._sums[row], self.division.describe(int(self._areas[row]))
+            several, parts = int(sums["several"]), (sums["pairs"], sums["apart"], sums["least"])
+            ranks = zip(self._ranks, *parts, strict=True)
+            found.append(AreaStats(
+                **area._asdict(),
+                **asdict(describe_pairs(parts[0].sum(), parts[1].sum(), parts[2].min())),
+                points=int(sums["by_number"].sum()),
+                pulses=int(sums["by_count"].sum()),
+                by_number=_share_counts(sums["by_number"]),
+                by_count=_share_counts(sums["by_count"]),
+                separations={name: describe_pairs(*values) for name, *values in ranks if values[0]},
+                several=several,
+                depth=float(sums["depth"]) / several if several else math.nan,
+            ))  # fmt: skip
+        return found
 
 
 def _share_counts(counts: np.ndarray) -> dict[int, float]:
@@ -557,21 +557,6 @@ class _Tally:
         found = {one.name: getattr(whole, one.name) for one in fields(PulseStats)}
         found["separations"] = {"all": Separation(whole.pairs, whole.mean, whole.least), **whole.separations}
         found["depth"] = self.depth / whole.several if whole.several else math.nan
-        return ReturnStats(
-            cloud=cloud,
-            **found,
-            incomplete=self.incomplete,
-            pulses_by=" and ".join(sorted(self.methods)),
-            dead_zone=zone,
-            dead_zones=zones,
-            hidden=hidden,
-            flags=None if self.flags is None else dict(zip(names, self.flags.tolist(), strict=True)),
-            warnings=tuple(self._warn(zone, hidden, whole)),
-            areas=tuple(stats for area in self.areas for stats in area.finish()),
-            left_out=self.left_out,
-        )
-
-    def _warn(self, zone: float, hidden: float, whole: AreaStats) -> list[str]:
         lines = list(self.notes)
         if self.left_out:
             lines.append(
@@ -596,4 +581,16 @@ class _Tally:
                 f"incomplete: {self.incomplete} of {whole.pulses} pulses have another number of points than stored in "
                 "them; tiles and thinned clouds give fewer returns per pulse than the sensor recorded"
             )
-        return lines
+        return ReturnStats(
+            cloud=cloud,
+            **found,
+            incomplete=self.incomplete,
+            pulses_by=" and ".join(sorted(self.methods)),
+            dead_zone=zone,
+            dead_zones=zones,
+            hidden=hidden,
+            flags=None if self.flags is None else dict(zip(names, self.flags.tolist(), strict=True)),
+            warnings=tuple(lines),
+            areas=tuple(stats for area in self.areas for stats in area.finish()),
+            left_out=self.left_out,
+        )

@@ -110,7 +110,20 @@ def read_scan_lines(
             continue
         names = [field.name for field in fields(_Pulses)]
         pulses = _Pulses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-        pulses = _join_waveforms(pulses.take(np.argsort(pulses.point, kind="stable")))
+        # Waveforms of one time and direction are one pulse, the earliest first.
+        waveforms = pulses.take(np.argsort(pulses.point, kind="stable"))
+        ray, n = waveforms.direction, len(waveforms)
+        new = find_pulses(waveforms.gps_time) == np.arange(n)
+        turned = np.linalg.norm(np.diff(ray, axis=0), axis=1) > _SAME_RAY * np.linalg.norm(ray[1:], axis=1)
+        new[1:] |= turned
+        start, pulse = np.flatnonzero(new), np.cumsum(new) - 1
+        lead = start[pulse]
+        lag = ((waveforms.origin - waveforms.origin[lead]) * ray[lead]).sum(axis=1) / (ray[lead] ** 2).sum(axis=1)
+        order = np.lexsort((lag, pulse))
+        waveforms, lag = waveforms.take(order), lag[order]
+        first = {field.name: getattr(waveforms, field.name)[start] for field in fields(waveforms)[:-3]}
+        time = waveforms.time + np.repeat(lag - lag[start][pulse], waveforms.count)
+        pulses = _Pulses(**first, count=np.add.reduceat(waveforms.count, start), time=time, values=waveforms.values)
         flat, length = pulses.direction[:, :2], np.linalg.norm(pulses.direction, axis=1)
         if axis is None:  # across the flight: where rays spread most
             unit_rays = flat / length[:, None]
@@ -152,22 +165,6 @@ def _shape(block: WaveformBlock) -> _Pulses:
     place = (block.point, block.gps_time, block.origin, block.direction)
     time = np.tile(np.arange(s) * block.spacing, n)
     return _Pulses(*place, np.full(n, block.spacing), np.full(n, s), time, values.reshape(-1))
-
-
-def _join_waveforms(waveforms: _Pulses) -> _Pulses:
-    """Pulses from waveforms in file order: those of one time and direction are one pulse, the earliest first."""
-    ray, n = waveforms.direction, len(waveforms)
-    new = find_pulses(waveforms.gps_time) == np.arange(n)
-    turned = np.linalg.norm(np.diff(ray, axis=0), axis=1) > _SAME_RAY * np.linalg.norm(ray[1:], axis=1)
-    new[1:] |= turned
-    start, pulse = np.flatnonzero(new), np.cumsum(new) - 1
-    lead = start[pulse]
-    lag = ((waveforms.origin - waveforms.origin[lead]) * ray[lead]).sum(axis=1) / (ray[lead] ** 2).sum(axis=1)
-    order = np.lexsort((lag, pulse))
-    waveforms, lag = waveforms.take(order), lag[order]
-    first = {field.name: getattr(waveforms, field.name)[start] for field in fields(waveforms)[:-3]}
-    time = waveforms.time + np.repeat(lag - lag[start][pulse], waveforms.count)
-    return _Pulses(**first, count=np.add.reduceat(waveforms.count, start), time=time, values=waveforms.values)
 
 
 def find_main_axis(apart: np.ndarray) -> np.ndarray:

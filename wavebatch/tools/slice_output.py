@@ -82,7 +82,7 @@ def build_cube(lines: Sequence[ScanLine], name: str) -> dict[str, np.ndarray]:
         raise InputError(f"{name}: scan lines differ in their spacing of samples; choose --lines of one digitizer")
     # Time from the common plane to the first sample of each pulse [ns]; 0 where it is not known.
     origin, direction = (np.concatenate([getattr(line, name) for line in lines]) for name in ("origin", "direction"))
-    starts = _split(align_times(origin, direction), lines)
+    starts = np.split(align_times(origin, direction), np.cumsum([len(line) for line in lines])[:-1])
     shift = [np.rint(start / spacing).astype(np.int64) for start in starts]
     columns = align_pulses(lines)
     pulses = 1 + max(int(column.max()) for column in columns)
@@ -115,7 +115,8 @@ def align_pulses(lines: Sequence[ScanLine]) -> list[np.ndarray]:
     unit = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
     apart = unit - unit.mean(axis=0)
     # Across the flight [rad], from the rays: 0 for the mean ray.
-    angles = _split(np.arcsin(np.clip(apart @ find_main_axis(apart), -1.0, 1.0)), lines)
+    angle = np.arcsin(np.clip(apart @ find_main_axis(apart), -1.0, 1.0))
+    angles = np.split(angle, np.cumsum([len(line) for line in lines])[:-1])
     longest = max(range(len(lines)), key=lambda i: len(lines[i]))
     # Order of the pulses of each line in which their angles ascend.
     found = [np.arange(len(angle))[:: -1 if len(angle) > 1 and angle[-1] < angle[0] else 1] for angle in angles]
@@ -134,11 +135,6 @@ def align_pulses(lines: Sequence[ScanLine]) -> list[np.ndarray]:
         column[order] = np.arange(len(order)) + shift - min(shifts)
         columns.append(column)
     return columns
-
-
-def _split(values: np.ndarray, lines: Sequence[ScanLine]) -> list[np.ndarray]:
-    """Values of the pulses of all lines, line by line."""
-    return np.split(values, np.cumsum([len(line) for line in lines])[:-1])
 
 
 @frozen(eq=False)

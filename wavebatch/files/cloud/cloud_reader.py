@@ -191,10 +191,27 @@ class CloudReader(Closing):
 
     def _find_ours(self, columns: Iterable[str], *, decibel: bool = False) -> dict[str, str]:
         """The field of each wavebatch column that the cloud has; decibel: also of those that are written in dB."""
-        if not self.written:
-            return find_columns(self.extra, columns)
-        found = {name: self.written[name] for name in columns if name in self.written}
-        return {name: one for name, one in found.items() if decibel or not self.extra[one].description.endswith("[dB]")}
+        if self.written:
+            known = {name: self.written[name] for name in columns if name in self.written}
+            return {name: one for name, one in known.items()
+                    if decibel or not self.extra[one].description.endswith("[dB]")}  # fmt: skip
+        # Other programs may drop the provenance: then by the names of the extra dimensions alone. wavebatch's name is
+        # preferred to those of other styles, and a name with the prefix `wb_` (`wb ` in old clouds) to one without. A
+        # dimension of another style counts only if it is stored as that style stores it: RIEGL's Amplitude, for
+        # example, is in dB.
+        wanted = set(columns)
+        names: list[tuple[str, str, float | None]] = [(column, column, None) for column in COLUMNS if column in wanted]
+        for style in STYLES.values():
+            names += [(key, naming.name, naming.scale) for key, naming in style.items() if not naming.decibel]
+        found: dict[str, str] = {}
+        for column, name, scale in names:
+            for field in (f"wb_{name.replace(' ', '_')}", f"wb {name}", name):
+                record = self.extra.get(field) if column in wanted else None
+                if record is None or (record.scaling is None) != (scale is None):
+                    continue
+                if column != "echo_flags" or record.dtype.kind == "u":
+                    found.setdefault(column, field)
+        return found
 
     def list_columns(self) -> list[str]:
         """Return the names of all columns of the file."""
@@ -219,7 +236,18 @@ class CloudReader(Closing):
         standard = name_standard(self.point_format)
         wanted, column = column, resolve(column, written, {name: name for name in self.extra} | standard, ours)
         if column in self.extra:
-            return self._describe_extra(column), lambda raw: self.extra[column].read(raw[column])
+            # Facts from the description in the file; for a wavebatch column from its declaration.
+            record = self.extra[column]
+            text = record.description
+            found = re.search(r"\[([^\[\]]+)\]\s*$", text)
+            unit, meaning = (found[1], text[: found.start()].strip()) if found else ("-", text.strip())
+            by_field = {field: ours for ours, field in self.written.items()}
+            name = by_field.get(column) or re.sub(r"^wb\d*[ _]", "", column)
+            if name in COLUMNS and found and unit == COLUMNS[name].unit:
+                meaning = COLUMNS[name].meaning
+            step = 0.0 if record.dtype.kind == "f" else abs((record.scaling or (1.0,))[0])
+            facts = ColumnFacts(column, unit, meaning, step, self._sources.get("echo_flags") == column)
+            return facts, lambda raw: record.read(raw[column])
         if column in known:
             fields = las.STANDARD_DTYPES[self.point_format]
             step = 0.0 if column in las.field_names(fields) and fields[column].kind == "f" else 1.0
@@ -239,40 +267,10 @@ class CloudReader(Closing):
         has = "" if hint.startswith("known") else f" Columns of the file: {', '.join(known)}"
         raise ConfigError(f"{self.path}: has no column {wanted!r}; {hint}{has}")
 
-    def _describe_extra(self, field: str) -> ColumnFacts:
-        """Facts from the description in the file; for a wavebatch column from its declaration."""
-        record = self.extra[field]
-        text = record.description
-        found = re.search(r"\[([^\[\]]+)\]\s*$", text)
-        unit, meaning = (found[1], text[: found.start()].strip()) if found else ("-", text.strip())
-        stored = {stored: column for column, stored in self.written.items()}
-        name = stored.get(field) or re.sub(r"^wb\d*[ _]", "", field)
-        if name in COLUMNS and found and unit == COLUMNS[name].unit:
-            meaning = COLUMNS[name].meaning
-        step = 0.0 if record.dtype.kind == "f" else abs((record.scaling or (1.0,))[0])
-        return ColumnFacts(field, unit, meaning, step, self._sources.get("echo_flags") == field)
-
     def _convert(self, raw: np.ndarray) -> np.ndarray:
+        """Rows of `dtype`; fields that the file does not have are 0, wavebatch columns NaN."""
         if "ray" in las.field_names(self.dtype) and self.has_packets:
             raw = raw[raw["wavepacket_index"] != 0]
-        rows = np.zeros(len(raw), self.dtype)
-        for name in las.field_names(self.dtype):
-            values = self._read_named(raw, name)
-            if values is not None:
-                rows[name] = values
-        return rows
-
-    def _read_named(self, raw: np.ndarray, name: str) -> np.ndarray | float | None:
-        """Values of a field of `dtype`; None where the file has none and they are 0."""
-        if name in COLUMNS:
-            field = self._sources.get(name)
-            return np.nan if field is None else self.extra[field].read(raw[field])
-        if name == "ray" and self.has_packets:
-            ray = np.stack([widen_integers(raw[axis]) for axis in ("x_t", "y_t", "z_t")], axis=1)
-            ray[~np.isfinite(ray).all(axis=1)] = 0.0  # damaged: as if there were none
-            return ray
-        if name == "gps_time" and self.has_gps_time:
-            return widen_integers(raw["gps_time"])
         readers = {
             "xyz": lambda: np.stack([read_field(raw, self.point_format, axis, self) for axis in "xyz"], axis=1),
             "flags": lambda: self.read_flags(raw),
@@ -283,7 +281,20 @@ class CloudReader(Closing):
             "scan_angle": lambda: las.read_angles(raw),
             "source": lambda: raw["point_source_id"],
         }
-        return readers[name]() if name in readers else None
+        rows = np.zeros(len(raw), self.dtype)
+        for name in las.field_names(self.dtype):
+            if name in COLUMNS:
+                field = self._sources.get(name)
+                rows[name] = np.nan if field is None else self.extra[field].read(raw[field])
+            elif name == "ray" and self.has_packets:
+                ray = np.stack([widen_integers(raw[axis]) for axis in ("x_t", "y_t", "z_t")], axis=1)
+                ray[~np.isfinite(ray).all(axis=1)] = 0.0  # damaged: as if there were none
+                rows[name] = ray
+            elif name == "gps_time" and self.has_gps_time:
+                rows[name] = widen_integers(raw["gps_time"])
+            elif name in readers:
+                rows[name] = readers[name]()
+        return rows
 
 
 class ColumnReader(CloudReader):
@@ -312,28 +323,6 @@ class ColumnReader(CloudReader):
         for place, read in enumerate(self._values):
             rows["values"][:, place] = read(raw)
         return rows
-
-
-def find_columns(extra: Mapping[str, las.ExtraRecord], columns: Iterable[str]) -> dict[str, str]:
-    """Return the field of each column that the cloud has, by the names of its extra dimensions alone.
-
-    For clouds without provenance, which other programs may drop. wavebatch's name is preferred to those of
-    other styles, and a name with the prefix `wb_` (`wb ` in old clouds) to one without. A dimension of another style
-    counts only if it is stored as that style stores it: RIEGL's Amplitude, for example, is in dB.
-    """
-    wanted = set(columns)
-    names: list[tuple[str, str, float | None]] = [(column, column, None) for column in COLUMNS if column in wanted]
-    for style in STYLES.values():
-        names += [(key, naming.name, naming.scale) for key, naming in style.items() if not naming.decibel]
-    found: dict[str, str] = {}
-    for column, name, scale in names:
-        for field in (f"wb_{name.replace(' ', '_')}", f"wb {name}", name):
-            record = extra.get(field) if column in wanted else None
-            if record is None or (record.scaling is None) != (scale is None):
-                continue
-            if column != "echo_flags" or record.dtype.kind == "u":
-                found.setdefault(column, field)
-    return found
 
 
 def check_alike(readers: Iterable[tuple[Path, ColumnFacts]]) -> ColumnFacts:

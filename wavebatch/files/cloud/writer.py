@@ -134,22 +134,6 @@ class Carried:
     """Whether added echoes get the value of the nearest return, because no value is free for "no data"."""
 
 
-def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[Carried, ...]:
-    """Return the extra dimensions of the input; all are copied.
-
-    whole: every output row comes from an input point, so no value for "no data" is needed.
-    """
-    at = las.STANDARD_DTYPES[checked.header.point_format].itemsize
-    carried = []
-    readable = [record.with_readable_texts() for record in checked.records]
-    for record in las.tell_apart(readable, checked.header.point_format):
-        empty = None if whole else las.choose_no_data(record)
-        marked = record if empty is None else record.with_no_data(empty)
-        carried.append(Carried(marked, at, copied=not whole and empty is None))
-        at += record.dtype.itemsize
-    return tuple(carried)
-
-
 @frozen(eq=False)
 class OutputLayout(Version):
     """Layout of the output points of one strip; picklable, so that workers can make rows with it."""
@@ -328,7 +312,17 @@ def plan_output(
         raise ConfigError(f"points {points!r}: must be echoes or returns")
     path = checked.path
     chosen = choose_version(path, checked.header, las_version, point_format, packets is not None)
-    carried = plan_carried(checked, points == "returns")
+    whole = points == "returns"
+    # All extra dimensions of the input are copied. Where every row comes from an input point, none needs a value for
+    # "no data".
+    at, copies = las.STANDARD_DTYPES[checked.header.point_format].itemsize, []
+    readable = [record.with_readable_texts() for record in checked.records]
+    for record in las.tell_apart(readable, checked.header.point_format):
+        empty = None if whole else las.choose_no_data(record)
+        marked = record if empty is None else record.with_no_data(empty)
+        copies.append(Carried(marked, at, copied=not whole and empty is None))
+        at += record.dtype.itemsize
+    carried = tuple(copies)
     written = style_columns(columns, names, [entry.record.name for entry in carried], no_data)
     records = [*(entry.record for entry in carried), *(entry.record for entry in written)]
     dtype = las.build_dtype(chosen.point_format, records)
@@ -342,7 +336,7 @@ def plan_output(
         dtype=dtype,
         carried=carried,
         written=tuple(written),
-        whole=points == "returns",
+        whole=whole,
         packets=None if packets is None else packets.packets,
     )
     if strict and layout.copied:
@@ -380,7 +374,11 @@ class CloudWriter(PointFile):
         self._inputs = [layout.source.path, *([packets.file] if packets else [])]
         self._evlrs, self.dropped = _choose_evlrs(layout.source.path, layout.source.header)
         source = layout.source.header
-        vlrs = [vlr for vlr in source.vlrs if _is_carried(vlr, layout)]
+        vlrs = []
+        for vlr in source.vlrs:
+            descriptor = vlr.user.startswith("LAS") and vlr.user.endswith("_Spec") and vlr.record_id in _DESCRIPTORS
+            if vlr.user != "copc" and (layout.packets is not None or not descriptor):
+                vlrs.append(vlr)
         earlier = sum(vlr.user == USER_ID for vlr in vlrs)
         if layout.wkt is not None:
             vlrs = [vlr for vlr in vlrs if not las.has_record([vlr], las.PROJECTION, las.WKT_ID)]
@@ -474,13 +472,6 @@ def _as_text(field: bytes) -> bytes:
     except UnicodeDecodeError:
         return text.decode("ascii", "replace").replace("\ufffd", "?").encode() + end + rest
     return field
-
-
-def _is_carried(vlr: las.Vlr, layout: OutputLayout) -> bool:
-    if vlr.user == "copc":
-        return False
-    descriptor = vlr.user.startswith("LAS") and vlr.user.endswith("_Spec") and vlr.record_id in _DESCRIPTORS
-    return layout.packets is not None or not descriptor
 
 
 def _plain(value: Any) -> Any:

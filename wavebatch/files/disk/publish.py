@@ -33,29 +33,14 @@ _FORMAT_BYTE, _ENCODING_BYTE = 104, 6
 _WAVEFORM_FORMATS, _WAVES_INTERNAL = (4, 5, 9, 10), 2
 
 
-class _Inputs:
-    """Files by name and by number, so that links and hard links are found too."""
-
-    def __init__(self) -> None:
-        self.names: set[str] = set()
-        self.numbers: set[tuple[int, int]] = set()
-
-    def add(self, path: Path) -> None:
-        for one in (path, *_packet_files(path)):
-            self.names.add(real_name(one))
-            self.numbers |= _number(one)
-
-    def has(self, target: Path) -> bool:
-        return real_name(target) in self.names or bool(_number(target) & self.numbers)
-
-
-_inputs: ContextVar[_Inputs | None] = ContextVar("wavebatch_inputs", default=None)
+_inputs: ContextVar[set[object] | None] = ContextVar("wavebatch_inputs", default=None)
+"""Files of the call by name and by number, so that links and hard links are found too."""
 
 
 @contextlib.contextmanager
 def protecting(paths: Iterable[Path | str | None] = ()) -> Iterator[None]:
     """A call that reads these files: no output inside may replace one of them; inside another call, it adds to that."""
-    token = _inputs.set(_Inputs()) if _inputs.get() is None else None
+    token = _inputs.set(set()) if _inputs.get() is None else None
     try:
         protect(paths)
         yield
@@ -68,15 +53,15 @@ def protect(paths: Iterable[Path | str | None]) -> None:
     """Add files to the inputs of the call, with the packet files of strips; does nothing outside `protecting`."""
     inputs = _inputs.get()
     if inputs is not None:
-        for path in paths:
-            if path is not None:
-                inputs.add(Path(path))
+        for path in [Path(path) for path in paths if path is not None]:
+            for one in (path, *_packet_files(path)):
+                inputs |= _identify(one)
 
 
 def refuse_input(target: Path) -> None:
     """Raise ConfigError if the output would replace an input of the call, also through a link."""
     inputs = _inputs.get()
-    if inputs is not None and inputs.has(Path(target)):
+    if inputs is not None and inputs & _identify(Path(target)):
         raise ConfigError(f"{target}: the output would replace this input; choose another output")
 
 
@@ -88,12 +73,13 @@ def real_name(path: Path) -> str:
         return os.path.abspath(path)
 
 
-def _number(path: Path) -> set[tuple[int, int]]:
+def _identify(path: Path) -> set[object]:
+    """The name of a file, links resolved, and its number, if it is there."""
     try:
         found = os.stat(path)
     except (OSError, ValueError):
-        return set()
-    return {(found.st_dev, found.st_ino)}
+        return {real_name(path)}
+    return {real_name(path), (found.st_dev, found.st_ino)}
 
 
 def _packet_files(path: Path) -> list[Path]:

@@ -23,7 +23,7 @@ import functools
 import math
 import re
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -110,7 +110,11 @@ class GeoKeys:
         """
         horizontal, vertical = self._read_unit(_LINEAR), self._read_unit(_VERTICAL)
         if horizontal is None and self.kind != "geographic":
-            horizontal = find_unit(self._find_code(_PROJECTED_CODE)) or _guess_unit(self.texts.decode("latin-1"))
+            horizontal, words = find_unit(self._find_code(_PROJECTED_CODE)), self.texts.decode("latin-1").lower()
+            if horizontal is None and any(part in words for part in ("ftus", "us survey f", "us_survey_f", "us feet")):
+                horizontal = 1200 / 3937
+            elif horizontal is None and re.search(r"\b(feet|foot|ft)\b", words):
+                horizontal = 0.3048
         if vertical is None:
             vertical = find_unit(self._find_code(_VERTICAL_CODE), vertical=True)
         return horizontal, vertical
@@ -137,13 +141,6 @@ def find_code(vlrs: Iterable[las.Vlr]) -> int | None:
     """Return the `sure_code` of the GeoTIFF keys in the records of a header."""
     directory = next((v.payload for v in vlrs if las.is_projection(v) and v.record_id == las.GEOTIFF_ID), b"")
     return GeoKeys.parse(directory).sure_code
-
-
-def _guess_unit(text: str) -> float | None:
-    words = text.lower()
-    if "ftus" in words or "us survey f" in words or "us_survey_f" in words or "us feet" in words:
-        return 1200 / 3937
-    return 0.3048 if re.search(r"\b(feet|foot|ft)\b", words) else None
 
 
 _PROJECTED_UNITS = {
@@ -197,13 +194,13 @@ def find_unit(code: int, *, vertical: bool = False) -> float | None:
 @functools.cache
 def _units(vertical: bool) -> dict[int, float]:
     table = _VERTICAL_UNITS if vertical else _PROJECTED_UNITS
-    return {code: unit for unit, codes in table.items() for text in codes.split() for code in _expand(text)}
-
-
-def _expand(text: str) -> Iterator[int]:
-    span, _, step = text.partition("/")
-    first, _, last = span.partition("-")
-    return iter(range(int(first), int(last or first) + 1, int(step or 1)))
+    found: dict[int, float] = {}
+    for unit, codes in table.items():
+        for text in codes.split():
+            span, _, step = text.partition("/")
+            first, _, last = span.partition("-")
+            found |= dict.fromkeys(range(int(first), int(last or first) + 1, int(step or 1)), unit)
+    return found
 
 
 _GRS80 = 'SPHEROID["GRS 1980",6378137,298.257222101,AUTHORITY["EPSG","7019"]]'

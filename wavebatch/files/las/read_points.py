@@ -92,35 +92,29 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     payloads = [vlr.payload for vlr in header.vlrs if las.has_record([vlr], "LASF_Spec", las.EXTRA_BYTES_RECORD_ID)]
     records = tuple(las.read_records(payloads[0] if payloads else b"", extra))
     dtype = las.build_dtype(number, records)
-    points_end = _find_points_end(path, header)
+    # The claimed points must fit before what follows them.
+    start = header.offset_to_points
+    points_end, limit = header.file_size, "it ends"
+    followers = {"its EVLRs begin": header.evlr_start if header.evlr_count else 0}
+    if not header.global_encoding & las.WAVES_EXTERNAL:
+        followers["its waveform record begins"] = header.waveform_start
+    for what, at in followers.items():
+        if start <= at <= header.file_size - las.EVLR_HEADER_SIZE and at < points_end:
+            points_end, limit = at, what
+    if not header.compressed:
+        room, points_end = points_end, start + header.point_count * header.point_length
+        if points_end > room:
+            raise damaged(
+                path,
+                f"the header claims {header.point_count} points of {header.point_length} bytes from byte {start} on, "
+                f"but {limit} at byte {room}, which leaves room for {(room - start) // header.point_length}",
+            )
     legacy, count = header.counts
     warnings: tuple[str, ...] = ()
     if header.version >= (1, 4) and legacy and legacy != count:
         used = "64-bit" if count else "legacy"
         warnings = (f"legacy point count {legacy} differs from the 64-bit count {count}; the {used} count is used",)
     return CheckedHeader(path, header.file_size, header, dtype, records, points_end, warnings)
-
-
-def _find_points_end(path: Path, header: las.LasHeader) -> int:
-    """Byte at which the points end; raises InputError if the claimed points do not fit before what follows them."""
-    start = header.offset_to_points
-    room, limit = header.file_size, "it ends"
-    followers = {"its EVLRs begin": header.evlr_start if header.evlr_count else 0}
-    if not header.global_encoding & las.WAVES_EXTERNAL:
-        followers["its waveform record begins"] = header.waveform_start
-    for what, at in followers.items():
-        if start <= at <= header.file_size - las.EVLR_HEADER_SIZE and at < room:
-            room, limit = at, what
-    if header.compressed:
-        return room
-    end = start + header.point_count * header.point_length
-    if end > room:
-        raise damaged(
-            path,
-            f"the header claims {header.point_count} points of {header.point_length} bytes from byte {start} on, but "
-            f"{limit} at byte {room}, which leaves room for {(room - start) // header.point_length}",
-        )
-    return end
 
 
 LASZIP_USER, LASZIP_ID = "laszip encoded", 22204

@@ -555,22 +555,6 @@ def take_some(judged: Judged, rows: np.ndarray) -> SomePackets:
     return judged.keys[rows], judged.n_samples[rows], judged.packed[rows]
 
 
-def _sort_by_kind(sample: Sequence[SomePackets]) -> dict[tuple[int, int, bool], np.ndarray]:
-    """Byte offsets (k,) by descriptor, number of samples and whether they are packed."""
-    found: dict[tuple[int, int, bool], np.ndarray] = {}
-    if not sample:
-        return found
-    keys, n_samples, packed = (np.concatenate(part) for part in zip(*sample, strict=True))
-    index = (keys & np.uint64(255)).astype(np.int64)
-    for number in distinct(index).tolist():
-        rows = np.flatnonzero(index == number)
-        rows = rows[even_places(len(rows), SAMPLED)]
-        kinds, kind = np.unique(np.stack([n_samples[rows], packed[rows]], axis=1), axis=0, return_inverse=True)
-        for place, (length, is_packed) in enumerate(kinds.tolist()):
-            found[number, length, bool(is_packed)] = keys[rows[kind.ravel() == place]] >> INDEX_BITS
-    return found
-
-
 @changeable
 class _Votes:
     """Waveforms whose signal goes up, and down; moments of all deviations from the medians."""
@@ -640,7 +624,18 @@ def find_forms(
     dict of int to SampleForm
         Without descriptors whose counts are read as they are.
     """
-    kinds = _sort_by_kind(sample)
+    # Byte offsets (k,) by descriptor, number of samples and whether they are packed.
+    kinds: dict[tuple[int, int, bool], np.ndarray] = {}
+    if sample:
+        keys, n_samples, is_packed = (np.concatenate(part) for part in zip(*sample, strict=True))
+        of_key = (keys & np.uint64(255)).astype(np.int64)
+        for index in distinct(of_key).tolist():
+            rows = np.flatnonzero(of_key == index)
+            rows = rows[even_places(len(rows), SAMPLED)]
+            pairs = np.stack([n_samples[rows], is_packed[rows]], axis=1)
+            found, kind = np.unique(pairs, axis=0, return_inverse=True)
+            for place, (length, packed) in enumerate(found.tolist()):
+                kinds[index, length, bool(packed)] = keys[rows[kind.ravel() == place]] >> INDEX_BITS
     # Order of packed bits: in the right one, neighbouring samples differ less.
     steps: dict[int, np.ndarray] = {}
     for (index, length, packed), offsets in kinds.items():

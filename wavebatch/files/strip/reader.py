@@ -216,7 +216,21 @@ class StripReader(Closing):
         sizes = np.concatenate([points["wavepacket_size"][own], entries["record"]["wavepacket_size"]])
         n_samples = np.concatenate([judged.n_samples[own], n_samples])
         packed = np.concatenate([judged.packed[own], packed])
-        lead, packet_of = _group_packets(keys, index)
+        # Rows of the owners of the packets, in their order, and the packet of each point.
+        packet_of = np.empty(len(keys), np.int32)
+        if np.all(index[1:] > index[:-1]) and np.all(keys[1:] >= keys[:-1]):  # as most vendors write them
+            groups = scanner.group_keys(keys)
+            packet_of[:] = np.repeat(np.arange(len(groups.starts), dtype=np.int32), groups.counts)
+            lead = groups.starts
+        else:
+            by_index = np.argsort(index, kind="stable")
+            groups = scanner.group_keys(keys[by_index])
+            lead = by_index[groups.order[groups.starts]]
+            order = np.argsort(index[lead], kind="stable")
+            rank = np.empty(len(lead), np.int32)
+            rank[order] = np.arange(len(lead), dtype=np.int32)
+            packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
+            lead = lead[order]
         packets = PacketTable(
             digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
             offset=keys[lead] >> packet_check.INDEX_BITS,
@@ -398,23 +412,6 @@ def read_scanner(records: np.ndarray) -> np.ndarray | None:
     if "classification_flags" not in field_names(records.dtype):
         return None
     return (records["classification_flags"] >> 4) & 3
-
-
-def _group_packets(keys: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the owners of the packets of points (n,), in their order, and the packet of each point, i4 (n,)."""
-    packet_of = np.empty(len(keys), np.int32)
-    if np.all(index[1:] > index[:-1]) and np.all(keys[1:] >= keys[:-1]):  # as most vendors write them
-        groups = scanner.group_keys(keys)
-        packet_of[:] = np.repeat(np.arange(len(groups.starts), dtype=np.int32), groups.counts)
-        return groups.starts, packet_of
-    by_index = np.argsort(index, kind="stable")
-    groups = scanner.group_keys(keys[by_index])
-    lead = by_index[groups.order[groups.starts]]
-    order = np.argsort(index[lead], kind="stable")
-    rank = np.empty(len(lead), np.int32)
-    rank[order] = np.arange(len(lead), dtype=np.int32)
-    packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
-    return lead[order], packet_of
 
 
 MOST_SLICES = 4096

@@ -296,22 +296,6 @@ class StripScan(Closing):
         self.decoded.close()
 
 
-def describe_hopeless(facts: StripFacts, reasons: dict[check.Reason, tuple[int, int]]) -> str:
-    """Return the message about a strip without any usable packet."""
-    if facts.packets.file is None:
-        name = facts.path.with_suffix(".wdp").name
-        return f"points refer to packets that are neither in the file nor next to it: put {name} next to the strip"
-    reason = max(reasons, key=lambda r: reasons[r][0])
-    count, first = reasons[reason]
-    remedy = f"{facts.packets.file.name} is cut, damaged or belongs to another strip: get it again"
-    if reason is check.Reason.PACKED:
-        remedy = "write the packets with 8, 16 or 32 bits per sample"
-    return (
-        f"no packet can be used: {count} of {facts.header.point_count} points (first: point {first}) "
-        f"{check.REASON_TEXTS[reason]}; {remedy}"
-    )
-
-
 def describe_oddities(reasons: dict[check.Reason, tuple[int, int]], short: int) -> Iterator[str]:
     """Yield warnings about a strip that can be processed."""
     for reason, (count, first) in reasons.items():
@@ -452,7 +436,18 @@ class Scanner:
             found.seal()
             overfull = distinct(np.concatenate(full))
             if suspects.any():
-                self._vote_far()
+                # Some units vote again with their context: in a shuffled strip only there the returns of a packet meet.
+                for unit in range(0, self._units, max(1, self._units // _FAR_SAMPLES)):
+                    start, stop = self._found.borders[unit], self._found.borders[unit + 1]
+                    context = unique_entries(self._found.context.read(unit))
+                    records = np.concatenate([self._source.read(start, stop), context["record"]])
+                    index = np.concatenate([np.arange(start, stop), context["index"]])
+                    judged = self._judge.judge(records, self._form)
+                    rows = np.flatnonzero(judged.usable)
+                    rows = rows[np.argsort(index[rows], kind="stable")]
+                    keys, records = judged.keys[rows], take_whole_records(records, rows)
+                    voters = _Near(keys, np.arange(len(rows)), rows, records, 0)
+                    self._vote(group_keys(keys), voters, np.ones(len(rows), bool))
             for start, judged in self._judge_again(overfull) if len(overfull) else ():
                 here, tally = judged.reason == check.Reason.OVERFULL, found.tally
                 many = int(here.sum())
@@ -466,7 +461,19 @@ class Scanner:
         reasons = tally.describe()
         problems = list(decision.problems)
         if not usable and missing < points:
-            problems.insert(0, describe_hopeless(facts, reasons))
+            packet_file = facts.packets.file
+            if packet_file is None:
+                name = facts.path.with_suffix(".wdp").name
+                why = "points refer to packets that are neither in the file nor next to it"
+                problems.insert(0, f"{why}: put {name} next to the strip")
+            else:
+                reason = max(reasons, key=lambda one: reasons[one][0])
+                count, first = reasons[reason]
+                remedy = f"{packet_file.name} is cut, damaged or belongs to another strip: get it again"
+                if reason is check.Reason.PACKED:
+                    remedy = "write the packets with 8, 16 or 32 bits per sample"
+                problems.insert(0, f"no packet can be used: {count} of {points} points (first: point {first}) "
+                                   f"{check.REASON_TEXTS[reason]}; {remedy}")  # fmt: skip
         low, high = facts.packets.offsets
         most = MAX_RETURNS if suspects.any() else MOST_OVERLAP
         if found.claimed > most * max(high - low, 0):
@@ -600,19 +607,6 @@ class Scanner:
             rows = np.flatnonzero(judged.usable)
             rows = rows[suspects[self._found.near.bin(judged.keys[rows])]]
             yield judged.keys[rows], start + rows
-
-    def _vote_far(self) -> None:
-        """Some units vote again with their context: in a shuffled strip only there the returns of a packet meet."""
-        for unit in range(0, self._units, max(1, self._units // _FAR_SAMPLES)):
-            start, stop = self._found.borders[unit], self._found.borders[unit + 1]
-            context = unique_entries(self._found.context.read(unit))
-            points = np.concatenate([self._source.read(start, stop), context["record"]])
-            index = np.concatenate([np.arange(start, stop), context["index"]])
-            judged = self._judge.judge(points, self._form)
-            rows = np.flatnonzero(judged.usable)
-            rows = rows[np.argsort(index[rows], kind="stable")]
-            near = _Near(judged.keys[rows], np.arange(len(rows)), rows, take_whole_records(points, rows), 0)
-            self._vote(group_keys(near.keys), near, np.ones(len(rows), bool))
 
 
 @frozen(eq=False)

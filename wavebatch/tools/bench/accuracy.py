@@ -173,10 +173,23 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     """
     if not len(truth):
         return np.empty((0, 3))
-    columns, painted = _differentiate(recording, truth)
+    # Derivatives of each echo alone by time, amplitude and sigma, (m, 3, s).
+    each = np.arange(len(truth))
+    amplitude, sigma = truth.amplitude.astype(np.float64), truth.sigma.astype(np.float64)
+
+    def paint(time: np.ndarray, width: np.ndarray) -> np.ndarray:
+        return paint_echoes(recording, len(truth), each, time, amplitude, width)
+
+    step = _STEP * recording.pulse.sigma
+    echo = paint(truth.time, sigma)
+    by_time = (paint(truth.time + step, sigma) - paint(truth.time - step, sigma)) / (2 * step)
+    wider, narrower = sigma + step, sigma - step
+    grown = _measure(recording.pulse, wider) - _measure(recording.pulse, narrower)
+    by_sigma = (paint(truth.time, wider) - paint(truth.time, narrower)) / np.maximum(grown, 1e-9)[:, None]
+    columns = np.stack([by_time, echo / amplitude[:, None], by_sigma], axis=1).astype(np.float64)
     # Samples count by their inverse standard deviation; clipped ones do not.
     signal = np.zeros((n, recording.n_samples))
-    np.add.at(signal, truth.waveform, painted)
+    np.add.at(signal, truth.waveform, echo)
     variance = effective_noise(recording) ** 2 + recording.noise_gain * np.maximum(signal, 0)
     weight = np.where(signal + recording.baseline < recording.clip, 1 / np.sqrt(variance), 0.0)
     columns *= weight[truth.waveform][:, None, :]
@@ -185,37 +198,18 @@ def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
     first = np.cumsum(count) - count
     for k in np.unique(count[count > 0]):
         rows = first[count == k][:, None] + np.arange(k)
-        bounds[rows] = _invert(columns[rows].reshape(len(rows), 3 * k, -1)).reshape(len(rows), k, 3)
+        # Standard deviations from weighted derivatives (g, p, s).
+        part = columns[rows].reshape(len(rows), 3 * k, -1)
+        scale = np.sqrt(np.square(part).sum(axis=2))
+        part = part / np.where(scale > 0, scale, 1.0)[:, :, None]
+        values, vectors = np.linalg.eigh(part @ part.transpose(0, 2, 1))
+        # Scaled columns: the diagonal is 1, so that eigenvalues show how well the parameters can be separated.
+        values = np.where(values > 1e-11, values, np.nan)
+        variance = (np.square(vectors) / values[:, None, :]).sum(axis=2)
+        known = ~np.isnan(variance) & (scale > 0)
+        error = np.sqrt(np.where(known, variance, 1.0)) / np.where(scale > 0, scale, 1.0)
+        bounds[rows] = np.where(known, error, np.inf).reshape(len(rows), k, 3)
     return bounds
-
-
-def _differentiate(recording: Recording, truth: EchoTable) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of each echo alone by time, amplitude and sigma, (m, 3, s), and the echo, (m, s)."""
-    rows = np.arange(len(truth))
-    amplitude, sigma = truth.amplitude.astype(np.float64), truth.sigma.astype(np.float64)
-
-    def paint(time: np.ndarray, width: np.ndarray) -> np.ndarray:
-        return paint_echoes(recording, len(truth), rows, time, amplitude, width)
-
-    step = _STEP * recording.pulse.sigma
-    echo = paint(truth.time, sigma)
-    by_time = (paint(truth.time + step, sigma) - paint(truth.time - step, sigma)) / (2 * step)
-    wider, narrower = sigma + step, sigma - step
-    grown = _measure(recording.pulse, wider) - _measure(recording.pulse, narrower)
-    by_sigma = (paint(truth.time, wider) - paint(truth.time, narrower)) / np.maximum(grown, 1e-9)[:, None]
-    return np.stack([by_time, echo / amplitude[:, None], by_sigma], axis=1).astype(np.float64), echo
-
-
-def _invert(columns: np.ndarray) -> np.ndarray:
-    """Standard deviations (g, p) from weighted derivatives (g, p, s)."""
-    scale = np.sqrt(np.square(columns).sum(axis=2))
-    columns = columns / np.where(scale > 0, scale, 1.0)[:, :, None]
-    values, vectors = np.linalg.eigh(columns @ columns.transpose(0, 2, 1))
-    # Scaled columns: the diagonal is 1, so that eigenvalues show how well the parameters can be separated.
-    values = np.where(values > 1e-11, values, np.nan)
-    variance = (np.square(vectors) / values[:, None, :]).sum(axis=2)
-    known = ~np.isnan(variance) & (scale > 0)
-    return np.where(known, np.sqrt(np.where(known, variance, 1.0)) / np.where(scale > 0, scale, 1.0), np.inf)
 
 
 def _measure(pulse: PulseModel, sigma: np.ndarray) -> np.ndarray:

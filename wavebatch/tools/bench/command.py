@@ -534,7 +534,22 @@ def _scene_sheet(section: Mapping[str, Any], tolerance_cm: float | None) -> Shee
         f"acceptance {_span(survey['acceptance'])}, Gaussians {', '.join(map(str, survey['components']))}"
     )
     parts: list[Part] = [Note(f"== {section['scene']}: {section['meaning']}"), Note(found)]
-    parts += [Later(partial(_draw_scene, section)), _speed_table(rows)]
+    head = ("median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front")
+    lines = []
+    for row in rows:
+        name = row["name"]
+        if row.get("same_as"):
+            name += f" (is {row['same_as']})"
+        if row.get("crashed_or_hung"):
+            name += f" ({row['crashed_or_hung']} crashed or hung)"
+        rates = []
+        for times in (row[kind] for kind in ("kernels", "file", "file_with_survey")):  # microseconds per waveform
+            rate, least, most = (1e6 / times[end] if times["median"] else 0.0 for end in ("median", "max", "min"))
+            rates.append(Cell(f"{rate:,.0f} ({least:,.0f}..{most:,.0f})", rate) if rate else Cell("-", ""))
+        megabytes = None if row["peak_bytes"] is None else row["peak_bytes"] / 1e6
+        lines.append((name, *rates, row["survey_seconds"]["median"], megabytes, "*" if row["pareto"] else ""))
+    speeds = Table(head, lines, ("", "", "", "", ".2f", ".0f", ""), sortable=True)
+    parts += [Later(partial(_draw_scene, section)), speeds]
     parts += [_figure_table("echoes found", rows, SHARES), _figure_table("rms error of the range", rows, LENGTHS)]
     for kind in ("isolated", "overlapped"):
         ratios = [(name, f"{name}_ratio_{kind}", 1.0, 3) for name in QUANTITIES]
@@ -552,24 +567,6 @@ def _scene_sheet(section: Mapping[str, Any], tolerance_cm: float | None) -> Shee
 def _span(times: Mapping[str, Any]) -> str:
     low, high = f"{times['min']:.4g}", f"{times['max']:.4g}"
     return low if low == high else f"{low}..{high}"
-
-
-def _speed_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    head = ("median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front")
-    lines = []
-    for row in rows:
-        name = row["name"]
-        if row.get("same_as"):
-            name += f" (is {row['same_as']})"
-        if row.get("crashed_or_hung"):
-            name += f" ({row['crashed_or_hung']} crashed or hung)"
-        rates = []
-        for times in (row[kind] for kind in ("kernels", "file", "file_with_survey")):  # microseconds per waveform
-            rate, least, most = (1e6 / times[end] if times["median"] else 0.0 for end in ("median", "max", "min"))
-            rates.append(Cell(f"{rate:,.0f} ({least:,.0f}..{most:,.0f})", rate) if rate else Cell("-", ""))
-        megabytes = None if row["peak_bytes"] is None else row["peak_bytes"] / 1e6
-        lines.append((name, *rates, row["survey_seconds"]["median"], megabytes, "*" if row["pareto"] else ""))
-    return Table(head, lines, ("", "", "", "", ".2f", ".0f", ""), sortable=True)
 
 
 def _figure_table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[ReportColumn]) -> Table:

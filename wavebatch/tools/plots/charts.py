@@ -125,7 +125,12 @@ def draw_histogram(edges: np.ndarray, counts: np.ndarray, *, title: str, label: 
     def draw(axes: Axes) -> None:
         axes.stairs(merged, borders, fill=True, color=SERIES[0], alpha=0.75)
         if log and borders[0] > 0:
-            _scale_log(axes.set_xscale, axes.xaxis)
+            from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set(xlim=(borders[0], borders[-1]), ylim=(0, 1.06 * merged.max()))
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value == round(value) else "")
 
@@ -145,15 +150,6 @@ def merge_bins(edges: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.nd
     return np.append(edges[first:last:step], edges[last]), np.add.reduceat(
         counts[first:last], np.arange(0, last - first, step)
     )
-
-
-def _scale_log(scale: Callable[..., Any], axis: Any) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
-    scale("log")
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
-    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def draw_counts(counts: Mapping[str, int] | Sequence[tuple[str, int]], *, title: str, label: str) -> list[Picture]:

@@ -286,19 +286,43 @@ def _split_series(found: Histogram) -> list[Histogram]:
 
 def _draw_histogram(axes: Axes, found: Histogram, *, log: bool, counts: bool) -> None:
     figure = axes.figure
-    for series in range(len(found.counts)):
-        _draw_series(axes, found, series, counts)
+    unit = "" if found.facts.unit == "-" else f" {plain_text(found.facts.unit)}"
+    alone = len(found.counts) == 1
+    for series, (low_end, middle, high_end) in enumerate(found.percentiles):
+        color = SERIES[series % len(SERIES)]
+        style = "-" if series < len(SERIES) else (0, (3, 1))
+        number = int(found.values[series])
+        shown = found.counts[series] if counts else found.counts[series] * (100.0 / max(number, 1))
+        if alone:
+            axes.stairs(shown, found.edges, fill=True, color=color, alpha=0.35)
+        low, median, high = (_value_text(value, found.edges) for value in (low_end, middle, high_end))
+        label = "" if alone else fit_text(figure, f"{plain_text(found.names[series], 200)}: ", 3.6, size=8.0)
+        text = f"{label}{number:,} values, mean {_value_text(found.means[series], found.edges)}, median {median}{unit}"
+        if number < FEWEST_IN_LINE:
+            filled, middles = np.flatnonzero(shown), 0.5 * (found.edges[:-1] + found.edges[1:])
+            # A share of two values is a half: it would press all other series down.
+            place = {} if counts else {"transform": axes.get_xaxis_transform()}
+            height = shown[filled] if counts else np.full(len(filled), 0.02)
+            axes.plot(middles[filled], height, "o", color=color, label=text, **place)
+        else:
+            axes.stairs(shown, found.edges, color=color, linewidth=1.2, linestyle=style, label=text)
+        if math.isnan(middle):
+            continue
+        axes.axvline(middle, color="#222222" if alone else color, linewidth=1.2, linestyle=(0, (5, 2)))
+        if alone:
+            axes.axvspan(low_end, high_end, color="#222222", alpha=0.06, linewidth=0, zorder=0,
+                         label=f"{PERCENTILES[0]:g} to {PERCENTILES[2]:g} %: {low} to {high}{unit}")  # fmt: skip
     whole = counts and not log
-    text = _count_text if counts else "{:g}".format
+    tick = _count_text if counts else "{:g}".format
     if log:
         axes.set_yscale("log")
     else:
         axes.set_ylim(bottom=0)
-    axes.yaxis.set_major_formatter(lambda value, _: text(value) if not whole or value == round(value) else "")
+    axes.yaxis.set_major_formatter(lambda value, _: tick(value) if not whole or value == round(value) else "")
     axes.ticklabel_format(axis="x", useOffset=False)
     axes.set_xlim(found.edges[0], found.edges[-1])
     axes.set_xlabel(fit_text(figure, plain_text(found.facts.label, 300), 7.0, size=9.5))
-    width = f"{found.edges[1] - found.edges[0]:.4g}{_unit_text(found)}"
+    width = f"{found.edges[1] - found.edges[0]:.4g}{unit}"
     axes.set_ylabel(f"{'values' if counts else 'share of the series'} per bin of {width} [{'-' if counts else '%'}]")
     rest = found.total.list_rest(int(found.below.sum()), "below the picture")
     above = int(found.above.sum())
@@ -306,39 +330,6 @@ def _draw_histogram(axes: Axes, found: Histogram, *, log: bool, counts: bool) ->
     axes.set_title(fit_text(figure, _title(found.clouds, found.total, found.facts.name, rest), 7.1, size=10.5))
     # Below the axes, where it covers no line.
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), borderaxespad=0.0, fontsize=8.0)
-
-
-def _unit_text(found: Histogram) -> str:
-    return "" if found.facts.unit == "-" else f" {plain_text(found.facts.unit)}"
-
-
-def _draw_series(axes: Axes, found: Histogram, series: int, as_counts: bool) -> None:
-    color = SERIES[series % len(SERIES)]
-    style = "-" if series < len(SERIES) else (0, (3, 1))
-    low_end, middle, high_end = found.percentiles[series]
-    alone = len(found.counts) == 1
-    number = int(found.values[series])
-    counts = found.counts[series] if as_counts else found.counts[series] * (100.0 / max(number, 1))
-    if alone:
-        axes.stairs(counts, found.edges, fill=True, color=color, alpha=0.35)
-    unit = _unit_text(found)
-    low, median, high = (_value_text(value, found.edges) for value in found.percentiles[series])
-    label = "" if alone else fit_text(axes.figure, f"{plain_text(found.names[series], 200)}: ", 3.6, size=8.0)
-    text = f"{label}{number:,} values, mean {_value_text(found.means[series], found.edges)}, median {median}{unit}"
-    if number < FEWEST_IN_LINE:
-        filled, middles = np.flatnonzero(counts), 0.5 * (found.edges[:-1] + found.edges[1:])
-        # A share of two values is a half: it would press all other series down.
-        place = {} if as_counts else {"transform": axes.get_xaxis_transform()}
-        height = counts[filled] if as_counts else np.full(len(filled), 0.02)
-        axes.plot(middles[filled], height, "o", color=color, label=text, **place)
-    else:
-        axes.stairs(counts, found.edges, color=color, linewidth=1.2, linestyle=style, label=text)
-    if math.isnan(middle):
-        return
-    axes.axvline(middle, color="#222222" if alone else color, linewidth=1.2, linestyle=(0, (5, 2)))
-    if alone:
-        axes.axvspan(low_end, high_end, color="#222222", alpha=0.06, linewidth=0, zorder=0,
-                     label=f"{PERCENTILES[0]:g} to {PERCENTILES[2]:g} %: {low} to {high}{unit}")  # fmt: skip
 
 
 def _value_text(value: float, edges: np.ndarray) -> str:

@@ -119,38 +119,7 @@ def _draw_panels(
     inner = place.subgridspec(len(heights), 1, height_ratios=heights, hspace=0.04)
     panels = [figure.add_subplot(inner[0])]
     panels += [figure.add_subplot(inner[row], sharex=panels[0]) for row in range(1, len(heights))]
-    _draw_signal(panels[0], view, times, small=small)
-    if view.seen is not None:
-        draw_detector(panels[1], view.seen, times, small=small)
-    _draw_residual(panels[-1], view, times)
-    size = 9 if small else 10.5
-    lines = [fit_text(figure, _title(view, times, short=small), room, size=size),
-             fit_parts(figure, _list_flags(view), room, size=size)]  # fmt: skip
-    panels[0].set_title("\n".join(lines), fontsize=size)
-    panels[-1].set_xlim(times)
-    return panels
-
-
-def _title(view: WaveformView, times: tuple[float, float], *, short: bool) -> str:
-    """Which waveform it is, which part of it is shown, and what the detector is."""
-    parts = [f"packet {view.packet}"] if view.packet >= 0 else []
-    parts += [f"point {view.point}"] + ([] if short else [f"GPS time {view.gps_time:.6f} s"])
-    if view.span_is_cut(times):
-        parts.append(f"{max(times[0], 0):.0f} to {min(times[1], view.time[-1]):.0f} of {view.time[-1]:.0f} ns")
-    lines = ["   ".join(parts)]
-    if view.seen is not None:
-        lines.append(view.seen.stage)
-    return "\n".join(lines)
-
-
-def _list_flags(view: WaveformView) -> list[str]:
-    """Each flag with the numbers of the echoes that have it."""
-    rows = {flag: [str(row) for row, bits in enumerate(view.echoes.flags.tolist(), 1) if bits & flag]
-            for flag in EchoFlag}  # fmt: skip
-    return [f"{flag.name} {','.join(found)}" for flag, found in rows.items() if found] or ["no flags"]
-
-
-def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, small: bool) -> None:
+    axes = panels[0]
     axes.tick_params(labelbottom=False)
     axes.axhspan(view.baseline - view.std, view.baseline + view.std, color="#e6e6e6", zorder=0, label=_LEGEND[1])
     level = view.fine_level
@@ -166,6 +135,29 @@ def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, 
     axes.errorbar(view.echoes.time[shown].astype(np.float64), find_echo_heights(view)[shown], yerr=amplitude, xerr=time,
                   fmt="D", markersize=4, markerfacecolor="none", color=ECHO, capsize=2, zorder=4, label="echoes")
     fit_signal_panel(axes, view, times)
+    if view.seen is not None:
+        draw_detector(panels[1], view.seen, times, small=small)
+    _draw_residual(panels[-1], view, times)
+    size = 9 if small else 10.5
+    parts = [f"packet {view.packet}"] if view.packet >= 0 else []
+    parts += [f"point {view.point}"] + ([] if small else [f"GPS time {view.gps_time:.6f} s"])
+    if view.span_is_cut(times):
+        parts.append(f"{max(times[0], 0):.0f} to {min(times[1], view.time[-1]):.0f} of {view.time[-1]:.0f} ns")
+    lines = ["   ".join(parts)]
+    if view.seen is not None:
+        lines.append(view.seen.stage)
+    lines = [fit_text(figure, "\n".join(lines), room, size=size),
+             fit_parts(figure, _list_flags(view), room, size=size)]  # fmt: skip
+    panels[0].set_title("\n".join(lines), fontsize=size)
+    panels[-1].set_xlim(times)
+    return panels
+
+
+def _list_flags(view: WaveformView) -> list[str]:
+    """Each flag with the numbers of the echoes that have it."""
+    rows = {flag: [str(row) for row, bits in enumerate(view.echoes.flags.tolist(), 1) if bits & flag]
+            for flag in EchoFlag}  # fmt: skip
+    return [f"{flag.name} {','.join(found)}" for flag, found in rows.items() if found] or ["no flags"]
 
 
 def draw_samples(axes: Axes, view: WaveformView, times: tuple[float, float], *, dot: float, thin: float = 1.0) -> None:

@@ -96,7 +96,19 @@ def cut_section(
     crs = _find_crs(clouds)
     if crs.unit == "deg":
         raise ConfigError(f"{paths[0]}: coordinates are degrees, heights are not: project the cloud to draw a section")
-    line = line or _choose_line(clouds)
+    if line is None:  # through the middle of the points, along their longer extent
+        _, sample, _ = cells.survey_places(clouds, option="--line")
+        if not sample.seen:
+            raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a position")
+        places = sample.read()["place"]
+        middle = places.mean(axis=0)
+        values, vectors = np.linalg.eigh(np.cov((places - middle).T) if len(places) > 1 else np.eye(2))
+        axis = vectors[:, 1] if values[1] > 0 else np.array([1.0, 0.0])
+        axis = axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
+        ends = (places - middle) @ axis
+        low, high = cells.robust_limits(ends, float(ends.min()), float(ends.max()))
+        margin = max(0.5 * (1.0 - (high - low)), 0.0)
+        line = (*(middle + (low - margin) * axis).tolist(), *(middle + (high + margin) * axis).tolist())
     start, end = np.array(line[:2]), np.array(line[2:])
     length = float(np.hypot(*(end - start)))
     if not (math.isfinite(length) and length > 0):
@@ -153,22 +165,6 @@ def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
     rest = np.sort(height)[few:-few]
     reach = max(cells.MARGIN * float(rest[-1] - rest[0]), 0.1 * length)
     return float(rest[0]) - reach, float(rest[-1]) + reach
-
-
-def _choose_line(clouds: cells.Clouds | VoxelFile) -> tuple[float, float, float, float]:
-    """A line through the middle of the points, along their longer extent."""
-    _, sample, _ = cells.survey_places(clouds, option="--line")
-    if not sample.seen:
-        raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a position")
-    places = sample.read()["place"]
-    middle = places.mean(axis=0)
-    values, vectors = np.linalg.eigh(np.cov((places - middle).T) if len(places) > 1 else np.eye(2))
-    axis = vectors[:, 1] if values[1] > 0 else np.array([1.0, 0.0])
-    axis = axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
-    ends = (places - middle) @ axis
-    low, high = cells.robust_limits(ends, float(ends.min()), float(ends.max()))
-    margin = max(0.5 * (1.0 - (high - low)), 0.0)
-    return (*(middle + (low - margin) * axis).tolist(), *(middle + (high + margin) * axis).tolist())
 
 
 @frozen(eq=False)
@@ -317,7 +313,13 @@ def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite
             set_layout(figure, compress=True)
         axes, place = (figure.subplots(), None) if flat else figure.subplots(1, 2, width_ratios=(1, 0.05))
         axes.set_anchor("C" if flat else "E")
-        shown, values = _draw_voxels(axes, found) if found.voxel else _draw_points(axes, found)
+        if found.voxel:
+            shown, values = _draw_voxels(axes, found)
+        else:
+            # Far points first would hide near ones by chance; in order of their values, large values are on top.
+            order, dot = np.argsort(found.value, kind="stable"), float(np.clip(40_000 / len(found.value), 0.5, 12.0))
+            places, values = (found.along[order], found.height[order]), found.value
+            shown = axes.scatter(*places, c=values[order], s=dot, cmap="viridis", linewidths=0)
         axes.set(xlim=(0.0, length), ylim=(low, high), aspect=aspect, xlabel=f"along the line [{found.crs.unit}]",
                  ylabel=f"{found.crs.upright} [{found.crs.upright_unit}]")  # fmt: skip
         axes.ticklabel_format(useOffset=False)
@@ -342,16 +344,6 @@ def _parts(found: Section, aspect: float) -> list[str]:
     parts += [f"below {100 * FAINT:g} % of the scale: empty"] * (found.voxel > 0 and found.facts.name in LIGHT)
     parts.append("equal scales" if aspect == 1.0 else f"heights {aspect:g} times exaggerated")
     return [*parts, f"CRS: {plain_text(found.crs.name, 90) or 'not given'}"]
-
-
-def _draw_points(axes, found: Section):
-    size = float(np.clip(40_000 / len(found.value), 0.5, 12.0))
-    # Far points first would hide near ones by chance; in order of their values, large values are on top.
-    order = np.argsort(found.value, kind="stable")
-    shown = axes.scatter(
-        found.along[order], found.height[order], c=found.value[order], s=size, cmap="viridis", linewidths=0
-    )
-    return shown, found.value
 
 
 def _draw_voxels(axes, found: Section):

@@ -106,7 +106,19 @@ def find_places(
         raise _too_many(path, wanted)
     if wanted.chosen:
         return _find_flagged(reader, scan, wanted, run)
-    numbers = _list_numbers(scan, wanted, str(path))
+    numbers: list[int] = []
+    if wanted.random:
+        number = min(wanted.random, scan.packets)
+        numbers = np.sort(np.random.default_rng(wanted.seed).choice(scan.packets, number, replace=False)).tolist()
+    elif not (wanted.packets or wanted.points or wanted.times):
+        numbers = even_places(scan.packets, wanted.number).tolist()
+    else:
+        for first, end in wanted.packets:
+            end = scan.packets if end is None else end
+            if not 0 <= first < end <= scan.packets:
+                span = str(first) if end == first + 1 else f"{first}:{end}"
+                raise ConfigError(f"{path}: there is no packet {span}; packets are 0 to {scan.packets - 1}")
+            numbers += range(first, min(end, first + wanted.limit + 1))
     if len(numbers) + len(wanted.points) + len(wanted.times) > wanted.limit:
         raise _too_many(path, wanted)
     for point in wanted.points:
@@ -152,23 +164,6 @@ def find_places(
 def _too_many(path: Any, wanted: Wanted) -> ConfigError:
     more = "" if wanted.sheet else f", {MOST_ON_SHEET} with --sheet"
     return ConfigError(f"{path}: too many waveforms for a picture; {wanted.limit} fit{more}")
-
-
-def _list_numbers(scan: StripScan, wanted: Wanted, path: str) -> list[int]:
-    """Numbers of the wanted packets; by default a few, spread evenly."""
-    if wanted.random:
-        number = min(wanted.random, scan.packets)
-        return np.sort(np.random.default_rng(wanted.seed).choice(scan.packets, number, replace=False)).tolist()
-    if not (wanted.packets or wanted.points or wanted.times):
-        return even_places(scan.packets, wanted.number).tolist()
-    numbers: list[int] = []
-    for first, end in wanted.packets:
-        end = scan.packets if end is None else end
-        if not 0 <= first < end <= scan.packets:
-            span = str(first) if end == first + 1 else f"{first}:{end}"
-            raise ConfigError(f"{path}: there is no packet {span}; packets are 0 to {scan.packets - 1}")
-        numbers += range(first, min(end, first + wanted.limit + 1))
-    return numbers
 
 
 def _read_units(reader: StripReader, scan: StripScan) -> Iterator[tuple[Unit, int]]:
@@ -507,8 +502,8 @@ def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
     rows = [[head, ["flags"]]]
     for view, row in every[:most]:
         front = [str(view.packet) if view.packet >= 0 else "-"] * several + [str(row + 1)]
-        front += [_measure(*pair) for pair in _measures(view, row)]
-        front += [_measure(*(_column(view, name)[row] for name in ("range", "range_error")))] * ranged
+        pairs = [*_measures(view, row), *[[_column(view, name)[row] for name in ("range", "range_error")]] * ranged]
+        front += [format_measure(value, error, "\N{PLUS-MINUS SIGN}") for value, error in pairs]
         rows.append([front, textwrap.wrap(name_flags(int(view.echoes.flags[row])) or "-", _FLAGS_WIDE)])
     widths = [max(len(front[place]) for front, _ in rows) for place in range(len(head))]
     lines = []
@@ -551,10 +546,6 @@ def _measures(view: WaveformView, row: int) -> Iterator[tuple[float, float]]:
 def _column(view: WaveformView, name: str) -> np.ndarray:
     """An attribute column of the echoes; NaN if the chain does not compute it."""
     return np.asarray(view.echoes.attributes.get(name, np.full(len(view.echoes), np.nan)), np.float64)
-
-
-def _measure(value: float, error: float) -> str:
-    return format_measure(value, error, "\N{PLUS-MINUS SIGN}")
 
 
 def _cell(value: float, digits: int) -> str:

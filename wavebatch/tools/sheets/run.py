@@ -88,7 +88,16 @@ class _Strip:
 
 def write_run_page(target: Path, result: BatchResult, folder: Path, command: str = "") -> None:
     """Write the page of a finished batch; folder: of its outputs. Raises InputError if it cannot be written."""
-    strips = [_read_strip(outcome, place, folder) for place, outcome in enumerate(result.outcomes)]
+    strips = []
+    for number, outcome in enumerate(result.outcomes):
+        place = report_path(outcome.job, folder)
+        report = None if outcome.status == "failed" else _read_report(place)
+        figures, sensor = {}, ""
+        if report is not None:
+            found, figures = report["strip"]["survey"]["figures"], measure_strip(report)
+            sensor = f"{found.get('bits', 0):.0f} bits, {found.get('spacing_ns', 0):g} ns"
+        cloud = cloud_path(outcome.job, folder)
+        strips.append(_Strip(outcome, number, cloud, place, report is not None, figures, sensor))
     marks = find_outliers([strip.figures for strip in strips], [strip.sensor for strip in strips])
     # Strips to look at come first, in the table and where there are too many to show all.
     order = sorted(strips, key=lambda one: (not (one.outcome.error or one.outcome.report.warnings),
@@ -99,16 +108,6 @@ def write_run_page(target: Path, result: BatchResult, folder: Path, command: str
     links = [("strips", "All strips"), *((one.mark, one.outcome.job.path.name) for one in shown), ("run", "Run")]
     parts = _list_parts(result, order, marks, shown, command)
     write_page(target, f"wavebatch run: {names}", parts, links if len(strips) > 1 else ())
-
-
-def _read_strip(outcome: Outcome, number: int, folder: Path) -> _Strip:
-    place = report_path(outcome.job, folder)
-    report = None if outcome.status == "failed" else _read_report(place)
-    figures, sensor = {}, ""
-    if report is not None:
-        found, figures = report["strip"]["survey"]["figures"], measure_strip(report)
-        sensor = f"{found.get('bits', 0):.0f} bits, {found.get('spacing_ns', 0):g} ns"
-    return _Strip(outcome, number, cloud_path(outcome.job, folder), place, report is not None, figures, sensor)
 
 
 def _read_report(path: Path) -> dict[str, Any] | None:
@@ -255,7 +254,14 @@ def _list_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> Iterator
     yield Sheet("Echoes", [Later(partial(figures_of, report["quality"]))])
     yield Later(partial(picture_cloud, cloud, PICTURED), "maps")
     yield Sheet("Flags", [flag_table(report["counts"])])
-    yield Sheet("Columns and no-data", _list_columns(report))
+    rows = [[column, number, REASONS[NoData[reason]][0] if NoData[reason] in REASONS else reason]
+            for column, reasons in sorted(report["counts"]["no_data"].items())
+            for reason, number in reasons.items()]  # fmt: skip
+    yield Sheet("Columns and no-data", [
+        Table(("column", "name in the cloud"), list(report["output"]["columns"].items())),
+        Table(("missing column", "reason"), list(report["output"]["not_computed"].items())),
+        Table(("column", "echoes", "value"), rows, title="Echoes without a value, by reason"),
+    ])  # fmt: skip
     yield Sheet("Provenance", _list_provenance(strip, report))
 
 
@@ -280,15 +286,6 @@ def flag_table(counts: Mapping[str, Any]) -> Table:
     rows = [(flag.name, number, number / points if points else None, meaning)
             for flag, meaning in FLAG_MEANINGS.items() for number in [counts["flags"][flag.name]]]  # fmt: skip
     return Table(("flag", "points", "share", "meaning"), rows, ".2%", sortable=True)
-
-
-def _list_columns(report: Mapping[str, Any]) -> Iterator[Table]:
-    yield Table(("column", "name in the cloud"), list(report["output"]["columns"].items()))
-    yield Table(("missing column", "reason"), list(report["output"]["not_computed"].items()))
-    rows = [[column, number, REASONS[NoData[reason]][0] if NoData[reason] in REASONS else reason]
-            for column, reasons in sorted(report["counts"]["no_data"].items())
-            for reason, number in reasons.items()]  # fmt: skip
-    yield Table(("column", "echoes", "value"), rows, title="Echoes without a value, by reason")
 
 
 def _list_provenance(strip: Path, report: Mapping[str, Any]) -> Iterator[Part]:

@@ -34,7 +34,7 @@ from wavebatch.tools.sheets.sheet import Cell, Code, Fact, Later, Note, Part, Pi
 
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
-    from wavebatch.surveying.calibration import Calibration, TargetResult
+    from wavebatch.surveying.calibration import TargetResult
 
 NOISE_KINDS = {
     "quiet": "quiet samples",
@@ -194,9 +194,8 @@ MOST_PAIRS = 60
 
 def calibration_sheet(flight: FlightCalibration) -> Sheet:
     """The sheet of a calibration of one strip or of several, without its notes, which are warnings."""
-    found = flight.calibration
     drawn = Later(partial(_draw_calibration, flight))
-    return Sheet("Calibration", [*_list_facts(found), *_list_tables(flight), drawn])
+    return Sheet("Calibration", [*_list_calibration(flight), drawn])
 
 
 def calibration_page(flight: FlightCalibration) -> list[Part]:
@@ -209,7 +208,9 @@ def calibration_page(flight: FlightCalibration) -> list[Part]:
     return [*(Note(words, "warning") for words in found.notes), *calibration_sheet(flight).parts, provenance]
 
 
-def _list_facts(found: Calibration) -> Iterator[Fact]:
+def _list_calibration(flight: FlightCalibration) -> Iterator[Part]:
+    """Constant, air, beam and swath; tables of targets, channels, strips and overlaps."""
+    found = flight.calibration
     constant = format_relative(found.constant, found.relative_error)
     yield Fact("constant", f"{constant} +- {100 * found.relative_error:.1f} % {UNIT}")
     yield Fact("attenuation", f"{found.attenuation:g} dB/km one way")
@@ -220,10 +221,6 @@ def _list_facts(found: Calibration) -> Iterator[Fact]:
         sides = f"{left:+.1f} % light to the left and {right:+.1f} % to the right"
         yield Fact("scan angle", f"{sides}, at {math.degrees(most):.1f} deg against straight down")
     yield Fact("conditions", found.conditions)
-
-
-def _list_tables(flight: FlightCalibration) -> Iterator[Table]:
-    found = flight.calibration
     tilted = any(one.incidence_deg is not None for one in found.targets)  # a column of reflectances has no angle
     rows = [(one.label, one.reflectance, one.echoes, _constant(one.constant, one.relative_error or one.spread),
              one.spread, *[_incidence(one)] * tilted,
@@ -328,23 +325,17 @@ def tabulate_angles(
     bound = np.array([bound_time(max(amplitude, 1e-3), max(one, 1e-6), system.noise.std, spacing)
                       for one in np.nan_to_num(sigma, nan=1.0)])  # fmt: skip
     variance, variance_err = _add_variance(system, spacing, sigma, bound)
-    error = _expect_error(variance, variance_err, distance, beam)
-    width = FWHM_PER_SIGMA * sigma
-    return AngleTable(distance, divergence, amplitude, ANGLES, spread, width, np.where(np.isnan(sigma), np.nan, error))
-
-
-def _expect_error(variance: np.ndarray, variance_err: np.ndarray, distance: float, beam: float) -> np.ndarray:
-    """Root mean square error of the angles of many echoes of each surface [deg].
-
-    The error column of a run belongs to one measured width: over the widths it jumps near 0, where half of the echoes
-    are read as 0. What a surface gives on average does not.
-    """
+    # Root mean square error of the angles of many echoes of each surface. The error column of a run belongs to one
+    # measured width: over the widths it jumps near 0, where half of the echoes are read as 0. What a surface gives on
+    # average does not.
     from scipy.special import erfinv  # every survey comes by this module
 
     normal = np.sqrt(2.0) * erfinv(np.arange(-_DRAWS + 1, _DRAWS, 2) / _DRAWS)
     measured = variance[:, None] + variance_err[:, None] * normal
     angle = angle_of_spread(np.sqrt(np.maximum(measured, 0.0)), distance, beam)
-    return np.degrees(np.sqrt(np.mean((angle - np.radians(ANGLES)[:, None]) ** 2, axis=1)))
+    error = np.degrees(np.sqrt(np.mean((angle - np.radians(ANGLES)[:, None]) ** 2, axis=1)))
+    width = FWHM_PER_SIGMA * sigma
+    return AngleTable(distance, divergence, amplitude, ANGLES, spread, width, np.where(np.isnan(sigma), np.nan, error))
 
 
 def _add_variance(

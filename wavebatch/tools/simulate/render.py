@@ -218,14 +218,19 @@ def spread_lobes(
     time, amplitude, sigma: (m,) as in the truth table. Heights are scaled so that all lobes together peak at
     `amplitude`.
     """
-    start = time - _find_delay(pulse, sigma)
+    # The datum lies after the main lobe's peak: of a flat target's echo, and later where a skewed lobe is stretched.
+    delay: np.ndarray | float = _find_flat(pulse) if pulse.lobes or pulse.kappa else 0.0
+    if pulse.kappa:
+        ratio = np.maximum(sigma / pulse.sigma, 0.7)
+        delay = delay + _find_flat(replace(pulse, lobes=())) * (ratio + ratio**-2 - 2)
+    start = time - delay
     if not pulse.lobes:
         return [(start, amplitude, sigma)]
     grid = np.linspace(sigma.min(initial=pulse.sigma), sigma.max(initial=pulse.sigma), 129)
     main = amplitude / np.interp(sigma, grid, _paint(pulse, grid)[1].max(axis=0))
     parts = [(start, main, sigma)]
-    for share, delay, width, scale in _widen(pulse, sigma):
-        parts.append((start + delay, main * share * scale, width))
+    for share, later, width, scale in _widen(pulse, sigma):
+        parts.append((start + later, main * share * scale, width))
     return parts
 
 
@@ -235,17 +240,6 @@ def _widen(pulse: PulseModel, sigma: np.ndarray):
     for share, delay, flat in pulse.lobes:
         width = np.sqrt(np.maximum(flat**2 + extra, 0.01 * flat**2))
         yield share, delay, width, flat / width * sigma / pulse.sigma
-
-
-def _find_delay(pulse: PulseModel, sigma: np.ndarray) -> np.ndarray | float:
-    """Datum after the main lobe's peak of echoes of these widths [ns], (m,)."""
-    if not (pulse.lobes or pulse.kappa):
-        return 0.0
-    delay = _find_flat(pulse)
-    if not pulse.kappa:
-        return delay
-    ratio = np.maximum(sigma / pulse.sigma, 0.7)
-    return delay + _find_flat(replace(pulse, lobes=())) * (ratio + ratio**-2 - 2)
 
 
 @cache
@@ -385,38 +379,31 @@ def paint_echoes(
     pad = max((int(job[4].max(initial=8)) for job in jobs), default=8)
     stride = recording.n_samples + pad
     canvas = np.zeros(n * stride + pad, np.float32)
-    for job in jobs:
-        _paint_lobes(canvas, pad, stride, recording, waveform, rank, *job)
+    # Echoes of equal rank lie in different waveforms, so that a gather, an add and a scatter lose nothing. Neighbouring
+    # waveforms share only the padding between them, which is not read.
+    for start, height, width, left, length, kappa in jobs:
+        position = start / recording.spacing
+        sample = np.floor(position).astype(np.int64) - left
+        inside = (sample > -pad) & (sample < recording.n_samples)
+        key = rank * 4096 + length
+        for value in np.unique(key[inside]):
+            rows = np.flatnonzero(inside & (key == value))
+            w = int(length[rows[0]])
+            windows = np.lib.stride_tricks.as_strided(canvas, (len(canvas) - w + 1, w), (4, 4))
+            offset = (sample[rows] - position[rows]).astype(np.float32)
+            z = np.arange(w, dtype=np.float32) + offset[:, None]
+            z *= (recording.spacing / width[rows]).astype(np.float32)[:, None]
+            if kappa:
+                z = main_lobe(z, kappa)
+            else:
+                z *= z
+                z *= np.float32(-0.5)
+                np.exp(z, out=z)
+            z *= height[rows].astype(np.float32)[:, None]
+            at = pad + waveform[rows].astype(np.int64) * stride + sample[rows]
+            z += windows[at]
+            windows[at] = z
     return canvas[pad:].reshape(n, stride)[:, : recording.n_samples]
-
-
-def _paint_lobes(canvas, pad, stride, recording, waveform, rank, start, height, width, left, length, kappa) -> None:
-    """Adds one lobe per echo.
-
-    Echoes of equal rank lie in different waveforms, so that a gather, an add and a scatter lose nothing. Neighbouring
-    waveforms share only the padding between them, which is not read.
-    """
-    position = start / recording.spacing
-    sample = np.floor(position).astype(np.int64) - left
-    inside = (sample > -pad) & (sample < recording.n_samples)
-    key = rank * 4096 + length
-    for value in np.unique(key[inside]):
-        rows = np.flatnonzero(inside & (key == value))
-        w = int(length[rows[0]])
-        windows = np.lib.stride_tricks.as_strided(canvas, (len(canvas) - w + 1, w), (4, 4))
-        offset = (sample[rows] - position[rows]).astype(np.float32)
-        z = np.arange(w, dtype=np.float32) + offset[:, None]
-        z *= (recording.spacing / width[rows]).astype(np.float32)[:, None]
-        if kappa:
-            z = main_lobe(z, kappa)
-        else:
-            z *= z
-            z *= np.float32(-0.5)
-            np.exp(z, out=z)
-        z *= height[rows].astype(np.float32)[:, None]
-        at = pad + waveform[rows].astype(np.int64) * stride + sample[rows]
-        z += windows[at]
-        windows[at] = z
 
 
 def record_counts(
@@ -435,7 +422,19 @@ def record_counts(
     top = recording.clip + 0.5
     for a in range(0, n, _ROWS):
         part = signal[a : a + _ROWS]
-        values = _draw_noise(recording, part, rng)
+        values = rng.standard_normal((len(part), s + recording.color), dtype=np.float32)
+        for _ in range(recording.color):
+            values = values[:, 1:] + values[:, :-1]
+        if recording.color:
+            taps = np.array([1.0])
+            for _ in range(recording.color):
+                taps = np.convolve(taps, [1.0, 1.0])
+            values /= np.float32(np.sqrt((taps**2).sum()))
+        if recording.noise_gain:
+            variance = np.float32(recording.noise_std**2) + np.float32(recording.noise_gain) * np.maximum(part, 0)
+            values *= np.sqrt(variance)
+        else:
+            values *= np.float32(recording.noise_std)
         values += part
         values += level[a : a + _ROWS, None]
         if recording.bits == 32:
@@ -446,21 +445,3 @@ def record_counts(
         rows = np.flatnonzero(~np.isnan(constant))
         counts[rows] = np.clip(constant[rows], 0, recording.clip).astype(dtype)[:, None]
     return counts
-
-
-def _draw_noise(recording: Recording, signal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    n, s = signal.shape
-    noise = rng.standard_normal((n, s + recording.color), dtype=np.float32)
-    for _ in range(recording.color):
-        noise = noise[:, 1:] + noise[:, :-1]
-    if recording.color:
-        taps = np.array([1.0])
-        for _ in range(recording.color):
-            taps = np.convolve(taps, [1.0, 1.0])
-        noise /= np.float32(np.sqrt((taps**2).sum()))
-    if recording.noise_gain:
-        variance = np.float32(recording.noise_std**2) + np.float32(recording.noise_gain) * np.maximum(signal, 0)
-        noise *= np.sqrt(variance)
-    else:
-        noise *= np.float32(recording.noise_std)
-    return noise

@@ -214,7 +214,25 @@ class LightModel:
         # The power is that of an echo as short as the pulse: a wider one spreads the same energy over a longer time.
         power *= self.options.sigma / sigma
         if self.options.shares is not None:
-            power *= self._measure_shares(rows, records, starts)
+            known_shares = over = 0
+            if self._read_share is None:
+                share = share_equally(rows["total"], starts)
+            else:
+                share = self._read_share(records).astype(float)
+                wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
+                if len(wrong):
+                    raise InputError(
+                        f"{self.path}: {self.options.shares} holds {share[wrong[0]]:g}, which is no share of a "
+                        "footprint: shares are 0 to 1; give a column with such values to --shares"
+                    )
+                known_shares = int(np.count_nonzero(np.isfinite(share)))
+                share, over = fill_shares(share, starts)
+            self.counts.own_share += known_shares
+            self.counts.assumed_share += len(share) - known_shares
+            self.counts.over_one += over
+            self.counts.pulses += len(starts)
+            self.counts.shares += float(share.sum())
+            power *= share
         return power, sigma
 
     def check_widths(self) -> None:
@@ -226,27 +244,6 @@ class LightModel:
                 f"{self.path}: --widths {self.options.widths}: {counts.limited_width} of {counts.own_width} values are "
                 f"outside of {least:.2g} to {most:.0f} ns; give a column with the width of each echo in ns"
             )
-
-    def _measure_shares(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        known = over = 0
-        if self._read_share is None:
-            share = share_equally(rows["total"], starts)
-        else:
-            share = self._read_share(records).astype(float)
-            wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
-            if len(wrong):
-                raise InputError(
-                    f"{self.path}: {self.options.shares} holds {share[wrong[0]]:g}, which is no share of a footprint: "
-                    "shares are 0 to 1; give a column with such values to --shares"
-                )
-            known = int(np.count_nonzero(np.isfinite(share)))
-            share, over = fill_shares(share, starts)
-        self.counts.own_share += known
-        self.counts.assumed_share += len(share) - known
-        self.counts.over_one += over
-        self.counts.pulses += len(starts)
-        self.counts.shares += float(share.sum())
-        return share
 
 
 def share_equally(total: np.ndarray, starts: np.ndarray) -> np.ndarray:

@@ -211,27 +211,23 @@ class WithGaps:
         low, high = _find_room(recording, self.margin)
         most = int(count.max(initial=1)) - 1
         top = min(self.high, (high - low) / max(most, 1)) if most * self.low < high - low else self.low
-        gaps = self._draw_gaps(rng, count, most, high - low, top)
+        # Gaps (n, most), 0 after the last echo. After 32 draws that did not fit, gaps are at most `top`.
+        used = np.arange(1, most + 1) < count[:, None]
+        gaps = np.zeros((len(count), most))
+        todo = np.flatnonzero(count > 1)
+        for attempt in range(33):
+            largest = self.high if attempt < 32 else top
+            drawn = np.exp(rng.uniform(np.log(self.low), np.log(max(largest, self.low)), (len(todo), most)))
+            drawn *= used[todo]
+            gaps[todo] = drawn
+            todo = todo[drawn.sum(axis=1) > high - low]
+            if not len(todo):
+                break
         ends = np.cumsum(gaps, axis=1)
         span = ends[:, -1] if most > 0 else np.zeros(len(count))
         start = low + rng.random(len(count)) * np.maximum(high - low - span, 0)
         times = np.concatenate([start[:, None], start[:, None] + ends], axis=1)
         return times[np.arange(most + 1) < np.maximum(count, 0)[:, None]]
-
-    def _draw_gaps(self, rng, count, most: int, room: float, fallback: float) -> np.ndarray:
-        """Gaps (n, most), 0 after the last echo. After 32 draws that did not fit, gaps are at most `fallback`."""
-        used = np.arange(1, most + 1) < count[:, None]
-        gaps = np.zeros((len(count), most))
-        todo = np.flatnonzero(count > 1)
-        for attempt in range(33):
-            top = self.high if attempt < 32 else fallback
-            drawn = np.exp(rng.uniform(np.log(self.low), np.log(max(top, self.low)), (len(todo), most)))
-            drawn *= used[todo]
-            gaps[todo] = drawn
-            todo = todo[drawn.sum(axis=1) > room]
-            if not len(todo):
-                break
-        return gaps
 
 
 def _find_room(recording: Recording, margin: float) -> tuple[float, float]:
@@ -590,7 +586,9 @@ def simulate_blocks(
         for number in range(start // block, -(-stop // block)):
             low = number * block
             parts.append(simulate_seed_block(scene, seed, number).cut(max(start - low, 0), min(stop - low, block)))
-        yield _join(parts, start)
+        shifts = np.cumsum([0, *(len(part.block) for part in parts[:-1])]).tolist()
+        truth = EchoTable.concatenate((part.truth, shift) for part, shift in zip(parts, shifts, strict=True))
+        yield replace(WaveformBlock.concatenate([part.block for part in parts]), first=start), truth
 
 
 def seed_block(scene: Scene) -> int:
@@ -646,9 +644,3 @@ def flag_truth(truth: EchoTable, recording: Recording) -> EchoTable:
     truth = truth.with_flags(EchoFlag.NEAR_EDGE, depth < EDGE * sigma)
     truth = truth.with_flags(EchoFlag.SATURATED, truth.amplitude + recording.baseline > recording.clip)
     return truth.with_flags(EchoFlag.WEAK, truth.amplitude < WEAK * recording.recorded_noise)
-
-
-def _join(parts: list[Simulated], first: int) -> tuple[WaveformBlock, EchoTable]:
-    shifts = np.cumsum([0, *(len(part.block) for part in parts[:-1])]).tolist()
-    truth = EchoTable.concatenate((part.truth, shift) for part, shift in zip(parts, shifts, strict=True))
-    return replace(WaveformBlock.concatenate([part.block for part in parts]), first=first), truth

@@ -25,7 +25,6 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.frozen import frozen
 from wavebatch.core.schema import CheckedOptions, Range, option
-from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.npz import NpzWriter, read_array_header, read_array_text, reading_npz
 from wavebatch.files.disk.raw_bytes import Closing
 from wavebatch.files.las.header import WITHOUT_WAVES, LasHeader, build_dtype, field_names
@@ -82,7 +81,10 @@ class TruthReader(Closing):
             if lacking:
                 raise InputError(f"{self.path}: no truth file of wavebatch simulate: lacks {', '.join(lacking)}")
             with self._archive.open(f"{_META}.npy") as member:
-                self.meta: dict[str, Any] = json.loads(self._read_text(member))
+                shape, _, dtype = read_array_header(member)
+                if shape or dtype.kind != "U" or dtype.itemsize > _MOST_TEXT:
+                    raise InputError(f"{self.path}: its description is {dtype}, no text; simulate the strip again")
+                self.meta: dict[str, Any] = json.loads(read_array_text(member.read(dtype.itemsize), dtype))
             # The numbers that comparisons need.
             for key, least, most in (("noise_std", 0.0, 1e9), ("spacing", 1e-6, 1e6), ("packets", 0, 1 << 40)):
                 value = self.meta[key]
@@ -91,12 +93,6 @@ class TruthReader(Closing):
 
     def _reading(self) -> contextlib.AbstractContextManager[None]:
         return reading_npz(self.path, "truth file of `wavebatch simulate`", "simulate the strip again")
-
-    def _read_text(self, member: IO[bytes]) -> str:
-        shape, _, dtype = read_array_header(member)
-        if shape or dtype.kind != "U" or dtype.itemsize > _MOST_TEXT:
-            raise InputError(f"{self.path}: its description is {dtype}, no text; simulate the strip again")
-        return read_array_text(member.read(dtype.itemsize), dtype)
 
     def close(self) -> None:
         """Closes the file."""
@@ -320,7 +316,7 @@ def _fill_points(dtype: np.dtype, simulated: Simulated, returns: Returns, scale:
     """Point records of the returns: every field but those of the packets."""
     block, pulse = simulated.block, returns.pulse
     points = np.zeros(len(pulse), dtype)
-    xyz = _locate(block, pulse, returns.time)
+    xyz = block.origin[pulse] + returns.time[:, None] * block.direction[pulse]
     for axis, (name, origin) in enumerate((("X", EAST), ("Y", NORTH), ("Z", 0.0))):
         values = np.rint((xyz[:, axis] - origin) / scale)
         if len(values) and np.abs(values).max() >= 2**31:
@@ -346,16 +342,11 @@ def _fill_points(dtype: np.dtype, simulated: Simulated, returns: Returns, scale:
     return points
 
 
-def _locate(block: WaveformBlock, pulse: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """True positions `time` ns after sample 0 of the pulses, f8 (k, 3) [m]."""
-    return block.origin[pulse] + time[:, None] * block.direction[pulse]
-
-
 def _list_truth(simulated: Simulated, packet: np.ndarray, offset: np.ndarray) -> dict[str, np.ndarray]:
     """Columns of the truth file for the echoes in stored packets; packet, offset: of every pulse, (n,)."""
     block, truth, rays = simulated.block, simulated.truth, simulated.rays
     rows = truth.waveform
-    xyz = _locate(block, rows, truth.time)
+    xyz = block.origin[rows] + truth.time[:, None] * block.direction[rows]
     speed = np.linalg.norm(block.direction[rows], axis=1)
     past_ground = np.einsum("ij,ij->i", xyz - rays.ground[rows], block.direction[rows]) / speed
     return {

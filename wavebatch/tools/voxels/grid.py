@@ -242,36 +242,33 @@ class VoxelGrid(Closing):
                 some = np.flatnonzero(sums[:, _ENERGY] > 0)
                 key, sums = key[some], sums[some]
             index = kernel.unpack_index(key)
-            yield index - self._low, self._finish(index, sums, log_error)
-
-    def _finish(self, index: np.ndarray, sums: np.ndarray, log_error: float) -> dict[str, np.ndarray]:
-        lit = sums[:, _LIGHT] > 0
-        share, rays, light = _list_shares(sums).T
-        rays = rays / self.spread[_classify(rays)]
-        # A share of 0 or 1 alone states no error: half a ray of light and of shade are added.
-        near = (share * rays + 0.5) / (rays + 1.0)
-        spread = near * (1.0 - near) / rays
-        by_ratio = (sums[:, _CAUGHT_BY_RATIO] - share * sums[:, _LIGHT_BY_RATIO]) * LIGHT_UNIT / light
-        columns = {
-            "energy": sums[:, _ENERGY] * self._unit,
-            "rays": sums[:, _RAYS],
-            "path": sums[:, _PATH] * PATH_UNIT,
-            "light": sums[:, _LIGHT] * LIGHT_UNIT,
-            "share": np.where(lit, share, np.nan),
-            "share_error": np.where(lit, np.sqrt(spread + (by_ratio * log_error) ** 2), np.nan),
-        }
-        if self._sections:
-            columns["cross_section"] = np.where(sums[:, _UNKNOWN] > 0, np.nan, sums[:, _SECTION] * SECTION_UNIT)
-        if self._floor is not None:
-            height = self._floor.measure_height((index + self.anchor + 0.5) * self.size)
-            columns["height"] = np.where(np.isfinite(height), height, np.nan)
-            ground = sums[:, _GROUND] * LIGHT_UNIT / light
-            columns["ground"] = np.where(lit, ground, np.nan)
-            columns["free_path"] = sums[:, _FREE] * PATH_UNIT
-            free = np.where(lit, columns["free_path"] / light, 0.0)
-            found = measure_attenuation(np.clip(share - ground, 0.0, 1.0), rays, free)
-            columns["attenuation"], columns["attenuation_error"] = found
-        return {column.name: columns[column.name].astype(column.dtype) for column in self.columns}
+            lit = sums[:, _LIGHT] > 0
+            share, rays, light = _list_shares(sums).T
+            rays = rays / self.spread[_classify(rays)]
+            # A share of 0 or 1 alone states no error: half a ray of light and of shade are added.
+            near = (share * rays + 0.5) / (rays + 1.0)
+            spread = near * (1.0 - near) / rays
+            by_ratio = (sums[:, _CAUGHT_BY_RATIO] - share * sums[:, _LIGHT_BY_RATIO]) * LIGHT_UNIT / light
+            columns = {
+                "energy": sums[:, _ENERGY] * self._unit,
+                "rays": sums[:, _RAYS],
+                "path": sums[:, _PATH] * PATH_UNIT,
+                "light": sums[:, _LIGHT] * LIGHT_UNIT,
+                "share": np.where(lit, share, np.nan),
+                "share_error": np.where(lit, np.sqrt(spread + (by_ratio * log_error) ** 2), np.nan),
+            }
+            if self._sections:
+                columns["cross_section"] = np.where(sums[:, _UNKNOWN] > 0, np.nan, sums[:, _SECTION] * SECTION_UNIT)
+            if self._floor is not None:
+                height = self._floor.measure_height((index + self.anchor + 0.5) * self.size)
+                columns["height"] = np.where(np.isfinite(height), height, np.nan)
+                ground = sums[:, _GROUND] * LIGHT_UNIT / light
+                columns["ground"] = np.where(lit, ground, np.nan)
+                columns["free_path"] = sums[:, _FREE] * PATH_UNIT
+                free = np.where(lit, columns["free_path"] / light, 0.0)
+                found = measure_attenuation(np.clip(share - ground, 0.0, 1.0), rays, free)
+                columns["attenuation"], columns["attenuation_error"] = found
+            yield index - self._low, {column.name: columns[column.name].astype(column.dtype) for column in self.columns}
 
 
 def _count(values: np.ndarray | float, unit: float) -> np.ndarray:
@@ -340,7 +337,32 @@ def write_las(
 
     The centres are exact: coordinates count half voxels from the lower corner of the grid.
     """
-    header = _build_header(space)
+    facts, source = space.facts, las.read_header(space.facts.path)
+    vlrs = repair_records(vlr for vlr in source.vlrs if las.is_projection(vlr))
+    if not las.has_record(vlrs, las.PROJECTION, las.WKT_ID) and (facts.crs or "").endswith("]"):
+        record = las.build_wkt(repair_wkt(facts.crs))  # from an extended record
+        if len(record.payload) > 65535:
+            raise InputError(f"{facts.path}: its CRS is longer than the record of a point cloud; write an .npz")
+        vlrs.append(record)
+    modern = source.point_format >= 6
+    encoding = source.global_encoding & 1
+    if modern and (las.has_record(vlrs, las.PROJECTION, las.WKT_ID) or not vlrs):
+        encoding |= las.WKT_BIT
+    text = json.dumps(space.meta, sort_keys=True, separators=(",", ":")).encode()
+    header = las.LasHeader(
+        version=(1, 4) if modern else source.version,
+        point_format=6 if modern else 0,
+        point_length=0,
+        scales=(0.5 * space.size,) * 3,
+        offsets=tuple(float(value) for value in space.origin),
+        vlrs=[*vlrs, las.Vlr(b"wavebatch", 1, text, b"how voxels were made (JSON)")],
+        file_source_id=source.file_source_id,
+        global_encoding=encoding,
+        project_id=source.project_id,
+        system_identifier=b"EXTRACTION",
+        generating_software=f"wavebatch {__version__}".encode(),
+        creation=source.creation,
+    )
     texts = [one.meaning if one.unit == "-" else f"{one.meaning} [{one.unit}]" for one in space.columns]
     columns = zip(space.columns, texts, strict=True)
     records = [las.ExtraRecord.build(one.name, one.dtype, text, no_data=one.no_data) for one, text in columns]
@@ -362,35 +384,6 @@ def write_las(
         file.drafts[:0] = others
         file.commit()
     return number
-
-
-def _build_header(space: VoxelSpace) -> las.LasHeader:
-    facts, source = space.facts, las.read_header(space.facts.path)
-    vlrs = repair_records(vlr for vlr in source.vlrs if las.is_projection(vlr))
-    if not las.has_record(vlrs, las.PROJECTION, las.WKT_ID) and (facts.crs or "").endswith("]"):
-        record = las.build_wkt(repair_wkt(facts.crs))  # from an extended record
-        if len(record.payload) > 65535:
-            raise InputError(f"{facts.path}: its CRS is longer than the record of a point cloud; write an .npz")
-        vlrs.append(record)
-    modern = source.point_format >= 6
-    encoding = source.global_encoding & 1
-    if modern and (las.has_record(vlrs, las.PROJECTION, las.WKT_ID) or not vlrs):
-        encoding |= las.WKT_BIT
-    text = json.dumps(space.meta, sort_keys=True, separators=(",", ":")).encode()
-    return las.LasHeader(
-        version=(1, 4) if modern else source.version,
-        point_format=6 if modern else 0,
-        point_length=0,
-        scales=(0.5 * space.size,) * 3,
-        offsets=tuple(float(value) for value in space.origin),
-        vlrs=[*vlrs, las.Vlr(b"wavebatch", 1, text, b"how voxels were made (JSON)")],
-        file_source_id=source.file_source_id,
-        global_encoding=encoding,
-        project_id=source.project_id,
-        system_identifier=b"EXTRACTION",
-        generating_software=f"wavebatch {__version__}".encode(),
-        creation=source.creation,
-    )
 
 
 PULSE_COLUMNS = {

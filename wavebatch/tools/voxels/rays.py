@@ -153,7 +153,13 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
         place = first[rows] + np.arange(length[rows[0]])[:, None]
         std = noise.std[rows].astype(np.float64)
         part = signal[place, rows]
-        profile = _deconvolve(part, taps, noise.std[rows], options)
+        if options.method == "wiener":
+            profile = deconvolve.deconvolve_wiener(part, taps, (options.snr or SNR) ** -2.0)
+        elif options.method == "gold":
+            profile = deconvolve.deconvolve_gold(part, taps, options.steps)
+        else:
+            level = np.float32(BACKGROUND) * noise.std[rows]
+            profile = deconvolve.deconvolve_richardson_lucy(part, taps, level, options.steps)
         near = np.ascontiguousarray(support[place, rows].T)
         kept, seen[rows] = deconvolve.keep_signal(np.ascontiguousarray(profile.T), near, least * std, floor * std)
         if options.method != "richardson_lucy":  # that iteration keeps the energy, the others do not
@@ -169,14 +175,6 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
         offset = offset * block.spacing
     clipped = (block.samples >= clip_level(block, system)).any(axis=1)
     return Profiles(value, area, seen, offset, anchored, clipped)
-
-
-def _deconvolve(signal: np.ndarray, taps: np.ndarray, std: np.ndarray, options: Deconvolution) -> np.ndarray:
-    if options.method == "wiener":
-        return deconvolve.deconvolve_wiener(signal, taps, (options.snr or SNR) ** -2.0)
-    if options.method == "gold":
-        return deconvolve.deconvolve_gold(signal, taps, options.steps)
-    return deconvolve.deconvolve_richardson_lucy(signal, taps, np.float32(BACKGROUND) * std, options.steps)
 
 
 def _pulse_taps(system: SystemPulse, spacing: float) -> tuple[np.ndarray, float]:
@@ -542,7 +540,18 @@ def join_packets(packets: np.ndarray, samples: np.ndarray, lost: np.ndarray) -> 
     ray, first = np.cumsum(new) - 1, np.flatnonzero(new)
     shift = shift - shift[first][ray]
     begin, end = packets["begin"] + shift, packets["end"] + shift
-    low, high = _share_overlaps(ray, first, begin, end)
+    # Of two packets that overlap, each counts to the middle of what both recorded: there, echoes are far from the ends
+    # of both. A packet inside another one does not count.
+    low, high, last = begin.copy(), end.copy(), first.copy()
+    rank = np.arange(len(ray)) - first[ray]
+    for number in range(1, int(rank.max(initial=0)) + 1):
+        row = np.flatnonzero(rank == number)
+        before = last[ray[row]]
+        inside, apart = end[row] <= end[before], begin[row] >= end[before]
+        middle = 0.5 * (begin[row] + end[before])
+        low[row] = np.where(inside, np.inf, np.where(apart, begin[row], middle))
+        high[before] = np.where(inside | apart, high[before], middle)
+        last[ray[row]] = np.where(inside, before, row)
 
     table = np.zeros(len(first), RAY)
     for name in PACKET.names:
@@ -571,27 +580,6 @@ def join_packets(packets: np.ndarray, samples: np.ndarray, lost: np.ndarray) -> 
     last[some] = final["time"] + 0.5 * final["spacing"]
     table["end"] = np.where(table["known"] < np.inf, np.maximum(last, table["known"]), last)
     return Rays(table, samples)
-
-
-def _share_overlaps(
-    ray: np.ndarray, first: np.ndarray, begin: np.ndarray, end: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The times between which each packet counts, where packets of a ray, sorted by `begin`, overlap.
-
-    Of two that overlap, each counts to the middle of what both recorded: there, echoes are far from the ends of both. A
-    packet inside another one does not count.
-    """
-    low, high, last = begin.copy(), end.copy(), first.copy()
-    rank = np.arange(len(ray)) - first[ray]
-    for number in range(1, int(rank.max(initial=0)) + 1):
-        row = np.flatnonzero(rank == number)
-        before = last[ray[row]]
-        inside, apart = end[row] <= end[before], begin[row] >= end[before]
-        middle = 0.5 * (begin[row] + end[before])
-        low[row] = np.where(inside, np.inf, np.where(apart, begin[row], middle))
-        high[before] = np.where(inside | apart, high[before], middle)
-        last[ray[row]] = np.where(inside, before, row)
-    return low, high
 
 
 def _find_known(
